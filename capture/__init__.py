@@ -1,0 +1,1 @@
+"""Drive the rig, know its errors, keep the frames."""

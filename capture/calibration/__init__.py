@@ -1,0 +1,1 @@
+"""Calibration of sensor, color and polarization, and the CALIBRATION/ format."""

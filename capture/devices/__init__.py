@@ -1,0 +1,1 @@
+"""Drivers: the wire format, the port, one thin driver for each box, and cameras."""

@@ -1,0 +1,1 @@
+"""Images to maps: one estimator a file, the pipeline on top."""

@@ -1,0 +1,1 @@
+"""The same rig, made of physics: emulated boxes, sensors, subjects, scenes."""

@@ -1,0 +1,1 @@
+"""Emulated controllers: state, command table and advance(dt)."""

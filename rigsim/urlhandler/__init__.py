@@ -1,0 +1,1 @@
+"""Pyserial URL handlers of the simulator."""
