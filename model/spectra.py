@@ -1,0 +1,395 @@
+"""Spectral data of skin, cameras, lights and observers, and their band averages.
+
+The tables are CSV files in ``model/data``; each file's header names its source and units.
+Everything is sampled by linear interpolation at the wavelengths that the caller asks for.
+"""
+
+from __future__ import annotations
+
+from functools import cache, lru_cache
+from importlib import resources
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+WAVELENGTH_NM: FloatArray = np.arange(400.0, 701.0, 10.0)
+"""Default sampling of the visible spectrum in nm: 400 to 700 in steps of 10, 31 samples."""
+WAVELENGTH_NM.setflags(write=False)
+
+HEMOGLOBIN_MOLAR_MASS_G_PER_MOL = 64_500.0  # Prahl 1998, molar mass behind the table
+HEMOGLOBIN_IN_BLOOD_G_PER_L = 150.0  # Prahl 1998, whole blood
+
+# Exponents and factors of the melanins' absorption, wavelength in nm, result in 1/mm:
+# Donner and Jensen 2006, doi:10.2312/EGWR/EGSR06/409-417.
+EUMELANIN_FACTOR_PER_MM, EUMELANIN_EXPONENT = 6.6e10, -3.33
+PHEOMELANIN_FACTOR_PER_MM, PHEOMELANIN_EXPONENT = 2.9e14, -4.75
+# Absorption of bloodless, melanin-free skin, 1/mm: Jacques 1998 (OMLC), Donner and Jensen 2006.
+BASELINE_OFFSET_PER_MM, BASELINE_FACTOR_PER_MM = 0.0244, 8.53
+BASELINE_ORIGIN_NM, BASELINE_SCALE_NM = 154.0, 66.2
+# Reduced scattering of the epidermis, 1/mm: Mie part and Rayleigh part. Public codes use
+# 2.0e11 to 2.22e11 for the Rayleigh factor; 2.2e11 is taken here.
+MIE_FACTOR_PER_MM, MIE_EXPONENT = 14.74, -0.22
+RAYLEIGH_FACTOR_PER_MM, RAYLEIGH_EXPONENT = 2.2e11, -4.0
+
+FLASH_TEMPERATURE_K = 6_000.0  # plasma continuum of the tube
+FLASH_CUTOFF_NM, FLASH_CUTOFF_WIDTH_NM = 395.0, 8.0  # ultraviolet-absorbing envelope
+
+_CAMERA_FILES = {
+    "Nikon 5100 (NPL)": "camera_nikon_5100_npl.csv",
+    "Sigma SDMerill (NPL)": "camera_sigma_sdmerill_npl.csv",
+}
+_DAYLIGHT_NOMINAL_K = {"D50": 5000.0, "D55": 5500.0, "D65": 6500.0}
+
+
+class SpectrumNameError(KeyError, ValueError):
+    """No spectrum of that name is stored."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+def hemoglobin_extinction(
+    wavelength_nm: ArrayLike = WAVELENGTH_NM,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the molar extinction of oxygenated and of deoxygenated hemoglobin.
+
+    Parameters
+    ----------
+    wavelength_nm
+        Wavelengths in nm, any shape, 380 to 780.
+
+    Returns
+    -------
+    tuple of ndarray
+        Decadic molar extinctions in 1/(cm mol/l): oxygenated, deoxygenated; shaped like the input.
+
+    References
+    ----------
+    S. Prahl, Tabulated molar extinction coefficient for hemoglobin in water, OMLC 1998.
+
+    Examples
+    --------
+    >>> oxy, deoxy = hemoglobin_extinction([540.0])
+    >>> float(oxy[0]), float(deoxy[0])
+    (53236.0, 46592.0)
+    """
+    values = _sampled("hemoglobin_extinction.csv", wavelength_nm, outside=None)
+    return values[..., 0], values[..., 1]
+
+
+def eumelanin_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+    """Return the absorption of eumelanin in 1/mm at wavelengths in nm (any shape).
+
+    References
+    ----------
+    Donner and Jensen 2006, doi:10.2312/EGWR/EGSR06/409-417.
+
+    Examples
+    --------
+    >>> round(float(eumelanin_absorption(500.0)), 2)
+    67.92
+    """
+    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    return np.asarray(EUMELANIN_FACTOR_PER_MM * wavelength**EUMELANIN_EXPONENT)
+
+
+def pheomelanin_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+    """Return the absorption of pheomelanin in 1/mm at wavelengths in nm (any shape).
+
+    References
+    ----------
+    Donner and Jensen 2006, doi:10.2312/EGWR/EGSR06/409-417.
+
+    Examples
+    --------
+    >>> round(float(pheomelanin_absorption(500.0)), 2)
+    43.88
+    """
+    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    return np.asarray(PHEOMELANIN_FACTOR_PER_MM * wavelength**PHEOMELANIN_EXPONENT)
+
+
+def baseline_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+    """Return the absorption in 1/mm of skin without blood and melanin, wavelengths in nm.
+
+    References
+    ----------
+    Donner and Jensen 2006, doi:10.2312/EGWR/EGSR06/409-417.
+
+    Examples
+    --------
+    >>> round(float(baseline_absorption(500.0)), 4)
+    0.0702
+    """
+    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    decay = np.exp(-(wavelength - BASELINE_ORIGIN_NM) / BASELINE_SCALE_NM)
+    return np.asarray(BASELINE_OFFSET_PER_MM + BASELINE_FACTOR_PER_MM * decay)
+
+
+def reduced_scattering(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+    """Return the reduced scattering of the epidermis in 1/mm, wavelengths in nm (any shape).
+
+    The dermis has half of it (Donner et al. 2008, doi:10.1145/1409060.1409093).
+
+    Examples
+    --------
+    >>> round(float(reduced_scattering(500.0)), 3)
+    7.276
+    """
+    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    mie = MIE_FACTOR_PER_MM * wavelength**MIE_EXPONENT
+    rayleigh = RAYLEIGH_FACTOR_PER_MM * wavelength**RAYLEIGH_EXPONENT
+    return np.asarray(mie + rayleigh)
+
+
+def camera_sensitivity(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+    """Return the relative spectral sensitivity of a camera's three channels.
+
+    Parameters
+    ----------
+    name
+        "Nikon 5100 (NPL)" or "Sigma SDMerill (NPL)".
+    wavelength_nm
+        Wavelengths in nm, shape (n,). Outside the measured range the sensitivity is zero.
+
+    Returns
+    -------
+    ndarray
+        Shape (n, 3): red, green, blue; dimensionless, one scale for all channels.
+
+    Raises
+    ------
+    SpectrumNameError
+        When no camera of that name is stored.
+
+    References
+    ----------
+    Darrodi et al. 2015, doi:10.1364/JOSAA.32.000381.
+    """
+    if name not in _CAMERA_FILES:
+        raise SpectrumNameError(_unknown("camera", name, camera_names()))
+    return _sampled(_CAMERA_FILES[name], wavelength_nm, outside=0.0)
+
+
+def camera_names() -> tuple[str, ...]:
+    """Return the names that `camera_sensitivity` knows."""
+    return tuple(_CAMERA_FILES)
+
+
+def illuminant_names() -> tuple[str, ...]:
+    """Return the names that `illuminant` knows."""
+    return (*_DAYLIGHT_NOMINAL_K, "A", "E", "xenon flash")
+
+
+def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+    """Return the relative spectral power of a light.
+
+    Parameters
+    ----------
+    name
+        "D50", "D55", "D65" (CIE daylight), "A", "E" (equal energy) or "xenon flash".
+    wavelength_nm
+        Wavelengths in nm, shape (n,), 380 to 780 for daylight.
+
+    Returns
+    -------
+    ndarray
+        Shape (n,), relative power per wavelength interval, 100 at 560 nm.
+
+    Raises
+    ------
+    SpectrumNameError
+        When no light of that name is known.
+
+    Notes
+    -----
+    "xenon flash" is a smooth description of a photographic flash tube, not a measurement: a black
+    body of 6000 K seen through an envelope that absorbs the ultraviolet (logistic edge at 395 nm).
+    Its correlated color temperature is about 5950 K. The weak visible xenon lines are left out.
+
+    References
+    ----------
+    CIE 015:2018 Colorimetry, doi:10.25039/TR.015.2018.
+
+    Examples
+    --------
+    >>> illuminant("D65", [560.0, 600.0]).round(1).tolist()
+    [100.0, 90.0]
+    """
+    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    if name in _DAYLIGHT_NOMINAL_K:
+        return _daylight(_DAYLIGHT_NOMINAL_K[name], wavelength)
+    if name == "A":
+        # CIE 015:2018: c2 = 1.435e7 nm K and 2848 K are the defining constants.
+        return _black_body(wavelength, 1.435e7, 2848.0)
+    if name == "E":
+        return np.full(wavelength.shape, 100.0)
+    if name == "xenon flash":
+
+        def envelope(nm: FloatArray) -> FloatArray:
+            return np.asarray(1.0 / (1.0 + np.exp(-(nm - FLASH_CUTOFF_NM) / FLASH_CUTOFF_WIDTH_NM)))
+
+        body = _black_body(wavelength, 1.4388e7, FLASH_TEMPERATURE_K)
+        return np.asarray(body * envelope(wavelength) / envelope(np.array(560.0)))
+    raise SpectrumNameError(_unknown("light", name, illuminant_names()))
+
+
+def color_matching_functions(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
+    """Return the CIE 1931 2-degree color matching functions, shape (n, 3), wavelengths in nm.
+
+    References
+    ----------
+    CIE 015:2018 Colorimetry, doi:10.25039/TR.015.2018.
+    """
+    return _sampled("cie_1931_2_degree.csv", wavelength_nm, outside=0.0)
+
+
+def band_weights(
+    camera: str, illuminant_name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM
+) -> FloatArray:
+    """Return weights that turn a sampled reflectance into white-balanced camera RGB.
+
+    Parameters
+    ----------
+    camera, illuminant_name
+        Names known to `camera_sensitivity` and `illuminant`.
+    wavelength_nm
+        Sampling of the reflectance in nm, shape (n,), increasing.
+
+    Returns
+    -------
+    ndarray
+        Shape (n, 3); every column sums to 1, so that a perfect white gives (1, 1, 1).
+
+    Notes
+    -----
+    Between samples the reflectance is taken as linear; sensitivity and light are integrated in
+    steps of 1 nm from the first to the last sample, and nothing is counted outside them.
+    """
+    return _band_weights(camera, illuminant_name, _increasing(wavelength_nm)).copy()
+
+
+def band_average(
+    spectra: ArrayLike,
+    camera: str,
+    illuminant_name: str,
+    *,
+    wavelength_nm: ArrayLike = WAVELENGTH_NM,
+) -> FloatArray:
+    """Return the white-balanced camera RGB of reflectance spectra.
+
+    Parameters
+    ----------
+    spectra
+        Reflectances, shape (..., n), dimensionless.
+    camera, illuminant_name
+        Names known to `camera_sensitivity` and `illuminant`.
+    wavelength_nm
+        The n wavelengths in nm.
+
+    Returns
+    -------
+    ndarray
+        Shape (..., 3), each channel divided by that of a perfect white.
+
+    Examples
+    --------
+    >>> band_average(np.full(31, 0.5), "Nikon 5100 (NPL)", "D55").round(12).tolist()
+    [0.5, 0.5, 0.5]
+    """
+    values = np.asarray(spectra, dtype=np.float64)
+    weights = band_weights(camera, illuminant_name, wavelength_nm)
+    if values.shape[-1:] != weights.shape[:1]:
+        raise ValueError(
+            f"spectra: last axis must have {weights.shape[0]} samples (one a wavelength), "
+            f"got shape {values.shape}"
+        )
+    return np.asarray(values @ weights)
+
+
+def camera_white(camera: str, illuminant_name: str) -> FloatArray:
+    """Return the camera RGB of a perfect white, not balanced, largest channel 1, shape (3,).
+
+    Divide camera RGB by it to get the white-balanced RGB of `band_average` (up to one scale).
+    """
+    wavelength = np.arange(380.0, 781.0, 1.0)
+    light = illuminant(illuminant_name, wavelength)
+    raw = light @ camera_sensitivity(camera, wavelength)
+    return np.asarray(raw / raw.max())
+
+
+@cache
+def _table(file_name: str) -> tuple[FloatArray, FloatArray]:
+    text = resources.files("model").joinpath("data", file_name).read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+    values = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
+    return values[:, 0], values[:, 1:]
+
+
+def _sampled(file_name: str, wavelength_nm: ArrayLike, *, outside: float | None) -> FloatArray:
+    """Interpolate a table linearly; `outside` is the value beyond it, None forbids going there."""
+    nodes, values = _table(file_name)
+    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    if outside is None and not np.all((wavelength >= nodes[0]) & (wavelength <= nodes[-1])):
+        raise ValueError(
+            f"wavelength_nm: the table {file_name} spans {nodes[0]:.0f} to {nodes[-1]:.0f} nm, "
+            f"got {np.min(wavelength):g} to {np.max(wavelength):g}"
+        )
+    columns = [
+        np.interp(wavelength, nodes, values[:, k], left=outside, right=outside)
+        for k in range(values.shape[1])
+    ]
+    return np.stack(columns, axis=-1)
+
+
+@lru_cache(maxsize=64)
+def _band_weights(camera: str, light_name: str, grid: tuple[float, ...]) -> FloatArray:
+    nodes = np.array(grid)
+    fine = np.linspace(nodes[0], nodes[-1], round(nodes[-1] - nodes[0]) + 1)
+    response = illuminant(light_name, fine)[:, None] * camera_sensitivity(camera, fine)
+    response[[0, -1]] *= 0.5  # trapezoid rule
+    # Hat functions of the samples at the fine wavelengths: linear interpolation as a matrix.
+    right = np.clip(np.searchsorted(nodes, fine, side="right"), 1, nodes.size - 1)
+    fraction = (fine - nodes[right - 1]) / (nodes[right] - nodes[right - 1])
+    weights = np.zeros((nodes.size, 3))
+    np.add.at(weights, right - 1, (1.0 - fraction)[:, None] * response)
+    np.add.at(weights, right, fraction[:, None] * response)
+    return np.asarray(weights / weights.sum(axis=0))
+
+
+def _increasing(wavelength_nm: ArrayLike) -> tuple[float, ...]:
+    grid = np.asarray(wavelength_nm, dtype=np.float64)
+    if grid.ndim != 1 or grid.size < 2 or not np.all(np.diff(grid) > 0):
+        raise ValueError(
+            "wavelength_nm: expected at least two increasing wavelengths on one axis, "
+            f"got shape {grid.shape}"
+        )
+    return tuple(grid.tolist())
+
+
+def _daylight(nominal_k: float, wavelength: FloatArray) -> FloatArray:
+    # CIE 015:2018, section 4.1.2; the nominal temperature is corrected for the change of c2.
+    t = nominal_k * 1.4388 / 1.4380
+    if t <= 7000.0:
+        x = -4.6070e9 / t**3 + 2.9678e6 / t**2 + 0.09911e3 / t + 0.244063
+    else:
+        x = -2.0064e9 / t**3 + 1.9018e6 / t**2 + 0.24748e3 / t + 0.237040
+    y = -3.0 * x**2 + 2.870 * x - 0.275
+    m = 0.0241 + 0.2562 * x - 0.7341 * y
+    m1 = round((-1.3515 - 1.7703 * x + 5.9114 * y) / m, 3)
+    m2 = round((0.0300 - 31.4424 * x + 30.0717 * y) / m, 3)
+    components = _sampled("cie_daylight_components.csv", wavelength, outside=None)
+    return np.asarray(components @ np.array([1.0, m1, m2]))
+
+
+def _black_body(wavelength: FloatArray, c2_nm_k: float, temperature_k: float) -> FloatArray:
+    def relative(nm: FloatArray) -> FloatArray:
+        return np.asarray(nm**-5.0 / np.expm1(c2_nm_k / (nm * temperature_k)))
+
+    return 100.0 * relative(wavelength) / relative(np.array(560.0))
+
+
+def _unknown(kind: str, name: str, known: tuple[str, ...]) -> str:
+    return f"{kind} {name!r} is not stored; known: {', '.join(known)}"
