@@ -1,0 +1,39 @@
+.DEFAULT_GOAL := help
+SKINRIG := .venv/bin/skinrig
+PYTEST := .venv/bin/python -m pytest
+
+.PHONY: help setup demo test test-long lint bench clean
+
+help:
+	@echo "make demo       simulate, capture, calibrate, reconstruct, report (leaves ./demo)"
+	@echo "make test       every test but the long ones"
+	@echo "make test-long  the long ones"
+	@echo "make lint       ruff, mypy and the import contracts"
+	@echo "make bench      error against run time of each stage"
+	@echo "each sets up what it needs in .venv first"
+
+setup: .venv/.ready
+
+.venv/.ready: pyproject.toml constraints.txt tools/setup_environment.sh
+	@tools/setup_environment.sh
+
+demo: .venv/.ready
+	@$(SKINRIG) demo --out demo
+
+lint: .venv/.ready
+	@.venv/bin/ruff check .
+	@.venv/bin/ruff format --check .
+	@.venv/bin/mypy
+	@.venv/bin/lint-imports
+
+test: .venv/.ready
+	@$(PYTEST) -q -m "not long"
+
+test-long: .venv/.ready
+	@$(PYTEST) -q -m long
+
+bench: .venv/.ready
+	@$(SKINRIG) bench
+
+clean:
+	rm -rf .venv demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,70 @@
+"""Map a function over tiles with a bounded number in flight, in order.
+
+The one seam for parallel and distributed work: any executor with ``submit`` fits, a
+``concurrent.futures`` pool or ``distributed.Client(...).get_executor()`` alike.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future
+from typing import TypeVar
+
+Tile = TypeVar("Tile")
+Result = TypeVar("Result")
+
+
+def map_tiles(
+    fn: Callable[[Tile], Result],
+    tiles: Iterable[Tile],
+    *,
+    executor: Executor | None = None,
+    window: int = 8,
+) -> Iterator[Result]:
+    """Yield ``fn(tile)`` for each tile, in the order of the tiles.
+
+    Parameters
+    ----------
+    fn
+        A pure function; defined at module level when the executor uses processes.
+    tiles
+        Small handles (paths, boxes, indices), read lazily; not the arrays themselves.
+    executor
+        Where to run; None runs in this thread.
+    window
+        The most tiles that may be in flight at once.
+
+    Yields
+    ------
+    Result
+        One result a tile, in order. When a tile raises, the tiles that have not started
+        are cancelled and the error is passed on.
+
+    Raises
+    ------
+    ValueError
+        When ``window`` is below 1.
+
+    Examples
+    --------
+    >>> list(map_tiles(abs, [-1, 2, -3]))
+    [1, 2, 3]
+    """
+    if window < 1:
+        raise ValueError(f"window: got {window}, expected at least 1")
+    if executor is None:
+        for tile in tiles:
+            yield fn(tile)
+        return
+    pending: deque[Future[Result]] = deque()
+    try:
+        for tile in tiles:
+            pending.append(executor.submit(fn, tile))
+            if len(pending) >= window:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        for future in pending:
+            future.cancel()
