@@ -1,0 +1,60 @@
+"""From an exception to one sentence and an exit code."""
+
+from __future__ import annotations
+
+DONE = 0
+LIMIT_MISSED = 1
+USAGE = 2
+BAD_INPUT = 3
+DEVICE_FAILED = 4
+EXTRA_MISSING = 5
+BUG = 70
+INTERRUPTED = 130
+
+
+class MissingExtra(ImportError):
+    """An optional part of the distribution is not installed."""
+
+    def __init__(self, what: str, extra: str) -> None:
+        super().__init__(
+            f"{what} needs the optional part '{extra}': pip install 'skinrig[{extra}]'"
+        )
+
+
+def exit_code(error: BaseException) -> int:
+    """Return the exit code that stands for ``error``.
+
+    Device errors are told from bad input by the package that raised them, so that this
+    module need not import the drivers.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED
+    if isinstance(error, ImportError):
+        return EXTRA_MISSING
+    own = [kind for kind in type(error).__mro__ if kind.__module__.split(".")[0] in _OWN]
+    names = {kind.__name__ for kind in own}
+    if any(kind.__module__.startswith("capture.devices") for kind in own) or (
+        names & {"DeviceError", "AcquisitionError"}
+    ):
+        return DEVICE_FAILED
+    if own or isinstance(error, (ValueError, OSError)):
+        return BAD_INPUT
+    return BUG
+
+
+_OWN = ("capture", "reconstruction", "model", "rigsim", "skinrig")
+
+
+def sentence(error: BaseException) -> str:
+    """Return what to print for ``error``, without a traceback."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted; the same command with --resume goes on where it stopped"
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    text = str(error).strip() or type(error).__name__
+    if exit_code(error) == BUG:
+        return (
+            f"this is a fault of skinrig, not yours ({type(error).__name__}: {text}); "
+            "run again with SKINRIG_TRACEBACK=1 and report what it prints"
+        )
+    return text

@@ -1,0 +1,36 @@
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from skinrig import png
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (4, 2, 3)])
+def test_an_8_bit_image_reads_back_equal_through_another_reader(shape):
+    image = np.random.default_rng(12345).integers(0, 256, shape, dtype=np.uint8)
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png.encode(image)))), image)
+
+
+def test_a_16_bit_gray_image_reads_back_equal():
+    image = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5000
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png.encode(image)))), image)
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((2, 2)), np.zeros((0, 2), np.uint8), np.zeros((2, 2, 4), np.uint8)]
+)
+def test_an_image_that_png_cannot_hold_is_refused(image):
+    with pytest.raises(ValueError, match="image: got"):
+        png.encode(image)
+
+
+def test_invalid_pixels_are_gray_and_ends_have_the_ends_colors():
+    values = np.array([[0.0, 1.0, np.nan, 2.0, 0.5]])
+    valid = np.array([[True, True, True, True, False]])
+    image = png.colorize(values, 0.0, 1.0, valid=valid)
+    np.testing.assert_array_equal(image[0, 2], 128)
+    np.testing.assert_array_equal(image[0, 4], 128)
+    np.testing.assert_array_equal(image[0, 1], image[0, 3])
+    assert (image[0, 0] != image[0, 1]).any()
