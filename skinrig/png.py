@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 
 def encode(image: NDArray[np.generic]) -> bytes:
-    """Encode an image as PNG.
+    r"""Encode an image as PNG.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def encode(image: NDArray[np.generic]) -> bytes:
     Examples
     --------
     >>> encode(np.zeros((2, 2), np.uint8))[:8]
-    b'\\x89PNG\\r\\n\\x1a\\n'
+    b'\x89PNG\r\n\x1a\n'
     """
     pixels = np.asarray(image)
     if pixels.dtype not in (np.uint8, np.uint16):

@@ -1,0 +1,88 @@
+"""Say what is installed, what is missing, and how to mend it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at."""
+
+    what: str
+    state: str
+    fine: bool
+    mend: str = ""
+    """What to type when it is not fine; empty when nothing needs doing."""
+
+
+_REQUIRED = {
+    "numpy": "numpy", "scipy": "scipy", "numba": "numba", "pydantic": "pydantic",
+    "serial": "pyserial", "xxhash": "xxhash", "rawpy": "rawpy", "tifffile": "tifffile",
+    "OpenEXR": "OpenEXR", "cv2": "opencv-contrib-python-headless", "colour": "colour-science",
+    "skimage": "scikit-image", "sklearn": "scikit-learn", "mitsuba": "mitsuba",
+    "matplotlib": "matplotlib",
+}  # fmt: skip
+_EXTRAS = {"distributed": "cluster", "pxr": "usd", "gphoto2": "gphoto", "harvesters": "genicam"}
+
+
+def examine(*, probe_renderer: bool = True) -> list[Finding]:
+    """Look at Python, the packages, the renderer's variant, threads and serial ports.
+
+    Parameters
+    ----------
+    probe_renderer
+        False skips the render probe, which takes a second or two.
+    """
+    version = platform.python_version()
+    findings = [
+        Finding(
+            "Python", version, tuple(map(int, version.split(".")[:2])) >= (3, 11),
+            "install Python 3.11 or newer",
+        )
+    ]  # fmt: skip
+    for module, name in _REQUIRED.items():
+        present = importlib.util.find_spec(module) is not None
+        state = importlib.metadata.version(name) if present else "missing"
+        findings.append(Finding(name, state, present, "" if present else f"pip install {name}"))
+    for module, extra in _EXTRAS.items():
+        present = importlib.util.find_spec(module) is not None
+        findings.append(
+            Finding(
+                f"optional: {extra}", "installed" if present else "not installed", True,
+                "" if present else f"pip install 'skinrig[{extra}]' when you need it",
+            )
+        )  # fmt: skip
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    findings.append(Finding("cores", str(cores), True))
+    if probe_renderer:
+        findings.append(_renderer())
+    findings.extend(_serial_ports())
+    return findings
+
+
+def _renderer() -> Finding:
+    from rigsim import render
+
+    choice = render.choose_variant()
+    fast = choice.name.startswith("llvm")
+    return Finding(
+        "Mitsuba variant", f"{choice.name} ({choice.why})", True,
+        "" if fast else "for speed install LLVM 17 or newer: apt-get install libllvm19",
+    )  # fmt: skip
+
+
+def _serial_ports() -> list[Finding]:
+    from serial.tools import list_ports
+
+    ports = sorted(port.device for port in list_ports.comports())
+    return [
+        Finding(
+            "serial ports", ", ".join(ports) or "none", True,
+            "" if ports else "none is needed to simulate; plug the rig in and look again",
+        )
+    ]  # fmt: skip

@@ -1,0 +1,170 @@
+"""Plots of the report as SVG text, equal bytes for equal input."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_COLORS = ("#2a78b8", "#d1602c", "#3f8f4f", "#8458a8")
+
+
+def _figure(width_in: float, height_in: float) -> tuple[Any, Any]:
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    mpl.rcParams["svg.hashsalt"] = "skinrig"
+    mpl.rcParams["svg.fonttype"] = "none"
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    # transparent on the page; strokes and text take the page's color through CSS
+    figure.patch.set_alpha(0.0)
+    axes.patch.set_alpha(0.0)
+    return figure, axes
+
+
+def _svg(figure: Any) -> str:
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    # black becomes the text color of the page, so that dark mode stays readable
+    text = text[text.index("<svg") :].replace("#000000", "currentColor")
+    return text.replace("<svg ", '<svg aria-hidden="true" ', 1)
+
+
+def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
+    """Draw one stage of a benchmark document: error against seconds, log-log.
+
+    Parameters
+    ----------
+    stage
+        Name, for the title.
+    document
+        The stage's entry in a ``skinrig.bench/1`` document.
+
+    Returns
+    -------
+    str
+        SVG. Points on the Pareto front are joined and labelled, others are hollow; the
+        Cramer-Rao bound is dashed where it is known.
+    """
+    figure, axes = _figure(5.2, 3.4)
+    points = document["points"]
+    seconds = np.array([p["seconds"] for p in points], float)
+    error = np.array([p["error"] for p in points], float)
+    low = np.array([p["error_interval"][0] for p in points], float)
+    high = np.array([p["error_interval"][1] for p in points], float)
+    bars = np.maximum(np.stack([error - low, high - error]), 0.0)
+    bars[0] = np.minimum(bars[0], 0.999 * error)  # a log axis has no room for zero
+    on_front = np.array([p["on_front"] for p in points], bool)
+    axes.errorbar(seconds, error, yerr=bars, fmt="none", ecolor=_COLORS[0], elinewidth=1)
+    axes.plot(seconds[~on_front], error[~on_front], "o", mfc="none", mec=_COLORS[0], label="beaten")
+    order = np.argsort(seconds[on_front])
+    axes.plot(
+        seconds[on_front][order], error[on_front][order], "o-", color=_COLORS[0], label="front"
+    )
+    for index in np.flatnonzero(on_front):
+        label = ", ".join(f"{k} {v}" for k, v in points[index]["knobs"].items())
+        label += "  (knee)" if index == document.get("knee") else ""
+        axes.annotate(
+            label,
+            (seconds[index], error[index]),
+            xytext=(5, 5),
+            textcoords="offset points",
+            fontsize=7,
+        )
+    bounds = np.array([p.get("cramer_rao_bound") or np.nan for p in points], float)
+    if np.isfinite(bounds).any():
+        known = np.isfinite(bounds)
+        axes.plot(seconds[known], bounds[known], "_", color=_COLORS[1], ms=14, label="Cramér-Rao")
+    if document.get("reference_error", 0) > 0:
+        axes.axhline(document["reference_error"], color="0.5", lw=0.8, ls=":")
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.margins(x=0.25, y=0.2)
+    axes.set_xlabel("seconds, warm, median")
+    axes.set_ylabel(document["error_name"])
+    axes.set_title(stage, fontsize=10)
+    axes.legend(fontsize=7, frameon=False)
+    return _svg(figure)
+
+
+def bars(
+    title: str,
+    labels: Sequence[str],
+    series: Mapping[str, NDArray[np.floating] | Sequence[float]],
+    *,
+    unit: str,
+    limit: float | None = None,
+) -> str:
+    """Draw groups of bars, one group a label, one bar a series; NaN leaves a gap."""
+    figure, axes = _figure(6.2, 3.0)
+    position = np.arange(len(labels))
+    width = 0.8 / max(len(series), 1)
+    for number, (name, values) in enumerate(series.items()):
+        axes.bar(
+            position + (number - (len(series) - 1) / 2) * width,
+            np.asarray(values, float),
+            width,
+            label=name,
+            color=_COLORS[number % len(_COLORS)],
+        )
+    if limit is not None:
+        axes.axhline(limit, color="0.5", ls="--", lw=1)
+    axes.set_xticks(position, labels, fontsize=8)
+    axes.set_ylabel(unit)
+    axes.set_title(title, fontsize=10)
+    axes.legend(fontsize=7, frameon=False)
+    return _svg(figure)
+
+
+def sensitivity(
+    title: str,
+    c_m: NDArray[np.floating],
+    c_hd: NDArray[np.floating],
+    percent: NDArray[np.floating],
+) -> str:
+    """Draw the least relative standard error over melanin and hemoglobin, in percent.
+
+    Parameters
+    ----------
+    title
+        Which chromophore.
+    c_m, c_hd
+        (N,) and (M,) volume fractions.
+    percent
+        (N, M) Cramer-Rao bound on the relative standard error; contours at 1, 3, 10, 30
+        and 100 %.
+    """
+    figure, axes = _figure(4.2, 3.2)
+    shown = np.clip(np.nan_to_num(percent, nan=1e4, posinf=1e4), 0.1, 1e3).T
+    mesh = axes.pcolormesh(
+        np.cbrt(c_m),
+        np.cbrt(c_hd),
+        np.log10(shown),
+        cmap="viridis_r",
+        shading="nearest",
+        rasterized=True,
+        vmin=-0.5,
+        vmax=2.5,
+    )
+    if shown.min() < 100 < shown.max():
+        contour = axes.contour(
+            np.cbrt(c_m), np.cbrt(c_hd), shown, [1, 3, 10, 30, 100], colors="w", linewidths=0.7
+        )
+        axes.clabel(contour, fmt="%g %%", fontsize=7)
+    ticks = np.array([0.001, 0.01, 0.05, 0.15, 0.3, 0.5])
+    axes.set_xticks(np.cbrt(ticks), [f"{t:g}" for t in ticks], fontsize=7)
+    axes.set_yticks(np.cbrt(ticks[:-1]), [f"{t:g}" for t in ticks[:-1]], fontsize=7)
+    axes.set_xlim(np.cbrt(c_m[0]), np.cbrt(c_m[-1]))
+    axes.set_ylim(np.cbrt(c_hd[0]), np.cbrt(c_hd[-1]))
+    axes.set_xlabel("melanin fraction C_m")
+    axes.set_ylabel("hemoglobin fraction C_hd")
+    axes.set_title(title, fontsize=10)
+    figure.colorbar(mesh, ax=axes, label="log10 of percent")
+    return _svg(figure)

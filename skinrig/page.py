@@ -1,0 +1,198 @@
+"""The pieces of the report page: checks, tables, map panels; text in, HTML out."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinrig import png
+
+STYLE = """
+:root{color-scheme:light dark;--fg:#1b1f24;--bg:#fff;--line:#d5dae0;--soft:#f3f5f7;--good:#1a6b35;--bad:#b3261e}
+@media(prefers-color-scheme:dark){:root{--fg:#e6e9ec;--bg:#14171a;--line:#3a4148;--soft:#1e2327;--good:#7ccf93;--bad:#ff8a80}}
+body{font:15px/1.5 system-ui,sans-serif;color:var(--fg);background:var(--bg);max-width:72rem;margin:0 auto;padding:1rem 1.2rem 4rem}
+h1{font-size:1.6rem;margin:.6rem 0}h2{font-size:1.2rem;border-bottom:1px solid var(--line);margin:2.2rem 0 .6rem}h3{font-size:1rem;margin:1.2rem 0 .3rem}
+table{border-collapse:collapse;margin:.5rem 0;font-size:.9rem}th,td{text-align:left;padding:.25rem .7rem;border-bottom:1px solid var(--line)}
+td.n,th.n{text-align:right;font-variant-numeric:tabular-nums}.good{color:var(--good)}.bad{color:var(--bad);font-weight:600}
+.verdict{font-size:1.1rem;padding:.6rem .9rem;background:var(--soft);border-left:4px solid currentColor;margin:.8rem 0}
+.maps{display:grid;grid-template-columns:repeat(auto-fit,minmax(11rem,1fr));gap:.8rem;margin:.4rem 0 1.4rem}
+figure{margin:0}figure img{width:100%;height:auto;image-rendering:auto;border:1px solid var(--line)}
+figcaption{font-size:.82rem}.scale{display:flex;align-items:center;gap:.4rem;font-size:.78rem;font-variant-numeric:tabular-nums}
+.scale img{flex:1;height:.6rem;border:0;min-width:3rem}
+.plots{display:flex;flex-wrap:wrap;gap:1rem}.plots svg{max-width:100%;height:auto}
+code{background:var(--soft);padding:0 .25rem}p.note{font-size:.9rem;opacity:.85}
+@media print{body{max-width:none}h2{break-after:avoid}figure,table{break-inside:avoid}}
+"""
+
+
+def escape(value: object) -> str:
+    """Return ``value`` as text that is safe inside HTML."""
+    return html.escape(str(value), quote=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One promise, what was measured, and whether it was kept."""
+
+    name: str
+    got: float
+    bound: float
+    sense: Literal["<=", ">="]
+    unit: str = ""
+    note: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether ``got`` keeps to ``bound``; NaN does not."""
+        return self.got <= self.bound if self.sense == "<=" else self.got >= self.bound
+
+
+def number(value: float) -> str:
+    """Return a number with four significant digits, or a dash where there is none."""
+    return "–" if value is None or not np.isfinite(value) else f"{value:.4g}"
+
+
+def checks_table(checks: Sequence[Check]) -> str:
+    """Return the table of checks, the missed ones first."""
+    rows = []
+    for check in sorted(checks, key=lambda c: c.passed):
+        word, kind = ("kept", "good") if check.passed else ("missed", "bad")
+        sign = "≤" if check.sense == "<=" else "≥"
+        rows.append(
+            f"<tr><td>{escape(check.name)}</td><td class=n>{number(check.got)} {escape(check.unit)}</td>"
+            f"<td class=n>{sign} {number(check.bound)} {escape(check.unit)}</td>"
+            f'<td class="{kind}">{word}</td><td>{escape(check.note)}</td></tr>'
+        )
+    return (
+        "<table><thead><tr><th>check</th><th class=n>measured</th><th class=n>limit</th>"
+        "<th>verdict</th><th>remark</th></tr></thead><tbody>" + "".join(rows) + "</tbody></table>"
+    )
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str = "") -> str:
+    """Return a table; numbers are set right-aligned with four digits."""
+
+    def cell(value: object) -> str:
+        if isinstance(value, (float, np.floating)):
+            return f"<td class=n>{number(float(value))}</td>"
+        if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
+            return f"<td class=n>{value}</td>"
+        return f"<td>{escape(value)}</td>"
+
+    body = "".join("<tr>" + "".join(cell(v) for v in row) + "</tr>" for row in rows)
+    title = f"<caption>{escape(caption)}</caption>" if caption else ""
+    header = "".join(f"<th>{escape(h)}</th>" for h in head)
+    return f"<table>{title}<thead><tr>{header}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def facts(values: Mapping[str, object]) -> str:
+    """Return a two-column table of names and values."""
+    return table(("what", "value"), list(values.items()))
+
+
+def shrink(image: NDArray[np.generic], width: int) -> NDArray[np.generic]:
+    """Take every n-th pixel so that the image is at most ``width`` wide."""
+    step = max(1, -(-image.shape[1] // width))
+    return image[step // 2 :: step, step // 2 :: step]
+
+
+def _picture(
+    title: str,
+    values: NDArray[np.floating],
+    low: float,
+    high: float,
+    scale: str,
+    valid: NDArray[np.bool_] | None,
+    unit: str,
+    width: int,
+) -> str:
+    small = shrink(values, width)
+    mask = None if valid is None else shrink(valid, width).astype(bool)
+    shown = small[mask] if mask is not None and mask.any() else small
+    shown = shown[np.isfinite(shown)]
+    median = number(float(np.median(shown))) if shown.size else "–"
+    ramp = np.tile(np.linspace(low, high, 96)[None, :], (6, 1))
+    alt = f"{title}: scale {number(low)} to {number(high)} {unit}, median {median}"
+    return (
+        f'<figure><img alt="{escape(alt)}" src="'
+        f'{png.data_uri(png.colorize(small.astype(float), low, high, scale=scale, valid=mask))}">'
+        f"<figcaption>{escape(title)}</figcaption>"
+        f'<div class=scale><span>{number(low)}</span><img alt="" src="'
+        f'{png.data_uri(png.colorize(ramp, low, high, scale=scale))}"><span>{number(high)} '
+        f"{escape(unit)}</span></div></figure>"
+    )
+
+
+def color_picture(title: str, linear: NDArray[np.floating], *, width: int = 320) -> str:
+    """Return a figure of a linear sRGB image, (H, W, 3)."""
+    small = shrink(np.asarray(linear), width)
+    return (
+        f'<figure><img alt="{escape(title)}" src="{png.data_uri(png.srgb8(small))}">'
+        f"<figcaption>{escape(title)}</figcaption></figure>"
+    )
+
+
+def map_panel(
+    name: str,
+    unit: str,
+    *,
+    estimate: NDArray[np.floating],
+    standard_error: NDArray[np.floating] | None = None,
+    truth: NDArray[np.floating] | None = None,
+    valid: NDArray[np.bool_] | None = None,
+    width: int = 280,
+) -> str:
+    """Return truth | estimate | error | standard error of a map, truth and estimate to one scale.
+
+    Parameters
+    ----------
+    name, unit
+        Of the map, for headings and scales.
+    estimate, standard_error, truth
+        (H, W); what is None is left out of the row.
+    valid
+        (H, W); other pixels are gray.
+    width
+        Pixels across; larger maps are thinned out.
+    """
+    mask = np.isfinite(estimate) if valid is None else np.asarray(valid, bool)
+    of_scale = [estimate[mask & np.isfinite(estimate)]]
+    if truth is not None:
+        of_scale.append(truth[mask & np.isfinite(truth)])
+    joined = np.concatenate(of_scale)
+    low, high = np.percentile(joined, [1, 99]) if joined.size else (0.0, 1.0)
+    parts = []
+    if truth is not None:
+        parts.append(_picture("truth", truth, low, high, "viridis", mask, unit, width))
+    parts.append(_picture("estimate", estimate, low, high, "viridis", mask, unit, width))
+    if truth is not None:
+        error = estimate - truth
+        inside = np.abs(error[mask & np.isfinite(error)])
+        reach = float(np.percentile(inside, 98)) if inside.size else 1.0
+        parts.append(
+            _picture("estimate − truth", error, -reach, reach, "RdBu_r", mask, unit, width)
+        )
+    if standard_error is not None:
+        inside = standard_error[mask & np.isfinite(standard_error)]
+        reach = float(np.percentile(inside, 98)) if inside.size else 1.0
+        parts.append(
+            _picture("standard error", standard_error, 0.0, reach, "magma", mask, unit, width)
+        )
+    return f"<h3>{escape(name)}</h3><div class=maps>{''.join(parts)}</div>"
+
+
+def document(title: str, body: str) -> str:
+    """Return the whole page; it makes no request and runs no script."""
+    return (
+        '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
+        "img-src data:; style-src 'unsafe-inline'\">"
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head>"
+        f"<body><main>{body}</main></body></html>\n"
+    )
