@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import resources
 from typing import Literal
 
 import numpy as np
@@ -12,22 +13,7 @@ from numpy.typing import NDArray
 
 from skinrig import png
 
-STYLE = """
-:root{color-scheme:light dark;--fg:#1b1f24;--bg:#fff;--line:#d5dae0;--soft:#f3f5f7;--good:#1a6b35;--bad:#b3261e}
-@media(prefers-color-scheme:dark){:root{--fg:#e6e9ec;--bg:#14171a;--line:#3a4148;--soft:#1e2327;--good:#7ccf93;--bad:#ff8a80}}
-body{font:15px/1.5 system-ui,sans-serif;color:var(--fg);background:var(--bg);max-width:72rem;margin:0 auto;padding:1rem 1.2rem 4rem}
-h1{font-size:1.6rem;margin:.6rem 0}h2{font-size:1.2rem;border-bottom:1px solid var(--line);margin:2.2rem 0 .6rem}h3{font-size:1rem;margin:1.2rem 0 .3rem}
-table{border-collapse:collapse;margin:.5rem 0;font-size:.9rem}th,td{text-align:left;padding:.25rem .7rem;border-bottom:1px solid var(--line)}
-td.n,th.n{text-align:right;font-variant-numeric:tabular-nums}.good{color:var(--good)}.bad{color:var(--bad);font-weight:600}
-.verdict{font-size:1.1rem;padding:.6rem .9rem;background:var(--soft);border-left:4px solid currentColor;margin:.8rem 0}
-.maps{display:grid;grid-template-columns:repeat(auto-fit,minmax(11rem,1fr));gap:.8rem;margin:.4rem 0 1.4rem}
-figure{margin:0}figure img{width:100%;height:auto;image-rendering:auto;border:1px solid var(--line)}
-figcaption{font-size:.82rem}.scale{display:flex;align-items:center;gap:.4rem;font-size:.78rem;font-variant-numeric:tabular-nums}
-.scale img{flex:1;height:.6rem;border:0;min-width:3rem}
-.plots{display:flex;flex-wrap:wrap;gap:1rem}.plots svg{max-width:100%;height:auto}
-code{background:var(--soft);padding:0 .25rem}p.note{font-size:.9rem;opacity:.85}
-@media print{body{max-width:none}h2{break-after:avoid}figure,table{break-inside:avoid}}
-"""
+STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
 
 
 def escape(value: object) -> str:
@@ -64,7 +50,8 @@ def checks_table(checks: Sequence[Check]) -> str:
         word, kind = ("kept", "good") if check.passed else ("missed", "bad")
         sign = "≤" if check.sense == "<=" else "≥"
         rows.append(
-            f"<tr><td>{escape(check.name)}</td><td class=n>{number(check.got)} {escape(check.unit)}</td>"
+            f"<tr><td>{escape(check.name)}</td>"
+            f"<td class=n>{number(check.got)} {escape(check.unit)}</td>"
             f"<td class=n>{sign} {number(check.bound)} {escape(check.unit)}</td>"
             f'<td class="{kind}">{word}</td><td>{escape(check.note)}</td></tr>'
         )
@@ -132,7 +119,7 @@ def color_picture(title: str, linear: NDArray[np.floating], *, width: int = 320)
     """Return a figure of a linear sRGB image, (H, W, 3)."""
     small = shrink(np.asarray(linear), width)
     return (
-        f'<figure><img alt="{escape(title)}" src="{png.data_uri(png.srgb8(small))}">'
+        f'<figure><img alt="{escape(title)}" src="{png.data_uri(png.srgb8(small.astype(float)))}">'
         f"<figcaption>{escape(title)}</figcaption></figure>"
     )
 

@@ -1,0 +1,153 @@
+"""The structure that the design promises, checked on the code itself."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("capture", "reconstruction", "rigsim", "model", "skinrig")
+COMPARISONS = {"all", "any", "allclose", "isclose", "array_equal"}
+
+
+def modules(*folders):
+    return [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))]
+
+
+def test_import_contracts_hold():
+    tool = Path(sys.executable).with_name("lint-imports")
+    run = subprocess.run([tool, "--no-cache"], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stdout[-3000:]
+
+
+def bare_comparisons(source):
+    return [
+        node.lineno
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Call)
+        and isinstance(node.value.func, ast.Attribute)
+        and node.value.func.attr in COMPARISONS
+    ]
+
+
+def test_no_test_compares_without_an_assertion():
+    found = [f"{p}:{line}" for p in modules("tests") for line in bare_comparisons(p.read_text())]
+    assert not found
+
+
+def test_a_comparison_without_an_assertion_would_be_found():
+    assert bare_comparisons("np.allclose(a, b)\nassert np.allclose(a, b)") == [1]
+
+
+def none_defaults_without_none(source):
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            continue
+        args = node.args
+        positional = [*args.posonlyargs, *args.args]
+        pairs = list(
+            zip(positional[len(positional) - len(args.defaults) :], args.defaults, strict=True)
+        ) + [(a, d) for a, d in zip(args.kwonlyargs, args.kw_defaults, strict=True) if d]
+        found += [
+            f"{node.name}.{arg.arg}"
+            for arg, default in pairs
+            if isinstance(default, ast.Constant)
+            and default.value is None
+            and arg.annotation is not None
+            and not re.search(r"None|Any|object", ast.unparse(arg.annotation))
+        ]
+    return found
+
+
+def test_a_default_of_none_shows_in_the_annotation():
+    found = [
+        f"{p.relative_to(ROOT)}: {name}"
+        for p in modules(*PACKAGES)
+        for name in none_defaults_without_none(p.read_text())
+    ]
+    assert not found
+
+
+def test_a_hidden_none_would_be_found():
+    assert none_defaults_without_none("def f(a: int = None, b: int | None = None): ...") == ["f.a"]
+
+
+@pytest.mark.parametrize("package", ["capture", "reconstruction", "rigsim", "model"])
+def test_a_package_works_without_the_application(package):
+    """No module of the four packages needs ``skinrig``: they are libraries of their own."""
+    names = [
+        ".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        for p in modules(package)
+    ]
+    code = (
+        "import importlib, sys, warnings\n"
+        "warnings.simplefilter('ignore')\n"
+        "class Refuse:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] == 'skinrig':\n"
+        "            raise ImportError('the application was imported')\n"
+        "sys.meta_path.insert(0, Refuse())\n"
+        f"for name in {names!r}:\n"
+        "    try:\n"
+        "        importlib.import_module(name)\n"
+        "    except ImportError as error:\n"
+        "        assert 'application' not in str(error), name\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-2000:]
+
+
+@pytest.mark.parametrize("module", ["capture", "capture.session", "capture.devices.flash"])
+def test_capture_loads_no_renderer_no_vision_library_and_no_simulator(module):
+    heavy = ("mitsuba", "cv2", "matplotlib", "rigsim", "skimage", "numba")
+    code = f"import sys, {module}; print([m for m in {heavy!r} if m in sys.modules])"
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert run.stdout.strip() == "[]", run.stdout + run.stderr
+
+
+def test_capture_has_no_branch_for_simulation():
+    found = [
+        f"{p.relative_to(ROOT)}:{node.lineno}"
+        for p in modules("capture")
+        for node in ast.walk(ast.parse(p.read_text()))
+        if isinstance(node, ast.If) and "simulat" in ast.unparse(node.test).lower()
+    ]
+    assert not found
+
+
+def test_tracked_files_name_no_machine_path_and_no_package_index():
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    index = re.compile(r"(index-url|find-links)|https?://[^ \"']*/(simple|packages)/")
+    places = [str(ROOT.parent) + "/", str(Path.home()) + "/"]
+    places = [place for place in places if len(place) > 2]
+    own = Path(__file__).resolve()
+    found = []
+    for name in filter(None, listed.stdout.split("\0")):
+        path = ROOT / name
+        if path.suffix in {".npz", ".exr", ".png"} or path.resolve() == own or not path.is_file():
+            continue
+        text = path.read_text(encoding="utf-8", errors="replace")
+        if index.search(text) or any(place in text for place in places):
+            found.append(name)
+    assert not found
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_module_has_a_name_that_says_nothing(package):
+    empty_names = {"utils", "util", "helpers", "helper", "common", "core", "manager", "misc"}
+    assert not [p for p in modules(package) if p.stem.strip("_") in empty_names]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_package_files_hold_no_logic(package):
+    long = [
+        p for p in (ROOT / package).rglob("__init__.py") if len(p.read_text().splitlines()) > 40
+    ]
+    assert not long
