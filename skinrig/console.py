@@ -1,0 +1,67 @@
+"""What commands print: results on stdout, progress on stderr, one document with --json."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+
+def plain(value: Any) -> Any:
+    """Return ``value`` as something that JSON can hold; NaN and infinities become None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [plain(item) for item in value]
+    if isinstance(value, (np.floating, float)):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    if isinstance(value, np.bool_):
+        return bool(value)
+    if value is None or isinstance(value, (str, int, bool)):
+        return value
+    return str(value)
+
+
+@dataclass(slots=True)
+class Console:
+    """Where a command writes.
+
+    With ``as_json`` nothing but the one document of :meth:`document` reaches stdout; what a
+    person would read goes to stderr.
+    """
+
+    as_json: bool = False
+    started_s: float = field(default_factory=time.perf_counter)
+
+    def say(self, text: str = "") -> None:
+        """Print a result for a person."""
+        print(text, file=sys.stderr if self.as_json else sys.stdout, flush=True)
+
+    def progress(self, text: str) -> None:
+        """Print a line of progress with the seconds since the command began."""
+        seconds = time.perf_counter() - self.started_s
+        print(f"[{seconds:6.1f} s] {text}", file=sys.stderr, flush=True)
+
+    def rows(self, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+        """Print a table with aligned columns."""
+        cells = [[str(h) for h in head]] + [
+            [f"{v:.4g}" if isinstance(v, float) else str(v) for v in row] for row in rows
+        ]
+        widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+        for row in cells:
+            line = "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True))
+            self.say(line.rstrip())
+
+    def document(self, schema: str, content: Mapping[str, Any]) -> None:
+        """Print the one JSON document of the command, when it was asked for."""
+        if self.as_json:
+            print(json.dumps({"schema": schema, **plain(content)}, allow_nan=False), flush=True)

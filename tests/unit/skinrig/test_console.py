@@ -1,0 +1,24 @@
+import json
+
+import numpy as np
+
+from skinrig.console import Console
+
+
+def test_json_is_the_only_thing_on_stdout(capsys):
+    console = Console(as_json=True)
+    console.say("for people")
+    console.progress("working")
+    console.rows(("a", "b"), [(1, 2.0)])
+    console.document("skinrig.x/1", {"value": np.float32(2), "gone": float("nan")})
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"schema": "skinrig.x/1", "value": 2.0, "gone": None}
+    assert "for people" in err
+    assert "working" in err
+
+
+def test_a_person_reads_results_on_stdout_and_no_json(capsys):
+    console = Console()
+    console.say("done")
+    console.document("skinrig.x/1", {})
+    assert capsys.readouterr().out == "done\n"
