@@ -1,0 +1,342 @@
+"""The nominal rig: lights, views and boxes, read from a TOML file and frozen."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from pydantic import ConfigDict
+
+from capture.documents import STRICT, Checks, Fault, InputError, near_miss, parse, read_toml
+
+Vector = tuple[float, float, float]
+Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG", "MONO"]
+
+PATTERNS: tuple[str, ...] = ("RGGB", "BGGR", "GRBG", "GBRG", "MONO")
+ID_RULE = "1 to 64 of A-Z a-z 0-9 _ - . , not starting with a dot"
+MAX_SIDE_PX = 65_535
+
+
+class RigError(InputError):
+    """A rig, or a rig file, that cannot be used."""
+
+
+def is_id(text: str) -> bool:
+    """Return whether ``text`` may name a step, view, light or box (and so be part of a file name).
+
+    Examples
+    --------
+    >>> is_id("cam-0"), is_id("../cam"), is_id("")
+    (True, False, False)
+    """
+    letters = all(c.isascii() and (c.isalnum() or c in "_-.") for c in text)
+    return letters and 1 <= len(text) <= 64 and not text.startswith(".")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Light:
+    """One light of the rig.
+
+    Angles of axes are measured in the plane across the light's beam from the horizontal (+x of a
+    camera at +z) towards +y, in degrees.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    name: str
+    position_mm: Vector
+    """Centre of the emitting disc, mm, rig frame."""
+    illuminant: str = "D55"
+    """Name of the spectrum, see ``model.spectra.illuminant``."""
+    polarizer_axis_deg: float
+    """Axis of the polarizer in front of the light, degrees, 0 <= axis < 180."""
+    energy_ws: float
+    """Energy of one pop at power 1, Ws (J), > 0."""
+    radius_mm: float
+    """Radius of the emitting disc, mm, > 0."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(f"Light {self.name!r}", RigError)
+        checks.that("name", self.name, is_id(self.name), ID_RULE)
+        checks.finite(position_mm=self.position_mm)
+        checks.that("position_mm", self.position_mm, _norm(self.position_mm) > 0, "not the origin")
+        checks.that("illuminant", self.illuminant, bool(self.illuminant), "a name")
+        checks.that(
+            "polarizer_axis_deg",
+            self.polarizer_axis_deg,
+            0 <= self.polarizer_axis_deg < 180,
+            "0 <= degrees < 180",
+        )
+        checks.positive(energy_ws=self.energy_ws, radius_mm=self.radius_mm)
+        checks.close()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """One camera of the rig: pinhole, sensor and analyser, all nominal."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    name: str
+    camera_model: str
+    serial: str
+    position_mm: Vector
+    """Centre of projection, mm, rig frame."""
+    target_mm: Vector
+    """Point on the optical axis, mm, rig frame."""
+    up: Vector
+    """Direction that is up in the image, rig frame, any length."""
+    focal_mm: float
+    """Distance from centre of projection to sensor, mm, > 0."""
+    pixel_um: float
+    """Pixel pitch, um, > 0."""
+    width_px: int
+    height_px: int
+    f_number: float
+    readout_s: float
+    """Time from the end of one exposure to readiness for the next, s, >= 0."""
+    bit_depth: int
+    """Bits of the converter, 8 to 16."""
+    cfa: Pattern
+    """Colors of the 2 x 2 cell read row by row, or MONO."""
+    black_level: int
+    """DN of no light."""
+    white_level: int
+    """DN of saturation, at most 2**bit_depth - 1."""
+    spectral_sensitivity: str = "Nikon 5100 (NPL)"
+    """Name of the curves, see ``model.spectra.camera_sensitivity``."""
+    analyser_axis_deg: float
+    """Axis of the analyser at rotator reading 0 (the parallel state), degrees, 0 <= axis < 180."""
+    full_well_e: float
+    """Electrons at ``white_level``, > 0."""
+    read_noise_e: float
+    """Read noise, electrons rms, >= 0."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(f"View {self.name!r}", RigError)
+        checks.that("name", self.name, is_id(self.name), ID_RULE)
+        for field in ("camera_model", "serial", "spectral_sensitivity"):
+            text = getattr(self, field)
+            checks.that(field, text, bool(text) and text.isprintable(), "a printable text")
+        checks.finite(position_mm=self.position_mm, target_mm=self.target_mm, up=self.up)
+        axis = _minus(self.position_mm, self.target_mm)
+        checks.that("target_mm", self.target_mm, _norm(axis) > 0, "not the camera's own position")
+        checks.that("up", self.up, _norm(_cross(self.up, axis)) > 0, "not along the optical axis")
+        checks.positive(
+            focal_mm=self.focal_mm,
+            pixel_um=self.pixel_um,
+            f_number=self.f_number,
+            full_well_e=self.full_well_e,
+        )
+        step = 1 if self.cfa == "MONO" else 2
+        for field in ("width_px", "height_px"):
+            size = getattr(self, field)
+            even = 2 <= size <= MAX_SIDE_PX and size % step == 0
+            checks.that(field, size, even, f"2 to {MAX_SIDE_PX}, even for a color filter array")
+        checks.that("readout_s", self.readout_s, 0 <= self.readout_s < math.inf, "seconds >= 0")
+        checks.that("bit_depth", self.bit_depth, 8 <= self.bit_depth <= 16, "8 to 16")
+        checks.that("cfa", self.cfa, self.cfa in PATTERNS, f"one of {', '.join(PATTERNS)}")
+        checks.that("black_level", self.black_level, self.black_level >= 0, ">= 0")
+        top = 2**self.bit_depth - 1 if 8 <= self.bit_depth <= 16 else 65_535
+        checks.that(
+            "white_level",
+            self.white_level,
+            self.black_level < self.white_level <= top,
+            f"black_level {self.black_level} < white_level <= {top}",
+        )
+        checks.that(
+            "analyser_axis_deg",
+            self.analyser_axis_deg,
+            0 <= self.analyser_axis_deg < 180,
+            "0 <= degrees < 180",
+        )
+        checks.that("read_noise_e", self.read_noise_e, 0 <= self.read_noise_e < math.inf, ">= 0")
+        checks.close()
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length in pixels (square pixels)."""
+        return self.focal_mm * 1e3 / self.pixel_um
+
+    @property
+    def distance_mm(self) -> float:
+        """Distance from camera to target, mm."""
+        return _norm(_minus(self.position_mm, self.target_mm))
+
+    @property
+    def field_mm(self) -> tuple[float, float]:
+        """Width and height seen at the target's distance, mm.
+
+        Examples
+        --------
+        >>> [round(side, 1) for side in load_rig("flash").view("cam").field_mm]
+        [260.7, 173.8]
+        """
+        scale = self.distance_mm / self.focal_px
+        return self.width_px * scale, self.height_px * scale
+
+    @property
+    def axes(self) -> tuple[Vector, Vector, Vector]:
+        """Unit vectors right, up and back (from target to camera) of the image, rig frame."""
+        back = _unit(_minus(self.position_mm, self.target_mm))
+        right = _unit(_cross(self.up, back))
+        return right, _cross(back, right), back
+
+    @property
+    def gain_e_per_dn(self) -> float:
+        """Nominal conversion gain, electrons per DN."""
+        return self.full_well_e / (self.white_level - self.black_level)
+
+    def resized(self, width_px: int) -> View:
+        """Return this view with ``width_px`` columns and the same field of view; rows stay even."""
+        step = 1 if self.cfa == "MONO" else 2
+        if not 2 <= width_px <= MAX_SIDE_PX or width_px % step:
+            raise RigError(
+                f"View {self.name!r} cannot be resized",
+                faults=[
+                    Fault("width_px", str(width_px), f"2 to {MAX_SIDE_PX}, a multiple of {step}")
+                ],
+            )
+        factor = self.width_px / width_px
+        height_px = max(step * round(self.height_px / factor / step), 2)
+        return dataclasses.replace(
+            self, width_px=width_px, height_px=height_px, pixel_um=self.pixel_um * factor
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rig:
+    """Lights, views and boxes with their limits; lengths in mm in the rig frame.
+
+    The frame's origin is the subject's centre; +x right, +y up, +z towards the main camera.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    name: str
+    lights: tuple[Light, ...]
+    views: tuple[View, ...]
+    boxes: tuple[str, ...]
+    """Names of the controllers that drive the lights."""
+    recycle_s: float
+    """Least time between two pops at power 1, s, >= 0."""
+    max_pops_per_min: float = 20.0
+    """Most pops in any minute, > 0."""
+    polarizer_move_s: float = 0.5
+    """Time to turn the analyser, s, >= 0."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(f"Rig {self.name!r}", RigError)
+        checks.that("name", self.name, is_id(self.name), ID_RULE)
+        for field, rows in (("lights", self.lights), ("views", self.views)):
+            names = tuple(row.name for row in rows)
+            checks.that(field, names, len(rows) > 0, "at least one")
+            checks.that(
+                field, names, len({n.casefold() for n in names}) == len(names), "unlike names"
+            )
+        good = all(is_id(box) for box in self.boxes) and len(set(self.boxes)) == len(self.boxes)
+        checks.that("boxes", self.boxes, good, f"names that differ, of {ID_RULE}")
+        checks.that("recycle_s", self.recycle_s, 0 <= self.recycle_s < math.inf, "seconds >= 0")
+        checks.positive(max_pops_per_min=self.max_pops_per_min)
+        move = self.polarizer_move_s
+        checks.that("polarizer_move_s", move, 0 <= move < math.inf, "seconds >= 0")
+        checks.close()
+
+    def view(self, name: str) -> View:
+        """Return the view called ``name``."""
+        return _named(self.views, name, f"rig {self.name!r} has no view {name!r}")
+
+    def light(self, name: str) -> Light:
+        """Return the light called ``name``."""
+        return _named(self.lights, name, f"rig {self.name!r} has no light {name!r}")
+
+    def resized(self, width_px: int) -> Rig:
+        """Return this rig with every view ``width_px`` wide: same field of view, larger pixels.
+
+        Examples
+        --------
+        >>> small = load_rig("flash").resized(504).view("cam")
+        >>> small.width_px, small.height_px, small.pixel_um
+        (504, 336, 45.0)
+        """
+        return dataclasses.replace(self, views=tuple(v.resized(width_px) for v in self.views))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the rig as JSON values; ``rig_from_json`` is the inverse."""
+        return dataclasses.asdict(self)
+
+
+def rig_from_json(data: Mapping[str, Any], *, where: str = "rig") -> Rig:
+    """Build a rig from decoded JSON or TOML, listing all faults at once.
+
+    Raises
+    ------
+    RigError
+        With every fault's path, what was found and what was expected.
+    """
+    return parse(Rig, data, where=where, error=RigError)
+
+
+def load_rig(name_or_path: str | Path) -> Rig:
+    """Return a rig that ships with the package, or one described in a TOML file.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        ``"flash"``, or a path (anything that ends in ``.toml`` or holds a separator).
+
+    Raises
+    ------
+    RigError
+        Where the file is missing or has faults; all of them are listed.
+
+    Examples
+    --------
+    >>> rig = load_rig("flash")
+    >>> [light.name for light in rig.lights], rig.view("cam").width_px
+    (['left', 'right'], 3024)
+    """
+    text = str(name_or_path)
+    if isinstance(name_or_path, Path) or text.endswith(".toml") or "/" in text:
+        path = Path(name_or_path)
+    else:
+        shipped = Path(str(files("capture"))) / "rigs"
+        known = sorted(file.stem for file in shipped.glob("*.toml"))
+        if text not in known:
+            hint = (
+                near_miss(text, known) or f"one of {', '.join(known)}, or the path of a .toml file"
+            )
+            raise RigError("there is no such rig", faults=[Fault("rig", repr(text), hint)])
+        path = shipped / f"{text}.toml"
+    return rig_from_json(read_toml(path, error=RigError), where=str(path))
+
+
+def _named(rows: tuple[Any, ...], name: str, what: str) -> Any:
+    for row in rows:
+        if row.name == name:
+            return row
+    known = [row.name for row in rows]
+    fault = Fault("name", repr(name), f"one of {', '.join(known)}", near_miss(name, known))
+    raise RigError(what, faults=[fault])
+
+
+def _minus(a: Vector, b: Vector) -> Vector:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _norm(a: Vector) -> float:
+    return math.hypot(*a)
+
+
+def _unit(a: Vector) -> Vector:
+    length = _norm(a)
+    return a[0] / length, a[1] / length, a[2] / length
