@@ -33,6 +33,7 @@ __all__ = [
     "CalibrationMissing",
     "Drift",
     "Quantity",
+    "default_validity",
     "digest_arrays",
     "drift",
     "load",
