@@ -111,6 +111,10 @@ class Checks:
         if not good:
             self._faults.append(Fault(field, shown(got), expected))
 
+    def note(self, fault: Fault) -> None:
+        """Note a fault found elsewhere."""
+        self._faults.append(fault)
+
     def finite(self, **values: float | Iterable[float]) -> None:
         """Note a fault for each value (or row of values) that is not finite."""
         for field, value in values.items():
@@ -151,7 +155,7 @@ def parse(kind: type[_T], data: object, *, where: str, error: type[InputError]) 
     bad: list[Fault] = []
     try:
         text = json.dumps(_speakable(data, "", bad), allow_nan=False)
-        value: _T = _adapter(kind).validate_json(text)
+        value: _T = _adapter(typing.cast(typing.Any, kind)).validate_json(text)
     except RecursionError as exc:
         raise error("is nested too deeply", where=where) from exc
     except ValidationError as exc:
@@ -285,7 +289,7 @@ def _known_keys(kind: Any, location: Sequence[object]) -> set[str]:
 
 
 def _speakable(data: object, path: str, bad: list[Fault]) -> object:
-    """Return ``data`` with what JSON cannot hold (NaN, dates, bytes) noted in ``bad`` and nulled."""
+    """Return ``data`` with what JSON cannot hold (NaN, dates) noted in ``bad`` and nulled."""
     if isinstance(data, dict):
         return {
             str(k): _speakable(v, f"{path}.{k}" if path else str(k), bad) for k, v in data.items()
