@@ -1,0 +1,18 @@
+"""Raw frames: our own DNG written and read, foreign raw files read, linear values with variance."""
+
+from capture.raw.dng import encode_dng, write_dng
+from capture.raw.frame import RawError, RawFrame, noise_profile
+from capture.raw.linear import LinearImage, linear_rgb
+from capture.raw.reading import decode, read
+
+__all__ = [
+    "LinearImage",
+    "RawError",
+    "RawFrame",
+    "decode",
+    "encode_dng",
+    "linear_rgb",
+    "noise_profile",
+    "read",
+    "write_dng",
+]

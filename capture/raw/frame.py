@@ -1,0 +1,154 @@
+"""One raw frame in memory: sensor values and what is needed to understand them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.documents import Checks, InputError, canonical_json
+from capture.rig import MAX_SIDE_PX, PATTERNS
+
+# 2**28 pixels: ten times the largest sensor of a capture rig, and 512 MiB of memory
+MAX_PIXELS = 2**28
+
+# EXIF LightSource codes, EXIF 2.32 table 9
+ILLUMINANT_CODES: Mapping[str, int] = {"A": 17, "D55": 20, "D65": 21, "D75": 22, "D50": 23}
+
+
+class RawError(InputError):
+    """A raw file, or the content of one, that cannot be used."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RawFrame:
+    """Sensor values as read out, with black and white levels and the settings of the exposure."""
+
+    cfa: NDArray[np.uint16]
+    """(H, W) uint16 DN, row 0 at the top; may be read-only."""
+    pattern: str
+    """Colors of the 2 x 2 cell row by row ("RGGB", "BGGR", "GRBG", "GBRG"), or "MONO"."""
+    black: tuple[float, ...]
+    """DN of no light for each position of the cell, row by row; a single value for MONO."""
+    white: int
+    """DN of saturation."""
+    exposure_s: float | None = None
+    """Exposure time, s; None where the file does not say."""
+    iso: int | None = None
+    """Sensitivity; None where the file does not say."""
+    camera_model: str = ""
+    camera_serial: str = ""
+    color_matrix: NDArray[np.float64] | None = None
+    """(3, 3) from CIE XYZ of ``color_illuminant`` to camera RGB; None where unknown."""
+    color_illuminant: str = "D65"
+    """Illuminant of ``color_matrix``: "A", "D50", "D55", "D65" or "D75"."""
+    neutral: tuple[float, float, float] | None = None
+    """Camera RGB of a neutral surface, largest 1; None where unknown."""
+    noise_profile: tuple[float, float] | None = None
+    """(scale, offset): variance = scale * x + offset, x in fractions of full scale (DNG 1.3)."""
+    f_number: float | None = None
+    focal_mm: float | None = None
+    captured_at: datetime | None = None
+    """Time of capture with its zone; None where the file does not say."""
+    step_id: str = ""
+    """Step of the plan the frame belongs to, empty for foreign files."""
+    session_id: str = ""
+    light: Mapping[str, Any] = field(default_factory=dict)
+    """The light that made the frame: polarizer, power, token, analyser."""
+    path: str = ""
+    """File the frame was read from, empty for a frame made in memory."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(f"Raw frame{' of step ' + self.step_id if self.step_id else ''}", RawError)
+        shape, dtype = self.cfa.shape, self.cfa.dtype
+        checks.that("cfa", f"{dtype} {shape}", self.cfa.ndim == 2, "uint16 of shape (H, W)")
+        checks.that("cfa", str(dtype), dtype == np.uint16, "uint16")
+        mono = self.pattern == "MONO"
+        checks.that("pattern", self.pattern, self.pattern in PATTERNS, f"one of {PATTERNS}")
+        if self.cfa.ndim == 2:
+            even = mono or (shape[0] % 2 == 0 and shape[1] % 2 == 0)
+            size = 1 <= min(shape) and max(shape) <= MAX_SIDE_PX and self.cfa.size <= MAX_PIXELS
+            checks.that("cfa", shape, size, f"sides of 1 to {MAX_SIDE_PX}, {MAX_PIXELS} pixels")
+            checks.that("cfa", shape, even, "even height and width for a color filter array")
+        cells = 1 if mono else 4
+        checks.that("black", self.black, len(self.black) == cells, f"{cells} value(s)")
+        checks.that("white", self.white, 0 < self.white <= 65_535, "1 to 65535")
+        below = all(math.isfinite(b) and 0 <= b < self.white for b in self.black)
+        checks.that("black", self.black, below, f"0 <= black < white {self.white}")
+        for name in ("exposure_s", "iso", "f_number", "focal_mm"):
+            value = getattr(self, name)
+            good = value is None or (math.isfinite(value) and value > 0)
+            checks.that(name, value, good, "a finite number > 0, or None")
+        if self.color_matrix is not None:
+            good = self.color_matrix.shape == (3, 3) and bool(np.isfinite(self.color_matrix).all())
+            checks.that("color_matrix", self.color_matrix, good, "(3, 3) finite numbers")
+        codes = ", ".join(ILLUMINANT_CODES)
+        good = self.color_illuminant in ILLUMINANT_CODES
+        checks.that("color_illuminant", self.color_illuminant, good, f"one of {codes}")
+        if self.neutral is not None:
+            good = len(self.neutral) == 3 and all(0 < x < math.inf for x in self.neutral)
+            checks.that("neutral", self.neutral, good, "three finite numbers > 0")
+        colored = self.color_matrix is not None or self.neutral is not None
+        checks.that("color_matrix, neutral", "given", not (mono and colored), "None for MONO")
+        if self.noise_profile is not None:
+            good = len(self.noise_profile) == 2 and all(
+                0 <= x < math.inf for x in self.noise_profile
+            )
+            checks.that("noise_profile", self.noise_profile, good, "(scale, offset), finite, >= 0")
+        for name in ("camera_model", "camera_serial", "step_id", "session_id"):
+            text = getattr(self, name)
+            good = text.isascii() and (text.isprintable() or not text) and len(text) <= 200
+            checks.that(name, text, good, "at most 200 printable ASCII characters")
+        if self.captured_at is not None:
+            zoned = self.captured_at.utcoffset() is not None
+            checks.that("captured_at", self.captured_at.isoformat(), zoned, "a time with its zone")
+        try:
+            size_bytes = len(canonical_json(dict(self.light)))
+            checks.that(
+                "light", f"{size_bytes} bytes", size_bytes <= 16_384, "at most 16 KiB of JSON"
+            )
+        except (TypeError, ValueError, RecursionError) as exc:
+            checks.that("light", str(exc), False, "values that JSON can hold, all finite")
+        checks.close()
+
+
+def noise_profile(
+    gain_e_per_dn: float, read_noise_e: float, *, black: float, white: float
+) -> tuple[float, float]:
+    """Return (scale, offset) of a sensor in the DNG convention.
+
+    Parameters
+    ----------
+    gain_e_per_dn : float
+        Electrons per DN, > 0.
+    read_noise_e : float
+        Read noise, electrons rms, >= 0 (with quantization, where that matters).
+    black, white : float
+        Levels in DN, black < white.
+
+    Returns
+    -------
+    tuple of float
+        With x = (DN - black) / (white - black): variance of x = scale * x + offset.
+
+    Notes
+    -----
+    Shot noise of N electrons has variance N; x = N / (gain * (white - black)).
+
+    Examples
+    --------
+    >>> noise_profile(2.0, 4.0, black=24, white=1024)
+    (0.0005, 4e-06)
+    """
+    checks = Checks("Noise profile", RawError)
+    checks.positive(gain_e_per_dn=gain_e_per_dn)
+    checks.that("read_noise_e", read_noise_e, 0 <= read_noise_e < math.inf, ">= 0")
+    checks.that("white", white, white > black, f"> black {black}")
+    checks.close()
+    full_scale_e = gain_e_per_dn * (white - black)
+    return 1.0 / full_scale_e, (read_noise_e / full_scale_e) ** 2

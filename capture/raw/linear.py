@@ -1,0 +1,176 @@
+"""From DN to linear camera RGB with the variance that shot and read noise leave in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.documents import Checks, Fault
+from capture.raw.frame import RawError, RawFrame, noise_profile
+
+Demosaic = Literal["superpixel", "bilinear"]
+UNIT = "fraction of full scale"
+
+_COLORS = "RGB"
+# bilinear interpolation of red and blue is separable; green takes its four neighbours
+_TRIANGLE = (0.5, 1.0, 0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class LinearImage:
+    """Linear camera RGB: black-subtracted, not white-balanced."""
+
+    rgb: NDArray[np.float32]
+    """(h, w, 3) fraction of full scale; negative values are kept."""
+    variance: NDArray[np.float32]
+    """(h, w, 3) variance of ``rgb``."""
+    valid: NDArray[np.bool_]
+    """(h, w) False where a saturated pixel contributes."""
+    unit: str = UNIT
+
+
+def linear_rgb(
+    frame: RawFrame,
+    *,
+    demosaic: Demosaic = "superpixel",
+    gain: float | None = None,
+    read_noise: float | None = None,
+) -> LinearImage:
+    """Return the linear camera RGB of a frame with its variance.
+
+    Parameters
+    ----------
+    frame : RawFrame
+        Of a sensor with a 2 x 2 color filter array.
+    demosaic : {"superpixel", "bilinear"}
+        "superpixel": one output pixel per 2 x 2 cell, (H/2, W/2), the two greens averaged, no
+        correlation between pixels. "bilinear": (H, W), missing colors from their neighbours, at
+        the border from those that exist; the noise of neighbouring pixels is correlated.
+    gain : float, optional
+        Calibrated conversion gain, electrons per DN; with ``read_noise`` instead of the file's
+        own noise profile.
+    read_noise : float, optional
+        Calibrated read noise, electrons rms.
+
+    Returns
+    -------
+    LinearImage
+        (DN - black) / (white - black), camera RGB. The variance of one sensor pixel is
+        scale * max(x, 0) + offset; with weights w the output has the variance sum(w**2 * var).
+
+    Raises
+    ------
+    RawError
+        For a MONO frame, and where neither the frame nor the caller says how noisy the sensor is.
+
+    Examples
+    --------
+    >>> cfa = np.full((4, 4), 612, np.uint16)
+    >>> frame = RawFrame(cfa=cfa, pattern="RGGB", black=(512.0,) * 4, white=1512)
+    >>> image = linear_rgb(frame, gain=2.0, read_noise=4.0)
+    >>> print(image.rgb[0, 0], (image.variance[0, 0] * 1e6).round(1))
+    [0.1 0.1 0.1] [54. 27. 54.]
+    """
+    checks = Checks("linear_rgb", RawError)
+    checks.that(
+        "demosaic", demosaic, demosaic in ("superpixel", "bilinear"), "superpixel, bilinear"
+    )
+    pair = (gain is None) == (read_noise is None)
+    checks.that("gain, read_noise", (gain, read_noise), pair, "both or neither")
+    checks.close()
+    if frame.pattern == "MONO":
+        fault = Fault("pattern", "MONO", "RGGB, BGGR, GRBG or GBRG")
+        raise RawError("a monochrome frame has no color", where=frame.path, faults=[fault])
+    x, variance = _pixels(frame, gain, read_noise)
+    good = frame.cfa < frame.white
+    if demosaic == "superpixel":
+        return _superpixel(frame.pattern, x, variance, good)
+    return _bilinear(frame.pattern, x, variance, good)
+
+
+def _pixels(
+    frame: RawFrame, gain: float | None, read_noise: float | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return value and variance of each sensor pixel, fractions of full scale."""
+    x = np.empty(frame.cfa.shape, np.float32)
+    variance = np.empty_like(x)
+    for cell, black in enumerate(frame.black):
+        rows, columns = slice(cell // 2, None, 2), slice(cell % 2, None, 2)
+        span = np.float32(1.0 / (frame.white - black))
+        part = (frame.cfa[rows, columns].astype(np.float32) - np.float32(black)) * span
+        if gain is not None and read_noise is not None:
+            scale, offset = noise_profile(gain, read_noise, black=black, white=frame.white)
+        elif frame.noise_profile is not None:
+            scale, offset = frame.noise_profile
+        else:
+            fault = Fault("noise_profile", "none", "one in the file, or gain and read_noise")
+            advice = "Calibrate the sensor and pass gain (electrons per DN) and read_noise."
+            what = "nothing says how noisy this frame is"
+            raise RawError(what, where=frame.path, faults=[fault], advice=advice)
+        x[rows, columns] = part
+        # below black the expected signal is none, not a negative shot noise
+        variance[rows, columns] = np.float32(scale) * np.maximum(part, 0) + np.float32(offset)
+    return x, variance
+
+
+def _superpixel(
+    pattern: str, x: NDArray[np.float32], variance: NDArray[np.float32], good: NDArray[np.bool_]
+) -> LinearImage:
+    height, width = x.shape[0] // 2, x.shape[1] // 2
+    rgb = np.zeros((height, width, 3), np.float32)
+    noise = np.zeros_like(rgb)
+    valid = np.ones((height, width), bool)
+    for cell, letter in enumerate(pattern):
+        part = (slice(cell // 2, None, 2), slice(cell % 2, None, 2))
+        band = _COLORS.index(letter)
+        weight = np.float32(1.0 / pattern.count(letter))
+        rgb[..., band] += weight * x[part]
+        noise[..., band] += weight**2 * variance[part]
+        valid &= good[part]
+    return LinearImage(rgb, noise, valid)
+
+
+def _bilinear(
+    pattern: str, x: NDArray[np.float32], variance: NDArray[np.float32], good: NDArray[np.bool_]
+) -> LinearImage:
+    rgb = np.empty((*x.shape, 3), np.float32)
+    noise = np.empty_like(rgb)
+    valid = np.ones(x.shape, bool)
+    bad = ~good
+    for band, letter in enumerate(_COLORS):
+        mask = np.zeros(x.shape, np.float32)
+        for cell in (c for c in range(4) if pattern[c] == letter):
+            mask[cell // 2 :: 2, cell % 2 :: 2] = 1
+        spread = _spread_green if letter == "G" else _spread_sparse
+        # weights that leave the image are shared among the others: a flat field stays flat
+        total = spread(mask, power=1)
+        rgb[..., band] = spread(x * mask, power=1) / total
+        noise[..., band] = spread(variance * mask, power=2) / total**2
+        valid &= spread(bad * mask, power=1) == 0
+    return LinearImage(rgb, noise, valid)
+
+
+def _spread_sparse(plane: NDArray[np.float32], *, power: int) -> NDArray[np.float32]:
+    """Convolve a red or blue plane (zero elsewhere) with the triangle's ``power``, separably."""
+    side, centre = (np.float32(w**power) for w in _TRIANGLE[:2])
+    rows = centre * plane
+    rows[1:] += side * plane[:-1]
+    rows[:-1] += side * plane[1:]
+    both = centre * rows
+    both[:, 1:] += side * rows[:, :-1]
+    both[:, :-1] += side * rows[:, 1:]
+    return both
+
+
+def _spread_green(plane: NDArray[np.float32], *, power: int) -> NDArray[np.float32]:
+    """Convolve the green plane: itself where it is green, else a quarter of each neighbour."""
+    weight = np.float32(0.25**power)
+    spread = plane.copy()
+    spread[1:] += weight * plane[:-1]
+    spread[:-1] += weight * plane[1:]
+    spread[:, 1:] += weight * plane[:, :-1]
+    spread[:, :-1] += weight * plane[:, 1:]
+    return spread
