@@ -1,0 +1,455 @@
+"""The only module that talks to Mitsuba: rays against a mesh, and radiance of described scenes.
+
+Rays are traced by Mitsuba's LLVM variants where they work, else by Embree through embreex, which
+needs no LLVM; scalar variants of Mitsuba then render what is described as a scene.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.rig import View
+from rigsim.atlas import BoolArray, interpolate
+from rigsim.mesh import Float32Array, Int32Array, Mesh
+from rigsim.variant import Kind, VariantChoice, choose_variant
+
+__all__ = [
+    "Caster",
+    "GBuffer",
+    "RenderError",
+    "VariantChoice",
+    "camera_rays",
+    "choose_variant",
+    "g_buffer",
+    "radiance",
+    "visibility",
+]
+
+logger = logging.getLogger(__name__)
+
+RAYS_PER_CALL: Final = 1 << 22
+"""Rays traced in one call; bounds the memory that a ray batch takes."""
+
+OFFSET_MM: Final = 0.02
+"""Distance by which shadow rays start above the surface; far above float32 steps at 200 mm."""
+
+
+class RenderError(RuntimeError):
+    """Mitsuba gave an image that cannot be used, or cannot be started."""
+
+
+@dataclass(frozen=True, slots=True)
+class GBuffer:
+    """What each camera ray meets first; shapes (H, W[, C]), row 0 is the top."""
+
+    mask: BoolArray
+    """Rays that meet the mesh."""
+    prim: Int32Array
+    """Triangle met, -1 for none."""
+    position_mm: Float32Array
+    """Point met, rig frame, zeros where nothing is met."""
+    normal: Float32Array
+    """Unit interpolated shading normal."""
+    face_normal: Float32Array
+    """Unit normal of the triangle."""
+    uv: Float32Array
+    """Texture coordinates."""
+    to_camera: Float32Array
+    """Unit vector from the point to the camera."""
+
+
+class _Tracer(Protocol):
+    def first_hit(
+        self, origins: Float32Array, directions: Float32Array
+    ) -> tuple[Int32Array, Float32Array]: ...
+
+    def blocked(
+        self, origins: Float32Array, directions: Float32Array, length: Float32Array
+    ) -> BoolArray: ...
+
+
+class Caster:
+    """Traces rays against one mesh.
+
+    Parameters
+    ----------
+    mesh
+        The mesh; it is copied.
+    choice
+        Variant to use; ``None`` chooses one for this machine.
+    """
+
+    def __init__(self, mesh: Mesh, *, choice: VariantChoice | None = None) -> None:
+        self.mesh = mesh
+        self.choice = choose_variant("rgb") if choice is None else choice
+        self._tracer: _Tracer
+        if self.choice.is_vectorized:
+            self._tracer = _MitsubaTracer(mesh, self.choice)
+        else:
+            self._tracer = _EmbreeTracer(mesh)
+
+    def first_hit(
+        self, origins: ArrayLike, directions: ArrayLike
+    ) -> tuple[Int32Array, Float32Array]:
+        """Find the first triangle on each ray.
+
+        Parameters
+        ----------
+        origins
+            Start points in mm, shape (N, 3).
+        directions
+            Unit vectors, shape (N, 3).
+
+        Returns
+        -------
+        prim : ndarray of int32
+            Triangle met, shape (N,), -1 for none.
+        weight : ndarray of float32
+            Weights of the triangle's second and third corner, shape (N, 2).
+        """
+        start, way = _ray_arrays(origins, directions)
+        prim = np.empty(len(start), np.int32)
+        weight = np.empty((len(start), 2), np.float32)
+        for part in _parts(len(start)):
+            prim[part], weight[part] = self._tracer.first_hit(start[part], way[part])
+        return prim, weight
+
+    def blocked(self, origins: ArrayLike, directions: ArrayLike, length_mm: ArrayLike) -> BoolArray:
+        """Tell which rays meet a triangle before their end.
+
+        Parameters
+        ----------
+        origins
+            Start points in mm, shape (N, 3).
+        directions
+            Unit vectors, shape (N, 3).
+        length_mm
+            Length of each ray in mm, shape (N,).
+
+        Returns
+        -------
+        ndarray of bool
+            Shape (N,).
+        """
+        start, way = _ray_arrays(origins, directions)
+        length = np.ascontiguousarray(np.broadcast_to(length_mm, len(start)), np.float32)
+        out = np.empty(len(start), np.bool_)
+        for part in _parts(len(start)):
+            out[part] = self._tracer.blocked(start[part], way[part], length[part])
+        return out
+
+
+def camera_rays(view: View, *, subpixels: int = 1) -> tuple[Float32Array, Float32Array]:
+    """Return the rays of a pinhole camera through its pixels or a regular grid inside them.
+
+    Parameters
+    ----------
+    view
+        The camera; pixel (0, 0) is the top left one.
+    subpixels
+        Rays along each side of a pixel.
+
+    Returns
+    -------
+    origins, directions : ndarray of float32
+        Shape (H k, W k, 3) each for k subpixels, rig frame in mm, directions of unit length.
+    """
+    if subpixels < 1:
+        raise ValueError(f"subpixels: got {subpixels}, expected at least 1")
+    k = subpixels
+    right, up, back = (np.array(axis) for axis in view.axes)
+    # Pixel (0, 0)'s centre is (0, 0); the optical axis meets the middle of the sensor.
+    x = (np.arange(view.width_px * k) + 0.5) / k - 0.5 - 0.5 * (view.width_px - 1)
+    y = (np.arange(view.height_px * k) + 0.5) / k - 0.5 - 0.5 * (view.height_px - 1)
+    way = x[None, :, None] * right - y[:, None, None] * up - view.focal_px * back
+    way /= np.linalg.norm(way, axis=-1, keepdims=True)
+    directions = way.astype(np.float32)
+    origins = np.broadcast_to(np.asarray(view.position_mm, np.float32), directions.shape)
+    return origins, directions
+
+
+def g_buffer(caster: Caster, view: View, *, subpixels: int = 1) -> GBuffer:
+    """Look at a mesh through a camera.
+
+    Parameters
+    ----------
+    caster
+        The mesh.
+    view
+        The camera.
+    subpixels
+        Rays along each side of a pixel; buffers are that much larger.
+
+    Returns
+    -------
+    GBuffer
+        Point samples; nothing is averaged over a pixel.
+    """
+    origins, directions = camera_rays(view, subpixels=subpixels)
+    shape = directions.shape[:2]
+    prim, weight = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
+    mesh = caster.mesh
+
+    def over(values: Float32Array) -> Float32Array:
+        return interpolate(values, mesh.faces, prim, weight).reshape(*shape, values.shape[-1])
+
+    corners = mesh.vertices_mm[mesh.faces]
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    mask = prim >= 0
+    face_normal = np.zeros((len(prim), 3), np.float32)
+    face_normal[mask] = flat[prim[mask]]
+    buffers = GBuffer(
+        mask=mask.reshape(shape),
+        prim=prim.reshape(shape),
+        position_mm=over(mesh.vertices_mm),
+        normal=_unit(over(mesh.normals)),
+        face_normal=_unit(face_normal.reshape(*shape, 3)),
+        uv=over(mesh.uv),
+        to_camera=-directions,
+    )
+    for name in ("position_mm", "normal", "face_normal", "uv"):
+        if not np.isfinite(getattr(buffers, name)).all():
+            raise RenderError(f"g-buffer {name}: values that are not finite; check the mesh")
+    return buffers
+
+
+def visibility(
+    caster: Caster,
+    position_mm: Float32Array,
+    normal: Float32Array,
+    light_mm: ArrayLike,
+    *,
+    radius_mm: float = 0.0,
+    samples: int = 1,
+) -> Float32Array:
+    """Return which part of a round light each surface point sees.
+
+    Parameters
+    ----------
+    caster
+        The mesh that casts shadows.
+    position_mm
+        Surface points, shape (..., 3), rig frame.
+    normal
+        Unit normals, shape (..., 3); rays start that side of the surface.
+    light_mm
+        Centre of the light, shape (3,); its disc faces the rig's origin.
+    radius_mm
+        Radius of the disc, 0 for a point.
+    samples
+        Points on the disc; the same golden spiral for every surface point, turned by an angle
+        that depends on the point's index only.
+
+    Returns
+    -------
+    ndarray of float32
+        Shape (...), 0 to 1. Points whose normal looks away from the light's centre by more than
+        the disc can reach get 0 without a ray.
+    """
+    if samples < 1 or radius_mm < 0.0:
+        raise ValueError(f"samples, radius_mm: got {samples}, {radius_mm}, expected >= 1, >= 0")
+    leading = position_mm.shape[:-1]
+    points = position_mm.reshape(-1, 3)
+    normals = normal.reshape(-1, 3)
+    light = np.asarray(light_mm, np.float32)
+    seen = np.zeros(len(points), np.float32)
+    toward = light - points
+    reach = np.einsum("ij,ij->i", toward, normals) > -radius_mm
+    index = np.flatnonzero(reach)
+    axis = light / max(float(np.linalg.norm(light)), 1e-6)
+    helper = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    side = np.cross(helper, axis)
+    side /= np.linalg.norm(side)
+    other = np.cross(axis, side)
+    start = points[index] + np.float32(OFFSET_MM) * normals[index]
+    golden = np.pi * (3.0 - np.sqrt(5.0))
+    turn = (index * 0.754877666) % 1.0 * 2.0 * np.pi  # inverse of the plastic number: well spread
+    for k in range(samples):
+        r = radius_mm * np.sqrt((k + 0.5) / samples) if samples > 1 else 0.0
+        angle = turn + k * golden
+        target = light + r * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other)
+        way = target - start
+        length = np.linalg.norm(way, axis=-1)
+        way /= length[:, None]
+        front = np.einsum("ij,ij->i", way, normals[index]) > 0.0
+        ray = np.flatnonzero(front)
+        free = ~caster.blocked(start[ray], way[ray], length[ray] * np.float32(0.999))
+        seen[index[ray]] += free
+    return (seen / np.float32(samples)).reshape(leading)
+
+
+def radiance(
+    description: Mapping[str, Any],
+    *,
+    kind: Kind,
+    samples: int,
+    seed: int = 0,
+) -> NDArray[np.float32]:
+    """Render a described scene.
+
+    Parameters
+    ----------
+    description
+        Mitsuba's scene dictionary; arrays and numbers only, no Mitsuba objects.
+    kind
+        Variant kind, see `rigsim.variant.choose_variant`.
+    samples
+        Samples per pixel.
+    seed
+        Seed of the sampler.
+
+    Returns
+    -------
+    ndarray of float32
+        The film, shape (H, W, channels).
+
+    Raises
+    ------
+    RenderError
+        The image holds values that are not finite.
+    """
+    mi = load(choose_variant(kind))
+    scene = mi.load_dict(dict(description))
+    image = np.array(mi.TensorXf(mi.render(scene, spp=samples, seed=seed)).numpy(), np.float32)
+    bad = int(np.count_nonzero(~np.isfinite(image).all(axis=-1)))
+    if bad:
+        raise RenderError(f"Mitsuba gave {bad} pixels that are not finite, expected none")
+    return image
+
+
+def load(choice: VariantChoice) -> Any:
+    """Import Mitsuba with a variant set.
+
+    Parameters
+    ----------
+    choice
+        Result of `rigsim.variant.choose_variant`; its library is set before the first import.
+
+    Returns
+    -------
+    module
+        ``mitsuba`` with the variant active.
+    """
+    mi = _import_mitsuba(choice.library)
+    if mi.variant() != choice.name:
+        try:
+            mi.set_variant(choice.name)
+        except ImportError as error:
+            raise RenderError(f"Mitsuba's variant {choice.name} is missing: {error}") from error
+    return mi
+
+
+@cache
+def _import_mitsuba(library: str) -> Any:
+    if library:
+        os.environ["DRJIT_LIBLLVM_PATH"] = library
+    try:
+        import drjit as dr
+        import mitsuba as mi
+    except ImportError as error:
+        raise RenderError(f"Mitsuba cannot be imported: {error}") from error
+    dr.set_thread_count(thread_count())
+    mi.set_log_level(mi.LogLevel.Error)
+    return mi
+
+
+def thread_count() -> int:
+    """Return how many threads rendering may use: this process's cores, at most 16."""
+    try:
+        cores = len(os.sched_getaffinity(0))
+    except AttributeError:  # not on every system
+        cores = os.cpu_count() or 1
+    return max(1, min(cores, 16))
+
+
+class _MitsubaTracer:
+    def __init__(self, mesh: Mesh, choice: VariantChoice) -> None:
+        self._choice = choice
+        mi = load(choice)
+        shape = mi.Mesh("mesh", len(mesh.vertices_mm), len(mesh.faces))
+        parameters = mi.traverse(shape)
+        parameters["vertex_positions"] = np.ravel(mesh.vertices_mm)
+        parameters["faces"] = np.ravel(mesh.faces).astype(np.uint32)
+        parameters.update()
+        self._scene = mi.load_dict({"type": "scene", "mesh": shape})
+
+    def _ray(
+        self, mi: Any, origins: Float32Array, directions: Float32Array, length: Any = None
+    ) -> Any:
+        start = mi.Point3f(*(np.ascontiguousarray(origins[:, k]) for k in range(3)))
+        way = mi.Vector3f(*(np.ascontiguousarray(directions[:, k]) for k in range(3)))
+        ray = mi.Ray3f(start, way)
+        if length is not None:
+            ray.maxt = mi.Float(length)
+        return ray
+
+    def first_hit(
+        self, origins: Float32Array, directions: Float32Array
+    ) -> tuple[Int32Array, Float32Array]:
+        mi = load(self._choice)
+        hit = self._scene.ray_intersect_preliminary(
+            self._ray(mi, origins, directions), coherent=True
+        )
+        valid = np.array(hit.is_valid())
+        prim = np.where(valid, np.array(hit.prim_index).astype(np.int64), -1).astype(np.int32)
+        weight = np.stack([np.array(hit.prim_uv.x), np.array(hit.prim_uv.y)], axis=-1)
+        return prim, np.where(valid[:, None], weight, 0.0).astype(np.float32)
+
+    def blocked(
+        self, origins: Float32Array, directions: Float32Array, length: Float32Array
+    ) -> BoolArray:
+        mi = load(self._choice)
+        hit = self._scene.ray_test(self._ray(mi, origins, directions, length), coherent=True)
+        return np.array(hit, np.bool_)
+
+
+class _EmbreeTracer:
+    def __init__(self, mesh: Mesh) -> None:
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
+
+        self._scene = rtcore_scene.EmbreeScene()
+        TriangleMesh(self._scene, mesh.vertices_mm, mesh.faces)
+
+    def first_hit(
+        self, origins: Float32Array, directions: Float32Array
+    ) -> tuple[Int32Array, Float32Array]:
+        if not len(origins):
+            return np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
+        hit = self._scene.run(origins, directions, output=True)
+        prim = np.asarray(hit["primID"], np.int32)
+        weight = np.stack([hit["u"], hit["v"]], axis=-1).astype(np.float32)
+        return prim, np.where(prim[:, None] >= 0, weight, np.float32(0.0))
+
+    def blocked(
+        self, origins: Float32Array, directions: Float32Array, length: Float32Array
+    ) -> BoolArray:
+        if not len(origins):
+            return np.zeros(0, np.bool_)
+        hit = self._scene.run(origins, directions, dists=length.copy(), query="OCCLUDED")
+        return np.asarray(hit) != -1
+
+
+def _ray_arrays(origins: ArrayLike, directions: ArrayLike) -> tuple[Float32Array, Float32Array]:
+    start = np.ascontiguousarray(origins, np.float32)
+    way = np.ascontiguousarray(directions, np.float32)
+    if start.shape != way.shape or start.ndim != 2 or start.shape[1] != 3:
+        raise ValueError(f"rays: got shapes {start.shape} and {way.shape}, expected (N, 3) twice")
+    return start, way
+
+
+def _parts(count: int) -> list[slice]:
+    return [slice(at, min(at + RAYS_PER_CALL, count)) for at in range(0, count, RAYS_PER_CALL)]
+
+
+def _unit(vectors: Float32Array) -> Float32Array:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0)

@@ -1,0 +1,294 @@
+"""Which Mitsuba variant can run here, found out before it could crash this process.
+
+Dr.Jit compiles its kernels with the LLVM library it finds. Libraries before version 17 abort
+the process when a kernel is compiled (15, 16) or are refused (14), so a library is first judged
+by the version in its file name, then by rendering eight by eight pixels in another process. The
+verdict is kept in the user's cache folder by the library's real path and its time of change.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from glob import glob
+from pathlib import Path
+from typing import Final, Literal
+
+logger = logging.getLogger(__name__)
+
+Kind = Literal["rgb", "mono", "mono_polarized", "spectral", "spectral_polarized"]
+
+OLDEST_LLVM: Final = 17
+"""Oldest major version of LLVM that has the intrinsics Dr.Jit's kernels need."""
+
+PROBE_TIMEOUT_S: Final = 120.0
+"""A probe that takes longer counts as failed; it takes one second on an idle machine."""
+
+# The scalar variants that are built into Mitsuba's wheels; a mono kind has no scalar twin.
+_SCALAR: Final[Mapping[Kind, str]] = {
+    "rgb": "scalar_rgb",
+    "mono": "scalar_rgb",
+    "mono_polarized": "scalar_spectral_polarized",
+    "spectral": "scalar_spectral",
+    "spectral_polarized": "scalar_spectral_polarized",
+}
+
+_FOLDERS: Final = (
+    "/usr/lib/*-linux-gnu*",
+    "/usr/lib/llvm-*/lib",
+    "/usr/lib64",
+    "/usr/lib64/llvm*/lib",
+    "/usr/lib",
+    "/usr/local/lib",
+    "/usr/local/opt/llvm*/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+    f"{sys.prefix}/lib",
+)
+
+_NOT_RUN: Final = "the probe did not run to its end"
+
+_PROBE: Final = """
+import drjit as dr, drjit.llvm
+if not dr.has_backend(dr.JitBackend.LLVM):
+    raise SystemExit("no LLVM backend")
+version = dr.detail.llvm_version()
+if tuple(version) < (%d,):
+    raise SystemExit("LLVM " + ".".join(map(str, version)) + " is too old")
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "max_depth": 2},
+    "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+    "light": {"type": "constant"}, "ball": {"type": "sphere", "center": [0.0, 0.0, 4.0]}})
+image = mi.TensorXf(mi.render(scene, spp=1)).numpy()
+if not (image > 0.0).any():
+    raise SystemExit("the image is black")
+print("LLVM " + ".".join(map(str, version)))
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class LibraryVerdict:
+    """What was found out about one LLVM library."""
+
+    path: str
+    """Path of the library file, links resolved."""
+    usable: bool
+    """Whether kernels can be compiled with it."""
+    why: str
+    """Version when usable, else the reason in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class VariantChoice:
+    """The Mitsuba variant that will be used, and why."""
+
+    name: str
+    """Mitsuba's name of the variant, as in ``llvm_ad_rgb``."""
+    why: str
+    """The reason in words, for people."""
+    library: str
+    """Path of the LLVM library; empty for scalar variants."""
+
+    @property
+    def is_vectorized(self) -> bool:
+        """Whether arrays of rays are traced in one call."""
+        return self.name.startswith("llvm")
+
+
+def find_libraries(environment: Mapping[str, str] | None = None) -> tuple[Path, ...]:
+    """Return the LLVM libraries of this machine, the newest version first.
+
+    Parameters
+    ----------
+    environment
+        Environment variables; ``DRJIT_LIBLLVM_PATH`` there names a file that is put first.
+
+    Returns
+    -------
+    tuple of Path
+        Real paths without duplicates. Libraries whose name tells no version come last.
+    """
+    environment = os.environ if environment is None else environment
+    found: dict[Path, None] = {}
+    named = environment.get("DRJIT_LIBLLVM_PATH", "")
+    if named:
+        found[Path(named).resolve()] = None
+    candidates = {
+        Path(name).resolve()
+        for folder in _FOLDERS
+        for pattern in ("libLLVM.so*", "libLLVM-[0-9]*.so*", "libLLVM*.dylib")
+        for name in glob(f"{folder}/{pattern}")
+    }
+    for path in sorted(candidates, key=lambda path: (-major_version(path), str(path))):
+        found[path] = None
+    return tuple(found)
+
+
+def major_version(path: Path) -> int:
+    """Return the major version that an LLVM library's file name tells, 0 when it tells none.
+
+    Examples
+    --------
+    >>> major_version(Path("libLLVM.so.19.1")), major_version(Path("libLLVM-15.so.1"))
+    (19, 15)
+    >>> major_version(Path("libLLVM.so"))
+    0
+    """
+    match = re.search(r"libLLVM(?:-|\.so\.)(\d+)", path.name)
+    return int(match.group(1)) if match else 0
+
+
+def judge_library(path: Path, *, cache: Path | None = None) -> LibraryVerdict:
+    """Find out, without risk to this process, whether an LLVM library can be used.
+
+    Parameters
+    ----------
+    path
+        The library file.
+    cache
+        Folder that keeps verdicts; ``None`` stands for the user's cache folder.
+
+    Returns
+    -------
+    LibraryVerdict
+        Usable or not, with the reason.
+    """
+    path = path.resolve()
+    version = major_version(path)
+    if 0 < version < OLDEST_LLVM:
+        return LibraryVerdict(str(path), False, f"LLVM {version} is older than {OLDEST_LLVM}")
+    if not path.is_file():
+        return LibraryVerdict(str(path), False, "there is no such file")
+    folder = user_cache() if cache is None else cache
+    key = f"{path}|{path.stat().st_mtime_ns}|{sys.executable}"
+    known = _read_cache(folder)
+    if key in known:
+        usable, why = known[key]
+        return LibraryVerdict(str(path), usable, why)
+    verdict = probe_library(path)
+    if _NOT_RUN not in verdict.why:  # a busy machine is no verdict on the library
+        known[key] = (verdict.usable, verdict.why)
+        _write_cache(folder, known)
+    return verdict
+
+
+def probe_library(path: Path, *, timeout_s: float = PROBE_TIMEOUT_S) -> LibraryVerdict:
+    """Render eight by eight pixels with an LLVM library in another process.
+
+    Parameters
+    ----------
+    path
+        The library file.
+    timeout_s
+        Time after which the probe counts as failed.
+
+    Returns
+    -------
+    LibraryVerdict
+        Usable when the other process ended well; a crash there is a verdict here.
+    """
+    environment = dict(os.environ, DRJIT_LIBLLVM_PATH=str(path))
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE % OLDEST_LLVM],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return LibraryVerdict(str(path), False, f"{_NOT_RUN}: {error}")
+    if done.returncode == 0 and done.stdout.strip():
+        return LibraryVerdict(str(path), True, done.stdout.strip().splitlines()[-1])
+    said = (done.stderr.strip().splitlines() or ["no message"])[-1]
+    if done.returncode < 0:
+        said = f"it ended the probe by signal {-done.returncode}"
+    return LibraryVerdict(str(path), False, said)
+
+
+def choose_variant(
+    kind: Kind = "rgb",
+    *,
+    environment: Mapping[str, str] | None = None,
+    libraries: Iterable[Path] | None = None,
+    cache: Path | None = None,
+) -> VariantChoice:
+    """Choose the fastest Mitsuba variant that works on this machine.
+
+    Parameters
+    ----------
+    kind
+        What the variant must compute: ``rgb``, ``mono``, ``mono_polarized``, ``spectral`` or
+        ``spectral_polarized``.
+    environment
+        Environment variables; ``SKINRIG_MITSUBA=scalar`` asks for a scalar variant.
+    libraries
+        LLVM libraries to consider, in this order; ``None`` looks for them.
+    cache
+        Folder that keeps verdicts; ``None`` stands for the user's cache folder.
+
+    Returns
+    -------
+    VariantChoice
+        Name, reason and library.
+
+    Raises
+    ------
+    ValueError
+        The kind is unknown, or the environment asks for something else than ``scalar``.
+
+    Examples
+    --------
+    >>> choose_variant("rgb", environment={"SKINRIG_MITSUBA": "scalar"}).name
+    'scalar_rgb'
+    """
+    if kind not in _SCALAR:
+        raise ValueError(f"kind: got {kind!r}, expected one of {', '.join(_SCALAR)}")
+    environment = os.environ if environment is None else environment
+    asked = environment.get("SKINRIG_MITSUBA", "")
+    if asked == "scalar":
+        return VariantChoice(_SCALAR[kind], "SKINRIG_MITSUBA=scalar asks for it", "")
+    if asked not in ("", "llvm"):
+        raise ValueError(f"SKINRIG_MITSUBA: got {asked!r}, expected scalar, llvm or nothing")
+    refused = []
+    for path in find_libraries(environment) if libraries is None else libraries:
+        verdict = judge_library(path, cache=cache)
+        if verdict.usable:
+            return VariantChoice(f"llvm_ad_{kind}", f"{verdict.why} works", verdict.path)
+        refused.append(f"{verdict.path}: {verdict.why}")
+        logger.debug("LLVM library refused: %s: %s", verdict.path, verdict.why)
+    why = "; ".join(refused) if refused else "no LLVM library was found"
+    return VariantChoice(_SCALAR[kind], f"no LLVM {OLDEST_LLVM} or newer ({why})", "")
+
+
+def user_cache() -> Path:
+    """Return the folder in which verdicts are kept, by the XDG convention."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if base else Path.home() / ".cache") / "skinrig"
+
+
+def _read_cache(folder: Path) -> dict[str, tuple[bool, str]]:
+    try:
+        document = json.loads((folder / "llvm.json").read_text(encoding="utf-8"))
+        return {str(key): (bool(usable), str(why)) for key, (usable, why) in document.items()}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}  # absent or damaged: the probe is simply run again
+
+
+def _write_cache(folder: Path, known: Mapping[str, tuple[bool, str]]) -> None:
+    # A folder that cannot be written costs a probe each time, not the run.
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=folder, suffix=".json")
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            json.dump(known, file, indent=1)
+        os.replace(name, folder / "llvm.json")
