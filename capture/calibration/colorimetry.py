@@ -1,0 +1,139 @@
+"""XYZ, Lab and white points: what a color calibration needs of CIE 15, on arrays."""
+
+import csv
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "WHITE_XYZ",
+    "adapt",
+    "chart_reference",
+    "delta_e_2000",
+    "lab_from_xyz",
+    "lab_jacobian",
+    "patch_names",
+    "white_point",
+    "xyz_from_lab",
+    "xyz_to_linear_srgb",
+]
+
+Float = NDArray[np.float64]
+
+WHITE_XYZ: dict[str, tuple[float, float, float]] = {  # 2 degree observer, Y = 1; ASTM E308-01
+    "A": (1.09850, 1.0, 0.35585),
+    "D50": (0.96422, 1.0, 0.82521),
+    "D55": (0.95682, 1.0, 0.92149),
+    "D65": (0.95047, 1.0, 1.08883),
+    "E": (1.0, 1.0, 1.0),
+}
+
+# Cone responses of the Bradford adaptation: Lam 1985; as in ICC.1:2010 annex E
+_BRADFORD = np.array(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+)
+
+# Primaries of IEC 61966-2-1 (sRGB) as chromaticities x, y
+_SRGB_XY = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
+
+_EPSILON = (6.0 / 29.0) ** 3  # CIE 15:2004, where the cube root begins
+
+
+def white_point(illuminant: str) -> Float:
+    """Return XYZ of the perfect diffuser, Y = 1, shape (3,).
+
+    Examples
+    --------
+    >>> white_point("D50").tolist()
+    [0.96422, 1.0, 0.82521]
+    """
+    if illuminant not in WHITE_XYZ:
+        raise ValueError(f"illuminant: got {illuminant!r}, expected one of {sorted(WHITE_XYZ)}")
+    return np.array(WHITE_XYZ[illuminant])
+
+
+def lab_from_xyz(xyz: ArrayLike, white: ArrayLike) -> Float:
+    """Return CIE L*a*b* of XYZ, shape (..., 3), for a white of the same scale."""
+    t = np.asarray(xyz, dtype=np.float64) / np.asarray(white, dtype=np.float64)
+    f = np.where(t > _EPSILON, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
+    x, y, z = f[..., 0], f[..., 1], f[..., 2]
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
+
+
+def xyz_from_lab(lab: ArrayLike, white: ArrayLike) -> Float:
+    """Return XYZ of CIE L*a*b*, shape (..., 3), in the scale of the white.
+
+    Examples
+    --------
+    >>> xyz_from_lab([100.0, 0.0, 0.0], white_point("D65")).tolist()
+    [0.95047, 1.0, 1.08883]
+    """
+    lab = np.asarray(lab, dtype=np.float64)
+    y = (lab[..., 0] + 16) / 116
+    f = np.stack([y + lab[..., 1] / 500, y, y - lab[..., 2] / 200], axis=-1)
+    t = np.where(f > 6 / 29, f**3, 3 * (6 / 29) ** 2 * (f - 4 / 29))
+    return t * np.asarray(white, dtype=np.float64)
+
+
+def lab_jacobian(xyz: ArrayLike, white: ArrayLike) -> Float:
+    """Return d(Lab)/d(XYZ), shape (..., 3, 3)."""
+    w = np.asarray(white, dtype=np.float64)
+    t = np.asarray(xyz, dtype=np.float64) / w
+    slope = np.where(
+        t > _EPSILON, 1 / (3 * np.cbrt(np.maximum(t, _EPSILON)) ** 2), 1 / (3 * (6 / 29) ** 2)
+    )
+    mix = np.array([[0.0, 116.0, 0.0], [500.0, -500.0, 0.0], [0.0, 200.0, -200.0]])
+    return mix * (slope / w)[..., None, :]
+
+
+def delta_e_2000(lab_a: ArrayLike, lab_b: ArrayLike) -> Float:
+    """Return the color difference CIEDE2000 (CIE 142-2001) of Lab colors, shape (...)."""
+    from colour import delta_E  # takes a second to import, so only where it is used
+
+    return np.asarray(delta_E(np.asarray(lab_a), np.asarray(lab_b), method="CIE 2000"))
+
+
+def adapt(xyz: ArrayLike, source_white: ArrayLike, target_white: ArrayLike) -> Float:
+    """Return XYZ seen under another white, by the Bradford transform, shape (..., 3)."""
+    source = _BRADFORD @ np.asarray(source_white, dtype=np.float64)
+    target = _BRADFORD @ np.asarray(target_white, dtype=np.float64)
+    matrix = np.linalg.solve(_BRADFORD, (target / source)[:, None] * _BRADFORD)
+    return np.asarray(xyz, dtype=np.float64) @ matrix.T
+
+
+def xyz_to_linear_srgb(xyz: ArrayLike, *, illuminant: str = "D65") -> Float:
+    """Return linear sRGB (D65) of XYZ under an illuminant, shape (..., 3), white = (1, 1, 1).
+
+    Examples
+    --------
+    >>> xyz_to_linear_srgb(white_point("D50"), illuminant="D50").round(6).tolist()
+    [1.0, 1.0, 1.0]
+    """
+    white = white_point("D65")
+    primaries = np.array([[x / y, 1.0, (1 - x - y) / y] for x, y in _SRGB_XY]).T
+    to_xyz = primaries * np.linalg.solve(primaries, white)
+    return adapt(xyz, white_point(illuminant), white) @ np.linalg.inv(to_xyz).T
+
+
+def _chart_rows() -> list[dict[str, str]]:
+    text = files("capture.calibration").joinpath("color_checker_classic.csv").read_text("utf-8")
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    return list(csv.DictReader(lines))
+
+
+def patch_names() -> tuple[str, ...]:
+    """Return the names of the 24 patches, row-major from dark skin."""
+    return tuple(row["name"] for row in _chart_rows())
+
+
+def chart_reference(illuminant: str = "D50") -> Float:
+    """Return XYZ (Y of the perfect diffuser = 1) of the ColorChecker Classic, shape (24, 3).
+
+    Row-major from dark skin to black. The published values are for D50; for another illuminant
+    they are adapted by the Bradford transform, which is an approximation of a few Delta E for
+    saturated patches: where the patches' spectra are known, integrate those instead.
+    """
+    lab = np.array([[float(row[k]) for k in "Lab"] for row in _chart_rows()])
+    d50 = white_point("D50")
+    return adapt(xyz_from_lab(lab, d50), d50, white_point(illuminant))
