@@ -1,0 +1,201 @@
+"""How far an estimate is from a truth, and whether its standard errors are honest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+Floats = NDArray[np.float64]
+
+
+def angular_error_rad(a: ArrayLike, b: ArrayLike) -> Floats:
+    """Return the angle between vectors, accurate for small angles too.
+
+    Parameters
+    ----------
+    a, b
+        (..., 3), of any length but zero.
+
+    Returns
+    -------
+    ndarray
+        (...), rad, in [0, pi]; NaN where a vector has no direction.
+
+    Examples
+    --------
+    >>> float(angular_error_rad([0, 0, 1], [0, 1e-9, 1]))
+    1e-09
+    """
+    a = np.asarray(a, np.float64)
+    b = np.asarray(b, np.float64)
+    cross = np.linalg.norm(np.cross(a, b), axis=-1)
+    dot = np.sum(a * b, axis=-1)
+    angle = np.arctan2(cross, dot)
+    return np.where((cross == 0) & (dot == 0), np.nan, angle)
+
+
+def delta_e_2000(lab_a: ArrayLike, lab_b: ArrayLike) -> Floats:
+    """Return the CIEDE2000 color difference with k_L = k_C = k_H = 1.
+
+    Parameters
+    ----------
+    lab_a, lab_b
+        (..., 3), CIE L*a*b* under the same white.
+
+    Returns
+    -------
+    ndarray
+        (...).
+
+    References
+    ----------
+    Sharma, Wu, Dalal 2005, doi 10.1002/col.20070 (with its equation numbers).
+    """
+    L1, a1, b1 = np.moveaxis(np.asarray(lab_a, np.float64), -1, 0)
+    L2, a2, b2 = np.moveaxis(np.asarray(lab_b, np.float64), -1, 0)
+    c_mean7 = ((np.hypot(a1, b1) + np.hypot(a2, b2)) / 2) ** 7  # eqs. (2), (3)
+    G = 0.5 * (1 - np.sqrt(c_mean7 / (c_mean7 + 25.0**7)))  # eq. (4)
+    a1p, a2p = (1 + G) * a1, (1 + G) * a2  # eq. (5)
+    C1, C2 = np.hypot(a1p, b1), np.hypot(a2p, b2)  # eq. (6)
+    h1 = np.degrees(np.arctan2(b1, a1p)) % 360  # eq. (7)
+    h2 = np.degrees(np.arctan2(b2, a2p)) % 360
+    gray = C1 * C2 == 0
+    dh = (h2 - h1 + 180) % 360 - 180  # eq. (10); a turn of 180 keeps either sign
+    dh = np.where(gray, 0.0, dh)
+    dH = 2 * np.sqrt(C1 * C2) * np.sin(np.radians(dh) / 2)  # eq. (11)
+    dL, dC = L2 - L1, C2 - C1  # eqs. (8), (9)
+    far = np.abs(h1 - h2) > 180
+    h_mean = np.where(far, (h1 + h2 + np.where(h1 + h2 < 360, 360, -360)) / 2, (h1 + h2) / 2)
+    h_mean = np.where(gray, h1 + h2, h_mean)  # eq. (14)
+    L_mean, C_mean = (L1 + L2) / 2, (C1 + C2) / 2
+    T = (  # eq. (15)
+        1
+        - 0.17 * np.cos(np.radians(h_mean - 30))
+        + 0.24 * np.cos(np.radians(2 * h_mean))
+        + 0.32 * np.cos(np.radians(3 * h_mean + 6))
+        - 0.20 * np.cos(np.radians(4 * h_mean - 63))
+    )
+    theta = 30 * np.exp(-(((h_mean - 275) / 25) ** 2))  # eq. (16)
+    R_C = 2 * np.sqrt(C_mean**7 / (C_mean**7 + 25.0**7))  # eq. (17)
+    S_L = 1 + 0.015 * (L_mean - 50) ** 2 / np.sqrt(20 + (L_mean - 50) ** 2)  # eq. (18)
+    S_C = 1 + 0.045 * C_mean  # eq. (19)
+    S_H = 1 + 0.015 * C_mean * T  # eq. (20)
+    R_T = -np.sin(np.radians(2 * theta)) * R_C  # eq. (21)
+    lightness, chroma, hue = dL / S_L, dC / S_C, dH / S_H
+    squared = lightness**2 + chroma**2 + hue**2 + R_T * chroma * hue  # eq. (22)
+    return np.sqrt(np.maximum(squared, 0.0))
+
+
+def individual_typology_angle_deg(lightness: ArrayLike, b_star: ArrayLike) -> Floats:
+    """Return the individual typology angle, arctan((L* - 50) / b*), in degrees.
+
+    Parameters
+    ----------
+    lightness, b_star
+        CIE L* and b* under D65, any shape that broadcasts.
+
+    Notes
+    -----
+    Above 55 very light, above 41 light, above 28 intermediate, above 10 tan, above -30 brown,
+    else dark (Chardon, Cretois, Hourseau 1991, doi 10.1111/j.1467-2494.1991.tb00561.x).
+
+    Examples
+    --------
+    >>> float(individual_typology_angle_deg(60.0, 10.0))
+    45.0
+    """
+    return np.degrees(np.arctan2(np.asarray(lightness, np.float64) - 50.0, b_star))
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """How often intervals held the truth.
+
+    Attributes
+    ----------
+    share
+        In [0, 1]; NaN when nothing was counted.
+    interval
+        Exact (Clopper-Pearson) 95 % interval of the share, for independent trials.
+    count
+        Trials.
+    """
+
+    share: float
+    interval: tuple[float, float]
+    count: int
+
+
+def coverage(
+    estimate: ArrayLike,
+    stderr: ArrayLike,
+    truth: ArrayLike,
+    *,
+    level: float = 0.6827,
+    valid: ArrayLike | None = None,
+) -> Coverage:
+    """Count how often ``truth`` lies in the Gaussian interval of ``estimate``.
+
+    Parameters
+    ----------
+    estimate, stderr, truth
+        Arrays that broadcast.
+    level
+        Nominal coverage, between 0 and 1.
+    valid
+        Which trials count; None: all that are finite.
+
+    Examples
+    --------
+    >>> coverage([0.0, 0.0], [1.0, 1.0], [0.5, 3.0]).share
+    0.5
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"level: got {level}, expected between 0 and 1")
+    deviation = np.abs(np.asarray(estimate, np.float64) - np.asarray(truth, np.float64))
+    error = np.broadcast_to(np.asarray(stderr, np.float64), deviation.shape)
+    counted = np.isfinite(deviation) & np.isfinite(error)
+    if valid is not None:
+        counted &= np.asarray(valid, bool)
+    n = int(np.count_nonzero(counted))
+    if n == 0:
+        return Coverage(float("nan"), (0.0, 1.0), 0)
+    reach = stats.norm.ppf(0.5 + level / 2)
+    k = int(np.count_nonzero(deviation[counted] <= reach * error[counted]))
+    test = stats.binomtest(k, n).proportion_ci(0.95, method="exact")
+    return Coverage(k / n, (float(test.low), float(test.high)), n)
+
+
+def median_with_interval(
+    values: ArrayLike, *, rng: np.random.Generator, level: float = 0.68, draws: int = 200
+) -> tuple[float, tuple[float, float]]:
+    """Return the median and its bootstrap interval.
+
+    Parameters
+    ----------
+    values
+        Any shape; NaN are dropped. More than 20,000 are thinned by a random choice.
+    rng
+        Draws the bootstrap samples.
+    level
+        Of the interval.
+    draws
+        Bootstrap samples.
+
+    Returns
+    -------
+    median, (low, high)
+        NaN when there are no values.
+    """
+    kept = np.asarray(values, np.float64).ravel()
+    kept = kept[np.isfinite(kept)]
+    if not kept.size:
+        return float("nan"), (float("nan"), float("nan"))
+    if kept.size > 20_000:
+        kept = rng.choice(kept, 20_000, replace=False)
+    medians = np.median(kept[rng.integers(0, kept.size, (draws, kept.size))], axis=1)
+    low, high = np.quantile(medians, [0.5 - level / 2, 0.5 + level / 2])
+    return float(np.median(kept)), (float(low), float(high))

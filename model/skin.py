@@ -1,0 +1,116 @@
+"""What is known about a piece of skin: named maps with unit, standard error and valid mask."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+UNITS: Mapping[str, str] = MappingProxyType(
+    {
+        "melanin": "volume fraction of the epidermis",
+        "hemoglobin": "volume fraction of blood in the dermis",
+        "shading": "1",
+        "diffuse": "1",
+        "specular": "1",
+        "normals": "1",
+        "position": "mm",
+        "roughness": "1",
+        "residual": "1",
+    }
+)
+"""Units of the maps that have one meaning everywhere; other names state their own."""
+
+
+@dataclass(frozen=True, slots=True)
+class SkinMap:
+    """One map of an appearance.
+
+    Attributes
+    ----------
+    values
+        (H, W) or (H, W, 3), float32. Row 0 is the top.
+    unit
+        "1" for numbers without dimension.
+    stderr
+        Standard error, same shape as ``values``; None only for a truth or a picture.
+    valid
+        (H, W) bool; None: every pixel is valid. Values outside it mean nothing.
+    description
+        One line for people: frame, color space, what was assumed.
+    """
+
+    values: NDArray[np.float32]
+    unit: str
+    stderr: NDArray[np.float32] | None = None
+    valid: NDArray[np.bool_] | None = None
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that do not fit and valid pixels that are not finite."""
+        values = np.asarray(self.values, np.float32)
+        if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] != 3):
+            raise ValueError(f"values: got shape {values.shape}, expected (H, W) or (H, W, 3)")
+        object.__setattr__(self, "values", values)
+        if not self.unit:
+            raise ValueError('unit: got an empty text, expected a unit or "1"')
+        if self.stderr is not None:
+            stderr = np.asarray(self.stderr, np.float32)
+            if stderr.shape != values.shape:
+                raise ValueError(f"stderr: got shape {stderr.shape}, expected {values.shape}")
+            object.__setattr__(self, "stderr", stderr)
+        if self.valid is not None:
+            valid = np.asarray(self.valid)
+            if valid.dtype != np.bool_ or valid.shape != values.shape[:2]:
+                raise ValueError(
+                    f"valid: got {valid.dtype} {valid.shape}, expected bool {values.shape[:2]}"
+                )
+            object.__setattr__(self, "valid", valid)
+        shown = values if self.valid is None else values[self.valid]
+        if not np.isfinite(shown).all():
+            raise ValueError("values: got NaN or infinity at a valid pixel, expected finite values")
+
+
+@dataclass(frozen=True, slots=True)
+class SkinAppearance:
+    """Maps of one size class with where they come from.
+
+    Attributes
+    ----------
+    maps
+        By name, see :data:`UNITS` for names with a fixed unit.
+    source
+        "measured" or "simulated".
+    parameters, inputs, versions
+        JSON values: settings, hashes of what was read, versions of what computed it.
+    left_out
+        What was not computed, and why.
+    seed
+        Of the simulation; None when nothing was drawn.
+
+    Examples
+    --------
+    >>> maps = {"melanin": SkinMap(np.full((2, 2), 0.05), UNITS["melanin"])}
+    >>> SkinAppearance(maps, "simulated").maps["melanin"].values.dtype
+    dtype('float32')
+    """
+
+    maps: Mapping[str, SkinMap]
+    source: str
+    parameters: Mapping[str, object] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    left_out: tuple[tuple[str, str], ...] = ()
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown source and a unit that contradicts the map's name."""
+        if self.source not in ("measured", "simulated"):
+            raise ValueError(f"source: got {self.source!r}, expected 'measured' or 'simulated'")
+        for name, skin_map in self.maps.items():
+            expected = UNITS.get(name)
+            if expected is not None and skin_map.unit != expected:
+                raise ValueError(f"{name}: got unit {skin_map.unit!r}, expected {expected!r}")

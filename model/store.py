@@ -1,0 +1,299 @@
+"""The APPEARANCE/ format: one EXR file a map and one sealed JSON document.
+
+``appearance.json`` names each file with its SHA-256, and seals itself; a folder appears whole
+or not at all. TRUTH/ folders have the same format.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+
+from model.skin import SkinAppearance, SkinMap
+
+SCHEMA = "skinrig.appearance/1"
+DOCUMENT = "appearance.json"
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
+
+
+class StoreError(ValueError):
+    """An APPEARANCE/ folder that cannot be read or written as it is."""
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class _FileEntry(_Strict):
+    file: str
+    sha256: str
+
+
+class _MapEntry(_Strict):
+    unit: str
+    shape: list[int]
+    description: str
+    values: _FileEntry
+    stderr: _FileEntry | None
+    valid: _FileEntry | None
+
+
+class _Document(_Strict):
+    schema_: Literal["skinrig.appearance/1"] = Field(alias="schema")
+    source: Literal["measured", "simulated"]
+    seed: int | None
+    maps: dict[str, _MapEntry]
+    parameters: dict[str, JsonValue]
+    inputs: dict[str, str]
+    versions: dict[str, str]
+    left_out: list[tuple[str, str]]
+    seal: str
+
+
+def write(path: str | Path, appearance: SkinAppearance) -> Path:
+    """Write an appearance as a folder, replacing an older one only when the new is complete.
+
+    Parameters
+    ----------
+    path
+        The folder. An existing APPEARANCE/ is replaced; any other existing folder is refused.
+    appearance
+        What to write.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    StoreError
+        When ``path`` exists and is something else, or a map's name cannot be a file's.
+    """
+    target = Path(path)
+    if target.exists() and not (target / DOCUMENT).is_file() and any(_entries(target)):
+        raise StoreError(
+            f"{target}: exists and is no APPEARANCE/ folder; nothing was written: name another"
+        )
+    for name in appearance.maps:
+        if not _NAME.fullmatch(name):
+            raise StoreError(f"map name: got {name!r}, expected lower case letters, digits and _")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    fresh = target.with_name(f".{target.name}.{uuid.uuid4().hex}.part")
+    fresh.mkdir()
+    try:
+        document: dict[str, Any] = {
+            "schema": SCHEMA,
+            "source": appearance.source,
+            "seed": appearance.seed,
+            "maps": {n: _write_map(fresh, n, m) for n, m in sorted(appearance.maps.items())},
+            "parameters": dict(appearance.parameters),
+            "inputs": dict(appearance.inputs),
+            "versions": dict(appearance.versions),
+            "left_out": [list(item) for item in appearance.left_out],
+        }
+        try:
+            document["seal"] = _seal(document)
+            text = json.dumps(document, indent=1, sort_keys=True, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise StoreError(f"parameters: cannot be written as JSON: {error}") from error
+        _write_synced(fresh / DOCUMENT, text.encode("utf-8") + b"\n")
+        _replace(fresh, target)
+    except BaseException:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise
+    return target
+
+
+def read(path: str | Path, *, only: tuple[str, ...] | None = None) -> SkinAppearance:
+    """Read an APPEARANCE/ or TRUTH/ folder and check every file that is read.
+
+    Parameters
+    ----------
+    path
+        The folder.
+    only
+        Names of the maps to load; None loads all.
+
+    Raises
+    ------
+    StoreError
+        Naming the file, when the folder is missing, damaged, of another schema version, or
+        holds no map of a wanted name.
+    """
+    folder = Path(path)
+    document = read_document(folder)
+    names = tuple(document.maps) if only is None else only
+    missing = [name for name in names if name not in document.maps]
+    if missing:
+        raise StoreError(
+            f"{folder}: has no map {missing[0]!r}; it has {', '.join(sorted(document.maps))}"
+        )
+    return SkinAppearance(
+        maps={name: _read_map(folder, document.maps[name]) for name in names},
+        source=document.source,
+        parameters=document.parameters,
+        inputs=document.inputs,
+        versions=document.versions,
+        left_out=tuple(document.left_out),
+        seed=document.seed,
+    )
+
+
+def read_document(folder: Path) -> _Document:
+    """Read and check ``appearance.json`` without loading any map."""
+    path = folder / DOCUMENT
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise StoreError(
+            f"{folder}: is no APPEARANCE/ folder ({error.strerror}: {DOCUMENT}); "
+            "`skinrig reconstruct` makes one"
+        ) from error
+    try:
+        loaded = json.loads(raw)
+    except ValueError as error:
+        raise StoreError(f"{path}: is not JSON ({error}); the folder is damaged") from error
+    version = loaded.get("schema") if isinstance(loaded, dict) else None
+    if version != SCHEMA:
+        raise StoreError(f"{path}: got schema {version!r}, expected {SCHEMA!r}")
+    try:
+        document = _Document.model_validate_json(raw)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise StoreError(f"{path}: {where}: {first['msg']}") from error
+    if _seal({k: v for k, v in loaded.items() if k != "seal"}) != document.seal:
+        raise StoreError(f"{path}: was changed after it was written (its seal does not fit)")
+    return document
+
+
+def _entries(folder: Path) -> list[Path]:
+    return list(folder.iterdir()) if folder.is_dir() else [folder]
+
+
+def _seal(document: Mapping[str, Any]) -> str:
+    text = json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()
+
+
+def _write_synced(path: Path, data: bytes) -> None:
+    with open(path, "xb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _replace(fresh: Path, target: Path) -> None:
+    """Move ``fresh`` to ``target``; an older folder stays until the new one is in place."""
+    old = None
+    if target.exists():
+        old = target.with_name(f".{target.name}.{uuid.uuid4().hex}.old")
+        os.rename(target, old)
+    try:
+        os.rename(fresh, target)
+    except OSError:
+        if old is not None:
+            os.rename(old, target)
+        raise
+    if old is not None:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _write_map(folder: Path, name: str, skin_map: SkinMap) -> dict[str, Any]:
+    def one(suffix: str, image: NDArray[Any] | None) -> dict[str, str] | None:
+        if image is None:
+            return None
+        file = f"{name}{suffix}.exr"
+        write_exr(folder / file, image.astype(np.float32))
+        return {"file": file, "sha256": _digest(folder / file)}
+
+    return {
+        "unit": skin_map.unit,
+        "shape": list(skin_map.values.shape),
+        "description": skin_map.description,
+        "values": one("", skin_map.values),
+        "stderr": one(".stderr", skin_map.stderr),
+        "valid": one(".valid", skin_map.valid),
+    }
+
+
+def _read_map(folder: Path, entry: _MapEntry) -> SkinMap:
+    def one(file: _FileEntry | None, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
+        if file is None:
+            return None
+        if Path(file.file).name != file.file or file.file.startswith("."):
+            raise StoreError(f"{folder}: got file name {file.file!r}, expected a plain name")
+        path = folder / file.file
+        if path.is_symlink() or not path.is_file():
+            raise StoreError(f"{path}: is missing; the folder is damaged")
+        if _digest(path) != file.sha256:
+            raise StoreError(f"{path}: was changed after it was written (its hash does not fit)")
+        image = read_exr(path)
+        if image.shape != shape:
+            raise StoreError(f"{path}: got shape {image.shape}, expected {shape}")
+        return image
+
+    shape = tuple(entry.shape)
+    values = one(entry.values, shape)
+    valid = one(entry.valid, shape[:2])
+    return SkinMap(
+        values=values if values is not None else np.zeros(shape, np.float32),
+        unit=entry.unit,
+        stderr=one(entry.stderr, shape),
+        valid=None if valid is None else valid > 0.5,
+        description=entry.description,
+    )
+
+
+def _digest(path: Path) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def write_exr(path: str | Path, image: NDArray[np.float32]) -> None:
+    """Write (H, W) as channel Y or (H, W, 3) as RGB, float32, compressed without loss."""
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    channel = "Y" if image.ndim == 2 else "RGB"
+    pixels = np.ascontiguousarray(image, np.float32)
+    with OpenEXR.File(header, {channel: pixels}) as file:
+        file.write(str(path))
+
+
+def read_exr(path: str | Path) -> NDArray[np.float32]:
+    """Read an EXR file with channel Y or RGB as float32 (H, W) or (H, W, 3).
+
+    Raises
+    ------
+    StoreError
+        When the file is no such EXR.
+    """
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path)) as file:
+            channels = file.channels()
+            name = "RGB" if "RGB" in channels else "Y"
+            if name not in channels:
+                raise StoreError(
+                    f"{path}: got channels {sorted(channels)}, expected Y or R, G and B"
+                )
+            pixels = np.array(channels[name].pixels, np.float32)
+    except StoreError:
+        raise
+    except Exception as error:  # the library raises bare RuntimeErrors of several kinds
+        raise StoreError(f"{path}: cannot be read as EXR ({error})") from error
+    return pixels

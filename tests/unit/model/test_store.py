@@ -1,0 +1,126 @@
+import json
+
+import numpy as np
+import pytest
+
+from model import store
+from model.skin import UNITS, SkinAppearance, SkinMap
+
+
+@pytest.fixture
+def appearance(rng):
+    melanin = rng.uniform(0, 0.5, (5, 7)).astype(np.float32)
+    valid = rng.random((5, 7)) > 0.3
+    melanin[~valid] = np.nan
+    return SkinAppearance(
+        maps={
+            "melanin": SkinMap(melanin, UNITS["melanin"], np.full((5, 7), 0.01), valid),
+            "diffuse": SkinMap(rng.random((5, 7, 3)), "1", description="camera RGB"),
+        },
+        source="simulated",
+        parameters={"iterations": 4},
+        inputs={"session": "ab12"},
+        left_out=(("normals", "not wanted"),),
+        seed=7,
+    )
+
+
+def test_what_is_written_reads_back_equal(tmp_path, appearance):
+    back = store.read(store.write(tmp_path / "a", appearance))
+    for name, written in appearance.maps.items():
+        np.testing.assert_array_equal(back.maps[name].values, written.values)
+        assert back.maps[name].unit == written.unit
+    np.testing.assert_array_equal(back.maps["melanin"].valid, appearance.maps["melanin"].valid)
+    np.testing.assert_array_equal(back.maps["melanin"].stderr, appearance.maps["melanin"].stderr)
+    assert back.maps["diffuse"].stderr is None
+    assert (back.source, back.seed, back.left_out) == ("simulated", 7, appearance.left_out)
+    assert back.parameters == {"iterations": 4}
+
+
+def test_a_folder_is_replaced_whole_and_nothing_stays_behind(tmp_path, appearance):
+    store.write(tmp_path / "a", appearance)
+    store.write(tmp_path / "a", SkinAppearance({}, "measured"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a"]
+    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == [store.DOCUMENT]
+
+
+def test_a_failed_write_leaves_the_old_folder(tmp_path, appearance):
+    store.write(tmp_path / "a", appearance)
+    bad = SkinAppearance(dict(appearance.maps), "simulated", parameters={"x": object()})
+    with pytest.raises(store.StoreError, match="JSON"):
+        store.write(tmp_path / "a", bad)
+    assert store.read(tmp_path / "a").seed == 7
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a"]
+
+
+def test_somebody_elses_folder_is_not_replaced(tmp_path, appearance):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "thesis.txt").write_text("years of work")
+    with pytest.raises(store.StoreError, match=r"is no APPEARANCE/"):
+        store.write(tmp_path / "a", appearance)
+    assert (tmp_path / "a" / "thesis.txt").read_text() == "years of work"
+
+
+def test_one_flipped_bit_in_any_file_is_named(tmp_path, appearance, rng):
+    folder = store.write(tmp_path / "a", appearance)
+    for path in sorted(folder.iterdir()):
+        whole = path.read_bytes()
+        data = bytearray(whole)
+        data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bytes(data))
+        with pytest.raises(store.StoreError, match=path.name):
+            store.read(folder)
+        path.write_bytes(whole)
+    store.read(folder)
+
+
+def test_another_schema_version_is_refused(tmp_path, appearance):
+    folder = store.write(tmp_path / "a", appearance)
+    document = json.loads((folder / store.DOCUMENT).read_text())
+    document["schema"] = "skinrig.appearance/9"
+    (folder / store.DOCUMENT).write_text(json.dumps(document))
+    with pytest.raises(store.StoreError, match=r"appearance/9.*expected"):
+        store.read(folder)
+
+
+def test_a_path_trick_in_the_document_is_refused(tmp_path, appearance):
+    folder = store.write(tmp_path / "a", appearance)
+    document = json.loads((folder / store.DOCUMENT).read_text())
+    document["maps"]["melanin"]["values"]["file"] = "../secret.exr"
+    del document["seal"]
+    document["seal"] = store._seal(document)
+    (folder / store.DOCUMENT).write_text(json.dumps(document))
+    with pytest.raises(store.StoreError, match="plain name"):
+        store.read(folder)
+
+
+def test_a_missing_map_is_named_with_those_there_are(tmp_path, appearance):
+    folder = store.write(tmp_path / "a", appearance)
+    with pytest.raises(store.StoreError, match=r"no map 'normals'; it has diffuse, melanin"):
+        store.read(folder, only=("normals",))
+
+
+def test_a_folder_that_is_none_is_named(tmp_path):
+    with pytest.raises(store.StoreError, match=r"is no APPEARANCE/ folder"):
+        store.read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"values": np.zeros(3)}, "values: got shape"),
+        ({"stderr": np.zeros((1, 2))}, "stderr: got shape"),
+        ({"valid": np.zeros((2, 2))}, "valid: got float64"),
+        ({"unit": ""}, "unit"),
+        ({"values": np.full((2, 2), np.nan)}, "NaN"),
+    ],
+)
+def test_a_map_that_does_not_fit_itself_is_refused(change, message):
+    arguments = {"values": np.zeros((2, 2)), "unit": "1"} | change
+    with pytest.raises(ValueError, match=message):
+        SkinMap(**arguments)
+
+
+def test_a_unit_that_contradicts_the_name_is_refused():
+    with pytest.raises(ValueError, match=r"melanin: got unit '%'"):
+        SkinAppearance({"melanin": SkinMap(np.zeros((1, 1)), "%")}, "measured")
