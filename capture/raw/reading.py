@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import mmap
-from datetime import UTC
 from pathlib import Path
 from typing import Any
 
@@ -159,8 +158,6 @@ def _described(raw: Any, tags: Directory | None) -> dict[str, Any]:
             "focal_mm": float(other.focal_length),
         }
         found |= {key: value for key, value in shot.items() if 0 < value < float("inf")}
-        if other.timestamp.timestamp() > 0:
-            found["captured_at"] = other.timestamp.replace(tzinfo=UTC)
     balance = [float(x) for x in raw.camera_whitebalance[:3]]
     if all(x > 0 for x in balance):
         inverse = [1.0 / x for x in balance]

@@ -1,0 +1,33 @@
+"""The SESSION/ format: frames that appear whole, a hash-chained journal, resume and verify."""
+
+from capture.session.disk import Disk
+from capture.session.errors import (
+    ConsentError,
+    SessionDamage,
+    SessionDiskError,
+    SessionError,
+    SessionLocked,
+)
+from capture.session.frames import FrameRecord
+from capture.session.journal import FrameLine
+from capture.session.manifest import SCHEMA, CalibrationRef, Manifest, Subject
+from capture.session.store import Session
+from capture.session.verification import VerifyReport, verify
+
+__all__ = [
+    "SCHEMA",
+    "CalibrationRef",
+    "ConsentError",
+    "Disk",
+    "FrameLine",
+    "FrameRecord",
+    "Manifest",
+    "Session",
+    "SessionDamage",
+    "SessionDiskError",
+    "SessionError",
+    "SessionLocked",
+    "Subject",
+    "VerifyReport",
+    "verify",
+]

@@ -1,0 +1,113 @@
+"""Reading a session folder: the manifest, the journal, and what they say about each other."""
+
+from __future__ import annotations
+
+import os
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+from capture.documents import Fault
+from capture.plan import PlanError
+from capture.session.disk import read_file
+from capture.session.errors import SessionDamage, SessionError
+from capture.session.journal import CloseLine, FrameLine, Walk, walk
+from capture.session.manifest import Manifest, decode
+
+MANIFEST, JOURNAL, FRAMES, ORPHANS = "session.json", "journal.jsonl", "frames", "orphans"
+MAX_MANIFEST_BYTES = 2**26
+MAX_JOURNAL_BYTES = 2**30
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What the two text files of a session say."""
+
+    manifest: Manifest
+    walk: Walk
+
+    @property
+    def frame_lines(self) -> tuple[FrameLine, ...]:
+        """All committed frames, in the order of commitment."""
+        return tuple(line for _, line in self.walk.lines if isinstance(line, FrameLine))
+
+    @property
+    def close_line(self) -> CloseLine | None:
+        """The end of the session, None while it is open."""
+        last = self.walk.lines[-1][1] if self.walk.lines else None
+        return last if isinstance(last, CloseLine) else None
+
+
+def read_contents(path: Path) -> Contents:
+    """Return manifest and journal of the session at ``path``; damage of the journal is noted.
+
+    Raises
+    ------
+    SessionError
+        Where there is no session, or one of an unknown schema.
+    SessionDamage
+        Where session.json is not what was written, or the journal is missing.
+    """
+
+    def no_session() -> SessionError:
+        advice = "Name the folder of a session; skinrig simulate and skinrig capture make one."
+        found = "no such folder" if not path.is_dir() else f"no {MANIFEST} in it"
+        faults = [Fault("folder", found, f"a folder with {MANIFEST}")]
+        return SessionError("is not a session", where=str(path), faults=faults, advice=advice)
+
+    where = path / MANIFEST
+    data = read_file(where, limit=MAX_MANIFEST_BYTES, what="manifest", missing=no_session)
+    manifest, seal = decode(data, where=str(where))
+    where = path / JOURNAL
+    journal = read_file(where, limit=MAX_JOURNAL_BYTES, what="journal")
+    walked = walk(journal, seal=seal, where=str(where))
+    if walked.damage is None:
+        walked = _against_plan(walked, manifest, str(where))
+    return Contents(manifest, walked)
+
+
+def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
+    """Note the first line that the plan does not allow: an unknown step, a frame twice."""
+    seen: set[str] = set()
+    for byte, line in walked.lines:
+        if isinstance(line, CloseLine):
+            got, good, expected = f"{line.frames} frames", line.frames == len(seen), str(len(seen))
+        else:
+            got, good, expected = line.file, line.file not in seen, "each frame once"
+            seen.add(line.file)
+            try:
+                step = manifest.plan.step(line.step)
+                if line.camera not in step.cameras:
+                    got, good, expected = line.camera, False, f"one of {', '.join(step.cameras)}"
+            except PlanError:
+                got, good, expected = line.step, False, "a step of the plan"
+        if not good:
+            damage = SessionDamage(
+                "does not fit the plan",
+                where=f"{where}, byte {byte}",
+                faults=[Fault("line", got, expected)],
+                advice="The journal was changed by another program; restore it from a copy.",
+            )
+            good_lines = tuple(pair for pair in walked.lines if pair[0] < byte)
+            return Walk(good_lines, walked.head, byte, 0, damage)
+    return walked
+
+
+def list_frames(path: Path) -> list[str]:
+    """Return the names in the frames folder, sorted; a link in its place is an error."""
+    folder = path / FRAMES
+    try:
+        if not stat.S_ISDIR(os.lstat(folder).st_mode):
+            raise NotADirectoryError
+        return sorted(os.listdir(folder))
+    except (FileNotFoundError, NotADirectoryError) as exc:
+        faults = [Fault(FRAMES, "no folder", "a folder, not a link")]
+        raise SessionDamage("is damaged", where=str(folder), faults=faults) from exc
+
+
+def undamaged_contents(path: Path) -> Contents:
+    """Return manifest and journal; damage of the journal is an error."""
+    contents = read_contents(path)
+    if contents.walk.damage is not None:
+        raise contents.walk.damage
+    return contents

@@ -1,0 +1,116 @@
+"""The file operations that a session's safety rests on, each one method that a test can replace.
+
+Reading needs no such care and is one function.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from capture.documents import Fault
+from capture.session.errors import SessionDamage, SessionError
+
+_E = TypeVar("_E", bound=SessionError)
+
+
+class Disk:
+    """The real disk. Every method is one operation in the order of a power-cut model."""
+
+    def make_dir(self, path: Path) -> None:
+        """Make a directory whose parent exists."""
+        os.mkdir(path)
+
+    def create(self, path: Path) -> int:
+        """Make a new file for writing and return its descriptor; an existing one is an error."""
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+
+    def open_append(self, path: Path) -> int:
+        """Open an existing file for appending; a symbolic link is an error."""
+        return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC)
+
+    def write(self, descriptor: int, data: bytes) -> None:
+        """Write all of ``data``, in one system call unless the kernel takes less."""
+        rest = memoryview(data)
+        while rest:
+            rest = rest[os.write(descriptor, rest) :]
+
+    def fsync(self, descriptor: int) -> None:
+        """Bring a file's data and size to the medium."""
+        os.fsync(descriptor)
+
+    def fdatasync(self, descriptor: int) -> None:
+        """Bring a file's data, and the size needed to read it, to the medium."""
+        os.fdatasync(descriptor)
+
+    def truncate(self, descriptor: int, size: int) -> None:
+        """Cut a file to ``size`` bytes."""
+        os.ftruncate(descriptor, size)
+
+    def rename(self, old: Path, new: Path) -> None:
+        """Give a file its new name in one step."""
+        os.rename(old, new)
+
+    def remove(self, path: Path) -> None:
+        """Take a file's name away."""
+        os.unlink(path)
+
+    def fsync_dir(self, path: Path) -> None:
+        """Bring the names in a directory to the medium."""
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def close(self, descriptor: int) -> None:
+        """Close a descriptor; a lock held through it ends."""
+        os.close(descriptor)
+
+    def lock(self, descriptor: int) -> bool:
+        """Take the writer's lock; False where another process holds it."""
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
+
+
+def read_file(
+    path: Path, *, limit: int, what: str, missing: Callable[[], SessionError] | None = None
+) -> bytes:
+    """Return the bytes of a regular file of at most ``limit`` bytes, following no link.
+
+    Raises
+    ------
+    SessionDamage
+        Where the file is missing (unless ``missing`` says otherwise), too large, or no plain file.
+    """
+    try:
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        descriptor = os.open(path, flags)
+    except OSError as exc:
+        if isinstance(exc, FileNotFoundError) and missing is not None:
+            raise missing() from exc
+        got = "a symbolic link" if path.is_symlink() else str(exc.strerror)
+        raise _damage(path, what, got, "a file") from exc
+    with open(descriptor, "rb") as file:
+        state = os.fstat(descriptor)
+        if not stat.S_ISREG(state.st_mode):
+            raise _damage(path, what, "not a plain file", "a file")
+        if state.st_size > limit:
+            raise _damage(path, what, f"{state.st_size} bytes", f"at most {limit}")
+        try:
+            return file.read()
+        except OSError as exc:
+            raise _damage(path, what, str(exc.strerror), "a readable file") from exc
+
+
+def _damage(path: Path, what: str, got: str, expected: str) -> SessionDamage:
+    advice = "Restore the file from a copy; skinrig verify lists all that is damaged."
+    faults = [Fault(what, got, expected)]
+    return SessionDamage("cannot be read", where=str(path), faults=faults, advice=advice)

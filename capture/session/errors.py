@@ -1,0 +1,25 @@
+"""What can be wrong with a session."""
+
+from __future__ import annotations
+
+from capture.documents import InputError
+
+
+class SessionError(InputError):
+    """A session that cannot be used in the way asked."""
+
+
+class SessionDamage(SessionError):
+    """A session whose files are not what was written."""
+
+
+class SessionLocked(SessionError):
+    """A session that another process is writing."""
+
+
+class ConsentError(SessionError):
+    """A use of the data that its subject has not agreed to."""
+
+
+class SessionDiskError(SessionError, OSError):
+    """The disk refused an operation; what was acknowledged before is safe."""

@@ -1,0 +1,98 @@
+"""The folder of a session made and put in order, one disk operation after the other."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from types import TracebackType
+
+from capture.documents import Fault
+from capture.session.contents import FRAMES, JOURNAL, MANIFEST, ORPHANS, Contents, list_frames
+from capture.session.disk import Disk
+from capture.session.errors import SessionDamage, SessionDiskError, SessionError
+
+_log = logging.getLogger(__name__)
+
+
+class DiskErrors:
+    """Turn the operating system's errors into one of ours, naming session and cause."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if isinstance(value, OSError) and not isinstance(value, SessionError):
+            what = f"the disk refused: {value.strerror or value}"
+            advice = "Free space or repair the disk, then resume; committed frames are safe."
+            error = SessionDiskError(what, where=str(value.filename or self._path), advice=advice)
+            raise error from value
+
+
+def write_new(disk: Disk, path: Path, data: bytes) -> None:
+    """Write a new file and bring its data to the medium; its name is the caller's to sync."""
+    descriptor = disk.create(path)
+    try:
+        disk.write(descriptor, data)
+        disk.fsync(descriptor)
+    finally:
+        disk.close(descriptor)
+
+
+def require_free(path: Path) -> None:
+    """Raise unless the folder is new, empty, or the debris of an interrupted creation."""
+    advice = "Choose a new folder, or resume the session that is there."
+    if path.is_symlink() or (path.exists() and not path.is_dir()):
+        faults = [Fault("folder", "something else", "a new or empty folder")]
+        raise SessionError("cannot start here", where=str(path), faults=faults, advice=advice)
+    if not path.parent.is_dir():
+        faults = [Fault("parent", "no such folder", "an existing folder")]
+        raise SessionError("cannot start here", where=str(path), faults=faults)
+    if not path.exists():
+        return
+    debris = {FRAMES, ORPHANS, JOURNAL, f"{MANIFEST}.part"}
+    found = {entry.name for entry in os.scandir(path)}
+    filled = any(
+        any((path / folder).iterdir()) for folder in (FRAMES, ORPHANS) if (path / folder).is_dir()
+    )
+    written = (path / JOURNAL).exists() and (path / JOURNAL).stat().st_size > 0
+    if found - debris or filled or written:
+        got = ", ".join(sorted(found)[:5])
+        faults = [Fault("folder", f"a folder with {got}", "a new or empty folder")]
+        raise SessionError("cannot start here", where=str(path), faults=faults, advice=advice)
+
+
+def set_orphans_aside(disk: Disk, path: Path, contents: Contents) -> None:
+    """Move files without a line to ``orphans/``; a committed frame that is gone is an error."""
+    lines = {Path(line.file).name: line for line in contents.frame_lines}
+    present = list_frames(path)
+    for name, line in lines.items():
+        size = (path / line.file).lstat().st_size if name in present else None
+        if size != line.bytes:
+            got = "nothing" if size is None else f"{size} bytes"
+            faults = [Fault(line.file, got, f"{line.bytes} bytes, as committed")]
+            advice = "Restore the frame from a copy; skinrig verify lists all that is damaged."
+            raise SessionDamage(
+                "a committed frame is gone", where=str(path), faults=faults, advice=advice
+            )
+    orphans = [name for name in present if name not in lines]
+    if not orphans:
+        return
+    taken = set(os.listdir(path / ORPHANS))
+    for name in orphans:
+        number = 1
+        while f"{name}.{number}" in taken:
+            number += 1
+        taken.add(f"{name}.{number}")
+        _log.warning("%s: no line in the journal, set aside", path / FRAMES / name)
+        disk.rename(path / FRAMES / name, path / ORPHANS / f"{name}.{number}")
+    disk.fsync_dir(path / ORPHANS)
+    disk.fsync_dir(path / FRAMES)

@@ -1,0 +1,77 @@
+"""Committed frames as they are asked for and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import xxhash
+
+from capture.documents import Fault
+from capture.plan import Step, Value
+from capture.session.disk import read_file
+from capture.session.errors import SessionDamage
+from capture.session.journal import FrameLine
+
+MAX_FRAME_BYTES = 2**30
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameRecord:
+    """One committed frame: its line of the journal and its step of the plan."""
+
+    step: Step
+    line: FrameLine
+
+    @property
+    def step_id(self) -> str:
+        """Id of the step."""
+        return self.step.id
+
+    @property
+    def kind(self) -> str:
+        """Kind of the step: "dark", "flat", "chart", "malus" or "subject"."""
+        return self.step.kind
+
+    @property
+    def index(self) -> Mapping[str, str | int | float]:
+        """Where the step stands in its series."""
+        return self.step.index
+
+    @property
+    def camera(self) -> str:
+        """Name of the view."""
+        return self.line.camera
+
+    @property
+    def file(self) -> str:
+        """Path inside the session."""
+        return self.line.file
+
+    @property
+    def attempt(self) -> int:
+        """1 for the first time the frame was taken."""
+        return self.line.attempt
+
+    @property
+    def settings(self) -> Mapping[str, Value]:
+        """What was asked for."""
+        return self.line.settings
+
+    @property
+    def actual(self) -> Mapping[str, Value]:
+        """What box and camera report to have done."""
+        return self.line.actual
+
+
+def check_frame(path: Path, line: FrameLine) -> bytes:
+    """Return the bytes of a frame's file, after size and hash have been checked."""
+    blob = read_file(path, limit=MAX_FRAME_BYTES, what="frame")
+    found = xxhash.xxh3_128_hexdigest(blob)
+    if len(blob) != line.bytes or found != line.xxh128:
+        got = f"{len(blob)} bytes, xxh128 {found}"
+        faults = [Fault("content", got, f"{line.bytes} bytes, xxh128 {line.xxh128}")]
+        advice = "Restore the frame from a copy, or take it again in a new session."
+        raise SessionDamage("is damaged", where=str(path), faults=faults, advice=advice)
+    return blob

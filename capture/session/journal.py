@@ -1,0 +1,216 @@
+"""journal.jsonl: one sealed line per completed frame, each chained to all before it.
+
+A line is ``{"h":HASH,"r":RECORD}`` in canonical JSON, with HASH the SHA-256 of the hash before and
+of RECORD; the first is chained to the seal of session.json. So a line of another session, a line
+left out, and any changed byte are found, and a line cut by a crash can only be the last.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from pydantic import ConfigDict
+
+from capture.documents import STRICT, Checks, Fault, canonical_json, parse, read_json, shown
+from capture.plan import Value
+from capture.rig import ID_RULE, is_id
+from capture.session.errors import SessionDamage
+
+MAX_LINE_BYTES = 65_536
+_XXH128 = re.compile(r"[0-9a-f]{32}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameLine:
+    """One committed frame, as the journal holds it."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    step: str
+    camera: str
+    attempt: int
+    file: str
+    """Path inside the session; must be the one that step, camera and attempt give."""
+    bytes: int
+    xxh128: str
+    settings: Mapping[str, Value]
+    """What was asked for."""
+    actual: Mapping[str, Value]
+    """What box and camera report to have done."""
+    t_box_s: float | None
+    """Time of the exposure on the clock of the box; None where there is no box."""
+    t_host_s: float
+
+    def __post_init__(self) -> None:
+        checks = Checks("Frame line", SessionDamage)
+        for name in ("step", "camera"):
+            checks.that(name, getattr(self, name), is_id(getattr(self, name)), ID_RULE)
+        checks.that("attempt", self.attempt, self.attempt >= 1, ">= 1")
+        expected = frame_file(self.step, self.camera, self.attempt)
+        checks.that("file", self.file, self.file == expected, expected)
+        checks.that("bytes", self.bytes, self.bytes > 0, "> 0")
+        good = _XXH128.fullmatch(self.xxh128) is not None
+        checks.that("xxh128", self.xxh128, good, "32 hexadecimal digits")
+        checks.close()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the line's record."""
+        return {
+            "type": "frame",
+            "step": self.step,
+            "camera": self.camera,
+            "attempt": self.attempt,
+            "file": self.file,
+            "bytes": self.bytes,
+            "xxh128": self.xxh128,
+            "settings": dict(self.settings),
+            "actual": dict(self.actual),
+            "t_box_s": self.t_box_s,
+            "t_host_s": self.t_host_s,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CloseLine:
+    """The end of a session: nothing may follow."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    frames: int
+    missing: tuple[str, ...]
+    """Steps of the plan that were not captured."""
+    reason: str
+    """Why they were not, empty where none is missing."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the line's record."""
+        return {
+            "type": "close",
+            "frames": self.frames,
+            "missing": list(self.missing),
+            "reason": self.reason,
+        }
+
+
+Line = FrameLine | CloseLine
+
+
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """What a journal holds."""
+
+    lines: tuple[tuple[int, Line], ...]
+    """First byte and content of every good line."""
+    head: str
+    """Last hash of the chain."""
+    end: int
+    """Byte after the last good line."""
+    torn: int
+    """Bytes after ``end`` that a crash cut off in the middle of writing; 0 for none."""
+    damage: SessionDamage | None
+    """The first line that is not what was written; None where all are."""
+
+    @property
+    def closed(self) -> bool:
+        """Whether the session was closed."""
+        return bool(self.lines) and isinstance(self.lines[-1][1], CloseLine)
+
+
+def frame_file(step: str, camera: str, attempt: int) -> str:
+    """Return the path of a frame inside its session.
+
+    Examples
+    --------
+    >>> frame_file("S001", "cam", 1), frame_file("S001", "cam", 2)
+    ('frames/S001+cam.dng', 'frames/S001+cam+2.dng')
+    """
+    suffix = "" if attempt == 1 else f"+{attempt}"
+    return f"frames/{step}+{camera}{suffix}.dng"
+
+
+def seal_line(previous: str, line: Line) -> tuple[bytes, str]:
+    """Return the bytes of the line that follows ``previous``, and its hash."""
+    record = canonical_json(line.to_json())
+    digest = hashlib.sha256(previous.encode("ascii") + record).hexdigest()
+    return b'{"h":"' + digest.encode("ascii") + b'","r":' + record + b"}\n", digest
+
+
+def walk(data: bytes, *, seal: str, where: str) -> Walk:
+    """Follow the chain from ``seal`` to the last line, a torn tail, or the first damage."""
+    lines: list[tuple[int, Line]] = []
+    head, start = seal, 0
+    while start < len(data):
+        stop = data.find(b"\n", start)
+        text = data[start:] if stop < 0 else data[start : stop + 1]
+        if lines and isinstance(lines[-1][1], CloseLine):
+            damage = _damage(where, start, "data after the end", shown(text[:40]), "nothing")
+            return Walk(tuple(lines), head, start, 0, damage)
+        try:
+            line, digest = _unseal(text, head, f"{where}, byte {start}")
+        except SessionDamage as exc:
+            if _is_torn(text, stop < 0, last=start + len(text) == len(data), head=head):
+                return Walk(tuple(lines), head, start, len(data) - start, None)
+            return Walk(tuple(lines), head, start, 0, exc)
+        if line is None:  # complete but for its newline: was never acknowledged
+            return Walk(tuple(lines), head, start, len(data) - start, None)
+        lines.append((start, line))
+        head, start = digest, start + len(text)
+    return Walk(tuple(lines), head, start, 0, None)
+
+
+def _unseal(text: bytes, head: str, where: str) -> tuple[Line | None, str]:
+    """Return content and hash of one line; None where only its newline is missing."""
+    if len(text) > MAX_LINE_BYTES:
+        raise _damage(where, None, "line", f"{len(text)} bytes", f"at most {MAX_LINE_BYTES}")
+    content = read_json(text, where=where, error=SessionDamage)
+    if not isinstance(content, dict) or not isinstance(content.get("r"), dict):
+        raise _damage(where, None, "line", shown(content), '{"h": hash, "r": record}')
+    record = dict(content["r"])
+    kind = record.pop("type", None)
+    try:
+        packed = canonical_json(content["r"])
+        digest = hashlib.sha256(head.encode("ascii") + packed).hexdigest()
+    except (ValueError, RecursionError) as exc:
+        raise _damage(where, None, "line", str(exc), "canonical JSON") from exc
+    expected = b'{"h":"' + digest.encode("ascii") + b'","r":' + packed + b"}\n"
+    if text != expected:
+        if text + b"\n" == expected:
+            return None, digest
+        got = shown(content.get("h"))
+        raise _damage(where, None, "hash", got, f"{digest}: the line is not what was written")
+    if kind == "frame":
+        return parse(FrameLine, record, where=where, error=SessionDamage), digest
+    if kind == "close":
+        return parse(CloseLine, record, where=where, error=SessionDamage), digest
+    raise _damage(where, None, "type", shown(kind), '"frame" or "close"')
+
+
+def _is_torn(text: bytes, unended: bool, *, last: bool, head: str) -> bool:
+    """Return whether a bad line looks like the cut-off end of an interrupted write.
+
+    A write that never reached the disk leaves a prefix of the line, zeros, or a prefix and zeros.
+    A flipped bit leaves at most one zero byte, and a line whose newline was hit is one byte longer
+    than a whole record: these are damage to something acknowledged.
+    """
+    if not last:
+        return False
+    if text.endswith(b"\0") or text.count(b"\0") > 1:
+        return True
+    if not unended:
+        return False
+    try:
+        whole, _ = _unseal(text[:-1], head, "")
+    except SessionDamage:
+        return True
+    return whole is not None
+
+
+def _damage(where: str, byte: int | None, path: str, got: str, expected: str) -> SessionDamage:
+    place = where if byte is None else f"{where}, byte {byte}"
+    advice = "Restore the journal from a copy; no line after this byte can be trusted."
+    faults = [Fault(path, got, expected)]
+    return SessionDamage("is damaged", where=place, faults=faults, advice=advice)

@@ -1,0 +1,213 @@
+"""session.json: who, what, with which rig and plan; written once, sealed in every byte."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import date, datetime
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import ConfigDict
+
+from capture.documents import STRICT, Checks, Fault, parse, read_json
+from capture.plan import Plan
+from capture.rig import ID_RULE, Rig, is_id
+from capture.session.errors import SessionDamage, SessionError
+
+SCHEMA = "skinrig.session/1"
+Source = Literal["measured", "simulated"]
+
+_SEAL = "seal"
+_SHA256 = re.compile(r"sha256:[0-9a-f]{64}")
+_PSEUDONYM = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """Who was captured, never by name, and what the person agreed to.
+
+    Parameters
+    ----------
+    pseudonym : str
+        1 to 64 letters, digits, ``_ . -``; no space, so that a full name is refused.
+    consent_scope : tuple of str
+        What the data may be used for, e.g. ``("research", "publication")``; empty for nothing
+        beyond the capture itself.
+    consent_expires : date or None
+        Last day of the consent; None where it has no end.
+
+    Examples
+    --------
+    >>> Subject("P042", ("research",), date(2031, 1, 1)).pseudonym
+    'P042'
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    pseudonym: str
+    consent_scope: tuple[str, ...] = ()
+    consent_expires: date | None = None
+
+    def __post_init__(self) -> None:
+        checks = Checks("Subject", SessionError)
+        good = _PSEUDONYM.fullmatch(self.pseudonym) is not None
+        checks.that("pseudonym", self.pseudonym, good, "letters, digits, _ . - (no full name)")
+        for scope in self.consent_scope:
+            checks.that("consent_scope", scope, is_id(scope), ID_RULE)
+        checks.close()
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationRef:
+    """A calibration that was in force, by the hash of its file."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    kind: str
+    sha256: str
+    """``sha256:`` and 64 hexadecimal digits."""
+    path: str = ""
+    """Where it stood, for people; the hash decides."""
+
+    def __post_init__(self) -> None:
+        checks = Checks("CalibrationRef", SessionError)
+        checks.that("kind", self.kind, is_id(self.kind), ID_RULE)
+        good = _SHA256.fullmatch(self.sha256) is not None
+        checks.that("sha256", self.sha256, good, '"sha256:" and 64 hexadecimal digits')
+        checks.close()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Manifest:
+    """The content of session.json."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    id: str
+    created_at: datetime
+    source: Source
+    subject: Subject
+    plan: Plan
+    rig: Rig
+    devices: Mapping[str, Any] = field(default_factory=dict)
+    """What each box and camera said it is (identification, serial number, limits)."""
+    calibrations: tuple[CalibrationRef, ...] = ()
+    seed: int | None = None
+    """Seed of a simulated session; None for a measured one."""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        checks = Checks("Session", SessionError)
+        checks.that("id", self.id, is_id(self.id), ID_RULE)
+        good = self.source in ("measured", "simulated")
+        checks.that("source", self.source, good, '"measured" or "simulated"')
+        zoned = self.created_at.utcoffset() is not None
+        checks.that("created_at", self.created_at.isoformat(), zoned, "a time with its zone")
+        checks.close()
+        self.plan.check(self.rig)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the manifest as JSON values, schema included, without the seal."""
+        expires = self.subject.consent_expires
+        return {
+            "schema": SCHEMA,
+            "id": self.id,
+            "created_at": self.created_at.isoformat(),
+            "source": self.source,
+            "subject": {
+                "pseudonym": self.subject.pseudonym,
+                "consent_scope": list(self.subject.consent_scope),
+                "consent_expires": None if expires is None else expires.isoformat(),
+            },
+            "plan": self.plan.to_json(),
+            "rig": self.rig.to_json(),
+            "devices": dict(self.devices),
+            "calibrations": [
+                {"kind": c.kind, "sha256": c.sha256, "path": c.path} for c in self.calibrations
+            ],
+            "seed": self.seed,
+            "versions": dict(self.versions),
+            "extra": dict(self.extra),
+        }
+
+    def encode(self) -> tuple[bytes, str]:
+        """Return the bytes of session.json and the seal that the journal starts from."""
+        return seal(self.to_json())
+
+
+def seal(content: Mapping[str, Any]) -> tuple[bytes, str]:
+    """Return the bytes of ``content`` with its seal added, and the seal.
+
+    Raises
+    ------
+    SessionError
+        Where ``content`` holds what JSON cannot.
+    """
+    try:
+        digest = hashlib.sha256(_written(content)).hexdigest()
+        return _written({**content, _SEAL: f"sha256:{digest}"}), f"sha256:{digest}"
+    except (TypeError, ValueError, RecursionError) as exc:
+        fault = Fault("devices, extra", str(exc), "texts, finite numbers, lists and tables")
+        raise SessionError("the manifest cannot be written", faults=[fault]) from exc
+
+
+def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
+    """Return manifest and seal of the bytes of a session.json.
+
+    Raises
+    ------
+    SessionError
+        Where the schema is not ours.
+    SessionDamage
+        Where any byte differs from what was written, or the content has faults.
+    """
+    content = read_json(data, where=where, error=SessionDamage)
+    if not isinstance(content, dict):
+        fault = Fault("", type(content).__name__, "a table")
+        raise SessionDamage("is not a session manifest", where=where, faults=[fault])
+    schema = content.pop("schema", None)
+    if schema != SCHEMA:
+        advice = "Read it with the version of skinrig that wrote it, or check the file."
+        faults = [Fault("schema", repr(schema), SCHEMA)]
+        raise SessionError("has an unknown schema", where=where, faults=faults, advice=advice)
+    found = content.pop(_SEAL, None)
+    written, expected = seal({"schema": schema, **content})
+    if found != expected or written != data:
+        # equal seals with unequal bytes: a change in spacing or in the spelling of a number
+        got = str(found) if found != expected else "other bytes than were sealed"
+        advice = "Restore session.json from a copy: it was changed after it was written."
+        faults = [Fault(_SEAL, got, expected)]
+        raise SessionDamage("is damaged", where=where, faults=faults, advice=advice)
+    return parse(Manifest, content, where=where, error=SessionDamage), expected
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what wrote a session."""
+    try:
+        ours = version("skinrig")
+    except PackageNotFoundError:
+        ours = "not installed"
+    return {"skinrig": ours, "python": platform.python_version(), "numpy": np.__version__}
+
+
+def calibration_refs(
+    calibrations: Sequence[CalibrationRef | Mapping[str, str]],
+) -> tuple[CalibrationRef, ...]:
+    """Return references given as objects or as tables of kind, sha256 and path."""
+    return tuple(
+        c
+        if isinstance(c, CalibrationRef)
+        else parse(CalibrationRef, dict(c), where="calibrations", error=SessionError)
+        for c in calibrations
+    )
+
+
+def _written(content: Mapping[str, Any]) -> bytes:
+    return (json.dumps(content, sort_keys=True, indent=1, allow_nan=False) + "\n").encode("ascii")

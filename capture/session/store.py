@@ -1,0 +1,381 @@
+"""A session being written or read: create, commit, resume, close, query."""
+
+from __future__ import annotations
+
+import logging
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import xxhash
+
+from capture import raw
+from capture.documents import Fault, shown
+from capture.plan import Plan, Value
+from capture.rig import Rig
+from capture.session.contents import (
+    FRAMES,
+    JOURNAL,
+    MANIFEST,
+    ORPHANS,
+    Contents,
+    undamaged_contents,
+)
+from capture.session.disk import Disk
+from capture.session.errors import SessionDiskError, SessionError, SessionLocked
+from capture.session.folder import DiskErrors, require_free, set_orphans_aside, write_new
+from capture.session.frames import MAX_FRAME_BYTES
+from capture.session.journal import (
+    MAX_LINE_BYTES,
+    CloseLine,
+    FrameLine,
+    Line,
+    frame_file,
+    seal_line,
+)
+from capture.session.manifest import (
+    CalibrationRef,
+    Manifest,
+    Subject,
+    calibration_refs,
+    versions,
+)
+from capture.session.view import SessionView
+
+_log = logging.getLogger(__name__)
+
+
+class Session(SessionView):
+    """Frames on disk with the journal that vouches for them.
+
+    Make one with `create`, go on with `resume`, read with `open`. A committed frame survives a
+    killed process and a power cut; a closed session is never modified.
+
+    Examples
+    --------
+    >>> import tempfile, numpy as np
+    >>> from capture.plan import flash_plan
+    >>> from capture.rig import load_rig
+    >>> rig = load_rig("flash").resized(16)
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> session = Session.create(
+    ...     folder.name + "/s", plan=flash_plan(rig, darks=1), rig=rig, devices={},
+    ...     subject=Subject("P042", ("research",)), source="simulated", seed=1)
+    >>> step, camera = session.todo()[0]
+    >>> blob = raw.encode_dng(
+    ...     np.full((10, 16), 512, np.uint16), pattern="RGGB", black=512, white=16383,
+    ...     step_id=step.id, session_id=session.id)
+    >>> session.commit(step.id, camera, blob, settings=step.settings, actual={}, t_host_s=0.0)
+    >>> session.release()
+    >>> [(r.step_id, r.kind) for r in Session.open(folder.name + "/s").frames()]
+    [('D000', 'dark')]
+    >>> folder.cleanup()
+    """
+
+    def __init__(
+        self, path: Path, contents: Contents, *, disk: Disk, descriptor: int | None
+    ) -> None:
+        super().__init__(path, contents)
+        self._disk = disk
+        self._descriptor = descriptor
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        *,
+        plan: Plan,
+        rig: Rig,
+        devices: Mapping[str, Any],
+        subject: Subject,
+        source: Literal["measured", "simulated"],
+        calibrations: Sequence[CalibrationRef | Mapping[str, str]] = (),
+        seed: int | None = None,
+        extra: Mapping[str, Any] | None = None,
+        session_id: str | None = None,
+        now: Callable[[], datetime] | None = None,
+        disk: Disk | None = None,
+    ) -> Session:
+        """Start a session in a new (or empty) folder and open it for writing.
+
+        Parameters
+        ----------
+        path : str or Path
+            The folder; its parent exists.
+        plan, rig : Plan, Rig
+            Checked against each other.
+        devices : mapping
+            What each box and camera said it is: JSON values.
+        subject : Subject
+        source : {"measured", "simulated"}
+        calibrations : sequence of CalibrationRef, or of tables of kind, sha256, path
+        seed : int, optional
+            Seed of a simulation.
+        extra : mapping, optional
+            Further JSON values.
+        session_id : str, optional
+            A fresh random one by default.
+        now : callable, optional
+            Clock, returns a time with its zone.
+        disk : Disk, optional
+            File operations; the real ones by default.
+
+        Raises
+        ------
+        SessionError
+            Where the folder holds something, or a value cannot be written.
+        """
+        disk = disk or Disk()
+        place = Path(path)
+        moment = (now or (lambda: datetime.now(UTC)))()
+        manifest = Manifest(
+            id=session_id or uuid.uuid4().hex,
+            created_at=moment,
+            source=source,
+            subject=subject,
+            plan=plan,
+            rig=rig,
+            devices=dict(devices),
+            calibrations=calibration_refs(calibrations),
+            seed=seed,
+            versions=versions(),
+            extra=dict(extra or {}),
+        )
+        data, _ = manifest.encode()
+        require_free(place)
+        with DiskErrors(place):
+            for folder in (place, place / FRAMES, place / ORPHANS):
+                if not folder.is_dir():
+                    disk.make_dir(folder)
+            if not (place / JOURNAL).exists():
+                write_new(disk, place / JOURNAL, b"")
+            # a session exists from the moment its manifest has its name, so that comes last
+            part = place / f"{MANIFEST}.part"
+            if part.exists():
+                disk.remove(part)
+            write_new(disk, part, data)
+            disk.fsync_dir(place)
+            disk.rename(part, place / MANIFEST)
+            disk.fsync_dir(place)
+            disk.fsync_dir(place.resolve().parent)
+        return cls.resume(place, disk=disk)
+
+    @classmethod
+    def open(cls, path: str | Path) -> Session:
+        """Open a session for reading, closed or not; a torn last line is left alone.
+
+        Raises
+        ------
+        SessionError
+            Where there is no session or its schema is unknown.
+        SessionDamage
+            Where manifest or journal are not what was written.
+        """
+        place = Path(path)
+        return cls(place, undamaged_contents(place), disk=Disk(), descriptor=None)
+
+    @classmethod
+    def resume(cls, path: str | Path, *, disk: Disk | None = None) -> Session:
+        """Open a session for writing after any kind of interruption.
+
+        Takes the writer's lock, cuts a torn last line of the journal, and sets files without a
+        line aside in ``orphans/``. What was acknowledged is there; the rest is in `todo`.
+
+        Raises
+        ------
+        SessionLocked
+            Where another process is writing.
+        SessionError
+            Where the session is closed.
+        SessionDamage
+            Where manifest or journal are not what was written, or a committed frame is missing.
+        """
+        disk = disk or Disk()
+        place = Path(path)
+        undamaged_contents(place)
+        with DiskErrors(place):
+            descriptor = disk.open_append(place / JOURNAL)
+        try:
+            if not disk.lock(descriptor):
+                what = "another process is writing this session"
+                raise SessionLocked(what, where=str(place), advice="Wait for it, or stop it.")
+            contents = undamaged_contents(place)  # again, under the lock
+            if contents.walk.closed:
+                advice = "Start a new session; a closed one is never modified."
+                raise SessionError("the session is closed", where=str(place), advice=advice)
+            with DiskErrors(place):
+                if contents.walk.torn:
+                    _log.warning("%s: cut %d torn bytes", place / JOURNAL, contents.walk.torn)
+                    disk.truncate(descriptor, contents.walk.end)
+                    disk.fdatasync(descriptor)
+                set_orphans_aside(disk, place, contents)
+        except BaseException:
+            disk.close(descriptor)
+            raise
+        return cls(place, contents, disk=disk, descriptor=descriptor)
+
+    def commit(
+        self,
+        step_id: str,
+        camera: str,
+        blob: bytes,
+        *,
+        settings: Mapping[str, Value],
+        actual: Mapping[str, Value],
+        t_box_s: float | None = None,
+        t_host_s: float,
+        attempt: int = 1,
+    ) -> None:
+        """Put one frame on the medium; when this returns, it survives a power cut.
+
+        Parameters
+        ----------
+        step_id, camera : str
+            Step of the plan and one of its cameras.
+        blob : bytes
+            A DNG of ours that names the same step and this session.
+        settings, actual : mapping
+            What was asked for, and what box and camera report.
+        t_box_s : float or None
+            Time of the exposure on the box's clock, s.
+        t_host_s : float
+            Time of arrival on the host's clock, s.
+        attempt : int
+            1, or one more than the last attempt for a frame taken again.
+
+        Raises
+        ------
+        SessionError
+            Where the frame does not belong here; nothing is written.
+        SessionDiskError
+            Where the disk refuses; nothing committed before is touched, and the session can be
+            resumed.
+        """
+        descriptor = self._writable()
+        self._check_commit(step_id, camera, blob, attempt)
+        line = FrameLine(
+            step=step_id,
+            camera=camera,
+            attempt=attempt,
+            file=frame_file(step_id, camera, attempt),
+            bytes=len(blob),
+            xxh128=xxhash.xxh3_128_hexdigest(blob),
+            settings=dict(settings),
+            actual=dict(actual),
+            t_box_s=None if t_box_s is None else float(t_box_s),
+            t_host_s=float(t_host_s),
+        )
+        text, head = self._seal(line)
+        target = self.path / line.file
+        part = target.with_name(target.name + ".part")
+        try:
+            with DiskErrors(self.path):
+                write_new(self._disk, part, blob)
+                self._disk.rename(part, target)
+                self._disk.fsync_dir(target.parent)
+                self._append(descriptor, text)
+        except SessionDiskError:
+            # how much reached the medium is unknown: only resume() can tell
+            self.release()
+            raise
+        self._head = head
+        self._lines.setdefault((step_id, camera), []).append(line)
+
+    def close(self, *, missing_because: str = "") -> None:
+        """End the session for good: nothing can be added afterwards.
+
+        Parameters
+        ----------
+        missing_because : str
+            Why steps of the plan are missing; required where some are.
+
+        Raises
+        ------
+        SessionError
+            Where steps are missing and no reason is given.
+        """
+        descriptor = self._writable()
+        missing = tuple(dict.fromkeys(step.id for step, _ in self.todo()))
+        if missing and not missing_because:
+            faults = [Fault("steps", f"{len(missing)} missing, first {missing[0]!r}", "none")]
+            advice = "Capture them, release() the session to go on later, or say why they stay out."
+            what = "the session is not complete"
+            raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
+        frames = sum(len(lines) for lines in self._lines.values())
+        line = CloseLine(frames=frames, missing=missing, reason=missing_because if missing else "")
+        text, head = self._seal(line)
+        try:
+            with DiskErrors(self.path):
+                self._append(descriptor, text)
+            self._head, self._close_line = head, line
+        finally:
+            self.release()
+
+    def release(self) -> None:
+        """Let go of the writer's lock; the session stays open and can be resumed."""
+        if self._descriptor is not None:
+            self._disk.close(self._descriptor)
+            self._descriptor = None
+
+    def __enter__(self) -> Session:
+        """Return the session."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Release the lock; closing is a deliberate act."""
+        self.release()
+
+    def _writable(self) -> int:
+        if self._descriptor is None:
+            why = "closed" if self.closed else "not open for writing"
+            advice = "A closed session is never modified; Session.resume opens one that is not."
+            raise SessionError(f"the session is {why}", where=str(self.path), advice=advice)
+        return self._descriptor
+
+    def _check_commit(self, step_id: str, camera: str, blob: bytes, attempt: int) -> None:
+        step = self.plan.step(step_id)
+        if camera not in step.cameras:
+            faults = [Fault("camera", shown(camera), f"one of {', '.join(step.cameras)}")]
+            raise SessionError(f"step {step_id!r} has no such camera", faults=faults)
+        done = self._lines.get((step_id, camera), [])
+        expected = done[-1].attempt + 1 if done else 1
+        if attempt < 1 or (done and attempt != expected):
+            faults = [Fault("attempt", str(attempt), f"{expected}")]
+            advice = "A committed frame stays; take it again with the next attempt number."
+            what = f"frame of step {step_id!r}, camera {camera!r} is already committed"
+            raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
+        if len(blob) > MAX_FRAME_BYTES:
+            faults = [Fault("blob", f"{len(blob)} bytes", f"at most {MAX_FRAME_BYTES}")]
+            raise SessionError("the frame is absurdly large", faults=faults)
+        frame = raw.decode(memoryview(blob), where=f"frame of step {step_id}")
+        for field, got, wanted in (
+            ("step_id", frame.step_id, step_id),
+            ("session_id", frame.session_id, self.id),
+        ):
+            if got != wanted:
+                advice = "Encode the DNG with the step and session it is committed to."
+                what = "the frame says it belongs elsewhere"
+                raise SessionError(what, faults=[Fault(field, shown(got), wanted)], advice=advice)
+
+    def _seal(self, line: Line) -> tuple[bytes, str]:
+        try:
+            text, head = seal_line(self._head, line)
+        except (TypeError, ValueError, RecursionError) as exc:
+            faults = [Fault("settings, actual", str(exc), "texts, finite numbers, true or false")]
+            raise SessionError("the journal line cannot be written", faults=faults) from exc
+        if len(text) > MAX_LINE_BYTES:
+            faults = [Fault("line", f"{len(text)} bytes", f"at most {MAX_LINE_BYTES}")]
+            raise SessionError("settings and actual are too long", faults=faults)
+        return text, head
+
+    def _append(self, descriptor: int, text: bytes) -> None:
+        self._disk.write(descriptor, text)
+        self._disk.fdatasync(descriptor)

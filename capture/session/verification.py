@@ -1,0 +1,131 @@
+"""Recompute everything a session says about itself, and name what is not so."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from datetime import UTC, date, datetime
+from pathlib import Path
+
+from capture.session.contents import (
+    FRAMES,
+    JOURNAL,
+    MANIFEST,
+    ORPHANS,
+    Contents,
+    list_frames,
+    read_contents,
+)
+from capture.session.errors import SessionError
+from capture.session.frames import check_frame
+
+_KNOWN = {MANIFEST, JOURNAL, FRAMES, ORPHANS, "index.sqlite", "ascmhl"}
+
+
+@dataclass(frozen=True, slots=True)
+class VerifyReport:
+    """What verification found."""
+
+    ok: bool
+    """Whether every committed byte is what was written."""
+    problems: tuple[str, ...]
+    """Damage: each names the file (and the byte, where one is known)."""
+    warnings: tuple[str, ...]
+    """What a person should know though nothing is damaged."""
+    frames: int
+    """Committed frames whose files are good."""
+    bytes: int
+    """Bytes of those frames."""
+
+
+def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
+    """Check manifest, journal and every frame of a session.
+
+    Parameters
+    ----------
+    path : str or Path
+        The session's folder.
+    today : date, optional
+        Day on which consent is judged; today by default.
+
+    Returns
+    -------
+    VerifyReport
+
+    Notes
+    -----
+    A flipped bit anywhere in a committed file is found: session.json carries a seal over all its
+    bytes, the journal a SHA-256 chain from that seal, and the journal a XXH3-128 of every frame.
+    This guards against accidents; against a forger only a copy of the last hash kept elsewhere
+    helps (``Session.content_hash``).
+    """
+    place = Path(path)
+    problems: list[str] = []
+    warnings: list[str] = []
+    try:
+        contents = read_contents(place)
+    except SessionError as exc:
+        return VerifyReport(False, (str(exc),), (), 0, 0)
+    if contents.walk.damage is not None:
+        problems.append(str(contents.walk.damage))
+    frames = size = 0
+    for line in contents.frame_lines:
+        try:
+            size += len(check_frame(place / line.file, line))
+            frames += 1
+        except SessionError as exc:
+            problems.append(str(exc))
+    strays = problems if contents.walk.closed else warnings
+    damaged_journal = contents.walk.damage is not None
+    strays.extend(_stray_frames(place, contents) if not damaged_journal else [])
+    warnings.extend(_state(place, contents))
+    warnings.extend(_consent(contents, today or datetime.now(UTC).date()))
+    return VerifyReport(not problems, tuple(problems), tuple(warnings), frames, size)
+
+
+def _stray_frames(place: Path, contents: Contents) -> list[str]:
+    try:
+        present = list_frames(place)
+    except SessionError as exc:
+        return [str(exc)] if contents.frame_lines or contents.walk.closed else []
+    known = {Path(line.file).name for line in contents.frame_lines}
+    advice = "it was never acknowledged; resuming sets it aside"
+    return [
+        f"{place / FRAMES / name}: no line in the journal; {advice}"
+        for name in present
+        if name not in known
+    ]
+
+
+def _state(place: Path, contents: Contents) -> list[str]:
+    notes = []
+    walk = contents.walk
+    if walk.torn:
+        where = f"{place / JOURNAL}, byte {walk.end}"
+        notes.append(f"{where}: {walk.torn} bytes of a line cut off by a crash; resuming cuts them")
+    done = {(line.step, line.camera) for line in contents.frame_lines}
+    steps = contents.manifest.plan.steps
+    missing = sum((step.id, camera) not in done for step in steps for camera in step.cameras)
+    end = contents.close_line
+    if end is None:
+        notes.append(f"{place}: not closed, {missing} frames of the plan are missing")
+    elif missing:
+        notes.append(f"{place}: closed with {missing} frames missing: {end.reason}")
+    if (place / ORPHANS).is_dir() and (orphans := os.listdir(place / ORPHANS)):
+        notes.append(f"{place / ORPHANS}: {len(orphans)} files set aside after interruptions")
+    for name in sorted(set(os.listdir(place)) - _KNOWN):
+        notes.append(f"{place / name}: not a part of the session, nothing vouches for it")
+    return notes
+
+
+def _consent(contents: Contents, today: date) -> list[str]:
+    subject = contents.manifest.subject
+    if contents.manifest.source == "simulated":
+        return []
+    who = f"subject {subject.pseudonym}"
+    if not subject.consent_scope:
+        return [f"{who}: no consent beyond the capture is recorded"]
+    expires = subject.consent_expires
+    if expires is not None and today > expires:
+        return [f"{who}: consent expired on {expires}; the data may not be used any more"]
+    return []

@@ -1,0 +1,139 @@
+"""What a session can be asked, whether it is being written or only read."""
+
+from __future__ import annotations
+
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import Literal
+
+from capture import raw
+from capture.documents import Fault, shown
+from capture.plan import Plan, Step
+from capture.rig import Rig
+from capture.session.contents import Contents
+from capture.session.errors import ConsentError, SessionDamage
+from capture.session.frames import FrameRecord, check_frame
+from capture.session.journal import FrameLine
+from capture.session.manifest import Manifest, Subject
+
+
+class SessionView:
+    """Plan, frames, consent and provenance of one session."""
+
+    def __init__(self, path: Path, contents: Contents) -> None:
+        self.path = path
+        self._contents = contents
+        self._head = contents.walk.head
+        self._close_line = contents.close_line
+        self._lines: dict[tuple[str, str], list[FrameLine]] = {}
+        for line in contents.frame_lines:
+            self._lines.setdefault((line.step, line.camera), []).append(line)
+
+    def todo(self) -> list[tuple[Step, str]]:
+        """Return the steps and cameras without a committed frame, in the order of the plan."""
+        return [
+            (step, camera)
+            for step in self.plan.steps
+            for camera in step.cameras
+            if (step.id, camera) not in self._lines
+        ]
+
+    def frames(self, kind: str | None = None, **index: str | int | float) -> list[FrameRecord]:
+        """Return the last attempt of each committed frame, in the order of the plan.
+
+        Parameters
+        ----------
+        kind : str, optional
+            Only steps of this kind.
+        **index
+            Only steps whose index has these values, e.g. ``polarizer="crossed"``.
+        """
+        missing = object()
+        return [
+            FrameRecord(step=step, line=self._lines[step.id, camera][-1])
+            for step in self.plan.steps
+            if kind in (None, step.kind)
+            and all(step.index.get(key, missing) == value for key, value in index.items())
+            for camera in step.cameras
+            if (step.id, camera) in self._lines
+        ]
+
+    def read(self, record: FrameRecord) -> raw.RawFrame:
+        """Return a committed frame, after its hash has been checked.
+
+        Raises
+        ------
+        SessionDamage
+            Where the file is missing or one bit of it differs from what was committed.
+        """
+        where = self.path / record.file
+        blob = check_frame(where, record.line)
+        frame = raw.decode(memoryview(blob), where=str(where))
+        if frame.step_id != record.step_id:
+            faults = [Fault("step", frame.step_id, record.step_id)]
+            raise SessionDamage("is another frame", where=str(where), faults=faults)
+        return frame
+
+    def export_allowed(self, scope: str, *, today: date | None = None) -> bool:
+        """Return whether the subject's consent covers ``scope`` today; nobody owns a simulation."""
+        if self.source == "simulated":
+            return True
+        expires = self.subject.consent_expires
+        in_time = expires is None or (today or datetime.now(UTC).date()) <= expires
+        return in_time and scope in self.subject.consent_scope
+
+    def require_consent(self, scope: str, *, today: date | None = None) -> None:
+        """Raise `ConsentError` where `export_allowed` is False."""
+        if not self.export_allowed(scope, today=today):
+            allowed = ", ".join(self.subject.consent_scope) or "nothing"
+            until = self.subject.consent_expires
+            expected = f"one of: {allowed}" + (f", until {until}" if until else "")
+            what = f"subject {self.subject.pseudonym} has not agreed to this use"
+            faults = [Fault("scope", shown(scope), expected)]
+            advice = "Ask the subject again, or keep the data inside the agreed scope."
+            raise ConsentError(what, where=str(self.path), faults=faults, advice=advice)
+
+    @property
+    def id(self) -> str:
+        """Name of the session, written into each of its frames."""
+        return self._contents.manifest.id
+
+    @property
+    def manifest(self) -> Manifest:
+        """All that was known when the session began."""
+        return self._contents.manifest
+
+    @property
+    def plan(self) -> Plan:
+        """What was to be captured."""
+        return self._contents.manifest.plan
+
+    @property
+    def rig(self) -> Rig:
+        """The nominal rig, resized as it was used."""
+        return self._contents.manifest.rig
+
+    @property
+    def source(self) -> Literal["measured", "simulated"]:
+        """Whether light or a simulation made the frames."""
+        return self._contents.manifest.source
+
+    @property
+    def subject(self) -> Subject:
+        """Who was captured."""
+        return self._contents.manifest.subject
+
+    @property
+    def seed(self) -> int | None:
+        """Seed of the simulation, None for a measured session."""
+        return self._contents.manifest.seed
+
+    @property
+    def closed(self) -> bool:
+        """Whether the session has ended for good."""
+        return self._close_line is not None
+
+    @property
+    def content_hash(self) -> str:
+        """``sha256:`` hash that vouches for manifest, journal and, through it, every frame."""
+        return self._head if self._head.startswith("sha256:") else f"sha256:{self._head}"
