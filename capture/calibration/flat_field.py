@@ -42,15 +42,31 @@ class SmoothField:
     coefficients : ndarray of float64, shape (T,)
         Of products of Legendre polynomials in row and column, each scaled to [-1, 1] over the
         image, total degree up to 4 for T = 15.
-    stderr : ndarray of float64, shape (T,)
-        Standard errors.
+    covariance : ndarray of float64, shape (T, T)
+        Of the coefficients.
     residual : float
         Root mean square of what the polynomial does not explain, relative.
+    level : float
+        What the samples are at the image's center, in their unit.
     """
 
     coefficients: Float
-    stderr: Float
+    covariance: Float
     residual: float
+    level: float = 1.0
+
+    @property
+    def stderr(self) -> Float:
+        """Standard errors of the coefficients, shape (T,)."""
+        return np.sqrt(np.diag(self.covariance)).astype(np.float64)
+
+    def evaluate_stderr(self, height: int, width: int) -> Float:
+        """Return the standard error of the field on every pixel of an image, shape (H, W)."""
+        scales, vectors = np.linalg.eigh(self.covariance)
+        total = np.zeros((height, width))
+        for scale, vector in zip(np.maximum(scales, 0.0), vectors.T, strict=True):
+            total += scale * SmoothField(vector, self.covariance, 0.0).evaluate(height, width) ** 2
+        return np.sqrt(total)
 
     def evaluate(self, height: int, width: int) -> Float:
         """Return the field on every pixel of an image, shape (H, W)."""
@@ -130,9 +146,10 @@ def fit_smooth_field(
     variance = float(misfit @ misfit) / (values.size - len(terms))
     covariance = np.linalg.inv((design * root[:, None]).T @ (design * root[:, None])) * variance
     return SmoothField(
-        coefficients / center,
-        np.sqrt(np.diag(covariance)) / center,
-        float(np.sqrt(variance) / center),
+        (coefficients / center).astype(np.float64),
+        (covariance / center**2).astype(np.float64),
+        float(np.sqrt(variance)) / center,
+        center,
     )
 
 

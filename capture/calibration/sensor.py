@@ -180,7 +180,7 @@ class SensorCalibration:
             saturated_by=tuple(calibration.notes["saturated_by"].split(", ")),
             dark_e_per_s=get(serial, "dark_e_per_s") if has_dark else None,
             flat=tuple(
-                SmoothField(c, e, float(r))
+                SmoothField(c, np.diag(e**2), float(r))
                 for c, e, r in zip(coefficients.value, errors, residuals, strict=True)
             ),
             chi2_per_dof=tuple(float(v) for v in get(serial, "chi2_per_dof").value),
