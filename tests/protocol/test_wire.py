@@ -1,0 +1,174 @@
+"""The line format, byte by byte."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from capture.devices import wire
+from capture.devices.wire import BadFrame, Code, Event, Reply, Request, decode, encode
+
+FRAMES = [
+    (Request(1, 0, "SYST:HELLO?"), b"@1:0000 SYST:HELLO?*9A6F\n"),
+    (Request(17, 0x9F3A, "FLAS:FIRE a1"), b"@17:9f3a FLAS:FIRE a1*68AB\n"),
+    (Request(0, 0xFFFF, "*IDN?"), b"@0:ffff *IDN?*9DF4\n"),
+    (Reply(17, 0x9F3A, Code.OK), b"=17:9f3a 0*6853\n"),
+    (Reply(17, 0x9F3A, Code.NOT_ARMED, "not armed"), b"=17:9f3a -203 not armed*DCBF\n"),
+    (Reply(4294967295, 1, Code.RECYCLE, "600 ms"), b"=4294967295:0001 103 600 ms*DE43\n"),
+    (Event(0, 0x9F3A, "WDOG:TRIP"), b"!0:9f3a WDOG:TRIP*CE95\n"),
+    (Event(3, 0x9F3A, "NAK", "204"), b"!3:9f3a NAK 204*E936\n"),
+]
+
+printable = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E), max_size=200)
+numbers = st.integers(0, 2**32 - 1)
+epochs = st.integers(0, 0xFFFF)
+frames = st.one_of(
+    st.builds(Request, numbers, epochs, printable.filter(bool)),
+    st.builds(Reply, numbers, epochs, st.integers(-9999, 9999), printable),
+    st.builds(Event, numbers, epochs, st.from_regex(r"[A-Z][A-Z0-9:]{0,31}", fullmatch=True)),
+)
+
+
+@pytest.mark.parametrize(("frame", "line"), FRAMES)
+def test_each_frame_has_its_bytes(frame, line):
+    assert encode(frame) == line
+    assert decode(line[:-1]) == frame
+
+
+def test_the_checksum_is_the_ibm_3740_one_bit_by_bit():
+    data = b"@17:9f3a SEQ:ARM 150"
+    register = 0xFFFF
+    for byte in data:
+        register ^= byte << 8
+        for _ in range(8):
+            register = (register << 1) ^ 0x1021 if register & 0x8000 else register << 1
+            register &= 0xFFFF
+    assert wire.crc16(data) == register
+    assert wire.crc16(b"123456789") == 0x29B1
+
+
+@given(frames)
+def test_decoding_returns_what_was_encoded(frame):
+    assert decode(encode(frame)[:-1]) == frame
+
+
+@given(st.binary(max_size=80))
+def test_a_line_that_decodes_is_the_one_that_encodes(line):
+    try:
+        frame = decode(line)
+    except BadFrame:
+        return
+    assert encode(frame)[:-1] == line
+
+
+@given(printable)
+def test_a_sealed_line_that_decodes_is_the_one_that_encodes(body):
+    line = wire.seal(body).encode()
+    try:
+        frame = decode(line)
+    except BadFrame:
+        return
+    assert encode(frame)[:-1] == line
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "17:9f3a FLAS:FIRE a1",  # no mark
+        "@017:9f3a FLAS:FIRE a1",  # leading zero
+        "@-1:9f3a FLAS:FIRE a1",
+        "@4294967296:9f3a FLAS:FIRE a1",  # beyond 32 bits
+        "@17:9F3A FLAS:FIRE a1",  # upper-case epoch
+        "@17:9f3 FLAS:FIRE a1",
+        "@17:9f3a",
+        "@17:9f3a ",
+        "=17:9f3a ok",
+        "=17:9f3a -0",
+        "=17:9f3a 0 ",  # second encoding of an empty payload
+        "=17:9f3a 10000",
+        "!1:9f3a nak",
+        "!1:9f3a NAK ",
+    ],
+)
+def test_a_second_spelling_of_a_frame_is_refused(body):
+    with pytest.raises(BadFrame):
+        decode(wire.seal(body).encode())
+
+
+@pytest.mark.parametrize(("_frame", "line"), FRAMES)
+def test_every_single_and_double_bit_flip_is_noticed(_frame, line):
+    bits = np.unpackbits(np.frombuffer(line[:-1], np.uint8))
+    pairs = [(i, j) for i in range(bits.size) for j in range(i, bits.size)]
+    for i, j in pairs[:: max(1, len(pairs) // 3000)]:
+        flipped = bits.copy()
+        flipped[[i, j]] ^= 1
+        with pytest.raises(BadFrame):
+            decode(np.packbits(flipped).tobytes())
+
+
+@pytest.mark.parametrize(("_frame", "line"), FRAMES)
+def test_every_lost_byte_is_noticed(_frame, line):
+    for i in range(len(line) - 1):
+        with pytest.raises(BadFrame):
+            decode(line[:i] + line[i + 1 : -1])
+
+
+def test_a_lower_case_checksum_is_refused():
+    with pytest.raises(BadFrame):
+        decode(b"@17:9f3a FLAS:FIRE a1*68ab")
+
+
+def test_the_longest_line_passes_and_one_byte_more_does_not():
+    room = wire.MAX_LINE_BYTES - len(encode(Request(1, 1, "x"))) + 1
+    longest = encode(Request(1, 1, "x" * room))
+    assert len(longest) == wire.MAX_LINE_BYTES
+    assert wire.LineSplitter().feed(longest) == [longest[:-1]]
+    assert decode(longest[:-1]) == Request(1, 1, "x" * room)
+    with pytest.raises(ValueError, match="1025 bytes"):
+        encode(Request(1, 1, "x" * (room + 1)))
+
+
+@pytest.mark.parametrize("text", ["", "a\nb", "caf\xe9", "\x7f"])
+def test_a_request_holds_printable_ascii_only(text):
+    with pytest.raises(ValueError, match="text"):
+        Request(1, 1, text)
+
+
+@pytest.mark.parametrize(("seq", "boot"), [(-1, 1), (2**32, 1), (1, -1), (1, 0x10000)])
+def test_numbers_out_of_their_field_are_refused(seq, boot):
+    with pytest.raises(ValueError, match="expected 0 to"):
+        Request(seq, boot, "*IDN?")
+
+
+def test_the_sequence_number_starts_again_after_32_bits():
+    assert wire.next_seq(2**32 - 1) == 0
+    assert wire.next_seq(0) == 1
+
+
+@given(st.lists(st.binary(max_size=12).map(lambda b: b.replace(b"\r", b"")), max_size=8))
+def test_lines_do_not_depend_on_how_the_stream_is_cut(pieces):
+    whole = b"".join(pieces)
+    splitter = wire.LineSplitter()
+    in_pieces = [line for piece in pieces for line in splitter.feed(piece)]
+    assert in_pieces == wire.LineSplitter().feed(whole)
+    assert in_pieces == [line for line in whole.split(b"\n")[:-1] if line]
+
+
+def test_overlong_garbage_is_dropped_up_to_the_next_newline():
+    splitter = wire.LineSplitter()
+    assert splitter.feed(b"x" * 1023) == []
+    assert splitter.feed(b"x") == []
+    assert splitter.feed(b"x" * 5000 + b"\n*IDN?\n") == [b"*IDN?"]
+    assert splitter.overlong_lines == 1
+
+
+def test_a_terminal_may_send_carriage_returns():
+    assert wire.LineSplitter().feed(b"*IDN?\r\nSTAT?\n") == [b"*IDN?", b"STAT?"]
+
+
+@pytest.mark.parametrize(
+    ("line", "meant"),
+    [(b"@17:9f3a FLAS", True), (b"7:9f3a FLAS:FIRE a*68AB", True), (b"*IDN?", False)],
+)
+def test_a_damaged_frame_is_told_from_a_bare_line(line, meant):
+    assert wire.looks_framed(line) is meant
