@@ -1,0 +1,145 @@
+"""Estimated maps against their truth: error, coverage and share masked, by melanin band."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import metrics
+from model.skin import SkinAppearance
+
+BANDS: tuple[tuple[float, float], ...] = (
+    (0.0, 0.02), (0.02, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, 0.51),
+)  # fmt: skip
+"""Melanin bands, volume fraction: about very light, light, tan, brown and dark skin."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapError:
+    """How one map compares with one truth, over one band of melanin.
+
+    Attributes
+    ----------
+    name
+        Of the map.
+    against
+        "sharp" (what the subject is made of) or "blurred" (after lateral transport).
+    band
+        Bounds of the true melanin fraction; None: all pixels.
+    pixels, masked
+        Pixels with a truth, and the share of them without a valid estimate.
+    median_relative, interval
+        Median of |estimate - truth| / truth and its 68 % bootstrap interval.
+    bias
+        Median of (estimate - truth) / truth.
+    coverage
+        Share of truths inside the 68 % interval of the estimate.
+    median_stderr
+        Median of the relative standard error, estimate's.
+    """
+
+    name: str
+    against: str
+    band: tuple[float, float] | None
+    pixels: int
+    masked: float
+    median_relative: float
+    interval: tuple[float, float]
+    bias: float
+    coverage: metrics.Coverage
+    median_stderr: float
+
+    @property
+    def band_name(self) -> str:
+        """The band as text."""
+        return "all" if self.band is None else f"C_m {self.band[0]:g}–{self.band[1]:g}"
+
+
+def compare(
+    appearance: SkinAppearance,
+    truth: SkinAppearance,
+    *,
+    names: tuple[str, ...] = ("melanin", "hemoglobin"),
+    rng: np.random.Generator,
+) -> list[MapError]:
+    """Compare maps with their truths, over all pixels and in each band of melanin.
+
+    Parameters
+    ----------
+    appearance
+        Estimated maps with standard errors.
+    truth
+        Maps of the same size; ``NAME`` is sharp, ``NAME_blurred`` has the lateral transport
+        of light in it, ``mask`` tells where there is skin. ``melanin`` is needed.
+    names
+        Which maps.
+    rng
+        For the bootstrap intervals.
+
+    Raises
+    ------
+    ValueError
+        When sizes differ or the truth has no melanin.
+    """
+    if "melanin" not in truth.maps:
+        raise ValueError("truth: has no map 'melanin', which the bands are made from")
+    melanin = truth.maps["melanin"].values
+    rows = []
+    for name in names:
+        if name not in appearance.maps:
+            continue
+        estimate = appearance.maps[name]
+        for suffix, against in (("", "sharp"), ("_blurred", "blurred")):
+            if name + suffix not in truth.maps:
+                continue
+            true_map = truth.maps[name + suffix]
+            if true_map.values.shape != estimate.values.shape:
+                raise ValueError(
+                    f"{name}: got an estimate of shape {estimate.values.shape} and a truth of "
+                    f"shape {true_map.values.shape}, expected the same"
+                )
+            skin = _skin(truth, true_map.values)
+            rows += [
+                _row(name, against, band, estimate, true_map.values, melanin, skin, rng)
+                for band in (None, *BANDS)
+            ]
+    return [row for row in rows if row.pixels >= 20]
+
+
+def _skin(truth: SkinAppearance, values: NDArray[np.float32]) -> NDArray[np.bool_]:
+    skin = np.isfinite(values) & (values > 0)
+    if "mask" in truth.maps:
+        skin &= truth.maps["mask"].values > 0.5
+    return skin
+
+
+def _row(name, against, band, estimate, true_values, melanin, skin, rng):  # type: ignore[no-untyped-def]
+    chosen = skin if band is None else skin & (melanin >= band[0]) & (melanin < band[1])
+    valid = chosen if estimate.valid is None else chosen & estimate.valid
+    pixels = int(np.count_nonzero(chosen))
+    value = estimate.values[valid].astype(np.float64)
+    true_value = true_values[valid].astype(np.float64)
+    relative = (value - true_value) / true_value
+    median, interval = metrics.median_with_interval(np.abs(relative), rng=rng)
+    if estimate.stderr is None:
+        held, spread = metrics.coverage([], [], []), float("nan")
+    else:
+        stderr = estimate.stderr[valid].astype(np.float64)
+        held = metrics.coverage(value, stderr, true_value)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios = stderr / np.abs(value)
+        spread = float(np.median(ratios)) if ratios.size else float("nan")
+    return MapError(
+        name=name,
+        against=against,
+        band=band,
+        pixels=pixels,
+        masked=1.0 - valid.sum() / pixels if pixels else float("nan"),
+        median_relative=median,
+        interval=interval,
+        bias=float(np.median(relative)) if relative.size else float("nan"),
+        coverage=held,
+        median_stderr=spread,
+    )

@@ -1,0 +1,76 @@
+import json
+
+import numpy as np
+import pytest
+
+from model import store
+from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig import report
+from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, to_document
+
+
+@pytest.fixture
+def folder(tmp_path, rng):
+    truth = 0.05 + 0.1 * rng.random((24, 32))
+    noise = rng.normal(0, 0.002, truth.shape)
+    stderr = np.full(truth.shape, 0.002)
+    store.write(
+        tmp_path / "appearance",
+        SkinAppearance(
+            {"melanin": SkinMap(truth + noise, UNITS["melanin"], stderr)},
+            "simulated",
+            parameters={"truth": "truth-flash", "assumed": ["<b>flat</b> light"]},
+            inputs={"session": "0123456789abcdef0123"},
+            left_out=(("tsumura", "not wanted"),),
+        ),
+    )
+    maps = {n: SkinMap(truth, UNITS["melanin"] if n == "melanin" else "1")
+            for n in ("melanin", "melanin_blurred")}  # fmt: skip
+    store.write(
+        tmp_path / "truth-flash", SkinAppearance(maps, "simulated", parameters={"kind": "truth"})
+    )
+    points = tuple(
+        Point({"n": n}, Timing(n, (n, n), 2 * n, 1.0), 1 / n, (0.9 / n, 1.1 / n)) for n in (1, 2, 4)
+    )
+    stage = StageBenchmark("inversion", "error, %", "truth", 0.1, points, (Limit("s", 2, 1, "<="),))
+    (tmp_path / "bench.json").write_text(json.dumps(to_document([stage])))
+    return tmp_path
+
+
+def test_the_page_is_the_same_twice_and_asks_for_nothing(folder):
+    html = report.build([folder])
+    assert html == report.build([folder])
+    assert "default-src 'none'" in html
+    assert "http://" not in html.replace("http://www.w3.org", "")
+    assert "<script" not in html
+
+
+def test_truth_estimate_error_and_standard_error_stand_side_by_side(folder):
+    html = report.build([folder])
+    for title in ("truth", "estimate", "estimate − truth", "standard error"):
+        assert f"<figcaption>{title}</figcaption>" in html
+
+
+def test_a_missed_limit_is_said_first(folder):
+    html = report.build([folder])
+    assert "1 of 2 checks missed" in html
+    assert html.index("missed</td>") < html.index("kept</td>")
+
+
+def test_text_from_files_cannot_become_markup(folder):
+    html = report.build([folder])
+    assert "<b>flat" not in html
+    assert "&lt;b&gt;flat" in html
+
+
+def test_maps_without_a_truth_are_reported_with_their_standard_errors(folder):
+    html = report.build([folder / "appearance"])
+    assert "No truth lies beside" in html
+    assert "estimate − truth" not in html
+
+
+def test_an_empty_folder_is_refused_with_what_to_do(tmp_path):
+    with pytest.raises(report.ReportError, match="skinrig demo"):
+        report.build([tmp_path])
+    with pytest.raises(report.ReportError, match="does not exist"):
+        report.build([tmp_path / "nothing"])
