@@ -66,9 +66,9 @@ def examine(*, probe_renderer: bool = True) -> list[Finding]:
 
 
 def _renderer() -> Finding:
-    from rigsim import render
+    from rigsim import variant
 
-    choice = render.choose_variant()
+    choice = variant.choose_variant()
     fast = choice.name.startswith("llvm")
     return Finding(
         "Mitsuba variant", f"{choice.name} ({choice.why})", True,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import metrics
-from model.skin import SkinAppearance
+from model.skin import SkinAppearance, SkinMap
 
 BANDS: tuple[tuple[float, float], ...] = (
     (0.0, 0.02), (0.02, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, 0.51),
@@ -115,7 +115,16 @@ def _skin(truth: SkinAppearance, values: NDArray[np.float32]) -> NDArray[np.bool
     return skin
 
 
-def _row(name, against, band, estimate, true_values, melanin, skin, rng):  # type: ignore[no-untyped-def]
+def _row(
+    name: str,
+    against: str,
+    band: tuple[float, float] | None,
+    estimate: SkinMap,
+    true_values: NDArray[np.float32],
+    melanin: NDArray[np.float32],
+    skin: NDArray[np.bool_],
+    rng: np.random.Generator,
+) -> MapError:
     chosen = skin if band is None else skin & (melanin >= band[0]) & (melanin < band[1])
     valid = chosen if estimate.valid is None else chosen & estimate.valid
     pixels = int(np.count_nonzero(chosen))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -34,6 +35,7 @@ def _svg(figure: Any) -> str:
     text = buffer.getvalue()
     # black becomes the text color of the page, so that dark mode stays readable
     text = text[text.index("<svg") :].replace("#000000", "currentColor")
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     return text.replace("<svg ", '<svg aria-hidden="true" ', 1)
 
 
