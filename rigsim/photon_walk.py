@@ -6,7 +6,6 @@ from math import copysign, log, sqrt
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 TALLIES = 5
 """Scores ahead of the layers and rings: diffuse and unscattered reflectance, diffuse and
@@ -99,13 +98,11 @@ def walk(table, ring_edges2, photons, seed, tally, events):  # type: ignore[no-u
         scattered = False
         if list_paths:
             path[:] = 0.0
-        top, bottom, sigma_t, albedo, g = (
-            table[1, 0],
-            table[1, 1],
-            table[1, 2],
-            table[1, 3],
-            table[1, 4],
-        )
+        top = table[layer, 0]
+        bottom = table[layer, 1]
+        sigma_t = table[layer, 2]
+        albedo = table[layer, 3]
+        g = table[layer, 4]
         s0, s1, s2, s3, u = _draw(s0, s1, s2, s3)
         depth_left = -log(u)  # optical depth to the next collision
 
