@@ -237,7 +237,7 @@ class Rig:
             names = tuple(row.name for row in rows)
             checks.that(field, names, len(rows) > 0, "at least one")
             checks.that(
-                field, names, len({n.casefold() for n in names}) == len(names), "unlike names"
+                field, names, len({n.casefold() for n in names}) == len(names), "names that differ"
             )
         good = all(is_id(box) for box in self.boxes) and len(set(self.boxes)) == len(self.boxes)
         checks.that("boxes", self.boxes, good, f"names that differ, of {ID_RULE}")

@@ -45,6 +45,7 @@ _LETTERS = "RGB"
 _CFA, _LINEAR_RAW = 32803, 34892
 _ALIGNMENT = 64
 _CROP_PX = 8
+_HEAD_BYTES = 65_536
 # XYZ (D65) -> linear sRGB, IEC 61966-2-1: stands in the file where the camera's own is unknown
 _SRGB = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
 
@@ -165,12 +166,17 @@ def write_dng(path: str | Path, cfa: NDArray[np.uint16], **description: Any) -> 
     part.replace(target)
 
 
-def is_ours(tags: Directory) -> bool:
-    """Return whether the file was written by `encode_dng`."""
-    return 50706 in tags and NAMESPACE.encode() in tags.data(700)
+def is_ours(buffer: memoryview) -> bool:
+    """Return whether the file was written by `encode_dng`, even where a part of its head is hurt.
+
+    Two marks are looked for, so that a damaged file of ours is refused by our strict reader and
+    never guessed at by a lenient one (LibRaw knows some formats by nothing but the file's size).
+    """
+    head = bytes(buffer[:_HEAD_BYTES])
+    return NAMESPACE.encode() in head or f"{SOFTWARE}\0".encode() in head
 
 
-def decode_dng(buffer: memoryview, *, where: str = "", tags: Directory | None = None) -> RawFrame:
+def decode_dng(buffer: memoryview, *, where: str = "") -> RawFrame:
     """Return the frame of a DNG of ours; its pixels are a read-only view of ``buffer``.
 
     Raises
@@ -178,9 +184,8 @@ def decode_dng(buffer: memoryview, *, where: str = "", tags: Directory | None = 
     RawError
         Where the file is cut short, damaged in one bit of its pixels, or not of ours.
     """
-    if tags is None:
-        tags = Directory(buffer, where=where)
-    if not is_ours(tags):
+    tags = Directory(buffer, where=where)
+    if 50706 not in tags or NAMESPACE.encode() not in tags.data(700):
         raise _error("is not a DNG of skinrig", where, "XMP", "no skinrig namespace", NAMESPACE)
     words = _read_xmp(tags.data(700), where)
     pixels = _pixels(buffer, tags, words.get("pixels", ""), where)

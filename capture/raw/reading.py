@@ -55,10 +55,9 @@ def read(path: str | Path) -> RawFrame:
 
 def decode(buffer: memoryview, *, where: str = "") -> RawFrame:
     """Return the raw frame of a file's bytes; see `read`."""
-    tags = _tags(buffer, where)
-    if tags is not None and is_ours(tags):
-        return decode_dng(buffer, where=where, tags=tags)
-    return _foreign(buffer, tags, where)
+    if is_ours(buffer):
+        return decode_dng(buffer, where=where)
+    return _foreign(buffer, _tags(buffer, where), where)
 
 
 def _tags(buffer: memoryview, where: str) -> Directory | None:

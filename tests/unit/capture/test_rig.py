@@ -1,0 +1,158 @@
+"""Rig files: geometry, strictness, and messages that say everything at once."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from capture.rig import RigError, is_id, load_rig, rig_from_json
+
+
+@pytest.fixture
+def flash():
+    return load_rig("flash")
+
+
+@pytest.fixture
+def flash_json(flash):
+    return json.loads(json.dumps(flash.to_json()))
+
+
+def test_the_flashes_stand_fourteen_degrees_beside_the_camera(flash):
+    camera = np.array(flash.view("cam").position_mm)
+    for light in flash.lights:
+        position = np.array(light.position_mm)
+        cosine = camera @ position / np.linalg.norm(camera) / np.linalg.norm(position)
+        assert np.degrees(np.arccos(cosine)) == pytest.approx(14.0, abs=0.01)
+        assert np.linalg.norm(position) == pytest.approx(1000.0, rel=1e-3)
+
+
+def test_the_camera_sees_a_face_with_six_megapixels(flash):
+    view = flash.view("cam")
+    width_mm, height_mm = view.field_mm
+    assert (view.width_px, view.height_px) == (3024, 2016)
+    assert width_mm == pytest.approx(260, abs=2)
+    assert height_mm == pytest.approx(width_mm * 2016 / 3024)
+
+
+def test_image_axes_are_right_handed_with_x_right_y_up_and_z_to_the_camera(flash):
+    right, up, back = map(np.array, flash.view("cam").axes)
+    np.testing.assert_allclose((right, up, back), np.eye(3), atol=1e-15)
+
+
+@pytest.mark.parametrize("width_px", [16, 504, 1512, 3024])
+def test_a_resized_rig_keeps_its_field_of_view(flash, width_px):
+    small = flash.resized(width_px).view("cam")
+    assert small.field_mm[0] == pytest.approx(flash.view("cam").field_mm[0])
+    # whole even rows: the height is off by less than one row of the small image
+    row_mm = small.field_mm[1] / small.height_px
+    assert abs(small.field_mm[1] - flash.view("cam").field_mm[1]) <= row_mm
+    assert small.height_px % 2 == 0
+
+
+def test_a_rig_survives_its_json(flash, flash_json):
+    assert rig_from_json(flash_json) == flash
+
+
+def test_a_rig_is_frozen(flash):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        flash.recycle_s = 0.0
+
+
+def test_all_faults_of_a_file_are_listed_with_their_paths(tmp_path, flash):
+    file = tmp_path / "broken.toml"
+    text = (
+        'name = "flash"\nboxes = []\nwavelength = 3\n'
+        '[[lights]]\nname = "a"\nposition_mm = [0.0, 0.0]\npolarizer_axis_deg = 200\n'
+        "energy_ws = 1\nradius_mm = -1\n"
+        '[[lights]]\nname = "b"\nposition_mm = [0, 0, nan]\npolarizer_axis_deg = 20\n'
+        "energy_ws = 1\nradius_cm = 1\n"
+    )
+    file.write_text(text)
+    with pytest.raises(RigError) as caught:
+        load_rig(file)
+    message = str(caught.value)
+    assert message.startswith(str(file))
+    paths = {fault.path for fault in caught.value.faults}
+    assert {"wavelength", "views", "recycle_s", "lights[1].position_mm[2]"} <= paths
+    assert {"lights[0].position_mm[2]", "lights[1].radius_cm", "lights[1].radius_mm"} <= paths
+    assert "did you mean radius_mm? (x10)" in message
+
+
+@pytest.mark.parametrize(
+    ("wrong", "suggestion"),
+    [
+        ("pixel_nm", "did you mean pixel_um? (x0.001)"),
+        ("focal_m", "did you mean focal_mm? (x1000)"),
+        ("readout_ms", "did you mean readout_s? (x0.001)"),
+        ("focal", "did you mean focal_mm? (in mm)"),
+        ("f_numbr", "did you mean f_number?"),
+        ("analyser_axis_rad", "did you mean analyser_axis_deg? (x57.2958)"),
+    ],
+)
+def test_a_near_miss_is_suggested_with_its_factor(flash_json, wrong, suggestion):
+    flash_json["views"][0][wrong] = 1.0
+    with pytest.raises(RigError) as caught:
+        rig_from_json(flash_json, where="some.toml")
+    assert suggestion in str(caught.value)
+    assert f"views[0].{wrong}" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "expected"),
+    [
+        ("cfa", "RGBG", "RGGB"),
+        ("width_px", 3025, "even"),
+        ("width_px", 10**9, "65535"),
+        ("black_level", 20_000, "white_level"),
+        ("white_level", 70_000, "<= 16383"),
+        ("focal_mm", 0.0, "> 0"),
+        ("focal_mm", "87", "number"),
+        ("up", [0.0, 0.0, 1.0], "optical axis"),
+        ("name", "../cam", "A-Z"),
+        ("full_well_e", float("inf"), "finite"),
+        ("readout_s", True, "number"),
+    ],
+)
+def test_a_value_out_of_range_is_named(flash_json, field, value, expected):
+    flash_json["views"][0][field] = value
+    with pytest.raises(RigError) as caught:
+        rig_from_json(flash_json)
+    assert [fault.path for fault in caught.value.faults] == [f"views[0].{field}"] or (
+        field == "black_level" and caught.value.faults[0].path == "views[0].white_level"
+    )
+    assert expected in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [(b"name = [", "is not TOML"), (b"\xff\xfe", "is not TOML"), (b"", "faults")],
+)
+def test_a_file_that_is_not_a_rig_gives_one_error(tmp_path, content, reason):
+    file = tmp_path / "rig.toml"
+    file.write_bytes(content)
+    with pytest.raises(RigError, match=reason):
+        load_rig(file)
+
+
+def test_unknown_names_are_answered_with_the_known_ones(flash):
+    with pytest.raises(RigError, match="did you mean flash"):
+        load_rig("flahs")
+    with pytest.raises(RigError, match="no such file"):
+        load_rig("nowhere/rig.toml")
+    with pytest.raises(RigError, match="did you mean cam"):
+        flash.view("camm")
+    with pytest.raises(RigError, match="left, right"):
+        flash.light("top")
+
+
+def test_two_lights_of_one_name_are_refused(flash_json):
+    flash_json["lights"][1]["name"] = "LEFT"
+    with pytest.raises(RigError, match="names that differ"):
+        rig_from_json(flash_json)
+
+
+@pytest.mark.parametrize("text", ["", ".", "..", "a/b", "a\\b", "a b", "ä", "x" * 65, "a+b", "a@b"])
+def test_an_id_can_never_leave_its_folder(text):
+    assert not is_id(text)
