@@ -21,7 +21,8 @@ FloatArray = NDArray[np.float64]
 _SERIES_TERMS = 9  # cosh(1) to 1e-16
 _CHUNK = 2048  # layers per batch: a few MB
 _MAX_DOUBLINGS = 60  # 1e18 starting layers: even without absorption nothing comes through
-_TRAPPED = 1e-14
+_SERIES_END = 1e-12  # Legendre moment at which the phase function's series ends
+_TRAPPED = 1e-14  # share that total reflection loses, see quadrature
 _OPAQUE = 1e-13  # transmittance at which a layer counts as semi-infinite
 
 
@@ -35,8 +36,6 @@ class Quadrature:
     """Weights of the integral over mu from 0 to 1, shape (n,)."""
     surface: FloatArray
     """Fresnel reflectance of the surface from inside, shape (n,)."""
-    orders: int
-    """Legendre orders that the weights integrate exactly, so that no energy is lost."""
 
 
 def reflectance(
@@ -79,8 +78,7 @@ def reflectance(
     References
     ----------
     van de Hulst 1980, Multiple Light Scattering; Prahl 1995, in Optical-Thermal Response of
-    Laser-Irradiated Tissue, doi:10.1007/978-1-4757-6092-7_5; Wiscombe 1977 (delta-M),
-    doi:10.1175/1520-0469(1977)034<1408:TDMRYA>2.0.CO;2.
+    Laser-Irradiated Tissue, doi:10.1007/978-1-4757-6092-7_5.
 
     Examples
     --------
@@ -104,9 +102,10 @@ def reflectance(
         owner[inverse.ravel()] = np.arange(stack.shape[0])
         index = _index_of(stack, layer, layers, owner)
         result = np.empty((rows.shape[0], rule.mu.size, rule.mu.size))
+        phase = _phase_matrices(float(eta), int(directions), float(g[layer]))
         for start in range(0, rows.shape[0], _CHUNK):
             part = slice(start, start + _CHUNK)
-            r, t = _layer(rows[part, 0], rows[part, 1], rows[part, 2], rule, float(g[layer]))
+            r, t = _layer(rows[part, :3], rule, float(g[layer]), phase)
             lower = np.diag(rule.surface)[None] if below is None else below[index[part]]
             result[part] = _add(r, t, np.broadcast_to(lower, r.shape))
         below, below_rows = result, inverse.ravel().astype(np.intp)
@@ -123,7 +122,6 @@ def quadrature(eta: float, directions: int) -> Quadrature:
     mu_c = np.sqrt(1.0 - 1.0 / eta**2)
     if mu_c < 1e-3:  # matched: a single range
         mu, weight = _radau(directions)
-        orders = 2 * directions - 2
     else:
         half = directions // 2
         node, node_weight = legendre.leggauss(half)
@@ -132,10 +130,9 @@ def quadrature(eta: float, directions: int) -> Quadrature:
         s, s_weight = _radau(half)
         mu = np.concatenate([0.5 * mu_c * (node + 1.0), mu_c + (1.0 - mu_c) * s**2])
         weight = np.concatenate([0.5 * mu_c * node_weight, 2.0 * (1.0 - mu_c) * s * s_weight])
-        orders = half - 1
     # Total reflection loses 1e-14, else light trapped in a clear slab makes a singular matrix.
     surface = np.minimum(fresnel.reflectance(mu, 1.0 / eta), 1.0 - _TRAPPED)
-    return Quadrature(mu, weight, surface, orders)
+    return Quadrature(mu, weight, surface)
 
 
 def _radau(count: int) -> tuple[FloatArray, FloatArray]:
@@ -162,16 +159,17 @@ def _index_of(
 
 
 def _layer(
-    sigma_a: FloatArray,
-    sigma_s_prime: FloatArray,
-    thickness: FloatArray,
+    properties: FloatArray,
     rule: Quadrature,
     anisotropy: float,
+    phase: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the matrices (r, t) of homogeneous layers without surfaces, shape (n, m, m)."""
+    """Return the matrices (r, t) of homogeneous layers without surfaces, shape (n, m, m).
+
+    `properties` holds sigma_a, sigma_s' and the thickness, shape (n, 3).
+    """
+    sigma_a, sigma_s_prime, thickness = properties.T
     sigma_s = sigma_s_prime / (1.0 - anisotropy)
-    cut = anisotropy**rule.orders if anisotropy else 0.0  # delta-M
-    sigma_s = sigma_s * (1.0 - cut)
     sigma_t = sigma_a + sigma_s
     empty = sigma_t <= 0.0
     albedo = np.where(empty, 0.0, sigma_s / np.where(empty, 1.0, sigma_t))
@@ -184,7 +182,7 @@ def _layer(
     doublings = np.minimum(doublings, _MAX_DOUBLINGS)
     doublings = np.where(infinite, _MAX_DOUBLINGS, doublings)
     first = np.where(infinite, tau, tau / np.exp2(doublings))
-    r, t = _thin_layer(albedo, first, rule, anisotropy, cut)
+    r, t = _thin_layer(albedo, first, rule, phase)
     identity = np.eye(rule.mu.size)
     for step in range(int(doublings.max(initial=0))):
         active = np.flatnonzero((doublings > step) & (np.max(t, axis=(1, 2)) > _OPAQUE))
@@ -199,7 +197,10 @@ def _layer(
 
 
 def _thin_layer(
-    albedo: FloatArray, tau: FloatArray, rule: Quadrature, anisotropy: float, cut: float
+    albedo: FloatArray,
+    tau: FloatArray,
+    rule: Quadrature,
+    phase: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
     """Solve the discrete transport equation exactly for layers of tau <= 2 mu_min.
 
@@ -210,7 +211,7 @@ def _thin_layer(
     """
     mu, weight = rule.mu, rule.weight
     half = 0.5 * tau[:, None, None]
-    even, odd = _phase_matrices(rule, anisotropy, cut)
+    even, odd = phase
     scatter = albedo[:, None, None] / mu[:, None]
     inverse_mu = np.diag(1.0 / mu)
     y = half * (inverse_mu - scatter * (even * weight))
@@ -223,16 +224,26 @@ def _thin_layer(
     return 0.5 * (plus + minus), 0.5 * (plus - minus)
 
 
+@lru_cache(maxsize=32)
 def _phase_matrices(
-    rule: Quadrature, anisotropy: float, cut: float
+    eta: float, directions: int, anisotropy: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the even and the odd part of the azimuthally averaged phase function, (m, m)."""
-    orders = np.arange(rule.orders if anisotropy else 1)
-    moment = (float(anisotropy) ** orders - cut) / (1.0 - cut)  # 0**0 = 1
-    basis = legendre.legvander(rule.mu, orders[-1]) * np.sqrt((2.0 * orders + 1.0) * moment)
-    even = basis[:, orders % 2 == 0]
-    odd = basis[:, orders % 2 == 1]
-    return even @ even.T, odd @ odd.T
+    """Return the sum and difference of forward and backward phase function, halved, (m, m).
+
+    The Henyey-Greenstein function is averaged over azimuth by its whole Legendre series. What the
+    quadrature misses of its forward peak stays in the direction it came from, so that no energy is
+    lost; this takes the place of delta-M, whose cut series is wrong for light that is scattered
+    once, and that is what strongly absorbing skin returns.
+    """
+    rule = quadrature(eta, directions)
+    count = 1 if anisotropy == 0.0 else int(np.ceil(np.log(_SERIES_END) / np.log(anisotropy))) + 1
+    order = np.arange(count)
+    basis = legendre.legvander(rule.mu, count - 1)
+    basis = basis * np.sqrt((2.0 * order + 1.0) * anisotropy**order)  # 0**0 = 1
+    even = basis[:, ::2] @ basis[:, ::2].T
+    odd = basis[:, 1::2] @ basis[:, 1::2].T
+    peak = np.diag((1.0 - even @ rule.weight) / rule.weight)
+    return even + peak, odd + peak
 
 
 def _hyperbolic_series(z: FloatArray) -> tuple[FloatArray, FloatArray]:

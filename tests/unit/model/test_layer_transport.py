@@ -104,6 +104,22 @@ def test_a_half_space_without_absorption_returns_all_that_enters(tier, eta):
     assert ours == pytest.approx(1.0 - fresnel.normal_reflectance(eta), abs=2e-6)
 
 
+def test_forward_scattering_converges_as_stated():
+    # Skin at 400, 550 and 700 nm and C_m = 0.5, where light scatters once or twice before it ends.
+    sigma_a = np.array([[70.0, 5.0], [25.0, 0.8], [8.5, 0.1]])
+    stack = sigma_a, [9.0, 4.5], [0.25, np.inf]
+    limit = layer_stack_reflectance(*stack, anisotropy=0.8, directions=48)
+    for directions, error in ((12, 1.6e-3), (16, 3e-4), (20, 7e-5), (24, 1.5e-5)):
+        ours = layer_stack_reflectance(*stack, anisotropy=0.8, directions=directions)
+        np.testing.assert_allclose(ours, limit, rtol=error)
+
+
+@pytest.mark.parametrize("anisotropy", [0.5, 0.8, 0.95])
+def test_forward_scattering_loses_no_energy(anisotropy):
+    ours = layer_stack_reflectance([0.0], [4.0], [np.inf], anisotropy=anisotropy)
+    assert ours == pytest.approx(1.0 - fresnel.normal_reflectance(1.4), abs=2e-6)
+
+
 @pytest.mark.parametrize("tier", TIERS)
 @pytest.mark.parametrize(
     ("sigma_a", "thickness"), [(0.0, np.inf), (0.0, 1.0), (2.0, np.inf), (2.0, 0.5)]
