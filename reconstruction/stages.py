@@ -61,6 +61,8 @@ class Outcome:
     """Stages that nothing wanted needs, each with the reason."""
     keys: Mapping[str, str]
     """Input hash of each stage that was needed."""
+    assumed: tuple[str, ...] = ()
+    """What was taken for granted for want of a calibration."""
 
 
 def order(stages: Sequence[Stage], want: Iterable[str]) -> list[Stage]:

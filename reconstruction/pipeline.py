@@ -1,0 +1,421 @@
+"""Sessions and calibrations to maps: computes what is wanted, and records what it assumed."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture import raw
+from capture.calibration import store as calibration_store
+from capture.calibration.color import ColorMatrix
+from capture.calibration.color import from_calibration as color_matrix_from
+from capture.calibration.polarization import PolarizationCalibration
+from capture.calibration.white import WhiteReference
+from capture.session import Session
+from model import color_table, store
+from model.skin import UNITS, SkinAppearance, SkinMap
+from reconstruction import chromophores, model_error, polarization, stages, tsumura
+
+REVISION = 1
+"""Grows when the code of a stage changes its result, so that older maps are computed again."""
+
+Float32 = NDArray[np.float32]
+
+
+class PipelineError(ValueError):
+    """A session that cannot be reconstructed as asked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """Linear light on superpixels: rgb and variance (H, W, 3), valid (H, W)."""
+
+    rgb: Float32
+    variance: Float32
+    valid: NDArray[np.bool_]
+
+
+@dataclass(slots=True)
+class Inputs:
+    """What a reconstruction reads, and what it has to assume for want of a calibration."""
+
+    session: Session
+    state: str
+    white: WhiteReference | None
+    polarization: PolarizationCalibration | None
+    color: ColorMatrix | None
+    neutral: NDArray[np.float64] | None
+    """Camera RGB of a white surface, as the color matrix was fitted to."""
+    camera: str
+    """Name of the spectral sensitivities that the color table is built for."""
+    illuminant: str
+    assumed: list[str] = field(default_factory=list)
+    hashes: dict[str, str] = field(default_factory=dict)
+
+
+MAPS = (
+    "melanin", "hemoglobin", "shading", "residual", "gamut_distance",
+    "diffuse", "specular", "picture", "specular_picture",
+    "tsumura_melanin", "tsumura_hemoglobin",
+)  # fmt: skip
+"""Maps that :func:`reconstruct` can make of a flash session."""
+
+
+def reconstruct(
+    session: str | Path,
+    *,
+    want: Sequence[str],
+    out: str | Path,
+    calibration: str | Path | None = None,
+    state: str = "neutral",
+    on_date: date | None = None,
+    truth: str = "",
+    progress: Callable[[str], None] | None = None,
+) -> stages.Outcome:
+    """Make the wanted maps of a session and write them to an APPEARANCE/ folder.
+
+    Parameters
+    ----------
+    session
+        SESSION/ folder, of the flash rig or of imported photographs.
+    want
+        Names out of :data:`MAPS`.
+    out
+        The folder. Maps in it that are still current, by the hash of all that they depend on,
+        are kept and not computed again.
+    calibration
+        CALIBRATION/ folder; without it assumptions take its place and are recorded.
+    state
+        Which state of the subject.
+    on_date
+        The date the calibrations must be valid on; None: that of the session.
+    truth
+        Name of the TRUTH/ folder beside ``out``, for the report.
+    progress
+        Called with one line before each stage that runs.
+
+    Returns
+    -------
+    stages.Outcome
+        With what ran, what was reused, and what was left out and why.
+
+    Raises
+    ------
+    PipelineError, stages.StageError, SessionError, CalibrationError
+        When frames are missing, a wanted map is unknown, or a file is damaged, of another rig
+        or out of date.
+    """
+    if not want:
+        raise PipelineError(f"want: got nothing, expected names out of {', '.join(MAPS)}")
+    opened = Session.open(session)
+    inputs = _inputs(opened, calibration, state, on_date)
+    graph = _graph(inputs)
+    previous = _previous(Path(out))
+    outcome = stages.run(graph, list(want), cache=_Kept(graph, previous), progress=progress)
+    outcome = replace(outcome, assumed=tuple(inputs.assumed))
+    if not outcome.ran and previous is not None and set(want) <= set(previous.maps):
+        return outcome
+    keys = _all_keys(graph)
+    maps = {name: outcome.products[name] for name in want}
+    if previous is not None:
+        recorded = _recorded_keys(previous)
+        for stage in graph:
+            if recorded.get(stage.name) == keys[stage.name]:
+                for name in stage.makes:
+                    if name in previous.maps:
+                        maps.setdefault(name, previous.maps[name])
+    appearance = SkinAppearance(
+        maps=maps,
+        source=opened.source,
+        parameters={
+            "kind": "appearance",
+            "session": Path(session).name,
+            "state": state,
+            "truth": truth,
+            "stages": {stage.name: keys[stage.name] for stage in graph},
+            "assumed": inputs.assumed,
+            "color_table": {"camera": inputs.camera, "illuminant": inputs.illuminant},
+        },
+        inputs=inputs.hashes,
+        versions=dict(opened.manifest.versions),
+        left_out=outcome.left_out,
+        seed=opened.seed,
+    )
+    store.write(out, appearance)
+    return outcome
+
+
+def _inputs(
+    session: Session, calibration: str | Path | None, state: str, on_date: date | None
+) -> Inputs:
+    rig, view = session.rig, session.rig.views[0]
+    when = on_date or session.manifest.created_at.date()
+    assumed = [str(text) for text in session.manifest.extra.get("assumed", [])]
+    hashes = {"session": session.content_hash}
+
+    def load(kind: str, otherwise: str) -> calibration_store.Calibration | None:
+        if calibration is not None:
+            try:
+                found = calibration_store.load(calibration, kind)
+            except calibration_store.CalibrationMissing:
+                pass
+            else:
+                calibration_store.require(
+                    found, rig=rig.name, serials=[view.serial], on_date=when, kind=kind
+                )
+                path = Path(calibration) / f"{kind}.json"
+                hashes[f"calibration {kind}"] = hashlib.sha256(path.read_bytes()).hexdigest()
+                return found
+        assumed.append(otherwise)
+        return None
+
+    imported = "photographs" in session.manifest.extra
+    white = load(
+        "white",
+        "the light is even and white is what the file's own white balance says"
+        if imported
+        else "the light is even and a white tile would fill 80 % of the range",
+    )
+    malus = load("polarization", "the polarizers are perfect")
+    matrix = load("color", "pictures show balanced camera RGB as if it were linear sRGB")
+    return Inputs(
+        session=session,
+        state=state,
+        white=WhiteReference.from_calibration(white, view.serial) if white else None,
+        polarization=PolarizationCalibration.from_calibration(malus, view.serial)
+        if malus
+        else None,
+        color=color_matrix_from(matrix, view.serial) if matrix else None,
+        neutral=matrix.quantity(view.serial, "white_rgb").value if matrix else None,
+        camera=view.spectral_sensitivity,
+        illuminant=rig.lights[0].illuminant,
+        assumed=assumed,
+        hashes=hashes,
+    )
+
+
+def _graph(inputs: Inputs) -> list[stages.Stage]:
+    base = {"revision": REVISION, "inputs": dict(sorted(inputs.hashes.items()))}
+    table = base | {"camera": inputs.camera, "illuminant": inputs.illuminant}
+    return [
+        stages.Stage(
+            "frames", (), ("parallel", "crossed"), lambda: _frames(inputs),
+            base | {"state": inputs.state},
+        ),
+        stages.Stage(
+            "separation", ("parallel", "crossed"), ("diffuse", "specular"),
+            lambda parallel, crossed: _separate(inputs, parallel, crossed), base,
+        ),
+        stages.Stage(
+            "chromophores", ("diffuse",),
+            ("melanin", "hemoglobin", "shading", "residual", "gamut_distance"),
+            lambda diffuse: _chromophores(inputs, diffuse), table | model_error.identity(),
+        ),
+        stages.Stage(
+            "tsumura", ("diffuse",), ("tsumura_melanin", "tsumura_hemoglobin"),
+            lambda diffuse: _tsumura(diffuse), base,
+        ),
+        stages.Stage(
+            "pictures", ("diffuse", "specular"), ("picture", "specular_picture"),
+            lambda diffuse, specular: _pictures(inputs, diffuse, specular), table,
+        ),
+    ]  # fmt: skip
+
+
+def _frames(inputs: Inputs) -> Mapping[str, Any]:
+    """Average the repeats of each polarizer state and subtract the darks."""
+    session = inputs.session
+    darks = [raw.linear_rgb(session.read(record)) for record in session.frames("dark")]
+    dark = np.mean([d.rgb for d in darks], axis=0, dtype=np.float64) if darks else 0.0
+    dark_variance = (
+        np.mean([d.variance for d in darks], axis=0, dtype=np.float64) / len(darks)
+        if darks
+        else 0.0
+    )
+    images: dict[str, Image | None] = {}
+    for polarizer in ("parallel", "crossed"):
+        shots = session.frames("subject", state=inputs.state, polarizer=polarizer)
+        linear = [raw.linear_rgb(session.read(record)) for record in shots]
+        if not linear:
+            images[polarizer] = None
+            continue
+        if any(image.rgb.shape != linear[0].rgb.shape for image in linear):
+            raise PipelineError(f"{polarizer} frames: differ in size, expected one camera setting")
+        power = [float(record.settings.get("power", 1.0)) for record in shots]
+        total = sum(power)
+        rgb = sum(image.rgb.astype(np.float64) for image in linear) - len(linear) * dark
+        variance = sum(image.variance.astype(np.float64) for image in linear)
+        variance = variance + len(linear) ** 2 * dark_variance
+        images[polarizer] = Image(
+            (rgb / total).astype(np.float32),
+            (variance / total**2).astype(np.float32),
+            np.logical_and.reduce([image.valid for image in linear]),
+        )
+    if images["crossed"] is None:
+        states = sorted({str(r.index.get("state")) for r in session.frames("subject")})
+        raise PipelineError(
+            f"session {session.id}: has no crossed frame of state {inputs.state!r}; "
+            f"it has the states {', '.join(states) or 'none'}"
+        )
+    return images
+
+
+def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping[str, SkinMap]:
+    """Split into diffuse and specular light, relative to a white tile in the same place."""
+    white = inputs.white
+    if parallel is None:
+        diffuse = Image(2 * crossed.rgb, 4 * crossed.variance, crossed.valid)
+        specular = np.zeros_like(crossed.rgb)
+        specular_error = np.zeros_like(crossed.rgb)
+        specular_valid = np.zeros(crossed.valid.shape, bool)
+    else:
+        leak = inputs.polarization.crossed_leak() if inputs.polarization is not None else None
+        separated = polarization.separate(
+            np.where(parallel.valid[..., None], parallel.rgb, np.nan),
+            np.where(crossed.valid[..., None], crossed.rgb, np.nan),
+            extinction=None if leak is None else 1.0 / np.maximum(leak, 1e-9),
+            variance=(parallel.variance, crossed.variance),
+        )
+        specular, specular_error = separated.specular, separated.stderr_specular
+        specular_valid = np.asarray(separated.valid)
+        # a highlight that saturates the parallel image leaves the crossed one usable
+        alone = crossed.valid & ~specular_valid
+        rgb = np.where(alone[..., None], 2 * crossed.rgb, separated.diffuse)
+        variance = np.where(alone[..., None], 4 * crossed.variance, np.square(separated.stderr))
+        diffuse = Image(rgb, variance, crossed.valid)
+    if white is not None:
+        reflectance, variance, valid = white.balance(diffuse.rgb, variance=diffuse.variance)
+        level = white.signal
+    else:
+        level = np.full_like(diffuse.rgb, _assumed_white(inputs))
+        reflectance, variance = diffuse.rgb / level, diffuse.variance / level**2
+        valid = np.ones(diffuse.valid.shape, bool)
+    valid = valid & diffuse.valid
+    return {
+        "diffuse": _map3(reflectance, np.sqrt(variance), valid, "white tile in its place = 1"),
+        "specular": _map3(
+            specular / level, specular_error / level, specular_valid & valid,
+            "specular light over that of a white tile",
+        ),
+    }  # fmt: skip
+
+
+ASSUMED_WHITE = 0.8
+"""Share of the range that a white tile is taken to fill when no white reference is at hand."""
+
+
+def _assumed_white(inputs: Inputs) -> Float32:
+    record = inputs.session.frames("subject")[0]
+    neutral = inputs.session.read(record).neutral
+    level = np.full(3, ASSUMED_WHITE)
+    if neutral is not None:
+        level = ASSUMED_WHITE * np.asarray(neutral, float) / max(neutral)
+    return level.astype(np.float32)
+
+
+def _map3(
+    values: NDArray[Any], stderr: NDArray[Any], valid: NDArray[np.bool_], description: str
+) -> SkinMap:
+    good = valid & np.isfinite(values).all(axis=-1) & np.isfinite(stderr).all(axis=-1)
+    keep = good[..., None]
+    return SkinMap(
+        np.where(keep, values, 0.0), "1", np.where(keep, stderr, 0.0), good,
+        f"camera RGB, {description}",
+    )  # fmt: skip
+
+
+def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
+    table = color_table.build(inputs.camera, inputs.illuminant)
+    found = chromophores.invert(
+        np.where(diffuse.valid[..., None], diffuse.values, np.nan),
+        table,
+        variance=np.square(diffuse.stderr),
+        model_error=model_error.load(),
+    )
+    good = np.asarray(found.valid)
+
+    def chromophore(name: str, values: NDArray[Any], stderr: NDArray[Any]) -> SkinMap:
+        return SkinMap(
+            np.where(good, values, 0.0), UNITS.get(name, "1"), np.where(good, stderr, 0.0), good
+        )
+
+    return {
+        "melanin": chromophore("melanin", found.melanin, found.stderr_melanin),
+        "hemoglobin": chromophore("hemoglobin", found.hemoglobin, found.stderr_hemoglobin),
+        "shading": SkinMap(np.where(good, found.shading, 0.0), "1", valid=good),
+        "residual": SkinMap(np.where(good, found.residual, 0.0), "1", valid=good),
+        "gamut_distance": SkinMap(
+            np.nan_to_num(found.gamut_distance), "1",
+            description="how far the color lies outside the model's, relative",
+        ),
+    }  # fmt: skip
+
+
+def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:
+    valid = diffuse.valid & (diffuse.values > 0).all(axis=-1)
+    found = tsumura.tsumura_ica(diffuse.values, valid)
+    note = "independent component of optical density, no absolute scale"
+    return {
+        f"tsumura_{name}": SkinMap(
+            np.where(found.valid, getattr(found, name), 0.0), "1", valid=found.valid,
+            description=note,
+        )
+        for name in ("melanin", "hemoglobin")
+    }  # fmt: skip
+
+
+def _pictures(inputs: Inputs, diffuse: SkinMap, specular: SkinMap) -> Mapping[str, SkinMap]:
+    """Show diffuse and specular light in linear sRGB."""
+    picture = diffuse.values.astype(np.float64)
+    if inputs.color is not None and inputs.neutral is not None:
+        picture = inputs.color.to_linear_srgb(picture * inputs.neutral)
+    return {
+        "picture": SkinMap(picture.astype(np.float32), "1", valid=diffuse.valid),
+        "specular_picture": SkinMap(specular.values, "1", valid=specular.valid),
+    }
+
+
+class _Kept:
+    """Finished maps in an older APPEARANCE/ folder, by the hash of their stage."""
+
+    def __init__(self, graph: Sequence[stages.Stage], previous: SkinAppearance | None) -> None:
+        self._by_key: dict[str, Mapping[str, SkinMap]] = {}
+        if previous is None:
+            return
+        recorded = _recorded_keys(previous)
+        for stage in graph:
+            kept = {name: previous.maps[name] for name in stage.makes if name in previous.maps}
+            if stage.name in recorded and len(kept) == len(stage.makes):
+                self._by_key[recorded[stage.name]] = kept
+
+    def load(self, key: str) -> Mapping[str, Any] | None:
+        return self._by_key.get(key)
+
+    def save(self, key: str, products: Mapping[str, Any]) -> None:
+        """Nothing: the finished folder is what is kept."""
+
+
+def _previous(out: Path) -> SkinAppearance | None:
+    if not (out / store.DOCUMENT).is_file():
+        return None
+    return store.read(out)
+
+
+def _recorded_keys(appearance: SkinAppearance) -> dict[str, str]:
+    recorded = appearance.parameters.get("stages", {})
+    return {str(k): str(v) for k, v in recorded.items()} if isinstance(recorded, dict) else {}
+
+
+def _all_keys(graph: Sequence[stages.Stage]) -> dict[str, str]:
+    made_by = {product: stage.name for stage in graph for product in stage.makes}
+    keys: dict[str, str] = {}
+    for stage in stages.order(graph, [p for s in graph for p in s.makes]):
+        keys[stage.name] = stages.input_hash(stage, [keys[made_by[p]] for p in stage.needs])
+    return keys

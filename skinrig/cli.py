@@ -1,0 +1,367 @@
+"""The command line: each command parses, calls one function, prints what it did."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from skinrig import errors
+from skinrig.console import Console
+
+app = typer.Typer(
+    name="skinrig",
+    help="Acquisition and calibration of skin appearance, with rigs that can be simulated.",
+    epilog="Begin with: skinrig demo",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=True,
+    rich_markup_mode=None,
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
+Seed = Annotated[int, typer.Option(help="Seed of everything that is drawn.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder to write.")]
+
+
+def _version(shown: bool) -> None:
+    if shown:
+        from importlib.metadata import version
+
+        typer.echo(f"skinrig {version('skinrig')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which one.")
+    ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Log details to stderr.")] = False,
+) -> None:
+    logging.basicConfig(
+        stream=sys.stderr,
+        level=logging.INFO if verbose else logging.WARNING,
+        format="%(levelname)s %(name)s: %(message)s",
+    )
+
+
+@app.command()
+def demo(
+    out: Out = Path("demo"),
+    rigs: Annotated[str, typer.Option(help="Which rigs, separated by commas.")] = "flash",
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Simulate, capture, calibrate, reconstruct and report, small; the place to begin.
+
+    Example: skinrig demo --out demo
+    """
+    from skinrig.demo import run_demo
+
+    console = Console(json)
+    console.document("skinrig.demo/1", run_demo(out, rigs.split(","), seed=seed, console=console))
+
+
+@app.command()
+def simulate(
+    rig: Annotated[str, typer.Argument(help="Name of a rig: flash.")],
+    out: Out,
+    size: Annotated[str, typer.Option(help="small or full.")] = "small",
+    seed: Seed = 0,
+    subject: Annotated[str, typer.Option(help="Preset, I to VI, palest or darkest.")] = "III",
+    mesh: Annotated[Path | None, typer.Option(help="Face mesh, .npz or .obj.")] = None,
+    target: Annotated[
+        str | None,
+        typer.Option(help="A target instead of a face: white, chart, flat, dark, malus."),
+    ] = None,
+    state: Annotated[list[str] | None, typer.Option(help="State of the face; repeatable.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
+    json: Json = False,
+) -> None:
+    """Capture a simulated subject or target through the real drivers into SESSION/.
+
+    Example: skinrig simulate flash --out session-flash --subject IV
+    """
+    from skinrig.simulation import simulate_session
+
+    console = Console(json)
+    done = simulate_session(
+        rig, out, size=size, seed=seed, subject=subject, mesh=mesh, target=target,
+        states=tuple(state or ("neutral",)), resume=resume, progress=console.progress,
+    )  # fmt: skip
+    console.say(
+        f"{done.session}: {done.frames} frames" + (f", truth in {done.truth}" if done.truth else "")
+    )
+    console.say(f"next: skinrig reconstruct {out} --want melanin,hemoglobin --out appearance")
+    console.document("skinrig.simulate/1", done.document())
+
+
+@app.command()
+def capture(
+    rig: Annotated[str, typer.Argument(help="Name of a rig, or its TOML file.")],
+    out: Out,
+    port: Annotated[list[str] | None, typer.Option(help="Box: NAME=URL; repeatable.")] = None,
+    camera: Annotated[list[str] | None, typer.Option(help="Camera: VIEW=URL; repeatable.")] = None,
+    plan: Annotated[Path | None, typer.Option(help="Plan, JSON; default: the rig's own.")] = None,
+    target: Annotated[str | None, typer.Option(help="Plan of a calibration target.")] = None,
+    subject: Annotated[str, typer.Option(help="Pseudonym of the subject.")] = "anonymous",
+    consent: Annotated[str, typer.Option(help="Scopes the subject agreed to, by commas.")] = "",
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print the plan.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
+    json: Json = False,
+) -> None:
+    """Run a plan on a rig: real, or served by `skinrig serve`.
+
+    Example: skinrig capture flash --port flash=/dev/ttyUSB0 --camera cam=hotfolder:incoming
+    --out session
+    """
+    from skinrig.acquisition import capture_session
+
+    console = Console(json)
+    done = capture_session(
+        rig, out, ports=port or [], cameras=camera or [], plan=plan, target=target,
+        pseudonym=subject, consent=tuple(filter(None, consent.split(","))), dry_run=dry_run,
+        resume=resume, console=console,
+    )  # fmt: skip
+    console.document("skinrig.capture/1", done)
+
+
+@app.command()
+def serve(
+    rig: Annotated[str, typer.Argument(help="Name of a rig.")],
+    pty: Annotated[bool, typer.Option("--pty", help="Boxes on a pseudo terminal.")] = False,
+    tcp: Annotated[str, typer.Option(help="Address for boxes and cameras.")] = "127.0.0.1:0",
+    anywhere: Annotated[
+        bool, typer.Option("--allow-remote", help="Let other machines connect.")
+    ] = False,
+    subject: Annotated[str, typer.Option(help="Preset of the simulated face.")] = "III",
+    size: Annotated[str, typer.Option(help="small or full.")] = "small",
+    seed: Seed = 0,
+) -> None:
+    """Serve a simulated rig to any client; the first lines are the addresses.
+
+    Example: skinrig serve flash --pty
+    """
+    from skinrig.serving import serve_rig
+
+    serve_rig(rig, pty=pty, tcp=tcp, allow_remote=anywhere, subject=subject, size=size, seed=seed)
+
+
+@app.command()
+def calibrate(
+    kind: Annotated[str, typer.Argument(help="sensor, color, polarization or white.")],
+    sessions: Annotated[list[Path], typer.Argument(help="Sessions of the target.")],
+    out: Out = Path("calibration"),
+    json: Json = False,
+) -> None:
+    """Make a calibration from sessions of a target and say how it drifted.
+
+    Example: skinrig calibrate sensor session-flat --out calibration
+    """
+    from datetime import date
+
+    from skinrig.calibrating import calibrate as make
+
+    console = Console(json)
+    done = make(kind, sessions, out, created=date.today())
+    console.rows(("quantity", "value"), done.summary)
+    for change in done.drift:
+        console.say(f"drift: {change}")
+    console.say(f"{done.path}: valid until {done.calibration.valid_until}")
+    console.document(
+        "skinrig.calibrate/1",
+        {"path": done.path, "values": dict(done.summary), "drift": [str(d) for d in done.drift]},
+    )
+
+
+import_app = typer.Typer(help="Bring in what other devices made.", no_args_is_help=True)
+app.add_typer(import_app, name="import")
+
+
+@import_app.command("photos")
+def import_photos(
+    directory: Annotated[Path, typer.Argument(help="Folder of photographs, or one file.")],
+    out: Out,
+    json: Json = False,
+) -> None:
+    """Turn RAW, TIFF, EXR, PNG or JPEG photographs into a session.
+
+    Example: skinrig import photos portraits --out session-portraits
+    """
+    from capture import importers
+
+    console = Console(json)
+    done = importers.import_photos(directory, out=out)
+    for text in done.assumed:
+        console.say(f"assumed: {text}")
+    console.say(f"{done.path}: {done.frames} photographs")
+    console.say(f"next: skinrig reconstruct {out} --want melanin,hemoglobin --out appearance")
+    console.document(
+        "skinrig.import/1", {"path": done.path, "frames": done.frames, "assumed": done.assumed}
+    )
+
+
+@app.command()
+def reconstruct(
+    session: Annotated[Path, typer.Argument(help="SESSION/ folder.")],
+    want: Annotated[str, typer.Option(help="Maps, separated by commas.")],
+    out: Out,
+    calibration: Annotated[Path | None, typer.Option(help="CALIBRATION/ folder.")] = None,
+    state: Annotated[str, typer.Option(help="State of the subject.")] = "neutral",
+    json: Json = False,
+) -> None:
+    """Make maps of a session; computes only what is wanted and not there yet.
+
+    Example: skinrig reconstruct session --want melanin,hemoglobin --out appearance
+    """
+    from reconstruction import pipeline
+    from skinrig.demo import truth_beside
+
+    console = Console(json)
+    truth = truth_beside(session)
+    done = pipeline.reconstruct(
+        session, want=[w.strip() for w in want.split(",") if w.strip()], out=out,
+        calibration=calibration, state=state, progress=console.progress,
+        truth=truth.name if truth else "",
+    )  # fmt: skip
+    for text in done.assumed:
+        console.say(f"assumed: {text}")
+    console.say(f"run: {', '.join(done.ran) or 'nothing'}")
+    console.say(f"reused: {', '.join(done.reused) or 'nothing'}")
+    for what, why in done.left_out:
+        console.say(f"left out: {what} ({why})")
+    console.say(f"next: skinrig report {out}")
+    console.document(
+        "skinrig.reconstruct/1",
+        {"path": out, "ran": done.ran, "reused": done.reused, "left_out": done.left_out,
+         "assumed": done.assumed},
+    )  # fmt: skip
+
+
+@app.command()
+def report(
+    paths: Annotated[list[Path], typer.Argument(help="Folders that skinrig wrote.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The page.")] = Path("report.html"),
+    json: Json = False,
+) -> None:
+    """Write one self-contained HTML page about what lies at PATHS.
+
+    Example: skinrig report demo -o report.html
+    """
+    from skinrig.report import build
+
+    console = Console(json)
+    page = build(paths)
+    out.write_text(page, encoding="utf-8")
+    console.say(f"{out}: {len(page) / 1e6:.2f} MB; open it in a browser")
+    console.document("skinrig.report/1", {"path": out, "bytes": len(page)})
+
+
+@app.command()
+def bench(
+    stage: Annotated[list[str] | None, typer.Option(help="Stage; repeatable; default all.")] = None,
+    budget: Annotated[float, typer.Option(help="Seconds to spend, about.")] = 300.0,
+    toy: Annotated[bool, typer.Option("--toy", help="Smallest sizes, no limits judged.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for bench.json.")] = None,
+    json: Json = False,
+) -> None:
+    """Measure error against run time; exit code 1 when a limit is missed.
+
+    Example: skinrig bench --stage chromophores --json
+    """
+    from skinrig.bench_stages import run_stages
+
+    console = Console(json)
+    document = run_stages(stage, budget_s=budget, toy=toy, out=out, console=console)
+    console.document(document.pop("schema"), document)
+    if not document["passed"]:
+        raise typer.Exit(errors.LIMIT_MISSED)
+
+
+@app.command()
+def verify(
+    session: Annotated[Path, typer.Argument(help="SESSION/ folder.")], json: Json = False
+) -> None:
+    """Check every byte of a session; exit code 3 names what is damaged.
+
+    Example: skinrig verify session
+    """
+    from capture.session import verify as check
+
+    console = Console(json)
+    found = check(session)
+    for text in found.warnings:
+        console.say(f"warning: {text}")
+    for text in found.problems:
+        console.say(f"damaged: {text}")
+    console.say(
+        f"{session}: {'sound' if found.ok else 'DAMAGED'}, {found.frames} frames, "
+        f"{found.bytes / 1e6:.1f} MB"
+    )
+    console.document(
+        "skinrig.verify/1",
+        {"ok": found.ok, "problems": found.problems, "warnings": found.warnings,
+         "frames": found.frames, "bytes": found.bytes},
+    )  # fmt: skip
+    if not found.ok:
+        raise typer.Exit(errors.BAD_INPUT)
+
+
+@app.command()
+def doctor(json: Json = False) -> None:
+    """Say what is installed, which renderer runs and why, and how to mend what is not.
+
+    Example: skinrig doctor
+    """
+    from skinrig.doctor import examine
+
+    console = Console(json)
+    findings = examine()
+    console.rows(
+        ("", "what", "state", "to mend"),
+        [("ok" if f.fine else "!!", f.what, f.state, f.mend) for f in findings],
+    )
+    rows: list[dict[str, Any]] = [
+        {"what": f.what, "state": f.state, "fine": f.fine, "mend": f.mend} for f in findings
+    ]
+    console.document("skinrig.doctor/1", {"findings": rows})
+    if not all(f.fine for f in findings):
+        raise typer.Exit(errors.EXTRA_MISSING)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return the exit code; no traceback reaches the user."""
+    if os.environ.get("SKINRIG_TRACEBACK"):
+        app(args=argv, standalone_mode=False)
+        return errors.DONE
+    try:
+        result = app(args=argv, standalone_mode=False)
+    except (typer.Exit, SystemExit) as stop:
+        code = getattr(stop, "exit_code", None)
+        return int(code if code is not None else getattr(stop, "code", 0) or 0)
+    except typer.Abort:
+        return errors.INTERRUPTED
+    except KeyboardInterrupt as stop:
+        print(f"skinrig: {errors.sentence(stop)}", file=sys.stderr)
+        return errors.INTERRUPTED
+    except Exception as error:
+        if hasattr(error, "exit_code") and hasattr(error, "show"):  # a usage error of Typer's
+            error.show()
+            return errors.USAGE
+        print(f"skinrig: {errors.sentence(error)}", file=sys.stderr)
+        return errors.exit_code(error)
+    return int(result or 0)
+
+
+def run() -> None:
+    """Entry point of the console script."""
+    sys.exit(main())
+
+
+if __name__ == "__main__":
+    run()
