@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -180,9 +180,10 @@ def _scenes(
     states: tuple[str, ...],
     seed: int,
 ) -> dict[str, Any]:
-    from rigsim import targets
     from rigsim.scenes.flash import FlashScene
     from rigsim.subject import make_subject
+
+    from rigsim import targets
 
     if target is not None:
         state = "white" if target == "white" else ""
@@ -202,8 +203,9 @@ def _drive(
     from capture.acquire import run_plan
     from capture.devices.camera import open_camera
     from capture.devices.flash import FlashBox
-    from capture.devices.port import Port
     from rigsim.world import World
+
+    from capture.devices.port import Port
 
     world = World(rig, seed=seed, clock="virtual", scene=next(iter(scenes.values())))
     name = world.register(session.id)
