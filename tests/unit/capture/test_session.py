@@ -1,0 +1,415 @@
+"""Sessions: what is committed stays, what does not belong is refused, what is known is kept."""
+
+import errno
+import json
+import os
+from datetime import UTC, date, datetime
+
+import numpy as np
+import pytest
+
+from capture import raw
+from capture.plan import PlanError, flash_plan
+from capture.rig import load_rig
+from capture.session import (
+    CalibrationRef,
+    ConsentError,
+    Disk,
+    Session,
+    SessionDamage,
+    SessionDiskError,
+    SessionError,
+    SessionLocked,
+    Subject,
+    verify,
+)
+
+RIG = load_rig("flash").resized(16)
+PLAN = flash_plan(RIG, states=("neutral", "anger"), darks=1)
+NOON = datetime(2026, 11, 21, 12, 0, tzinfo=UTC)
+
+
+def create(path, **changes):
+    description = {
+        "plan": PLAN,
+        "rig": RIG,
+        "devices": {"flash": {"idn": "SKINRIG,FLASH,0001,1.0"}},
+        "subject": Subject("P042", ("research",), date(2031, 1, 1)),
+        "source": "measured",
+        "now": lambda: NOON,
+    }
+    return Session.create(path, **(description | changes))
+
+
+def dng(session, step_id, *, fill=600):
+    values = np.full((10, 16), fill, np.uint16)
+    return raw.encode_dng(
+        values, pattern="RGGB", black=512, white=16383, step_id=step_id, session_id=session.id
+    )
+
+
+def commit(session, step_id, *, fill=600, **changes):
+    settings = session.plan.step(step_id).settings
+    words = {"settings": settings, "actual": {"power": 1.0}, "t_box_s": 1.5, "t_host_s": 2.5}
+    session.commit(step_id, "cam", dng(session, step_id, fill=fill), **(words | changes))
+
+
+def commit_all(session):
+    for number, (step, _) in enumerate(session.todo()):
+        commit(session, step.id, fill=600 + number)
+
+
+@pytest.fixture
+def session(tmp_path):
+    with create(tmp_path / "s") as made:
+        yield made
+
+
+@pytest.fixture
+def closed(session):
+    commit_all(session)
+    session.close()
+    return session.path
+
+
+def files(path):
+    return {
+        str(file.relative_to(path)): file.read_bytes()
+        for file in sorted(path.rglob("*"))
+        if file.is_file()
+    }
+
+
+# --- life of a session ----------------------------------------------------------------------------
+
+
+def test_a_session_is_a_folder_of_manifest_journal_and_frames(closed):
+    assert set(files(closed)) == {
+        "session.json",
+        "journal.jsonl",
+        *(f"frames/{step.id}+cam.dng" for step in PLAN.steps),
+    }
+    assert (closed / "orphans").is_dir()
+
+
+def test_what_was_committed_is_read_back_bit_for_bit(closed):
+    opened = Session.open(closed)
+    for number, record in enumerate(opened.frames()):
+        frame = opened.read(record)
+        assert set(np.unique(frame.cfa)) == {600 + number}
+        assert (frame.step_id, frame.session_id) == (record.step_id, opened.id)
+        assert record.settings == PLAN.step(record.step_id).settings
+        assert (record.actual, record.line.t_box_s, record.line.t_host_s) == (
+            {"power": 1.0},
+            1.5,
+            2.5,
+        )
+
+
+def test_todo_is_the_plan_minus_what_is_done(session):
+    assert [step.id for step, _ in session.todo()] == [step.id for step in PLAN.steps]
+    commit(session, "S001")
+    assert [step.id for step, _ in session.todo()] == ["D000", "S000", "S002", "S003"]
+
+
+def test_frames_are_found_by_kind_and_index(closed):
+    opened = Session.open(closed)
+    crossed = opened.frames("subject", polarizer="crossed")
+    assert [record.index["state"] for record in crossed] == ["neutral", "anger"]
+    assert [r.step_id for r in opened.frames("dark")] == ["D000"]
+    assert opened.frames("chart") == []
+    assert opened.frames(bracket=1) == []
+
+
+def test_an_interrupted_session_goes_on_where_it_stopped(session):
+    commit(session, "D000")
+    session.release()
+    with Session.resume(session.path) as again:
+        assert [record.step_id for record in again.frames()] == ["D000"]
+        assert len(again.todo()) == 4
+        commit_all(again)
+        again.close()
+    assert verify(session.path, today=NOON.date()).warnings == ()
+
+
+def test_the_last_attempt_of_a_frame_counts_and_the_first_stays(session):
+    commit(session, "D000", fill=700)
+    commit(session, "D000", fill=800, attempt=2)
+    (record,) = session.frames("dark")
+    assert (record.attempt, int(session.read(record).cfa[0, 0])) == (2, 800)
+    assert (session.path / "frames/D000+cam.dng").exists()
+
+
+def test_reading_needs_no_lock_and_sees_what_was_acknowledged(session):
+    commit(session, "D000")
+    assert [record.step_id for record in Session.open(session.path).frames()] == ["D000"]
+
+
+def test_a_second_writer_is_refused(session):
+    with pytest.raises(SessionLocked, match="another process"):
+        Session.resume(session.path)
+
+
+def test_a_closed_session_is_never_modified(closed):
+    before = files(closed)
+    with pytest.raises(SessionError, match="closed"):
+        Session.resume(closed)
+    with pytest.raises(SessionError, match="never modified"):
+        commit(Session.open(closed), "S000")
+    with pytest.raises(SessionError, match="cannot start here"):
+        create(closed)
+    verify(closed)
+    assert files(closed) == before
+    assert Session.open(closed).closed
+
+
+def test_an_incomplete_session_closes_only_with_a_reason(session):
+    commit(session, "D000")
+    with pytest.raises(SessionError, match="4 missing"):
+        session.close()
+    session.close(missing_because="the subject left")
+    report = verify(session.path, today=NOON.date())
+    assert report.ok
+    assert any("the subject left" in warning for warning in report.warnings)
+
+
+def test_a_session_opened_for_reading_cannot_be_written(session):
+    with pytest.raises(SessionError, match="not open for writing"):
+        commit(Session.open(session.path), "D000")
+
+
+def test_the_debris_of_an_interrupted_creation_can_be_used_again(tmp_path):
+    path = tmp_path / "s"
+    (path / "frames").mkdir(parents=True)
+    (path / "journal.jsonl").touch()
+    (path / "session.json.part").write_bytes(b"{")
+    with pytest.raises(SessionError, match="is not a session"):
+        Session.resume(path)
+    create(path).release()
+    assert verify(path).ok
+
+
+def test_files_without_a_line_are_set_aside_and_never_lost(session):
+    commit(session, "D000")
+    session.release()
+    (session.path / "frames/S000+cam.dng").write_bytes(b"unacknowledged")
+    (session.path / "frames/S001+cam.dng.part").write_bytes(b"half")
+    with Session.resume(session.path) as again:
+        assert next(step.id for step, _ in again.todo()) == "S000"
+    aside = sorted(file.read_bytes() for file in (session.path / "orphans").iterdir())
+    assert aside == [b"half", b"unacknowledged"]
+    assert [file.name for file in (session.path / "frames").iterdir()] == ["D000+cam.dng"]
+
+
+def test_orphans_of_one_name_do_not_overwrite_each_other(session):
+    for content in (b"first", b"second"):
+        session.release()
+        (session.path / "frames/S000+cam.dng").write_bytes(content)
+        session = Session.resume(session.path)
+    session.release()
+    aside = sorted(file.read_bytes() for file in (session.path / "orphans").iterdir())
+    assert aside == [b"first", b"second"]
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "reason"),
+    [
+        ({"step_id": "S999"}, PlanError, "no step"),
+        ({"step_id": "../../x"}, PlanError, "no step"),
+        ({"camera": "left"}, SessionError, "no such camera"),
+        ({"attempt": 0}, SessionError, "attempt"),
+        ({"settings": {"power": float("nan")}}, SessionError, "cannot be written"),
+        ({"actual": {"note": "x" * 70_000}}, SessionError, "too long"),
+        ({"blob": b"not a frame"}, raw.RawError, "not a raw file"),
+        ({"blob": b""}, raw.RawError, "is not a raw file|is empty"),
+    ],
+)
+def test_a_commit_that_cannot_be_leaves_no_trace(session, change, error, reason):
+    before = files(session.path)
+    words = {
+        "step_id": "S000",
+        "camera": "cam",
+        "blob": dng(session, "S000"),
+        "settings": {},
+        "actual": {},
+        "t_host_s": 0.0,
+    } | change
+    with pytest.raises(error, match=reason):
+        session.commit(words.pop("step_id"), words.pop("camera"), words.pop("blob"), **words)
+    assert files(session.path) == before
+    commit(session, "S000")
+
+
+def test_a_frame_of_another_step_or_session_is_refused(session, tmp_path):
+    with pytest.raises(SessionError, match="step_id: got 'S001', expected S000"):
+        session.commit("S000", "cam", dng(session, "S001"), settings={}, actual={}, t_host_s=0.0)
+    with create(tmp_path / "other") as other, pytest.raises(SessionError, match="session_id"):
+        session.commit("S000", "cam", dng(other, "S000"), settings={}, actual={}, t_host_s=0.0)
+
+
+def test_a_committed_frame_is_not_committed_twice(session):
+    commit(session, "D000")
+    with pytest.raises(SessionError, match="already committed"):
+        commit(session, "D000")
+
+
+@pytest.mark.parametrize("content", ["file", "folder"])
+def test_a_session_does_not_start_on_top_of_something(tmp_path, content):
+    path = tmp_path / "s"
+    if content == "file":
+        path.write_text("notes")
+    else:
+        path.mkdir()
+        (path / "notes.txt").write_text("notes")
+    with pytest.raises(SessionError, match="cannot start here"):
+        create(path)
+    with pytest.raises(SessionError, match="no such folder"):
+        create(tmp_path / "nowhere" / "s")
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"source": "guessed"}, "source"),
+        ({"devices": {"flash": object()}}, "cannot be written"),
+        ({"extra": {"gain": float("nan")}}, "cannot be written"),
+        ({"calibrations": [{"kind": "sensor", "sha256": "abc"}]}, "sha256"),
+        ({"session_id": "../x"}, "id"),
+        ({"now": lambda: datetime(2026, 1, 1)}, "created_at"),
+    ],
+)
+def test_a_manifest_that_cannot_be_is_refused_before_anything_is_made(tmp_path, changes, reason):
+    with pytest.raises(SessionError, match=reason):
+        create(tmp_path / "s", **changes)
+    assert not (tmp_path / "s").exists()
+
+
+@pytest.mark.parametrize("name", ["Ada Lovelace", "", "a/b", "x" * 65])
+def test_a_subject_has_a_pseudonym_and_no_name(name):
+    with pytest.raises(SessionError, match="pseudonym"):
+        Subject(name)
+
+
+def test_a_plan_for_another_rig_starts_no_session(tmp_path):
+    plan = type(PLAN)("dome", PLAN.steps)
+    with pytest.raises(PlanError, match="rig"):
+        create(tmp_path / "s", plan=plan)
+
+
+# --- what is kept ---------------------------------------------------------------------------------
+
+
+def test_the_manifest_says_who_what_with_what_and_whether_it_was_real(tmp_path):
+    digest = "sha256:" + "0" * 64
+    reference = CalibrationRef("sensor", digest)
+    create(
+        tmp_path / "s", source="simulated", seed=7, calibrations=[reference], extra={"size": 16}
+    ).release()
+    opened = Session.open(tmp_path / "s")
+    assert (opened.source, opened.seed) == ("simulated", 7)
+    assert (opened.plan, opened.rig) == (PLAN, RIG)
+    assert opened.subject == Subject("P042", ("research",), date(2031, 1, 1))
+    assert opened.manifest.calibrations == (reference,)
+    assert opened.manifest.created_at == NOON
+    assert opened.manifest.devices["flash"]["idn"].startswith("SKINRIG")
+    assert {"skinrig", "python", "numpy"} <= set(opened.manifest.versions)
+    assert json.loads((tmp_path / "s/session.json").read_text())["schema"] == "skinrig.session/1"
+
+
+def test_the_content_hash_vouches_for_every_commit(session):
+    seen = {session.content_hash}
+    for step, _ in session.todo():
+        commit(session, step.id)
+        assert session.content_hash not in seen
+        assert session.content_hash.startswith("sha256:")
+        seen.add(session.content_hash)
+    assert Session.open(session.path).content_hash == session.content_hash
+
+
+@pytest.mark.parametrize(
+    ("scope", "today", "allowed"),
+    [
+        ("research", date(2030, 12, 31), True),
+        ("research", date(2031, 1, 1), True),
+        ("research", date(2031, 1, 2), False),
+        ("publication", date(2030, 1, 1), False),
+    ],
+)
+def test_consent_ends_with_its_scope_and_its_last_day(session, scope, today, allowed):
+    assert session.export_allowed(scope, today=today) == allowed
+    if not allowed:
+        with pytest.raises(ConsentError, match="P042 has not agreed"):
+            session.require_consent(scope, today=today)
+
+
+def test_nobody_has_to_agree_to_a_simulation(tmp_path):
+    with create(tmp_path / "s", source="simulated", subject=Subject("virtual-III")) as made:
+        assert made.export_allowed("publication")
+
+
+def test_verify_warns_of_expired_and_of_missing_consent(closed, tmp_path):
+    assert verify(closed, today=date(2031, 1, 1)).warnings == ()
+    late = verify(closed, today=date(2031, 1, 2))
+    assert late.ok
+    assert ["consent expired on 2031-01-01" in warning for warning in late.warnings] == [True]
+    with create(tmp_path / "t", subject=Subject("P1")) as made:
+        assert any("no consent" in warning for warning in verify(made.path).warnings)
+
+
+def test_verify_counts_frames_and_bytes(closed):
+    report = verify(closed, today=NOON.date())
+    sizes = [file.stat().st_size for file in (closed / "frames").iterdir()]
+    assert (report.frames, report.bytes) == (len(sizes), sum(sizes))
+
+
+# --- the disk -------------------------------------------------------------------------------------
+
+
+class FullDisk(Disk):
+    """Refuses one operation, once ``after`` of its kind have worked."""
+
+    def __init__(self, operation, after):
+        self._operation, self._left = operation, after
+        real = getattr(Disk, operation)
+
+        def refuse(*arguments):
+            self._left -= 1
+            if self._left < 0:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return real(self, *arguments)
+
+        setattr(self, operation, refuse)
+
+
+@pytest.mark.parametrize(
+    "operation", ["create", "write", "fsync", "rename", "fsync_dir", "fdatasync"]
+)
+def test_a_refusing_disk_costs_one_frame_and_none_that_was_acknowledged(session, operation):
+    commit(session, "D000")
+    session.release()
+    writer = Session.resume(session.path, disk=FullDisk(operation, after=0))
+    with pytest.raises(SessionDiskError, match="No space left"):
+        commit(writer, "S000")
+    with pytest.raises(SessionError, match="not open for writing"):
+        commit(writer, "S001")
+    with Session.resume(session.path) as again:
+        assert "D000" in [record.step_id for record in again.frames()]
+        commit_all(again)
+        again.close()
+    assert verify(session.path).ok
+
+
+def test_a_disk_error_is_an_operating_system_error_too(tmp_path):
+    with pytest.raises(OSError, match="disk refused"):
+        create(tmp_path / "s", disk=FullDisk("make_dir", after=1))
+
+
+def test_a_frame_that_vanished_is_named_and_not_silently_retaken(session):
+    commit(session, "D000")
+    session.release()
+    (session.path / "frames/D000+cam.dng").unlink()
+    with pytest.raises(SessionDamage, match=r"frames/D000\+cam.dng: got nothing"):
+        Session.resume(session.path)
