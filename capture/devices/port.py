@@ -1,0 +1,452 @@
+"""Request and reply over a pyserial URL, and the tree of errors that devices raise.
+
+A port is opened with `serial.serial_for_url`, so ``/dev/serial/by-id/...``, ``socket://host:port``
+and every URL of the entry-point group ``capture.urlhandlers`` are the same to a driver. Of pyserial
+only open, read, write, in_waiting, reset_input_buffer and close are used.
+
+One thread uses a port. One request is under way at a time; a retry sends the same bytes, so that
+the box can tell it from a new request and never acts twice.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import importlib
+import importlib.metadata
+import logging
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import serial
+
+from . import wire
+from .wire import Code, Event, Reply, Request
+
+__all__ = [
+    "SYSTEM_CLOCK",
+    "BadAnswer",
+    "BoxRebooted",
+    "Clock",
+    "CommandRefused",
+    "DeviceError",
+    "Hello",
+    "LinkLost",
+    "LinkStatistics",
+    "Port",
+    "PortBusy",
+    "PortTimeout",
+    "PortUrlError",
+    "WrongDevice",
+]
+
+log = logging.getLogger(__name__)
+
+URL_HANDLERS = "capture.urlhandlers"
+READ_SLICE_S = 0.02
+"""How long one read waits, in s; longer waits are made of slices."""
+NOISE_LIMIT_BYTES = 65_536
+"""So many bytes without the answer among them end an attempt, whatever the clock says."""
+
+try:
+    from termios import error as _termios_error
+except ImportError:  # pragma: no cover - Windows has no termios
+    _termios_error = OSError  # type: ignore[misc,assignment]
+
+# what pyserial lets through when the device is gone or the port was closed under a reader
+_LINK_FAILURES = (OSError, _termios_error, TypeError, AttributeError)
+
+
+class DeviceError(Exception):
+    """Root of what drivers raise about a device."""
+
+
+class PortUrlError(DeviceError, ValueError):
+    """The URL names no way to reach a device."""
+
+
+class LinkLost(DeviceError, ConnectionError):
+    """The port cannot be opened, or is gone; whether the last act was done is not known."""
+
+
+class PortBusy(LinkLost):
+    """Another program holds the port."""
+
+
+class PortTimeout(DeviceError, TimeoutError):
+    """No answer in spite of retries; whether the act was done is not known."""
+
+
+class BoxRebooted(DeviceError, ConnectionResetError):
+    """The box started again: it is dark, disarmed and has forgotten its settings."""
+
+
+class WrongDevice(DeviceError, ValueError):
+    """Behind the URL is another device, or one that speaks another version."""
+
+
+class BadAnswer(DeviceError, ValueError):
+    """A well-framed answer whose content is not what the manual says."""
+
+
+class CommandRefused(DeviceError, RuntimeError):
+    """The box refused and did nothing.
+
+    Attributes
+    ----------
+    code
+        Why, see `capture.devices.wire.Code`.
+    text
+        The command.
+    """
+
+    def __init__(self, text: str, code: int, reason: str) -> None:
+        super().__init__(f"{text!r} was refused with {code}: {reason}; nothing was done")
+        self.text = text
+        self.code = code
+
+
+class Clock(Protocol):
+    """Where time comes from; real or simulated."""
+
+    def monotonic(self) -> float:
+        """Return the time in s since any fixed instant."""
+
+    def sleep(self, seconds: float) -> None:
+        """Let `seconds` pass."""
+
+
+class _SystemClock:
+    def monotonic(self) -> float:
+        return time.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+
+SYSTEM_CLOCK: Clock = _SystemClock()
+
+
+@dataclass(slots=True)
+class LinkStatistics:
+    """What happened on one port since it was made."""
+
+    requests: int = 0
+    """Commands and queries asked for."""
+    frames: int = 0
+    """Frames sent, retries included."""
+    retries: int = 0
+    """Frames sent again."""
+    naks: int = 0
+    """Times the box reported a damaged frame."""
+    stale: int = 0
+    """Answers to earlier requests, thrown away."""
+    bad_lines: int = 0
+    """Lines that were not frames, thrown away."""
+    lost_events: int = 0
+    """Gaps in the numbers of events."""
+    reboots: int = 0
+    """Times the box was found to have started again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """How a box introduces itself."""
+
+    version: int
+    """Version of the wire protocol."""
+    kind: str
+    """What it is, e.g. ``flash``."""
+    serial: str
+    """Serial number: the device, whatever the port is called today."""
+    firmware: str
+    boot: int
+    """Epoch drawn at power-up, 1 to 65535."""
+
+
+class _WriteStalled(Exception):
+    pass
+
+
+class Port:
+    """A box on a pyserial URL, asked one thing at a time.
+
+    Parameters
+    ----------
+    url
+        ``/dev/...``, ``socket://host:port``, or what a handler of `URL_HANDLERS` knows.
+    clock
+        Measures timeouts; a read that returns nothing also counts as its slice of time, so that a
+        port on a simulated clock times out under any clock.
+    timeout_s
+        Wait for an answer before the same bytes are sent again.
+    retries
+        How often they are sent again.
+    first_seq
+        First sequence number. By default random, so that a box never takes a new run's request for
+        a retry of the last run's; give it only for byte-identical replays on a fresh box.
+    baudrate
+        Bits per second, for real serial lines.
+
+    Raises
+    ------
+    PortUrlError
+        When no handler knows the URL.
+    LinkLost
+        When the port cannot be opened (`PortBusy` when another program holds it).
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        clock: Clock | None = None,
+        timeout_s: float = 0.25,
+        retries: int = 8,
+        first_seq: int | None = None,
+        baudrate: int = 115_200,
+    ) -> None:
+        if not timeout_s > 0.0:
+            raise ValueError(f"timeout_s: got {timeout_s}, expected more than 0")
+        if retries < 0:
+            raise ValueError(f"retries: got {retries}, expected 0 or more")
+        self.url = url
+        self.clock = SYSTEM_CLOCK if clock is None else clock
+        self.statistics = LinkStatistics()
+        self.events: deque[Event] = deque(maxlen=256)
+        self.boot = wire.UNKNOWN_BOOT
+        self._timeout_s = timeout_s
+        self._retries = retries
+        self._baudrate = baudrate
+        self._seq = secrets.randbelow(wire.MAX_SEQ + 1) if first_seq is None else first_seq
+        self._splitter = wire.LineSplitter()
+        self._lines: deque[bytes] = deque()
+        self._next_event: int | None = None
+        self._owner = threading.get_ident()
+        self._serial: Any = None
+        self._open()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def hello(self, *, patience_s: float = 3.0) -> Hello:
+        """Learn the epoch and the identity of the box; needed first and after each reboot.
+
+        Parameters
+        ----------
+        patience_s
+            How long to knock: opening a port may reset the box, which is then deaf for a while.
+        """
+        self._check_thread()
+        self.boot = wire.UNKNOWN_BOOT
+        self._next_event = None
+        with self._translated("flush"):
+            self._serial.reset_input_buffer()
+        self._splitter.clear()
+        self._lines.clear()
+        attempts = max(1, round(patience_s / self._timeout_s))
+        reply = self._exchange("SYST:HELLO?", attempts=attempts, knock=True)
+        if reply.code != Code.OK:
+            raise CommandRefused("SYST:HELLO?", reply.code, reply.payload)
+        version, kind, serial_number, firmware = _hello_fields(self.url, reply.payload)
+        if version != wire.PROTOCOL_VERSION:
+            raise WrongDevice(
+                f"{self.url}: the box speaks protocol {version}, expected "
+                f"{wire.PROTOCOL_VERSION}; update its firmware or this program"
+            )
+        self.boot = reply.boot
+        return Hello(version, kind, serial_number, firmware, reply.boot)
+
+    def ask(self, text: str) -> str:
+        """Send one command or query and return the payload of its answer.
+
+        Raises
+        ------
+        CommandRefused
+            The box did nothing and says why.
+        PortTimeout, LinkLost, BoxRebooted
+            It is not known whether it was done.
+        """
+        self._check_thread()
+        if self.boot == wire.UNKNOWN_BOOT:
+            raise BoxRebooted(f"{self.url}: the epoch of the box is not known; say hello first")
+        reply = self._exchange(text, attempts=1 + self._retries, knock=False)
+        if reply.code != Code.OK:
+            raise CommandRefused(text, reply.code, reply.payload)
+        return reply.payload
+
+    def listen(self, seconds: float) -> list[Event]:
+        """Let `seconds` pass on the line and return the events that came, oldest first."""
+        self._check_thread()
+        for _ in self._received(seconds):
+            self.statistics.stale += 1  # an answer nobody waits for
+        events = list(self.events)
+        self.events.clear()
+        return events
+
+    def reopen(self, url: str | None = None) -> Hello:
+        """Close, open again (elsewhere when `url` is given) and say hello."""
+        self.close()
+        self.url = self.url if url is None else url
+        self._open()
+        return self.hello()
+
+    def close(self) -> None:
+        """Close the port; doing so twice is allowed."""
+        port, self._serial = self._serial, None
+        if port is not None:
+            with contextlib.suppress(*_LINK_FAILURES):
+                port.close()
+
+    def _check_thread(self) -> None:
+        if threading.get_ident() != self._owner:
+            raise RuntimeError(f"{self.url}: used by two threads; a port belongs to its maker")
+
+    def _open(self) -> None:
+        _load_handler(self.url)
+        try:
+            self._serial = serial.serial_for_url(
+                self.url,
+                baudrate=self._baudrate,
+                timeout=READ_SLICE_S,
+                write_timeout=self._timeout_s,
+                exclusive=True,
+            )
+        except ValueError as exc:
+            raise PortUrlError(f"{self.url!r} is not a port: {exc}") from exc
+        except _LINK_FAILURES as exc:
+            busy = getattr(exc, "errno", None) in (errno.EAGAIN, errno.EBUSY, errno.EACCES)
+            kind = PortBusy if busy and "xclusive" in str(exc) else LinkLost
+            hint = "another program holds it" if kind is PortBusy else "is it plugged in?"
+            raise kind(f"cannot open {self.url}: {exc}; {hint}") from exc
+        self._splitter.clear()
+        self._lines.clear()
+
+    @contextlib.contextmanager
+    def _translated(self, doing: str) -> Iterator[None]:
+        if self._serial is None:
+            raise LinkLost(f"{self.url}: cannot {doing}, the port is closed; reopen it")
+        try:
+            yield
+        except serial.SerialTimeoutException as exc:
+            raise _WriteStalled from exc
+        except _LINK_FAILURES as exc:
+            self.close()
+            raise LinkLost(
+                f"{self.url}: the link was lost in {doing} ({exc}); whether the last act was done "
+                "is not known; reopen the port"
+            ) from exc
+
+    def _exchange(self, text: str, *, attempts: int, knock: bool) -> Reply:
+        seq, self._seq = self._seq, wire.next_seq(self._seq)
+        frame = wire.encode(Request(seq, self.boot, text))
+        statistics = self.statistics
+        statistics.requests += 1
+        for attempt in range(attempts):
+            statistics.frames += 1
+            statistics.retries += attempt > 0
+            # a newline lost before would glue two frames together
+            line = b"\n" + frame if knock or attempt else frame
+            try:
+                with self._translated("write"):
+                    self._serial.write(line)
+            except _WriteStalled:
+                log.warning("%s: the box does not take bytes", self.url)
+                continue
+            reply = self._await_reply(seq)
+            if reply is not None:
+                return reply
+        raise PortTimeout(
+            f"{self.url}: no answer to {text!r} after {attempts} attempts of {self._timeout_s:g} "
+            "s; whether it was done is not known; check cable and power, then say hello"
+        )
+
+    def _await_reply(self, seq: int) -> Reply | None:
+        """Return the answer to `seq`, or None when the request must be sent again."""
+        for frame in self._received(self._timeout_s):
+            if isinstance(frame, Event):
+                if frame.name == "NAK":
+                    self.statistics.naks += 1
+                    return None
+            elif frame.seq == seq:
+                return frame
+            else:
+                self.statistics.stale += 1
+        return None
+
+    def _received(self, seconds: float) -> Iterator[Reply | Event]:
+        """Yield frames from the box for `seconds`; events are also kept in `events`."""
+        start_s = self.clock.monotonic()
+        silent_s = 0.0
+        bytes_left = NOISE_LIMIT_BYTES
+        while True:
+            while self._lines:
+                frame = self._frame_in(self._lines.popleft())
+                if frame is not None:
+                    yield frame
+            if max(silent_s, self.clock.monotonic() - start_s) >= seconds or bytes_left <= 0:
+                return
+            with self._translated("read"):
+                data = self._serial.read(max(1, self._serial.in_waiting))
+            silent_s += 0.0 if data else READ_SLICE_S
+            bytes_left -= len(data)
+            self._lines.extend(self._splitter.feed(data))
+
+    def _frame_in(self, line: bytes) -> Reply | Event | None:
+        try:
+            frame = wire.decode(line)
+        except wire.BadFrame:
+            frame = None
+        if frame is None or isinstance(frame, Request):
+            self.statistics.bad_lines += 1
+            return None
+        if self.boot not in (wire.UNKNOWN_BOOT, frame.boot):
+            self.boot = wire.UNKNOWN_BOOT
+            self.statistics.reboots += 1
+            raise BoxRebooted(
+                f"{self.url}: the box has started again (epoch {frame.boot:04x}) and forgotten its "
+                "settings; it is dark and disarmed; say hello, then set it up again"
+            )
+        if isinstance(frame, Event):
+            if self._next_event is not None and frame.number > self._next_event:
+                self.statistics.lost_events += frame.number - self._next_event
+            self._next_event = frame.number + 1
+            if frame.name != "NAK":
+                self.events.append(frame)
+        return frame
+
+
+def _hello_fields(url: str, payload: str) -> tuple[int, str, str, str]:
+    fields = payload.split(",")
+    if len(fields) != 4 or not fields[0].isdecimal():
+        raise BadAnswer(
+            f"{url}: 'SYST:HELLO?' was answered with {payload!r}, expected "
+            "'version,kind,serial,firmware'"
+        )
+    return int(fields[0]), fields[1], fields[2], fields[3]
+
+
+def _load_handler(url: str) -> None:
+    """Make the entry point that serves the scheme of `url` known to pyserial."""
+    scheme, separator, _ = url.partition("://")
+    if not separator:
+        return
+    for entry_point in importlib.metadata.entry_points(group=URL_HANDLERS, name=scheme.lower()):
+        # pyserial swallows an ImportError of its handlers; here it shows
+        importlib.import_module(f"{entry_point.value}.protocol_{entry_point.name}")
+        if entry_point.value not in serial.protocol_handler_packages:
+            serial.protocol_handler_packages.append(entry_point.value)
