@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label
 
 from capture.calibration.colorimetry import chart_reference, xyz_to_linear_srgb
+from capture.calibration.store import CalibrationError
 
 __all__ = ["ChartError", "Patches", "find_chart", "measure_patches"]
 
@@ -21,7 +22,7 @@ MAX_DETECTION_PX = 2000  # longer sides are shrunk for detection only
 MISFIT_LIMIT = 0.35  # of the spread of the patches' colors that an affine map may leave
 
 
-class ChartError(ValueError):
+class ChartError(CalibrationError):
     """No usable color chart in the image; the message says what was looked for and what to do."""
 
 

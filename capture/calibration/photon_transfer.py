@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.calibration.store import CalibrationError
+
 __all__ = [
     "Blocks",
     "CurveFit",
@@ -30,7 +32,7 @@ CLIP_SIGMAS = 6.0  # distance to saturation, in standard deviations, that a usab
 SPREAD = 0.02  # pixel-to-pixel spread of sensitivity allowed for in that distance
 
 
-class PhotonTransferError(ValueError):
+class PhotonTransferError(CalibrationError):
     """The frames do not allow a photon transfer fit; the message says why and what to take."""
 
 

@@ -9,7 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 from scipy.stats import t as student
 
-from capture.calibration.store import Calibration, Quantity, Source, default_validity
+from capture.calibration.store import (
+    Calibration,
+    CalibrationError,
+    Quantity,
+    Source,
+    default_validity,
+)
 
 __all__ = [
     "MalusFit",
@@ -26,7 +32,7 @@ LEAST_MODULATION_SIGMAS = 5.0
 MAX_JITTER = 0.3  # relative; a light less steady than this is out of order
 
 
-class PolarizationError(ValueError):
+class PolarizationError(CalibrationError):
     """A Malus series that cannot be fitted; the message says why and what to take."""
 
 

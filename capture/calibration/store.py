@@ -22,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from capture.documents import InputError
+
 __all__ = [
     "KINDS",
     "SCHEMA",
@@ -50,7 +52,7 @@ DEFAULT_VALIDITY_DAYS = 90
 Source: TypeAlias = Literal["measured", "simulated"]
 
 
-class CalibrationError(ValueError):
+class CalibrationError(InputError):
     """A calibration that cannot be used; the message says why and what to do."""
 
 
