@@ -180,24 +180,23 @@ def load_mesh(path: str | Path) -> Mesh:
     raise MeshFileError(f"{path}: got suffix {path.suffix!r}, expected .npz or .obj")
 
 
-def centered(mesh: Mesh, *, depth_mm: float) -> Mesh:
+def centered(mesh: Mesh, *, nose_tip_mm: tuple[float, float, float] = (0.0, -8.0, 25.0)) -> Mesh:
     """Move a face mesh so that the rig's cameras look at its middle.
 
     Parameters
     ----------
     mesh
-        A face that looks towards +z.
-    depth_mm
-        The z coordinate that the foremost vertex (the tip of the nose) gets.
+        A face that looks towards +z; its foremost vertex is taken as the tip of the nose.
+    nose_tip_mm
+        Where that vertex goes, rig frame.
 
     Returns
     -------
     Mesh
-        The mesh with its bounding box centred on x = y = 0.
+        The mesh moved, not turned or scaled.
     """
-    low, high = mesh.vertices_mm.min(axis=0), mesh.vertices_mm.max(axis=0)
-    middle = 0.5 * (low + high)
-    shift = np.array([-middle[0], -middle[1], depth_mm - high[2]], np.float32)
+    foremost = mesh.vertices_mm[int(np.argmax(mesh.vertices_mm[:, 2]))]
+    shift = np.array(nose_tip_mm, np.float32) - foremost
     return Mesh(mesh.vertices_mm + shift, mesh.faces, mesh.uv, mesh.normals)
 
 

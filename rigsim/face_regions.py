@@ -1,0 +1,131 @@
+"""Soft regions of a face, drawn around the landmarks of the mean head."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.head import LANDMARKS_MM, lip_outline
+from rigsim.mesh import Float32Array, Mesh
+
+REGION_NAMES: Final = (
+    "forehead",
+    "cheeks",
+    "nose",
+    "lips",
+    "lids",
+    "temples",
+    "chin",
+    "jaw",
+    "neck",
+    "crow",
+    "brows",
+    "mouth corners",
+    "nose sides",
+)
+"""Regions that `region_masks` draws."""
+
+# Landmarks and radii along x, y, z in mm of each region's soft balls.
+_BALLS: Final[Mapping[str, tuple[tuple[str, tuple[float, float, float]], ...]]] = {
+    "forehead": (("forehead", (42.0, 22.0, 40.0)),),
+    "cheeks": (
+        ("cheek left", (18.0, 17.0, 25.0)),
+        ("cheek right", (18.0, 17.0, 25.0)),
+    ),
+    "nose": (
+        ("nose tip", (13.0, 11.0, 18.0)),
+        ("nose wing left", (8.0, 8.0, 10.0)),
+        ("nose wing right", (8.0, 8.0, 10.0)),
+    ),
+    "lids": (("eye left", (18.0, 11.0, 18.0)), ("eye right", (18.0, 11.0, 18.0))),
+    "temples": (("temple left", (14.0, 20.0, 25.0)), ("temple right", (14.0, 20.0, 25.0))),
+    "chin": (("chin", (20.0, 13.0, 25.0)),),
+    "jaw": (("jaw left", (20.0, 20.0, 30.0)), ("jaw right", (20.0, 20.0, 30.0))),
+    "neck": (("neck", (60.0, 28.0, 60.0)),),
+    "crow": (("crow left", (9.0, 13.0, 14.0)), ("crow right", (9.0, 13.0, 14.0))),
+    "brows": (("brow left", (20.0, 7.0, 20.0)), ("brow right", (20.0, 7.0, 20.0))),
+    "mouth corners": (
+        ("mouth corner left", (7.0, 8.0, 12.0)),
+        ("mouth corner right", (7.0, 8.0, 12.0)),
+    ),
+    "nose sides": (("fold left", (6.0, 13.0, 12.0)), ("fold right", (6.0, 13.0, 12.0))),
+}
+
+_CENTERS: Final = dict(LANDMARKS_MM) | {
+    "crow left": (-52.0, 24.0, -22.0),
+    "crow right": (52.0, 24.0, -22.0),
+    "fold left": (-22.0, -20.0, 2.0),
+    "fold right": (22.0, -20.0, 2.0),
+}
+
+
+def on_mean_head(points_mm: Float32Array, mesh: Mesh) -> Float32Array:
+    """Move points of a face mesh to where they would lie on the mean head.
+
+    Parameters
+    ----------
+    points_mm
+        Positions on the mesh, shape (..., 3), rig frame.
+    mesh
+        A face that looks towards +z.
+
+    Returns
+    -------
+    ndarray of float32
+        Shape (..., 3): scaled so that the face is as wide, moved so that the tips of the noses
+        coincide.
+    """
+    vertices = mesh.vertices_mm.astype(np.float64)
+    tip = vertices[np.argmax(vertices[:, 2])]
+    level = np.abs(vertices[:, 1] - tip[1]) < 25.0
+    width = np.ptp(vertices[level, 0]) if level.any() else np.ptp(vertices[:, 0])
+    scale = MEAN_WIDTH_MM / max(float(width), 1e-6)
+    mean_tip = np.array(LANDMARKS_MM["nose tip"])
+    return np.asarray((points_mm - tip) * scale + mean_tip, np.float32)
+
+
+MEAN_WIDTH_MM: Final = 158.0
+"""Width of the mean head within 25 mm of the height of the nose's tip, ears included."""
+
+
+def region_masks(points_mm: Float32Array) -> dict[str, Float32Array]:
+    """Draw the regions of a face.
+
+    Parameters
+    ----------
+    points_mm
+        Points on the mean head, shape (..., 3).
+
+    Returns
+    -------
+    dict
+        `REGION_NAMES` to masks in [0, 1], shape (...); soft, and they may overlap.
+    """
+    masks = {name: _balls(points_mm, balls) for name, balls in _BALLS.items()}
+    masks["lips"] = _lips(points_mm)
+    return masks
+
+
+def _balls(
+    points: Float32Array, balls: tuple[tuple[str, tuple[float, float, float]], ...]
+) -> Float32Array:
+    total = np.zeros(points.shape[:-1], np.float32)
+    for name, radii in balls:
+        q = (points - np.array(_CENTERS[name], np.float32)) / np.array(radii, np.float32)
+        total = np.maximum(total, np.exp(-np.sum(q * q, axis=-1)))
+    return total
+
+
+def _lips(points: Float32Array) -> Float32Array:
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    top, bottom = lip_outline(x)
+    border_mm = 0.7  # the vermilion border is crisp
+    inside = _step((top - y) / border_mm) * _step((y - bottom) / border_mm)
+    return np.asarray(inside * _step((z + 22.0) / 4.0) * (np.abs(x) < 26.0), np.float32)
+
+
+def _step(t: NDArray[np.floating]) -> NDArray[np.floating]:
+    return 0.5 * (1.0 + np.tanh(t))

@@ -1,0 +1,120 @@
+"""Melanin of a face: base, slow variation, sun, freckles, moles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.mesh import Float32Array
+from rigsim.surface_noise import scattered_spots, smooth_noise
+
+MELANIN_LIMIT: Final = 0.5
+"""Largest volume fraction, Jimenez et al. 2010, table 1."""
+
+MELANIN_PRESETS: Final[Mapping[str, float]] = {
+    "palest": 0.005,
+    "I": 0.012,
+    "II": 0.03,
+    "III": 0.065,
+    "IV": 0.13,
+    "V": 0.22,
+    "VI": 0.33,
+    "darkest": 0.45,
+}
+"""Volume fraction of melanosomes of each preset. Between the ends they follow the ranges of light
+(1.3-6.3 %), moderately (11-16 %) and darkly (18-43 %) pigmented adults in Jacques 1998, "Skin
+optics summary", Oregon Medical Laser Center; the ends are those of the range to be covered."""
+
+
+def melanin_map(
+    points_mm: Float32Array,
+    regions: Mapping[str, Float32Array],
+    base: float,
+    *,
+    seed: int,
+) -> Float32Array:
+    """Draw the melanin of a face.
+
+    Parameters
+    ----------
+    points_mm
+        Points on the mean head, shape (..., 3).
+    regions
+        Masks of `rigsim.face_regions.region_masks`.
+    base
+        Volume fraction of melanosomes around which the map varies, 0.001 to 0.45.
+    seed
+        Any integer; it also decides where the sun did not reach.
+
+    Returns
+    -------
+    ndarray of float32
+        Volume fraction of melanosomes in the epidermis, shape (...), 0.0005 to 0.5.
+    """
+    if not 0.001 <= base <= 0.45:
+        raise ValueError(f"base: got {base}, expected a melanin fraction from 0.001 to 0.45")
+    rng = np.random.default_rng([seed, 1])
+    # Variations are steps of log-odds against the limit: factors for pale skin, bounded for dark.
+    step = 0.10 * smooth_noise(points_mm, (40.0, 18.0), seed=seed + 11)
+    step += 0.05 * smooth_noise(points_mm, (7.0, 3.0, 1.4), seed=seed + 12)
+    step += 0.12 * regions["forehead"] + 0.14 * regions["lids"] + 0.06 * regions["temples"]
+    step -= 0.55 * regions["lips"] + 0.10 * regions["neck"]
+    step += _tan(points_mm, base, rng)
+    step += _freckles(points_mm, regions, base, seed=seed, rng=rng)
+    step += _moles(points_mm, base, seed=seed, rng=rng)
+    odds = base / (MELANIN_LIMIT - base) * np.exp(step)
+    return np.asarray(MELANIN_LIMIT * odds / (1.0 + odds), np.float32)
+
+
+def _tan(points: Float32Array, base: float, rng: np.random.Generator) -> NDArray[np.floating]:
+    """Sun everywhere but under a cap or behind glasses; half a tan is in the base already."""
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    gain = float(rng.uniform(0.25, 0.5)) * (0.4 + 0.6 * float(np.exp(-base / 0.1)))
+    if rng.random() < 0.5:
+        edge = float(rng.uniform(56.0, 70.0))  # a cap down to this height
+        hidden = _step((y - edge - 0.0025 * x * x) / 1.5)
+    else:
+        half_width, half_height = rng.uniform(22.0, 25.0), rng.uniform(13.0, 17.0)
+        q = ((np.abs(x) - 34.0) / half_width) ** 4 + ((y - 21.0) / half_height) ** 4
+        hidden = _step((1.0 - q) * 4.0) * _step((z + 40.0) / 5.0)
+    return gain * (0.45 - hidden)
+
+
+def _freckles(
+    points: Float32Array,
+    regions: Mapping[str, Float32Array],
+    base: float,
+    *,
+    seed: int,
+    rng: np.random.Generator,
+) -> NDArray[np.floating]:
+    where = 0.9 * regions["cheeks"] + 0.9 * regions["nose"] + 0.25 * regions["forehead"] + 0.03
+    where = where * (1.0 - regions["lips"])
+    # Freckles belong to pale skin.
+    amount = float(rng.uniform(0.2, 0.8)) * float(np.exp(-base / 0.05))
+    spots = scattered_spots(
+        points, amount * where, cell_mm=3.6, radius_mm=(0.4, 1.1), seed=seed + 21, softness=5.0
+    )
+    return 0.9 * spots
+
+
+def _moles(
+    points: Float32Array, base: float, *, seed: int, rng: np.random.Generator
+) -> NDArray[np.floating]:
+    spots = scattered_spots(
+        points,
+        np.full(points.shape[:-1], 0.16),
+        cell_mm=26.0,
+        radius_mm=(0.7, 2.2),
+        seed=seed + 31,
+        softness=8.0,
+    )
+    # Nevi hold several times the melanin of the skin around them.
+    return float(rng.uniform(1.4, 2.0)) * (1.0 + 0.6 * float(np.exp(-base / 0.05))) * spots
+
+
+def _step(t: NDArray[np.floating]) -> NDArray[np.floating]:
+    return 0.5 * (1.0 + np.tanh(t))

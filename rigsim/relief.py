@@ -1,0 +1,148 @@
+"""Fine geometry of the skin's surface: pores, wrinkles, and how rough and oily it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.atlas import Atlas
+from rigsim.mesh import Float32Array
+from rigsim.surface_noise import line_network, scattered_spots, smooth_noise
+
+
+def height_um(
+    points_mm: Float32Array,
+    regions: Mapping[str, Float32Array],
+    *,
+    texel_mm: float,
+    seed: int,
+) -> Float32Array:
+    """Draw pores, folds and fine wrinkles.
+
+    Parameters
+    ----------
+    points_mm
+        Points on the mean head, shape (..., 3).
+    regions
+        Masks of `rigsim.face_regions.region_masks`.
+    texel_mm
+        Size of a texel; what is finer than two texels is left out or widened at less depth.
+    seed
+        Any integer.
+
+    Returns
+    -------
+    ndarray of float32
+        Height in um, shape (...); pits are negative.
+    """
+    height = np.zeros(points_mm.shape[:-1], np.float32)
+    porous = 0.25 + 0.6 * regions["nose"] + 0.5 * regions["cheeks"] + 0.2 * regions["forehead"]
+    porous = np.clip(porous * (1.0 - regions["lips"]) * (1.0 - 0.8 * regions["lids"]), 0.0, 1.0)
+    pores = scattered_spots(
+        points_mm,
+        porous,
+        cell_mm=1.1,
+        radius_mm=(0.10, 0.24),
+        seed=seed + 71,
+        softness=4.0,
+        smallest_mm=0.8 * texel_mm,
+    )
+    height -= 60.0 * pores * (0.5 + 0.5 * porous)
+    # Lines of expression: horizontal on the forehead, fans beside the eyes, upright on the lips.
+    stretched = points_mm * np.array([0.12, 1.0, 0.4], np.float32)
+    height -= _furrows(stretched, 9.0, 0.9, texel_mm, 45.0, seed + 72) * regions["forehead"]
+    fans = points_mm * np.array([0.25, 1.0, 0.25], np.float32)
+    height -= _furrows(fans, 4.0, 0.6, texel_mm, 45.0, seed + 73) * regions["crow"]
+    upright = points_mm * np.array([1.0, 0.15, 0.3], np.float32)
+    height -= _furrows(upright, 2.4, 0.45, texel_mm, 60.0, seed + 74) * regions["lips"]
+    # The net of primary lines, a quarter of a millimetre apart, where texels can show it.
+    if texel_mm < 0.2:
+        net = line_network(points_mm, 0.6, max(0.1, texel_mm), seed=seed + 75)
+        height -= 18.0 * net
+    if texel_mm < 0.8:
+        height += 6.0 * smooth_noise(points_mm, (max(1.0, 2.5 * texel_mm),), seed=seed + 76)
+    return height
+
+
+def roughness_map(
+    points_mm: Float32Array, regions: Mapping[str, Float32Array], *, seed: int
+) -> Float32Array:
+    """Draw how rough the surface is; oil on forehead, nose and chin smooths it.
+
+    Parameters
+    ----------
+    points_mm
+        Points on the mean head, shape (..., 3).
+    regions
+        Masks of `rigsim.face_regions.region_masks`.
+    seed
+        Any integer.
+
+    Returns
+    -------
+    ndarray of float32
+        GGX alpha, shape (...), 0.15 to 0.5.
+
+    Notes
+    -----
+    Around the Beckmann roughness of 0.3 to 0.35 that fits measured facial skin
+    (Weyrich et al. 2006, doi:10.1145/1141911.1141987).
+    """
+    rng = np.random.default_rng([seed, 3])
+    oil = float(rng.uniform(0.6, 1.2)) * np.maximum(
+        np.maximum(0.7 * regions["forehead"], regions["nose"]), 0.6 * regions["chin"]
+    )
+    alpha = 0.36 - 0.11 * oil - 0.08 * regions["lips"] - 0.03 * regions["lids"]
+    alpha *= 1.0 + 0.07 * smooth_noise(points_mm, (22.0, 8.0), seed=seed + 81)
+    return np.asarray(np.clip(alpha, 0.15, 0.5), np.float32)
+
+
+def relief_normals(atlas: Atlas, height: NDArray[np.floating]) -> Float32Array:
+    """Tilt the normals of a surface by a height map.
+
+    Parameters
+    ----------
+    atlas
+        Surface under each texel.
+    height
+        Height in um, shape (N, N).
+
+    Returns
+    -------
+    ndarray of float32
+        Unit normals, shape (N, N, 3), rig frame; unchanged where the texture has no surface.
+    """
+    h = np.where(atlas.covered, height, 0.0).astype(np.float64) * 1e-3
+    valid = atlas.covered
+    along_u, along_v = np.zeros_like(h), np.zeros_like(h)
+    both = valid[:, 2:] & valid[:, :-2]
+    along_u[:, 1:-1] = np.where(both, 0.5 * (h[:, 2:] - h[:, :-2]), 0.0) * atlas.size
+    both = valid[2:] & valid[:-2]
+    # Row 0 is the top: v grows against the rows.
+    along_v[1:-1] = np.where(both, 0.5 * (h[:-2] - h[2:]), 0.0) * atlas.size
+    du, dv = atlas.dp_du_mm.astype(np.float64), atlas.dp_dv_mm.astype(np.float64)
+    e, f = np.sum(du * du, axis=-1), np.sum(du * dv, axis=-1)
+    g = np.sum(dv * dv, axis=-1)
+    determinant = e * g - f * f
+    safe = determinant > 1e-9 * np.maximum(e, g) ** 2
+    inverse = np.where(safe, 1.0 / np.where(safe, determinant, 1.0), 0.0)
+    a = (g * along_u - f * along_v) * inverse
+    b = (e * along_v - f * along_u) * inverse
+    tilted = atlas.normal - (a[..., None] * du + b[..., None] * dv)
+    length = np.linalg.norm(tilted, axis=-1, keepdims=True)
+    return np.where(length > 0.0, tilted / np.maximum(length, 1e-12), 0.0).astype(np.float32)
+
+
+def _furrows(
+    points: Float32Array,
+    cell_mm: float,
+    width_mm: float,
+    texel_mm: float,
+    depth_um: float,
+    seed: int,
+) -> Float32Array:
+    drawn = max(width_mm, 1.2 * texel_mm)
+    lines = line_network(points, cell_mm, drawn, seed=seed)
+    return np.asarray(depth_um * width_mm / drawn * lines, np.float32)
