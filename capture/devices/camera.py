@@ -1,0 +1,314 @@
+"""What every camera answers, and the rule by which a frame is believed.
+
+A valid image can be the wrong one: left over from an earlier trigger, of the camera next to it,
+or taken with other settings. A frame is therefore accepted on what it says of itself, never
+because it arrived.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.devices.port import DeviceError
+
+ENTRY_POINTS = "capture.cameras"
+MAX_EXPOSURE_DEVIATION_EV = 1.0 / 3.0
+
+
+class CameraError(DeviceError, RuntimeError):
+    """A camera did not do what was asked."""
+
+
+class CameraUrlError(CameraError, ValueError):
+    """An address that no camera answers to."""
+
+
+class FrameTimeout(CameraError, TimeoutError):
+    """No frame came in time."""
+
+
+class FrameRefused(CameraError):
+    """A frame that is not the one that was asked for."""
+
+
+class StaleFrame(FrameRefused):
+    """A frame of an earlier trigger."""
+
+
+class WrongCamera(FrameRefused):
+    """A frame of another camera."""
+
+
+class WrongExposure(FrameRefused):
+    """A frame with other settings than those asked for."""
+
+
+class Trigger(StrEnum):
+    """What starts an exposure."""
+
+    SOFTWARE = "software"
+    EDGE = "edge"
+    LEVEL = "level"
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Settings of an exposure.
+
+    Attributes
+    ----------
+    exposure_s
+        Time, s, above 0.
+    iso
+        Sensitivity, above 0.
+    """
+
+    exposure_s: float
+    iso: int
+
+    def __post_init__(self) -> None:
+        """Refuse what no camera can do."""
+        if not (math.isfinite(self.exposure_s) and self.exposure_s > 0):
+            raise ValueError(f"exposure_s: got {self.exposure_s}, expected a time above 0")
+        if self.iso <= 0:
+            raise ValueError(f"iso: got {self.iso}, expected a number above 0")
+
+    def deviation_ev(self, other: Exposure) -> float:
+        """Return how much brighter ``self`` makes an image than ``other``, in stops.
+
+        Examples
+        --------
+        >>> Exposure(0.02, 100).deviation_ev(Exposure(0.01, 200))
+        0.0
+        """
+        return math.log2(self.exposure_s * self.iso / (other.exposure_s * other.iso))
+
+
+@dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """What a camera is.
+
+    Attributes
+    ----------
+    serial, model
+        The serial number identifies the camera; no two in a rig share one.
+    width_px, height_px
+        Of its frames.
+    pattern
+        Color filter array, "RGGB" and so on, or "MONO".
+    black, white
+        Levels, DN; black for each position of the filter array.
+    triggers
+        Those it understands.
+    """
+
+    serial: str
+    model: str
+    width_px: int
+    height_px: int
+    pattern: str
+    black: tuple[float, ...]
+    white: int
+    triggers: tuple[Trigger, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame as a camera hands it over, with what it says of itself.
+
+    Attributes
+    ----------
+    serial
+        Of the camera that took it.
+    seq
+        Counts the frames since the camera was armed, from 0.
+    t_start_s, t_end_s
+        Of the exposure, on the camera's clock.
+    exposure
+        What was really set.
+    image
+        Sensor values, (H, W) uint16, or a whole raw file as bytes.
+    light
+        What the camera knows of the light; may be empty.
+    """
+
+    serial: str
+    seq: int
+    t_start_s: float
+    t_end_s: float
+    exposure: Exposure
+    image: NDArray[np.uint16] | bytes
+    light: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Camera(Protocol):
+    """A camera, whatever is behind it."""
+
+    @property
+    def info(self) -> CameraInfo:
+        """What it is."""
+
+    def clock_s(self) -> float:
+        """Return the time on the clock that stamps its frames, s."""
+
+    def configure(self, want: Exposure) -> Exposure:
+        """Set an exposure and return what was really set."""
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        """Make ready for ``count`` frames; frames waiting from before are dropped."""
+
+    def fire(self) -> None:
+        """Start one exposure; for the software trigger only."""
+
+    def frame(self, timeout_s: float) -> Frame:
+        """Return the next frame, or raise :class:`FrameTimeout`."""
+
+    def abort(self) -> None:
+        """Give up what was armed."""
+
+    def close(self) -> None:
+        """Let go of the camera."""
+
+
+def open_camera(url: str) -> Camera:
+    """Open a camera by its address.
+
+    Parameters
+    ----------
+    url
+        ``sim://WORLD/VIEW``, ``tcp://HOST:PORT/VIEW``, ``hotfolder:PATH``, ``gphoto2:SERIAL``.
+        The part before the colon names an entry point of the group ``capture.cameras``.
+
+    Raises
+    ------
+    CameraUrlError
+        When no such kind of camera is installed.
+    CameraError
+        When the camera does not answer.
+    """
+    kind, colon, rest = url.partition(":")
+    found = {entry.name: entry for entry in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+    if not colon or kind not in found:
+        raise CameraUrlError(
+            f"camera address: got {url!r}, expected KIND:REST with KIND one of "
+            f"{', '.join(sorted(found))}; for example hotfolder:incoming"
+        )
+    camera: Camera = found[kind].load()(rest.removeprefix("//"))
+    return camera
+
+
+def check_frame(
+    frame: Frame, info: CameraInfo, *, seq: int, not_before_s: float, want: Exposure
+) -> None:
+    """Raise when ``frame`` is not the one that was asked for.
+
+    Parameters
+    ----------
+    frame
+        As the camera handed it over.
+    info
+        Of the camera that was asked.
+    seq
+        The number that the frame must carry.
+    not_before_s
+        When the trigger was given, on the camera's clock.
+    want
+        The exposure that was asked for.
+
+    Raises
+    ------
+    WrongCamera
+        When the serial number is another's.
+    StaleFrame
+        When it was exposed before the trigger, or carries another number.
+    WrongExposure
+        When its settings differ by more than a third of a stop.
+    """
+    if frame.serial != info.serial:
+        raise WrongCamera(
+            f"camera {info.serial}: got a frame of camera {frame.serial}; two cameras are "
+            "mixed up: address each by its serial number"
+        )
+    if frame.seq != seq:
+        raise StaleFrame(f"camera {info.serial}: got frame number {frame.seq}, expected {seq}")
+    if frame.t_start_s < not_before_s:
+        raise StaleFrame(
+            f"camera {info.serial}: got a frame exposed {not_before_s - frame.t_start_s:.3f} s "
+            "before the trigger"
+        )
+    deviation = frame.exposure.deviation_ev(want)
+    if not abs(deviation) <= MAX_EXPOSURE_DEVIATION_EV + 1e-9:
+        raise WrongExposure(
+            f"camera {info.serial}: got {frame.exposure.exposure_s:g} s at ISO "
+            f"{frame.exposure.iso}, expected {want.exposure_s:g} s at ISO {want.iso} "
+            f"({deviation:+.2f} stops off)"
+        )
+    if isinstance(frame.image, np.ndarray):
+        shape = (info.height_px, info.width_px)
+        if frame.image.shape != shape or frame.image.dtype != np.uint16:
+            raise FrameRefused(
+                f"camera {info.serial}: got a {frame.image.dtype} frame of shape "
+                f"{frame.image.shape}, expected uint16 {shape}"
+            )
+
+
+def next_frame(
+    camera: Camera, *, seq: int, not_before_s: float, want: Exposure, timeout_s: float
+) -> tuple[Frame, int]:
+    """Return the frame that was asked for, and how many stale ones were dropped on the way.
+
+    Parameters
+    ----------
+    camera
+        Armed.
+    seq, not_before_s, want
+        As for :func:`check_frame`.
+    timeout_s
+        For each frame that is waited for.
+
+    Raises
+    ------
+    FrameTimeout
+        When nothing came, or nothing but stale frames (at most 8 are looked at).
+    WrongCamera, WrongExposure
+        Which no waiting mends.
+    """
+    for stale in range(8):
+        frame = camera.frame(timeout_s)
+        try:
+            check_frame(frame, camera.info, seq=seq, not_before_s=not_before_s, want=want)
+        except StaleFrame:
+            continue
+        return frame, stale
+    raise FrameTimeout(
+        f"camera {camera.info.serial}: sent 8 stale frames in a row; switch it off and on"
+    )
+
+
+def check_serials(cameras: Mapping[str, Camera], expected: Sequence[tuple[str, str]]) -> None:
+    """Raise when a view's camera is not the one the rig file names.
+
+    Parameters
+    ----------
+    cameras
+        By view.
+    expected
+        View and serial number, as in the rig file.
+    """
+    for view, serial in expected:
+        if view not in cameras:
+            raise CameraUrlError(f"view {view!r}: no camera was given; add --camera {view}=URL")
+        got = cameras[view].info.serial
+        if got != serial:
+            raise WrongCamera(
+                f"view {view!r}: got the camera {got}, expected {serial} as the rig file says; "
+                "exchange the addresses, or write the new serial number into the rig file"
+            )

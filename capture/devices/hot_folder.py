@@ -1,0 +1,171 @@
+"""A folder as a camera: any tethering program that writes raw files there will do.
+
+The program and a person's finger, or the flash box's trigger line, take the picture. A frame is a
+raw file that appeared after the camera was armed and has stopped growing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from capture import raw
+from capture.devices.camera import (
+    CameraError,
+    CameraInfo,
+    CameraUrlError,
+    Exposure,
+    Frame,
+    FrameTimeout,
+    Trigger,
+)
+
+POLL_S = 0.1
+SETTLED_S = 0.5
+"""A file whose size has not changed for so long is taken to be whole."""
+SUFFIXES = frozenset(
+    ".dng .nef .cr2 .cr3 .arw .raf .orf .rw2 .pef .srw .kdc .dcr .iiq .3fr .rwl".split()
+)
+
+
+def open_camera(rest: str) -> HotFolder:
+    """Open ``hotfolder:PATH`` or ``hotfolder:PATH?serial=NUMBER``."""
+    path, _, query = rest.partition("?")
+    serial = query.removeprefix("serial=") if query.startswith("serial=") else ""
+    if query and not serial:
+        raise CameraUrlError(f"hotfolder:{rest}: got {query!r}, expected serial=NUMBER")
+    return HotFolder(Path(path), serial=serial)
+
+
+class HotFolder:
+    """Camera over a folder that another program fills.
+
+    Parameters
+    ----------
+    path
+        An existing folder.
+    serial
+        Serial number that frames must carry; empty: that of the first file in the folder, which
+        must then hold one.
+    clock, sleep
+        For tests; the clock must be the one that stamps files (seconds since 1970).
+
+    Raises
+    ------
+    CameraUrlError
+        When the folder is missing, or no file tells the serial number.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        serial: str = "",
+        clock: Callable[[], float] = time.time,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        if not path.is_dir():
+            raise CameraUrlError(f"hotfolder:{path}: is no folder; make it, then try again")
+        self._path = path
+        self._clock = clock
+        self._sleep = sleep
+        self._seen = set(self._files())
+        self._seq = 0
+        self._armed = 0
+        self._want = Exposure(0.01, 100)
+        sample = next(iter(sorted(self._seen)), None)
+        if sample is None:
+            raise CameraUrlError(
+                f"hotfolder:{path}: is empty; take one test picture into it, so that the camera "
+                "is known"
+            )
+        frame = raw.read(sample)
+        self._info = CameraInfo(
+            serial=serial or frame.camera_serial or frame.camera_model,
+            model=frame.camera_model,
+            width_px=frame.cfa.shape[1],
+            height_px=frame.cfa.shape[0],
+            pattern=frame.pattern,
+            black=frame.black,
+            white=frame.white,
+            triggers=(Trigger.EDGE, Trigger.SOFTWARE),
+        )
+
+    @property
+    def info(self) -> CameraInfo:
+        """What the test picture says of the camera."""
+        return self._info
+
+    def clock_s(self) -> float:
+        """Return the clock that stamps files."""
+        return self._clock()
+
+    def configure(self, want: Exposure) -> Exposure:
+        """Note what is wanted; the tethering program sets it."""
+        self._want = want
+        return want
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        """Ignore all that is in the folder now."""
+        if count < 1:
+            raise CameraError(f"count: got {count}, expected 1 or more")
+        self._seen |= set(self._files())
+        self._seq = 0
+        self._armed = count
+
+    def fire(self) -> None:
+        """Do nothing: a folder takes no picture; the operator or the trigger line does."""
+
+    def frame(self, timeout_s: float) -> Frame:
+        """Wait for a new raw file that has stopped growing, and read it."""
+        deadline = self._clock() + timeout_s
+        sizes: dict[Path, tuple[int, float]] = {}
+        while True:
+            now = self._clock()
+            for path in self._files():
+                if path in self._seen:
+                    continue
+                try:
+                    size = path.stat().st_size
+                except FileNotFoundError:  # a temporary file that was renamed meanwhile
+                    continue
+                known = sizes.get(path)
+                if known is None or known[0] != size:
+                    sizes[path] = (size, now)
+                elif size and now - known[1] >= SETTLED_S:
+                    return self._take(path)
+            if now >= deadline:
+                raise FrameTimeout(
+                    f"hotfolder:{self._path}: no new raw file in {timeout_s:g} s; is the "
+                    "tethering program writing there?"
+                )
+            self._sleep(POLL_S)
+
+    def abort(self) -> None:
+        """Ignore what is in the folder."""
+        self._seen |= set(self._files())
+        self._armed = 0
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+    def _files(self) -> list[Path]:
+        return [p for p in self._path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
+
+    def _take(self, path: Path) -> Frame:
+        self._seen.add(path)
+        blob = path.read_bytes()
+        picture = raw.read(path)
+        written = path.stat().st_mtime
+        exposure_s = picture.exposure_s or self._want.exposure_s
+        frame = Frame(
+            serial=picture.camera_serial or picture.camera_model or self._info.serial,
+            seq=self._seq,
+            t_start_s=written - exposure_s,
+            t_end_s=written,
+            exposure=Exposure(exposure_s, picture.iso or self._want.iso),
+            image=blob,
+        )
+        self._seq += 1
+        return frame
