@@ -1,0 +1,374 @@
+"""Run a plan on a rig: set up, expose, tear down; whatever happens, the lights end dark.
+
+The driver decides nothing and this module nothing about bytes: what to shoot is the plan's, what is
+missing is the session's, whether a frame is the right one is the camera rule's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from capture import raw
+from capture.devices.camera import (
+    Camera,
+    CameraError,
+    Exposure,
+    Frame,
+    FrameRefused,
+    FrameTimeout,
+    Trigger,
+    check_serials,
+    next_frame,
+)
+from capture.devices.port import DeviceError
+from capture.plan import Plan, Step
+from capture.rig import Rig, View
+from capture.session import Session
+
+log = logging.getLogger(__name__)
+
+MAX_ATTEMPTS = 3
+CHARGE_TIMEOUT_S = 60.0
+FRAME_MARGIN_S = 5.0
+"""How much longer than exposure and read-out a frame may take to come."""
+
+
+class AcquisitionError(DeviceError, RuntimeError):
+    """A plan could not be carried out; what was captured is safe in the session."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """The operator stopped the capture; the session can be resumed."""
+
+
+class FlashReport(Protocol):
+    """What the box says of a flash that it fired."""
+
+    token: str
+    t_box_s: float
+    power: float
+    polarizer: str
+    analyser_deg: float
+
+
+class Flash(Protocol):
+    """The part of the flash driver that a capture needs."""
+
+    @property
+    def limits(self) -> Mapping[str, Any]:
+        """What the box allows, in its own words and units."""
+
+    def arm(self) -> None:
+        """Allow light."""
+
+    def set_polarizer(self, polarizer: str) -> None:
+        """Turn the analyser to "parallel" or "crossed"."""
+
+    def set_analyser(self, angle_deg: float) -> None:
+        """Turn the analyser to an angle."""
+
+    def set_power(self, power: float) -> None:
+        """Set the power, 0 to 1."""
+
+    def wait_charged(self, timeout_s: float) -> None:
+        """Wait until the packs are charged for the power that is set."""
+
+    def fire(self, token: str) -> Any:
+        """Fire once; the same token never fires twice."""
+
+    def dark(self) -> None:
+        """Put all light out and disarm."""
+
+
+@dataclass(frozen=True, slots=True)
+class Acquired:
+    """What a run of a plan did.
+
+    Attributes
+    ----------
+    steps
+        Steps captured in this run.
+    frames
+        Frames committed.
+    stale
+        Stale frames that were dropped.
+    retakes
+        Steps that had to be shot again.
+    """
+
+    steps: int
+    frames: int
+    stale: int
+    retakes: int
+
+
+def run_plan(
+    plan: Plan,
+    rig: Rig,
+    *,
+    boxes: Mapping[str, Flash],
+    cameras: Mapping[str, Camera],
+    session: Session,
+    progress: Callable[[str], None] | None = None,
+    prompt: Callable[[str], None] | None = None,
+    interrupted: Callable[[], bool] | None = None,
+    clock: Callable[[], float] = time.time,
+) -> Acquired:
+    """Capture what the session still lacks of a plan.
+
+    Parameters
+    ----------
+    plan
+        What to capture; steps that the session holds already are not repeated.
+    rig
+        The rig that the plan is for.
+    boxes, cameras
+        Open drivers by name: the box "flash", and a camera for each view.
+    session
+        Open for writing.
+    progress
+        Called with one line a step.
+    prompt
+        Called with the state ("smile") before the first step that needs it, so that the subject
+        can take it; returns when the subject is ready.
+    interrupted
+        Asked before each step; True stops in good order.
+    clock
+        The host's time, s since 1970, for the journal.
+
+    Returns
+    -------
+    Acquired
+
+    Raises
+    ------
+    AcquisitionError
+        When a step fails three times, or the plan goes beyond what the box allows; this is found
+        before anything flashes.
+    DeviceError
+        When a box or camera is lost.
+    Interrupted
+        When ``interrupted`` said so.
+    """
+    plan.check(rig)
+    if "flash" not in boxes:
+        raise AcquisitionError("box 'flash': no port was given; add --port flash=URL")
+    box = boxes["flash"]
+    check_serials(cameras, [(view.name, view.serial) for view in rig.views])
+    _check_limits(plan, box.limits)
+    steps = _steps(session)
+    counts = {"steps": 0, "frames": 0, "stale": 0, "retakes": 0}
+    state: str | None = None
+    try:
+        box.arm()
+        for number, step in enumerate(steps, start=1):
+            if interrupted is not None and interrupted():
+                raise Interrupted
+            wanted = step.index.get("state")
+            if wanted is not None and wanted != state:
+                state = str(wanted)
+                if prompt is not None:
+                    prompt(state)
+            if progress is not None:
+                progress(f"{number}/{len(steps)} {step.id} {step.kind} {_index_text(step)}")
+            _take(step, rig, box, cameras, session, clock, counts)
+    finally:
+        _tear_down(box, cameras)
+    return Acquired(**counts)
+
+
+def _steps(session: Session) -> list[Step]:
+    """Return the steps that lack a frame of any camera, once each, in the plan's order."""
+    found: dict[str, Step] = {}
+    for step, _ in session.todo():
+        found.setdefault(step.id, step)
+    return list(found.values())
+
+
+def _index_text(step: Step) -> str:
+    return " ".join(f"{name}={value}" for name, value in step.index.items())
+
+
+def _check_limits(plan: Plan, limits: Mapping[str, Any]) -> None:
+    low = float(limits.get("power_min", 0.0))
+    high = float(limits.get("power_max", 1.0))
+    for step in plan.steps:
+        power = float(step.settings.get("power", 0.0))
+        if step.kind != "dark" and power > 0 and not low <= power <= high:
+            raise AcquisitionError(
+                f"step {step.id}: got power {power:g}, the box allows {low:g} to {high:g}; "
+                "nothing was fired: change the plan"
+            )
+
+
+def _take(
+    step: Step,
+    rig: Rig,
+    box: Flash,
+    cameras: Mapping[str, Camera],
+    session: Session,
+    clock: Callable[[], float],
+    counts: dict[str, int],
+) -> None:
+    """Take one step with all its cameras, or none: a step with one bad frame is shot again."""
+    refusals: list[str] = []
+    for attempt in range(1, MAX_ATTEMPTS + 1):
+        try:
+            report, frames, stale = _expose(step, rig, box, cameras, attempt)
+        except (FrameRefused, FrameTimeout) as error:
+            log.warning("step %s, attempt %d: %s", step.id, attempt, error)
+            refusals.append(str(error))
+            counts["retakes"] += 1
+            for camera in (cameras[name] for name in step.cameras):
+                camera.abort()
+            continue
+        counts["stale"] += stale
+        light = _light(report)
+        for name, frame in frames.items():
+            blob = _dng(frame, rig.view(name), cameras[name], step, session, light)
+            session.commit(
+                step.id,
+                name,
+                blob,
+                settings=dict(step.settings),
+                actual={
+                    "exposure_s": frame.exposure.exposure_s,
+                    "iso": frame.exposure.iso,
+                    "serial": frame.serial,
+                    "tries": attempt,
+                    **light,
+                },
+                t_box_s=None if report is None else float(report.t_box_s),
+                t_host_s=clock(),
+            )
+            counts["frames"] += 1
+        counts["steps"] += 1
+        return
+    raise AcquisitionError(
+        f"step {step.id}: failed {MAX_ATTEMPTS} times ({refusals[-1]}); what was captured is safe: "
+        "mend the cause and run the same command with --resume"
+    )
+
+
+def _expose(
+    step: Step, rig: Rig, box: Flash, cameras: Mapping[str, Camera], attempt: int
+) -> tuple[Any | None, dict[str, Frame], int]:
+    """Set the light and the cameras, make the exposure, and collect one frame a camera."""
+    want = Exposure(float(step.settings["exposure_s"]), int(step.settings["iso"]))
+    power = 0.0 if step.kind == "dark" else float(step.settings.get("power", 1.0))
+    if power > 0:
+        if "analyser_deg" in step.settings:
+            box.set_analyser(float(step.settings["analyser_deg"]))
+        else:
+            box.set_polarizer(str(step.settings["polarizer"]))
+        box.set_power(power)
+        box.wait_charged(CHARGE_TIMEOUT_S)
+    chosen = {name: cameras[name] for name in step.cameras}
+    lit_by_box = power > 0
+    triggers = {
+        name: Trigger.EDGE
+        if lit_by_box and Trigger.EDGE in camera.info.triggers
+        else Trigger.SOFTWARE
+        for name, camera in chosen.items()
+    }
+    asked: dict[str, Exposure] = {}
+    not_before: dict[str, float] = {}
+    for name, camera in chosen.items():
+        got = camera.configure(want)
+        if abs(got.deviation_ev(want)) > 1.0 / 3.0 + 1e-9:
+            raise CameraError(
+                f"view {name!r}: the camera sets {got.exposure_s:g} s at ISO {got.iso}, the plan "
+                f"wants {want.exposure_s:g} s at ISO {want.iso}; choose settings it has"
+            )
+        asked[name] = want
+        camera.arm(1, triggers[name])
+        not_before[name] = camera.clock_s()
+    for name, camera in chosen.items():
+        if triggers[name] is Trigger.SOFTWARE:
+            camera.fire()
+    report = box.fire(f"{step.id}.{attempt}") if lit_by_box else None
+    frames: dict[str, Frame] = {}
+    stale = 0
+    for name, camera in chosen.items():
+        timeout_s = want.exposure_s + rig.view(name).readout_s + FRAME_MARGIN_S
+        frames[name], dropped = next_frame(
+            camera, seq=0, not_before_s=not_before[name], want=asked[name], timeout_s=timeout_s
+        )
+        stale += dropped
+    return report, frames, stale
+
+
+def _light(report: Any | None) -> dict[str, str | float]:
+    """Which light made a frame: what the box acknowledged, not what was asked for."""
+    if report is None:
+        return {"light": "none", "power": 0.0}
+    return {
+        "light": "flash",
+        "token": str(report.token),
+        "power": float(report.power),
+        "polarizer": str(report.polarizer),
+        "analyser_deg": float(report.analyser_deg),
+    }
+
+
+def _dng(
+    frame: Frame,
+    view: View,
+    camera: Camera,
+    step: Step,
+    session: Session,
+    light: Mapping[str, str | float],
+) -> bytes:
+    """Encode a frame as our DNG, with the step and the light in it."""
+    if isinstance(frame.image, bytes):
+        # a maker's raw file is written anew: its own metadata can name people and places
+        picture = raw.decode(memoryview(frame.image), where=f"step {step.id}, view {view.name}")
+        cfa, pattern, black, white = picture.cfa, picture.pattern, picture.black, picture.white
+        matrix, profile, neutral = picture.color_matrix, picture.noise_profile, picture.neutral
+    else:
+        info = camera.info
+        cfa, pattern, black, white = frame.image, info.pattern, info.black, info.white
+        matrix, neutral = None, None
+        profile = raw.noise_profile(
+            view.gain_e_per_dn,
+            view.read_noise_e,
+            black=float(np.mean(info.black)),
+            white=float(info.white),
+        )
+    return raw.encode_dng(
+        cfa,
+        pattern=pattern,
+        black=black,
+        white=white,
+        exposure_s=frame.exposure.exposure_s,
+        iso=frame.exposure.iso,
+        camera_model=camera.info.model,
+        camera_serial=frame.serial,
+        color_matrix=matrix,
+        neutral=neutral,
+        noise_profile=profile,
+        f_number=view.f_number,
+        focal_mm=view.focal_mm,
+        step_id=step.id,
+        session_id=session.id,
+        light=light,
+    )
+
+
+def _tear_down(box: Flash, cameras: Mapping[str, Camera]) -> None:
+    """Put the light out and let the cameras go; nothing here hides the error that led here."""
+    try:
+        box.dark()
+    except DeviceError as error:
+        # the box's own lease puts the light out when the host is not heard
+        log.error("the box could not be told to go dark: %s; its lease ends the light", error)
+    for camera in cameras.values():
+        with contextlib.suppress(DeviceError):
+            camera.abort()

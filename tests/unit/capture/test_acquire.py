@@ -1,0 +1,195 @@
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from capture.acquire import AcquisitionError, Interrupted, run_plan
+from capture.devices.camera import CameraInfo, Frame, FrameTimeout, Trigger, WrongCamera
+from capture.devices.port import LinkLost
+from capture.plan import flash_plan
+from capture.rig import load_rig
+from capture.session import Session, Subject, verify
+
+RIG = load_rig("flash").resized(16)
+VIEW = RIG.views[0]
+
+
+class Box:
+    """A flash box that notes what it is told and drives the cameras' trigger line."""
+
+    def __init__(self, log, fail_at=None):
+        self.log, self.fail_at, self.shots = log, fail_at, 0
+        self.limits = {"power_min": 0.03125, "power_max": 1.0}
+        self.polarizer, self.power, self.line = "parallel", 0.0, []
+
+    def arm(self):
+        self.log.append("arm")
+
+    def set_polarizer(self, polarizer):
+        self.polarizer = polarizer
+
+    def set_analyser(self, angle_deg):
+        self.polarizer = "other"
+
+    def set_power(self, power):
+        self.power = power
+
+    def wait_charged(self, timeout_s):
+        pass
+
+    def fire(self, token):
+        self.shots += 1
+        if self.shots == self.fail_at:
+            raise LinkLost("unplugged")
+        self.log.append(f"fire {token} {self.polarizer}")
+        for camera in self.line:
+            camera.expose()
+        return SimpleNamespace(
+            token=token, t_box_s=float(self.shots), power=self.power, polarizer=self.polarizer,
+            analyser_deg=90.0 if self.polarizer == "crossed" else 0.0,
+        )  # fmt: skip
+
+    def dark(self):
+        self.log.append("dark")
+
+
+class Camera:
+    def __init__(self, spoil=()):
+        self.info = CameraInfo(
+            VIEW.serial, VIEW.camera_model, VIEW.width_px, VIEW.height_px, "RGGB", (512.0,) * 4,
+            VIEW.white_level, (Trigger.EDGE, Trigger.SOFTWARE),
+        )  # fmt: skip
+        self.now, self.spoil, self.taken, self.queue = 0.0, list(spoil), 0, []
+
+    def clock_s(self):
+        return self.now
+
+    def configure(self, want):
+        self.want = want
+        return want
+
+    def arm(self, count, trigger):
+        self.queue = []
+
+    def fire(self):
+        self.expose()
+
+    def expose(self):
+        self.now += 1.0
+        image = np.full((VIEW.height_px, VIEW.width_px), 600 + self.taken, np.uint16)
+        frame = Frame(VIEW.serial, 0, self.now, self.now + 0.01, self.want, image)
+        self.taken += 1
+        if self.spoil:
+            change = self.spoil.pop(0)
+            frame = None if change == "dropped" else dataclasses.replace(frame, **change)
+        if frame is not None:
+            self.queue.append(frame)
+
+    def frame(self, timeout_s):
+        if not self.queue:
+            raise FrameTimeout("no frame")
+        return self.queue.pop(0)
+
+    def abort(self):
+        self.queue = []
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def plan():
+    return flash_plan(RIG, darks=1, states=("neutral", "smile"))
+
+
+@pytest.fixture
+def session(tmp_path, plan):
+    made = Session.create(
+        tmp_path / "s", plan=plan, rig=RIG, devices={}, subject=Subject("p"), source="measured"
+    )
+    yield made
+    made.release()
+
+
+def run(plan, session, box, camera, **more):
+    box.line = [camera]
+    return run_plan(
+        plan, RIG, boxes={"flash": box}, cameras={"cam": camera}, session=session,
+        clock=lambda: 1.0, **more,
+    )  # fmt: skip
+
+
+def test_every_step_is_committed_with_the_light_that_made_it(plan, session):
+    log = []
+    done = run(plan, session, Box(log), Camera())
+    assert (done.steps, done.frames, done.retakes) == (5, 5, 0)
+    session.close()
+    assert verify(session.path).ok
+    crossed = session.frames("subject", state="neutral", polarizer="crossed")[0]
+    assert crossed.actual["polarizer"] == "crossed"
+    frame = session.read(crossed)
+    assert frame.light["polarizer"] == "crossed"
+    assert frame.step_id == crossed.step_id
+    assert session.read(session.frames("dark")[0]).light["light"] == "none"
+
+
+def test_the_subject_is_asked_once_for_each_state(plan, session):
+    asked = []
+    run(plan, session, Box([]), Camera(), prompt=asked.append)
+    assert asked == ["neutral", "smile"]
+
+
+@pytest.mark.parametrize("fault", ["dropped", {"seq": 5}, {"t_start_s": -1.0}])
+def test_a_step_without_its_frame_is_shot_again_with_a_new_token(plan, session, fault):
+    log = []
+    done = run(plan, session, Box(log), Camera(spoil=[{}, fault]))
+    assert (done.frames, done.retakes) == (5, 1)
+    shots = [entry for entry in log if entry.startswith("fire")]
+    assert len(shots) == len(set(shots)) == 5
+
+
+def test_a_step_that_keeps_failing_ends_dark_with_what_was_captured(plan, session):
+    log = []
+    with pytest.raises(AcquisitionError, match=r"failed 3 times.*--resume"):
+        run(plan, session, Box(log), Camera(spoil=[{}, {}, *["dropped"] * 9]))
+    assert log[-1] == "dark"
+    assert len(session.frames()) == 2
+
+
+def test_a_lost_link_ends_dark_and_a_second_run_takes_only_what_is_missing(plan, session):
+    log = []
+    with pytest.raises(LinkLost):
+        run(plan, session, Box(log, fail_at=3), Camera())
+    assert log[-1] == "dark"
+    done = run(plan, session, Box(log), Camera())
+    assert done.steps == 2
+    assert session.todo() == []
+
+
+def test_an_interrupt_ends_dark(plan, session):
+    log = []
+    with pytest.raises(Interrupted):
+        run(plan, session, Box(log), Camera(), interrupted=lambda: len(log) > 2)
+    assert log[-1] == "dark"
+
+
+def test_a_plan_beyond_the_boxs_limits_is_refused_before_anything_flashes(plan, session):
+    box = Box([])
+    box.limits = {"power_max": 0.5}
+    with pytest.raises(AcquisitionError, match="nothing was fired"):
+        run(plan, session, box, Camera())
+    assert box.log == []
+
+
+def test_a_camera_that_is_not_the_rigs_is_refused_before_anything_flashes(plan, session):
+    camera, log = Camera(), []
+    camera.info = dataclasses.replace(camera.info, serial="ZZ")
+    with pytest.raises(WrongCamera, match=r"got the camera ZZ, expected"):
+        run(plan, session, Box(log), camera)
+    assert log == []
+
+
+def test_a_missing_box_is_named_with_what_to_type(plan, session):
+    with pytest.raises(AcquisitionError, match="--port flash=URL"):
+        run_plan(plan, RIG, boxes={}, cameras={"cam": Camera()}, session=session)
