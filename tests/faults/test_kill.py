@@ -1,0 +1,180 @@
+"""A writer killed with SIGKILL at random instants loses nothing that it acknowledged.
+
+A nursery process imports the package once and forks writers. A writer resumes (or creates) the
+session, commits one frame after the other and, when a commit has returned, writes the step's id to
+a pipe: the acknowledgement. The test kills it after a random time and looks at what is there.
+"""
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from capture.session import Session, verify
+
+FRAMES = 40
+
+NURSERY = """
+import json, logging, os, sys, traceback
+from pathlib import Path
+
+import numpy as np
+
+from capture import raw
+from capture.plan import Plan, Step
+from capture.rig import load_rig
+from capture.session import Session, Subject
+
+logging.disable(logging.WARNING)
+RIG = load_rig("flash").resized(16)
+PLAN = Plan("flash", tuple(
+    Step(f"S{n:03d}", "subject", {}, {}, ("cam",)) for n in range(FRAMES)))
+
+
+def write(path, acknowledged):
+    if (path / "session.json").exists():
+        session = Session.resume(path)
+    else:
+        session = Session.create(path, plan=PLAN, rig=RIG, devices={}, subject=Subject("P1"),
+                                 source="simulated", session_id="killed")
+    os.write(acknowledged, b"started ")
+    for step, camera in session.todo():
+        values = np.full((96, 128), 600 + int(step.id[1:]), np.uint16)
+        blob = raw.encode_dng(values, pattern="RGGB", black=512, white=16383,
+                              step_id=step.id, session_id=session.id)
+        session.commit(step.id, camera, blob, settings={}, actual={}, t_host_s=0.0)
+        os.write(acknowledged, step.id.encode() + b" ")
+    session.close()
+    os.write(acknowledged, b"closed ")
+
+
+for order in iter(sys.stdin.readline, ""):
+    path, fifo = json.loads(order)
+    child = os.fork()
+    if not child:
+        try:
+            write(Path(path), os.open(fifo, os.O_WRONLY))
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+        os._exit(0)
+    print(child, flush=True)
+    sys.stdin.readline()  # until then a dead child keeps its number, and no other is hit
+    _, status = os.waitpid(child, 0)
+    print(status, flush=True)
+"""
+
+
+class Nursery:
+    """Forks writers and kills them."""
+
+    def __init__(self, folder):
+        self.fifo = folder / "acknowledged"
+        os.mkfifo(self.fifo)
+        single = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", NURSERY.replace("FRAMES", str(FRAMES))],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | single,
+        )
+
+    def write(self, path, *, killed_after_s=None):
+        """Let a writer work, to its end or to its death; return acknowledgements and status."""
+        self.tell(json.dumps([str(path), str(self.fifo)]))
+        child = int(self.process.stdout.readline())
+        said = b""
+        with open(self.fifo, "rb", buffering=0) as acknowledged:
+            if killed_after_s is not None:
+                deadline = time.monotonic() + killed_after_s
+                while (left := deadline - time.monotonic()) > 0:
+                    if select.select([acknowledged], [], [], left)[0]:
+                        part = acknowledged.read(65536)
+                        said += part
+                        if not part:  # the writer has ended by itself
+                            break
+                os.kill(child, signal.SIGKILL)
+            while part := acknowledged.read(65536):
+                said += part
+        self.tell("reap")
+        return said.decode().split(), int(self.process.stdout.readline())
+
+    def tell(self, line):
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
+    def end(self):
+        self.process.stdin.close()
+        self.process.wait(timeout=30)
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def nursery(tmp_path):
+    made = Nursery(tmp_path)
+    yield made
+    made.end()
+
+
+def frames_of(session):
+    """Return step -> whether its frame holds what the writer put into it."""
+    return {
+        record.step_id: set(np.unique(session.read(record).cfa)) == {600 + int(record.step_id[1:])}
+        for record in session.frames()
+    }
+
+
+@pytest.mark.parametrize("kills", [6, pytest.param(60, marks=pytest.mark.long)])
+def test_a_killed_writer_loses_nothing_it_acknowledged(nursery, tmp_path, rng, kills):
+    """Every instant is drawn uniformly over the time of about 15 commits."""
+    tally = Counter()
+    acknowledged: set[str] = set()
+    path = tmp_path / "s0"
+    span_s = 0.05
+    while tally["kills"] < kills:
+        started_s = time.monotonic()
+        said, status = nursery.write(path, killed_after_s=rng.uniform(0, span_s))
+        took_s = time.monotonic() - started_s
+        tally["kills"] += os.WIFSIGNALED(status)
+        assert os.WIFSIGNALED(status) or status == 0
+        fresh = {word for word in said if word not in ("started", "closed")}
+        if len(fresh) >= 3:  # follow the speed of the machine
+            span_s = 15 * took_s / len(fresh)
+        elif not fresh:
+            span_s *= 1.2
+        acknowledged |= fresh
+        if not (path / "session.json").exists():
+            assert not said
+            continue
+        session = Session.open(path)
+        right = frames_of(session)
+        tally["lost"] += len(acknowledged - set(right))
+        tally["corrupt"] += sum(not good for good in right.values())
+        tally["damaged"] += not verify(path).ok
+        if session.closed:
+            assert set(right) == {step.id for step in session.plan.steps}
+            tally["orphans"] += len(list((path / "orphans").iterdir()))
+            tally["sessions completed"] += 1
+            acknowledged = set()
+            path = tmp_path / f"s{tally['sessions completed']}"
+        else:
+            assert "closed" not in said
+        tally["acknowledged"] += len(fresh)
+    print(dict(tally))
+    assert (tally["lost"], tally["corrupt"], tally["damaged"]) == (0, 0, 0)
+    assert tally["acknowledged"] > 0
+    if (path / "session.json").exists():
+        # the last one is left in peace: it completes
+        said, status = nursery.write(path)
+        assert status == 0
+        assert "closed" in said
+        assert all(frames_of(Session.open(path)).values())
+        assert verify(path).ok
