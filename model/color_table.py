@@ -1,0 +1,275 @@
+"""The color of skin as a table over melanin and hemoglobin (Jimenez 2010, eq. 7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from importlib import resources
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline, RectBivariateSpline
+
+from model import spectra
+from model.fresnel import ETA_SKIN
+from model.tissue_optics import (
+    BETA_M,
+    C_HD_MAX,
+    C_HE_PER_C_HD,
+    C_M_MAX,
+    OXYGENATION,
+    two_layer_reflectance,
+)
+
+FloatArray = NDArray[np.float64]
+
+SPECTRAL_NODES = 41
+"""Nodes along each axis of the stored spectral table, see tools/make_reflectance_table.py."""
+LIVE_NODES = 29
+"""Nodes along each axis when the spectral table must be computed first."""
+STORED_ANISOTROPIES = (0.0, 0.8)
+"""Mean cosines g of scattering for which the spectral table is stored."""
+_SMALLEST_SIZE = 8
+_POINTS_AT_ONCE = 32_768
+
+
+class ColorTableError(ValueError):
+    """A color table cannot be built or asked for what it does not hold."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColorTable:
+    """White-balanced camera RGB of skin over the cube roots of its chromophores.
+
+    Between its nodes the table is a cubic spline along both axes, so that its derivatives are
+    continuous and belong exactly to its values.
+    """
+
+    camera: str
+    """Name of the camera's spectral sensitivities."""
+    illuminant: str
+    """Name of the light's spectrum."""
+    rgb: FloatArray
+    """Shape (size, size, 3): [i, j] is the color at C_m = c_m_max (i/(size-1))^3 and
+    C_hd = c_hd_max (j/(size-1))^3; each channel of a perfect white reflector is 1."""
+    c_m_max: float = C_M_MAX
+    """Volume fraction of melanin at the end of the first axis."""
+    c_hd_max: float = C_HD_MAX
+    """Volume fraction of dermal blood at the end of the second axis."""
+    anisotropy: float = 0.0
+    """Mean cosine g of scattering behind the table."""
+    cells: FloatArray = field(init=False, repr=False)
+    """Shape (size-1, size-1, 3, 4, 4): coefficients of x^p y^q in each cell at [..., p, q], with
+    x and y the fractions of the way across the cell."""
+
+    def __post_init__(self) -> None:
+        """Refuse a table that is not one, and work out its cells."""
+        rgb = np.asarray(self.rgb, dtype=np.float64)
+        size = rgb.shape[0] if rgb.ndim else 0
+        if rgb.shape != (size, size, 3) or size < _SMALLEST_SIZE:
+            raise ColorTableError(
+                f"rgb: expected (size, size, 3) with size >= {_SMALLEST_SIZE}, got {rgb.shape}"
+            )
+        if not (np.isfinite(rgb).all() and (rgb > 0.0).all()):
+            raise ColorTableError("rgb: expected finite positive colors at every node")
+        rgb = rgb.copy()
+        rgb.setflags(write=False)
+        cells = _spline_cells(rgb)
+        cells.setflags(write=False)
+        object.__setattr__(self, "rgb", rgb)
+        object.__setattr__(self, "cells", cells)
+
+    @property
+    def size(self) -> int:
+        """Nodes along each axis."""
+        return int(self.rgb.shape[0])
+
+    def lookup(self, c_m: ArrayLike, c_hd: ArrayLike) -> FloatArray:
+        """Return the color of skin.
+
+        Parameters
+        ----------
+        c_m, c_hd
+            Volume fractions of melanin and dermal blood within the table's range, broadcast.
+
+        Returns
+        -------
+        ndarray
+            Shape (..., 3), white-balanced camera RGB of the diffuse reflectance.
+
+        Raises
+        ------
+        ColorTableError
+            When a fraction lies outside the table.
+        """
+        return self._evaluate(c_m, c_hd)[0]
+
+    def jacobian(self, c_m: ArrayLike, c_hd: ArrayLike) -> FloatArray:
+        """Return the derivatives of the color.
+
+        Parameters
+        ----------
+        c_m, c_hd
+            Volume fractions within the table's range and above 0, broadcast. (At 0 the cube root
+            has no derivative.)
+
+        Returns
+        -------
+        ndarray
+            Shape (..., 3, 2): derivative of each channel by C_m and by C_hd.
+
+        Raises
+        ------
+        ColorTableError
+            When a fraction lies outside the table or is 0.
+        """
+        melanin, blood = np.asarray(c_m, dtype=np.float64), np.asarray(c_hd, dtype=np.float64)
+        if not ((melanin > 0.0).all() and (blood > 0.0).all()):
+            raise ColorTableError("c_m, c_hd: expected fractions above 0 for derivatives, got 0")
+        _, by_i, by_j = self._evaluate(melanin, blood)
+        # i = (size - 1) cbrt(c / c_max), so di/dc = i / (3 c)
+        last = self.size - 1
+        di_dc = last * np.cbrt(melanin / self.c_m_max) / (3.0 * melanin)
+        dj_dc = last * np.cbrt(blood / self.c_hd_max) / (3.0 * blood)
+        return np.stack(
+            np.broadcast_arrays(by_i * di_dc[..., None], by_j * dj_dc[..., None]), axis=-1
+        )
+
+    def _evaluate(
+        self, c_m: ArrayLike, c_hd: ArrayLike
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the color and its derivatives by the two node indices."""
+        i, j = np.broadcast_arrays(
+            _node_index("c_m", c_m, self.c_m_max, self.size),
+            _node_index("c_hd", c_hd, self.c_hd_max, self.size),
+        )
+        shape = i.shape
+        i, j = i.ravel(), j.ravel()
+        out = np.empty((3, i.size, 3))
+        for start in range(0, i.size, _POINTS_AT_ONCE):
+            part = slice(start, start + _POINTS_AT_ONCE)
+            row = np.minimum(i[part].astype(np.intp), self.size - 2)
+            column = np.minimum(j[part].astype(np.intp), self.size - 2)
+            cell = self.cells[row, column]
+            x, dx = _powers(i[part] - row)
+            y, dy = _powers(j[part] - column)
+            for k, (a, b) in enumerate(((x, y), (dx, y), (x, dy))):
+                out[k, part] = np.einsum("ncpq,np,nq->nc", cell, a, b)
+        value, by_i, by_j = out.reshape(3, *shape, 3)
+        return value, by_i, by_j
+
+
+def build(
+    camera: str,
+    illuminant: str,
+    *,
+    size: int = 128,
+    anisotropy: float = 0.0,
+    beta_m: float = BETA_M,
+    oxygenation: float = OXYGENATION,
+    eta: float = ETA_SKIN,
+) -> ColorTable:
+    """Build the color table of a camera under a light.
+
+    Parameters
+    ----------
+    camera, illuminant
+        Names known to `model.spectra`, e.g. "Nikon 5100 (NPL)", "D65".
+    size
+        Nodes along each axis, at least 8.
+    anisotropy
+        Mean cosine g of scattering, in [0, 1). The paper's model has 0; skin has
+        `model.tissue_optics.ANISOTROPY_SKIN`, and where melanin exceeds a few percent it matters.
+    beta_m, oxygenation, eta
+        As in `model.tissue_optics.two_layer_reflectance`. With other values than the defaults, or
+        a g that is not stored, the spectra are computed first: 1 s (g = 0) to 5 s instead of 0.1.
+
+    Returns
+    -------
+    ColorTable
+        Epidermal blood is a quarter of dermal blood. Within 1e-4 (relative) of the reflectance
+        of `two_layer_reflectance` averaged over the camera's bands.
+
+    Raises
+    ------
+    SpectrumNameError
+        For an unknown camera or light.
+    ColorTableError
+        For a size below 8.
+
+    References
+    ----------
+    Jimenez et al. 2010, doi:10.1145/1866158.1866167, eq. (7) and Table 1.
+
+    Examples
+    --------
+    >>> table = build("Nikon 5100 (NPL)", "D65")
+    >>> table.lookup(0.02, 0.02).round(2).tolist()
+    [0.27, 0.2, 0.18]
+    """
+    if size < _SMALLEST_SIZE:
+        raise ColorTableError(f"size: expected at least {_SMALLEST_SIZE} nodes, got {size}")
+    weights = spectra.band_weights(camera, illuminant)
+    log_reflectance = _log_spectra(anisotropy, beta_m, oxygenation, eta)
+    axes = spectral_axes(log_reflectance.shape[0])
+    fine = spectral_axes(size)
+    rgb = np.zeros((size, size, 3))
+    for band, weight in enumerate(weights):
+        spline = RectBivariateSpline(*axes, log_reflectance[..., band], s=0)
+        rgb += np.exp(spline(*fine))[..., None] * weight
+    return ColorTable(camera, illuminant, rgb, anisotropy=anisotropy)
+
+
+def spectral_axes(nodes: int) -> tuple[FloatArray, FloatArray]:
+    """Return the cube roots of C_m and of C_hd along the axes, from 0 to Table 1's ends."""
+    u = np.linspace(0.0, np.cbrt(C_M_MAX), nodes)  # eq. (7)
+    v = np.linspace(0.0, np.cbrt(C_HD_MAX), nodes)
+    return u, v
+
+
+@lru_cache(maxsize=8)
+def _log_spectra(anisotropy: float, beta_m: float, oxygenation: float, eta: float) -> FloatArray:
+    """Return log reflectance over (C_m, C_hd, wavelength), stored or computed."""
+    paper = (beta_m, oxygenation, eta) == (BETA_M, OXYGENATION, ETA_SKIN)
+    if paper and anisotropy in STORED_ANISOTROPIES and C_HE_PER_C_HD == 0.25:
+        source = resources.files("model").joinpath("data", "two_layer_reflectance.npz")
+        with source.open("rb") as stream, np.load(stream) as stored:
+            return np.asarray(stored[f"log_reflectance_g{anisotropy:g}"], dtype=np.float64)
+    u, v = spectral_axes(LIVE_NODES)
+    reflectance = two_layer_reflectance(
+        spectra.WAVELENGTH_NM,
+        u[:, None] ** 3,
+        v[None, :] ** 3,
+        beta_m=beta_m,
+        oxygenation=oxygenation,
+        eta=eta,
+        anisotropy=anisotropy,
+    )
+    return np.asarray(np.log(reflectance))
+
+
+def _spline_cells(rgb: FloatArray) -> FloatArray:
+    """Return the tensor cubic spline through the nodes as one polynomial a cell."""
+    nodes = np.arange(rgb.shape[0])
+    along_i = CubicSpline(nodes, rgb, axis=0).c[::-1]  # (p, cell i, node j, channel)
+    both = CubicSpline(nodes, along_i, axis=2).c[::-1]  # (q, cell j, p, cell i, channel)
+    return np.ascontiguousarray(np.transpose(both, (3, 1, 4, 2, 0)))
+
+
+def _node_index(name: str, fraction: ArrayLike, largest: float, size: int) -> FloatArray:
+    values = np.asarray(fraction, dtype=np.float64)
+    within = (values >= 0.0) & (values <= largest * (1.0 + 1e-12))
+    if not within.all():
+        raise ColorTableError(
+            f"{name}: the table spans 0 to {largest:g}, got {values[~within].flat[0]:g}"
+        )
+    return np.asarray((size - 1) * np.cbrt(values / largest))
+
+
+def _powers(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    one = np.ones_like(x)
+    zero = np.zeros_like(x)
+    return (
+        np.stack([one, x, x**2, x**3], axis=-1),
+        np.stack([zero, one, 2.0 * x, 3.0 * x**2], axis=-1),
+    )
