@@ -91,7 +91,7 @@ def run_demo(
                     subject=subject,
                     seed=seed,
                     width_px=width_px,
-                )  # fmt: skip
+                )
             )
     rows: list[list[Any]] = []
     with share("flash: reconstruct melanin and hemoglobin"):

@@ -181,9 +181,9 @@ def _scenes(
     seed: int,
 ) -> dict[str, Any]:
     from rigsim.scenes.flash import FlashScene
-    from rigsim.subject import make_subject
 
     from rigsim import targets
+    from rigsim.subject import make_subject
 
     if target is not None:
         state = "white" if target == "white" else ""
@@ -200,11 +200,11 @@ def _drive(
     progress: Callable[[str], None] | None,
 ) -> float:
     """Run the session's plan through the drivers, on a world registered under its id."""
-    from capture.acquire import run_plan
-    from capture.devices.camera import open_camera
     from capture.devices.flash import FlashBox
     from rigsim.world import World
 
+    from capture.acquire import run_plan
+    from capture.devices.camera import open_camera
     from capture.devices.port import Port
 
     world = World(rig, seed=seed, clock="virtual", scene=next(iter(scenes.values())))
