@@ -1,0 +1,6 @@
+"""Foreign pictures into SESSION/: photographs of any camera, stripped of what identifies people."""
+
+from capture.importers.photos import Imported, import_photos
+from capture.importers.pictures import Photo, PhotoError, read_photo
+
+__all__ = ["Imported", "Photo", "PhotoError", "import_photos", "read_photo"]

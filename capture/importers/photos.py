@@ -1,0 +1,397 @@
+"""A folder of photographs into a closed SESSION/, with everything that had to be assumed."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+import shutil
+import uuid
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from capture import raw
+from capture.documents import Fault, InputError
+from capture.importers.pictures import Encoding, Photo, PhotoError, read_photo
+from capture.plan import Kind, Plan, Step, Value
+from capture.rig import Light, Rig, View
+from capture.session import Session, Subject
+
+logger = logging.getLogger(__name__)
+
+RIG_NAME = "imported"
+UNKNOWN_SERIAL = "unknown"
+SIDECARS = frozenset(
+    ".txt .md .csv .json .xmp .thm .pp3 .dop .xml .html .pdf .zip .mov .mp4 .lp".split()
+)
+_POLARIZERS = {"parallel": "parallel", "crossed": "crossed", "cross": "crossed"}
+_SENSOR_MM = 36.0  # width of the full-frame sensor that stands in for an unknown one
+_DISTANCE_MM = 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """What an import made."""
+
+    path: str
+    """The SESSION/ folder."""
+    frames: int
+    assumed: list[str]
+    """What had to be assumed, one sentence each; also in the session's manifest."""
+    states: tuple[str, ...]
+    """Names of the subject's states, one per photograph or pair of photographs."""
+    ignored: tuple[str, ...]
+    """Files that are no photographs, left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """One photograph found fit, before it is written."""
+
+    file: Path
+    sha256: str
+    encoding: Encoding
+    model: str
+    pattern: str
+    shape: tuple[int, int]
+    levels: tuple[int, int]
+    focal_mm: float | None
+    exposure_s: float | None
+    iso: int | None
+    notes: tuple[str, ...]
+
+    @property
+    def camera(self) -> tuple[str, str, tuple[int, int], tuple[int, int]]:
+        """What tells one camera (and its setting) from another."""
+        return self.model, self.pattern, self.shape, self.levels
+
+
+def import_photos(
+    directory: str | Path,
+    *,
+    out: str | Path,
+    rig: Rig | None = None,
+    camera_serial: str = UNKNOWN_SERIAL,
+    sensitivity: str = "Nikon 5100 (NPL)",
+    illuminant: str | None = None,
+    kind: Kind = "subject",
+    subject: Subject | None = None,
+    now: Callable[[], datetime] | None = None,
+) -> Imported:
+    """Turn photographs into a closed session; all of them, or none.
+
+    Every photograph becomes a state of the subject, named after its file; a single one is called
+    "neutral". Two files that differ only by the words "parallel" and "crossed" in their names are
+    the two polarizer states of one photograph. Time, place, owner and serial numbers stay behind.
+
+    Parameters
+    ----------
+    directory : str or Path
+        A folder (its subfolders are not entered), or one file.
+    out : str or Path
+        The new SESSION/ folder.
+    rig : Rig, optional
+        The rig whose first camera took the photographs, so that its calibrations apply; they must
+        be raw files of that camera's size. Default: a rig made up from what the files say.
+    camera_serial : str
+        Serial number to record, for calibrations; without `rig` only.
+    sensitivity : str
+        Name of the camera's spectral sensitivity, see ``model.spectra``; without `rig` only.
+    illuminant : str, optional
+        Name of the light; default "D65" for display pictures, "D55" for raw ones.
+    kind : {"subject", "chart", "flat", "dark"}
+        What the photographs show.
+    subject : Subject, optional
+        Who they show; default an unnamed one who agreed to nothing beyond the capture.
+    now : callable, optional
+        Clock, returns a time with its zone.
+
+    Returns
+    -------
+    Imported
+
+    Raises
+    ------
+    PhotoError
+        Listing every file that cannot be used; then nothing is written.
+    SessionError
+        Where `out` is not free.
+    """
+    clock = now or (lambda: datetime.now(UTC))
+    files, ignored = _files(Path(directory))
+    entries = _inspect(files)
+    light = illuminant or ("D65" if any(e.encoding == "sRGB" for e in entries) else "D55")
+    used, views = _rig(entries, rig, camera_serial, sensitivity, light)
+    steps = _steps(entries, views, kind)
+    assumed = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
+    target = Path(out)
+    part = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise PhotoError(
+            "cannot write here",
+            where=str(target),
+            faults=[Fault("out", "something that exists", "a new or empty folder")],
+            advice="Choose a new folder.",
+        )
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        session = Session.create(
+            part,
+            plan=Plan(used.name, tuple(step for step, _ in steps)),
+            rig=used,
+            devices={},
+            subject=subject or Subject("unnamed"),
+            source="measured",
+            extra={
+                "assumed": assumed,
+                "photographs": [
+                    {"step": step.id, "sha256": entry.sha256, "encoding": entry.encoding}
+                    for step, entry in steps
+                ],
+            },
+            now=clock,
+        )
+        with session:
+            for step, entry in steps:
+                _commit(session, step, entry, clock)
+            session.close()
+        if target.exists():
+            target.rmdir()
+        part.rename(target)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
+    return Imported(str(target), len(steps), assumed, states, tuple(ignored))
+
+
+def _files(directory: Path) -> tuple[list[Path], list[str]]:
+    """Return the candidates in a folder, sorted by name, and what is left out."""
+    if directory.is_file():
+        return [directory], []
+    if not directory.is_dir():
+        raise PhotoError(
+            "there is no such folder", where=str(directory), advice="Name a folder or one file."
+        )
+    files, ignored = [], []
+    for file in sorted(directory.iterdir()):
+        if file.is_dir() or file.name.startswith(".") or file.suffix.lower() in SIDECARS:
+            ignored.append(file.name)
+        else:
+            files.append(file)
+    if not files:
+        raise PhotoError(
+            "holds no photographs",
+            where=str(directory),
+            faults=[Fault("files", f"{len(ignored)} other entries", "at least one photograph")],
+        )
+    return files, ignored
+
+
+def _inspect(files: Sequence[Path]) -> list[_Entry]:
+    """Decode every file once, so that a bad one is found before anything is written."""
+    entries, faults = [], []
+    for file in files:
+        try:
+            photo = read_photo(file)
+        except InputError as exc:
+            reason = "; ".join([exc.what, *(str(fault) for fault in exc.faults)])
+            faults.append(Fault(file.name, reason, "a photograph"))
+            continue
+        entries.append(_entry(file, photo))
+    if faults:
+        raise PhotoError(
+            f"{len(faults)} of {len(files)} files cannot be imported",
+            where=str(files[0].parent),
+            faults=faults,
+            advice="Repair these files or move them away; nothing was written.",
+        )
+    return entries
+
+
+def _entry(file: Path, photo: Photo) -> _Entry:
+    frame = photo.frame
+    height, width = frame.cfa.shape
+    return _Entry(
+        file=file,
+        sha256=f"sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}",
+        encoding=photo.encoding,
+        model=frame.camera_model or "unknown camera",
+        pattern=frame.pattern,
+        shape=(height, width),
+        levels=(round(sum(frame.black) / len(frame.black)), frame.white),
+        focal_mm=frame.focal_mm,
+        exposure_s=frame.exposure_s,
+        iso=frame.iso,
+        notes=photo.notes,
+    )
+
+
+def _rig(
+    entries: Sequence[_Entry], rig: Rig | None, serial: str, sensitivity: str, illuminant: str
+) -> tuple[Rig, list[str]]:
+    """Return the session's rig and the view of every photograph."""
+    if rig is not None:
+        view = rig.views[0]
+        wanted = (view.cfa, (view.height_px, view.width_px))
+        for entry in entries:
+            if entry.encoding != "raw" or (entry.pattern, entry.shape) != wanted:
+                got = f"{entry.encoding} {entry.shape[1]} x {entry.shape[0]} {entry.pattern}"
+                raise PhotoError(
+                    "was not taken by this rig's camera",
+                    where=str(entry.file),
+                    faults=[
+                        Fault("picture", got, f"raw {view.width_px} x {view.height_px} {view.cfa}")
+                    ],
+                    advice="Import it without a rig.",
+                )
+        return rig, [view.name] * len(entries)
+    cameras = list(dict.fromkeys(entry.camera for entry in entries))
+    names = {camera: "cam" if k == 0 else f"cam{k + 1}" for k, camera in enumerate(cameras)}
+    first = {entry.camera: entry for entry in reversed(entries)}
+    made = Rig(
+        name=RIG_NAME,
+        lights=(
+            Light(
+                name="unknown",
+                position_mm=(0.0, 0.0, _DISTANCE_MM),
+                illuminant=illuminant,
+                polarizer_axis_deg=0.0,
+                energy_ws=1.0,
+                radius_mm=1.0,
+            ),
+        ),
+        views=tuple(_view(names[c], first[c], serial, sensitivity) for c in cameras),
+        boxes=(),
+        recycle_s=0.0,
+    )
+    return made, [names[entry.camera] for entry in entries]
+
+
+def _view(name: str, entry: _Entry, serial: str, sensitivity: str) -> View:
+    height, width = entry.shape
+    black, white = entry.levels
+    return View(
+        name=name,
+        camera_model=entry.model,
+        serial=serial,
+        position_mm=(0.0, 0.0, _DISTANCE_MM),
+        target_mm=(0.0, 0.0, 0.0),
+        up=(0.0, 1.0, 0.0),
+        focal_mm=entry.focal_mm or 50.0,
+        pixel_um=1e3 * _SENSOR_MM / width,
+        width_px=width,
+        height_px=height,
+        f_number=8.0,
+        readout_s=0.0,
+        bit_depth=min(max(white.bit_length(), 8), 16),
+        cfa=entry.pattern,  # type: ignore[arg-type]
+        black_level=black,
+        white_level=white,
+        spectral_sensitivity=sensitivity,
+        analyser_axis_deg=0.0,
+        full_well_e=20_000.0,
+        read_noise_e=10.0,
+    )
+
+
+def _named(stem: str) -> tuple[str, str | None]:
+    """Split a file's stem into a state and the polarizer's state its words name.
+
+    Examples
+    --------
+    >>> _named("anna crossed-2"), _named("portrait"), _named("crossed")
+    (('anna-2', 'crossed'), ('portrait', None), ('neutral', 'crossed'))
+    """
+    words = [word for word in re.split(r"[^A-Za-z0-9]+", stem) if word]
+    polarizer = next((_POLARIZERS[w.lower()] for w in words if w.lower() in _POLARIZERS), None)
+    rest = [word for word in words if word.lower() not in _POLARIZERS]
+    return "-".join(rest)[:60] or "neutral", polarizer
+
+
+def _steps(
+    entries: Sequence[_Entry], views: Sequence[str], kind: Kind
+) -> list[tuple[Step, _Entry]]:
+    named = [_named(entry.file.stem) for entry in entries]
+    if len({state for state, _ in named}) == 1:
+        named = [("neutral", polarizer) for _, polarizer in named]
+    seen: set[tuple[str, str]] = set()
+    steps = []
+    for number, (entry, view, (state, polarizer)) in enumerate(
+        zip(entries, views, named, strict=True)
+    ):
+        shown = polarizer or "crossed"
+        # two files of one name (raw and JPEG of one shot) are two photographs, not repeats
+        name, count = state, 2
+        while (name, shown) in seen:
+            name, count = f"{state}-{count}", count + 1
+        seen.add((name, shown))
+        index: dict[str, str | int | float] = {"state": name, "polarizer": shown, "repeat": 0}
+        settings: dict[str, Value] = {}
+        if polarizer is not None:
+            settings["polarizer"] = polarizer
+        if entry.exposure_s is not None:
+            settings["exposure_s"] = entry.exposure_s
+        if entry.iso is not None:
+            settings["iso"] = entry.iso
+        steps.append((Step(f"P{number:03d}", kind, index, settings, (view,)), entry))
+    return steps
+
+
+def _assumptions(
+    entries: Sequence[_Entry], *, made_up: bool, light: str, camera: View
+) -> list[str]:
+    """Return every assumption once, with how many photographs it concerns."""
+    counts = Counter(note for entry in entries for note in entry.notes)
+    total = len(entries)
+    texts = [note if n == total else f"{note} ({n} of {total})" for note, n in counts.items()]
+    plain = sum(_named(entry.file.stem)[1] is None for entry in entries)
+    if plain:
+        of = "" if plain == total else f" ({plain} of {total})"
+        texts.append(
+            "no polarizers are named, so that specular light counts as diffuse as if the"
+            f" photograph were crossed{of}"
+        )
+    if made_up:
+        texts.append(
+            f"the camera's spectral sensitivity is that of {camera.spectral_sensitivity!r} and the"
+            f" light is {light}"
+        )
+        texts.append("distance, focal length and pixel pitch are not known: no lengths in mm")
+    return texts
+
+
+def _commit(session: Session, step: Step, entry: _Entry, clock: Callable[[], datetime]) -> None:
+    photo = read_photo(entry.file)
+    frame = photo.frame
+    (view,) = step.cameras
+    model = frame.camera_model
+    blob = raw.encode_dng(
+        frame.cfa,
+        pattern=frame.pattern,
+        black=frame.black,
+        white=frame.white,
+        exposure_s=frame.exposure_s,
+        iso=frame.iso,
+        camera_model=model,
+        camera_serial=session.rig.view(view).serial,
+        color_matrix=frame.color_matrix,
+        color_illuminant=frame.color_illuminant,
+        neutral=frame.neutral,
+        noise_profile=frame.noise_profile,
+        f_number=frame.f_number,
+        focal_mm=frame.focal_mm,
+        step_id=step.id,
+        session_id=session.id,
+    )
+    session.commit(
+        step.id,
+        view,
+        blob,
+        settings=step.settings,
+        actual={},
+        t_host_s=clock().timestamp(),
+    )

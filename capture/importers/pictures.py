@@ -1,0 +1,381 @@
+"""One photograph, of whatever format, as a raw frame of linear values without its metadata."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture import raw
+from capture.documents import Fault, InputError
+
+Encoding = Literal["raw", "linear", "sRGB"]
+
+MAX_BYTES = 2**30
+MAX_PICTURE_PIXELS = 2**26  # four raw cells each: the largest frame a session takes
+WHITE_DN = 65_535
+FLOAT_BLACK_DN = 1_024  # room for the negative values of floating-point pictures
+FLOAT_HEADROOM = 1.02  # nothing in a floating-point picture saturates, so its top stays below white
+
+# What nothing in a picture tells: electrons at full scale and read noise of a small camera sensor
+ASSUMED_FULL_WELL_E = 20_000.0
+ASSUMED_READ_NOISE_E = 10.0
+
+_JPEG, _PNG, _EXR = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_TIFF_SUFFIXES = (".tif", ".tiff")
+_ADVICE = "Give the photograph as the camera or the raw converter wrote it."
+
+
+class PhotoError(InputError):
+    """A photograph, or a folder of them, that cannot be imported."""
+
+
+@dataclass(frozen=True, slots=True)
+class Photo:
+    """A decoded photograph."""
+
+    frame: raw.RawFrame
+    """Linear values; a picture's pixel is one 2 x 2 cell, which "superpixel" gives back exactly.
+    Holds no time, place, serial number or owner."""
+    encoding: Encoding
+    """What the file held: raw sensor values, linear light, or display values that were decoded."""
+    notes: tuple[str, ...] = ()
+    """What was assumed or lost, one sentence each."""
+
+
+def read_photo(path: str | Path) -> Photo:
+    """Read a RAW, TIFF, OpenEXR, PNG or JPEG file; its content decides, not its name.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    Photo
+        Camera RGB of a RAW file; linear sRGB of the others, where 8-bit TIFF, PNG and JPEG are
+        decoded by the curve of IEC 61966-2-1 and 16-bit or float TIFF and EXR are linear already.
+
+    Raises
+    ------
+    PhotoError
+        Where the file is missing, empty, cut short, too large, or no photograph.
+    """
+    file = Path(path)
+    where = str(file)
+    head = _head(file, where)
+    if head.startswith(_JPEG):
+        return _display(file, where, *_check_jpeg(file.read_bytes(), where))
+    if head.startswith(_PNG):
+        return _display(file, where, *_check_png(file.read_bytes(), where))
+    if head.startswith(_EXR):
+        return _exr(file, where)
+    if head.startswith(_TIFF) and file.suffix.lower() in _TIFF_SUFFIXES:
+        return _tiff(file, where)
+    return _raw(file, where)
+
+
+def decode_srgb(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return linear light of display values in [0, 1], IEC 61966-2-1.
+
+    Examples
+    --------
+    >>> decode_srgb(np.array([0.0, 0.5, 1.0])).round(6).tolist()
+    [0.0, 0.214041, 1.0]
+    """
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def cells_of(rgb: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Return an RGGB frame, (2H, 2W), each of whose 2 x 2 cells is one pixel of an RGB picture.
+
+    Examples
+    --------
+    >>> cells_of(np.array([[[1, 2, 3]]], np.uint16)).tolist()
+    [[1, 2], [2, 3]]
+    """
+    height, width, _ = rgb.shape
+    cfa = np.empty((2 * height, 2 * width), np.uint16)
+    cfa[0::2, 0::2] = rgb[..., 0]
+    cfa[0::2, 1::2] = rgb[..., 1]
+    cfa[1::2, 0::2] = rgb[..., 1]
+    cfa[1::2, 1::2] = rgb[..., 2]
+    return cfa
+
+
+def _error(what: str, where: str, path: str, got: str, expected: str) -> PhotoError:
+    return PhotoError(what, where=where, faults=[Fault(path, got, expected)], advice=_ADVICE)
+
+
+def _head(file: Path, where: str) -> bytes:
+    try:
+        if not file.is_file():
+            raise _error("is no file", where, "file", "nothing or a folder", "a photograph")
+        size = file.stat().st_size
+        if size == 0:
+            raise _error("is empty", where, "size", "0 bytes", "a photograph")
+        if size > MAX_BYTES:
+            raise _error("is too large", where, "size", f"{size} bytes", f"at most {MAX_BYTES}")
+        with file.open("rb") as stream:
+            return stream.read(16)
+    except OSError as exc:
+        raise _error("cannot be read", where, "file", str(exc.strerror), "a photograph") from exc
+
+
+def _check_size(width: int, height: int, where: str) -> None:
+    if width < 1 or height < 1 or width * height > MAX_PICTURE_PIXELS:
+        raise _error(
+            "is absurd in size",
+            where,
+            "size",
+            f"{width} x {height} pixels",
+            f"1 to {MAX_PICTURE_PIXELS} pixels",
+        )
+
+
+def _assumed_noise(black: float, white: float) -> tuple[float, float]:
+    gain = ASSUMED_FULL_WELL_E / (white - black)
+    return raw.noise_profile(gain, ASSUMED_READ_NOISE_E, black=black, white=white)
+
+
+NOISE_NOTE = (
+    f"the noise is that of {ASSUMED_FULL_WELL_E:.0f} electrons at full scale and"
+    f" {ASSUMED_READ_NOISE_E:.0f} electrons read noise"
+)
+
+
+def _raw(file: Path, where: str) -> Photo:
+    try:
+        frame = raw.read(file)
+    except raw.RawError as exc:
+        raise PhotoError(exc.what, where=where, faults=exc.faults, advice=_ADVICE) from exc
+    notes = []
+    if frame.noise_profile is None:
+        black = float(np.mean(frame.black))
+        frame = replace(frame, noise_profile=_assumed_noise(black, frame.white))
+        notes.append(NOISE_NOTE)
+    if frame.neutral is None and frame.pattern != "MONO":
+        notes.append("the file names no white balance, so its channels count as balanced")
+    # what identifies people, places and owners stays behind
+    frame = replace(
+        frame, camera_serial="", captured_at=None, step_id="", session_id="", light={}, path=""
+    )
+    return Photo(frame, "raw", tuple(notes))
+
+
+def _frame(values: NDArray[np.uint16], black: int) -> raw.RawFrame:
+    color = values.ndim == 3
+    return raw.RawFrame(
+        cfa=cells_of(values) if color else np.ascontiguousarray(values),
+        pattern="RGGB" if color else "MONO",
+        black=(float(black),) * (4 if color else 1),
+        white=WHITE_DN,
+        neutral=(1.0, 1.0, 1.0) if color else None,
+        noise_profile=_assumed_noise(black, WHITE_DN),
+    )
+
+
+def _display(file: Path, where: str, what: str, notes: list[str]) -> Photo:
+    import cv2
+
+    try:
+        pixels = cv2.imdecode(
+            np.fromfile(file, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
+        )
+    except (cv2.error, MemoryError, ValueError) as exc:
+        raise _error("is damaged", where, what, "data that cannot be decoded", "a picture") from exc
+    if pixels is None:
+        raise _error("is damaged", where, what, "data that cannot be decoded", "a picture")
+    return _from_display(np.asarray(pixels), where, notes)
+
+
+def _from_display(pixels: NDArray[Any], where: str, notes: list[str]) -> Photo:
+    """Decode 8- or 16-bit display values, (H, W) or (H, W, 3)."""
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise _error("is of no known depth", where, "samples", str(pixels.dtype), "8 or 16 bit")
+    codes = 256 if pixels.dtype == np.uint8 else 65_536
+    table = np.rint(WHITE_DN * decode_srgb(np.arange(codes) / (codes - 1))).astype(np.uint16)
+    if pixels.ndim == 3 and (pixels == pixels[..., :1]).all():
+        pixels = pixels[..., 0]
+        notes = [*notes, "the picture is gray, so that it holds no color to estimate from"]
+    depth = "8" if codes == 256 else "16"
+    notes = [
+        f"{depth}-bit display values were decoded by the sRGB curve; what the camera did to tone"
+        " and color before is not undone",
+        *notes,
+        NOISE_NOTE,
+    ]
+    return Photo(_frame(table[pixels], 0), "sRGB", tuple(notes))
+
+
+def _check_png(data: bytes, where: str) -> tuple[str, list[str]]:
+    """Walk the chunks of a PNG: sizes, checksums, end."""
+    at = 8
+    kinds: set[bytes] = set()
+    notes: list[str] = []
+    while True:
+        if at + 12 > len(data):
+            raise _error("is cut short", where, "PNG", f"{len(data)} bytes", "a whole file")
+        length, kind = struct.unpack_from(">I4s", data, at)
+        if at + 12 + length > len(data):
+            raise _error("is cut short", where, "PNG", f"{len(data)} bytes", "a whole file")
+        (found,) = struct.unpack_from(">I", data, at + 8 + length)
+        if zlib.crc32(data[at + 4 : at + 8 + length]) != found:
+            name = kind.decode("ascii", "replace")
+            raise _error("is damaged", where, f"PNG chunk {name}", "a wrong checksum", "its own")
+        if not kinds:
+            if kind != b"IHDR" or length != 13:
+                raise _error("is damaged", where, "PNG", "no header", "a header first")
+            width, height, _, color = struct.unpack_from(">IIBB", data, at + 8)
+            _check_size(width, height, where)
+            if color in (4, 6):
+                notes.append("transparency was dropped")
+        kinds.add(kind)
+        at += 12 + length
+        if kind == b"IEND":
+            break
+    if kinds & {b"iCCP", b"cICP"}:
+        notes.append("its color profile was not applied; the colors count as sRGB")
+    return "PNG", notes
+
+
+_JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def _check_jpeg(data: bytes, where: str) -> tuple[str, list[str]]:
+    """Walk the segments of a JPEG up to its scan, and look for the end of that."""
+    at, notes, sized = 2, [], False
+    cut = _error("is cut short", where, "JPEG", f"{len(data)} bytes", "a whole file")
+    while True:
+        if at + 4 > len(data):
+            raise cut
+        if data[at] != 0xFF:
+            raise _error("is damaged", where, "JPEG", f"no marker at byte {at}", "a marker")
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        if marker == 0x01 or 0xD0 <= marker <= 0xD8:  # markers without a length
+            at += 2
+            continue
+        (length,) = struct.unpack_from(">H", data, at + 2)
+        if length < 2 or at + 2 + length > len(data):
+            raise cut
+        body = data[at + 4 : at + 2 + length]
+        if marker in _JPEG_SIZE_MARKERS and len(body) >= 5:
+            height, width = struct.unpack_from(">HH", body, 1)
+            _check_size(width, height, where)
+            sized = True
+        if marker == 0xE2 and body.startswith(b"ICC_PROFILE\0") and b"sRGB" not in body:
+            notes.append("its color profile was not applied; the colors count as sRGB")
+        at += 2 + length
+        if marker == 0xDA:
+            break
+    # the scan escapes 0xFF, so that this can only be the end of the image
+    if not sized or data.find(b"\xff\xd9", at) < 0:
+        raise cut
+    return "JPEG", list(dict.fromkeys(notes))
+
+
+def _linear(pixels: NDArray[Any], where: str, notes: list[str]) -> Photo:
+    """Store linear whole numbers as they are, floating-point values on a scale of their own."""
+    if pixels.dtype == np.uint16:
+        return Photo(_frame(pixels, 0), "linear", (*notes, NOISE_NOTE))
+    values = pixels.astype(np.float64)
+    known = np.isfinite(values)
+    top = float(values[known].max(initial=0.0))
+    if not top > 0:
+        raise _error("is black", where, "largest value", f"{top:g}", "a value above 0")
+    scale = (WHITE_DN - FLOAT_BLACK_DN) / (FLOAT_HEADROOM * top)
+    dn = np.rint(FLOAT_BLACK_DN + scale * np.where(known, values, 0.0))
+    notes = [*notes, f"values were divided by {FLOAT_HEADROOM * top:.6g} to fit the range"]
+    if (dn < 0).any():
+        notes.append(f"{int((dn < 0).sum())} values far below zero were raised to the lowest level")
+    if not known.all():
+        notes.append(f"{int((~known).sum())} values that are no numbers count as saturated")
+    stored = np.where(known, np.clip(dn, 0, WHITE_DN - 1), WHITE_DN).astype(np.uint16)
+    return Photo(_frame(stored, FLOAT_BLACK_DN), "linear", (*notes, NOISE_NOTE))
+
+
+def _channels(pixels: NDArray[Any], where: str, notes: list[str]) -> NDArray[Any]:
+    """Return (H, W) or (H, W, 3) of whatever a file holds."""
+    squeezed = pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels
+    if squeezed.ndim == 3 and squeezed.shape[2] == 4:
+        notes.append("transparency was dropped")
+        squeezed = squeezed[..., :3]
+    if squeezed.ndim != 2 and not (squeezed.ndim == 3 and squeezed.shape[2] == 3):
+        raise _error(
+            "is no picture", where, "shape", str(pixels.shape), "(H, W), (H, W, 3) or (H, W, 4)"
+        )
+    return squeezed
+
+
+def _tiff(file: Path, where: str) -> Photo:
+    import tifffile
+
+    notes: list[str] = []
+    try:
+        with tifffile.TiffFile(file) as stream:
+            page = stream.pages.first
+            height, width = int(page.imagelength), int(page.imagewidth)
+            _check_size(width, height, where)
+            ends = [o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=False)]
+            size = file.stat().st_size
+            if not ends or max(ends) > size:
+                raise _error("is cut short", where, "TIFF", f"{size} bytes", "a whole file")
+            planar = int(page.planarconfig) == 2 and page.samplesperpixel > 1
+            profile = 34675 in page.tags
+            pages = len(stream.pages)
+            pixels = np.asarray(page.asarray())
+    except InputError:
+        raise
+    except (OSError, ValueError, RuntimeError, IndexError, KeyError, TypeError, struct.error,
+            AttributeError, MemoryError, ZeroDivisionError) as exc:  # fmt: skip
+        got = str(exc).splitlines()[0][:120] if str(exc) else type(exc).__name__
+        raise _error("is no readable TIFF", where, "TIFF", got, "an uncompressed TIFF") from exc
+    if pages > 1:
+        notes.append(f"only the first of {pages} pages was taken")
+    if planar:
+        pixels = np.moveaxis(pixels, 0, -1)
+    if profile:
+        notes.append("its color profile was not applied; the colors count as sRGB primaries")
+    pixels = _channels(pixels, where, notes)
+    if pixels.dtype == np.uint8:
+        return _from_display(pixels, where, notes)
+    if pixels.dtype == np.uint16 or np.issubdtype(pixels.dtype, np.floating):
+        return _linear(pixels, where, [*notes, "the TIFF's values count as linear light"])
+    raise _error("is of no known depth", where, "samples", str(pixels.dtype), "8, 16 bit or float")
+
+
+def _exr(file: Path, where: str) -> Photo:
+    import OpenEXR
+
+    notes: list[str] = []
+    try:
+        with OpenEXR.File(str(file), header_only=True) as header:
+            low, high = header.header()["dataWindow"]
+            width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+        _check_size(width, height, where)
+        with OpenEXR.File(str(file), separate_channels=True) as stream:
+            channels = {name: np.array(c.pixels) for name, c in stream.channels().items()}
+    except InputError:
+        raise
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError) as exc:
+        got = str(exc).splitlines()[0][:120] if str(exc) else type(exc).__name__
+        raise _error("is damaged", where, "OpenEXR", got, "a whole OpenEXR file") from exc
+    names = next((n for n in (("R", "G", "B"), ("Y",)) if set(n) <= set(channels)), None)
+    if names is None:
+        raise _error("holds no picture", where, "channels", ", ".join(sorted(channels)), "R, G, B")
+    if left := sorted(set(channels) - set(names)):
+        notes.append(f"channels {', '.join(left)} were left out")
+    planes = [channels[name].astype(np.float32) for name in names]
+    if any(plane.shape != (height, width) for plane in planes):
+        raise _error("holds no picture", where, "channels", "different sizes", "one size")
+    return _linear(planes[0] if len(planes) == 1 else np.stack(planes, axis=-1), where, notes)
