@@ -60,6 +60,7 @@ def read_contents(path: Path) -> Contents:
     manifest, seal = decode(data, where=str(where))
     where = path / JOURNAL
     journal = read_file(where, limit=MAX_JOURNAL_BYTES, what="journal")
+    _require_folder(path / FRAMES)
     walked = walk(journal, seal=seal, where=str(where))
     if walked.damage is None:
         walked = _against_plan(walked, manifest, str(where))
@@ -94,15 +95,21 @@ def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
 
 
 def list_frames(path: Path) -> list[str]:
-    """Return the names in the frames folder, sorted; a link in its place is an error."""
-    folder = path / FRAMES
+    """Return the names in the frames folder, sorted."""
+    return sorted(os.listdir(path / FRAMES))
+
+
+def _require_folder(folder: Path) -> None:
+    """Raise where ``folder`` is missing or is a link to somewhere else."""
     try:
-        if not stat.S_ISDIR(os.lstat(folder).st_mode):
-            raise NotADirectoryError
-        return sorted(os.listdir(folder))
-    except (FileNotFoundError, NotADirectoryError) as exc:
-        faults = [Fault(FRAMES, "no folder", "a folder, not a link")]
-        raise SessionDamage("is damaged", where=str(folder), faults=faults) from exc
+        plain = stat.S_ISDIR(os.lstat(folder).st_mode)
+    except FileNotFoundError:
+        plain = False
+    if not plain:
+        got = "a symbolic link" if folder.is_symlink() else "no folder"
+        faults = [Fault(FRAMES, got, "a folder, not a link")]
+        advice = "Restore the folder from a copy."
+        raise SessionDamage("is damaged", where=str(folder), faults=faults, advice=advice)
 
 
 def undamaged_contents(path: Path) -> Contents:

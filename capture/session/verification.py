@@ -84,10 +84,7 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
 
 
 def _stray_frames(place: Path, contents: Contents) -> list[str]:
-    try:
-        present = list_frames(place)
-    except SessionError as exc:
-        return [str(exc)] if contents.frame_lines or contents.walk.closed else []
+    present = list_frames(place)
     known = {Path(line.file).name for line in contents.frame_lines}
     advice = "it was never acknowledged; resuming sets it aside"
     return [

@@ -8,6 +8,7 @@ sync, show that the model can tell.
 
 import itertools
 import os
+import shutil
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -313,6 +314,7 @@ def outcomes(tmp_path, disk_kind, frames):
         root.mkdir()
         lay_out(image, root)
         counts[judge(root / "s", acknowledged, plan)] += 1
+        shutil.rmtree(root)
     return counts
 
 
@@ -358,6 +360,7 @@ def test_a_second_power_cut_while_resuming_loses_nothing_either(tmp_path):
             place.mkdir()
             lay_out(second, place)
             counts[judge(place / "s", acknowledged, plan)] += 1
+            shutil.rmtree(place)
     print(f"{sum(counts.values())} images of two cuts: {dict(counts)}")
     assert set(counts) == {"ok"}
 
