@@ -46,8 +46,17 @@ _DAYLIGHT_NOMINAL_K = {"D50": 5000.0, "D55": 5500.0, "D65": 6500.0}
 class SpectrumNameError(KeyError, ValueError):
     """No spectrum of that name is stored."""
 
-    def __str__(self) -> str:
-        return str(self.args[0])
+    LINEAR_SRGB = "linear sRGB"
+
+
+XYZ_TO_LINEAR_SRGB: FloatArray = np.array(
+    [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+)
+"""XYZ under D65 to linear sRGB, IEC 61966-2-1:1999."""
+
+
+def __str__(self) -> str:
+    return str(self.args[0])
 
 
 def hemoglobin_extinction(
@@ -150,7 +159,9 @@ def camera_sensitivity(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> F
     Parameters
     ----------
     name
-        "Nikon 5100 (NPL)" or "Sigma SDMerill (NPL)".
+        "Nikon 5100 (NPL)", "Sigma SDMerill (NPL)", or "linear sRGB": the color matching functions
+        of the sRGB primaries, negative in places, for pictures that are colorimetric already;
+        under D65 its white-balanced RGB is linear sRGB.
     wavelength_nm
         Wavelengths in nm, shape (n,). Outside the measured range the sensitivity is zero.
 
@@ -166,8 +177,10 @@ def camera_sensitivity(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> F
 
     References
     ----------
-    Darrodi et al. 2015, doi:10.1364/JOSAA.32.000381.
+    Darrodi et al. 2015, doi:10.1364/JOSAA.32.000381; IEC 61966-2-1:1999.
     """
+    if name == LINEAR_SRGB:
+        return np.asarray(color_matching_functions(wavelength_nm) @ XYZ_TO_LINEAR_SRGB.T)
     if name not in _CAMERA_FILES:
         raise SpectrumNameError(_unknown("camera", name, camera_names()))
     return _sampled(_CAMERA_FILES[name], wavelength_nm, outside=0.0)
@@ -175,7 +188,7 @@ def camera_sensitivity(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> F
 
 def camera_names() -> tuple[str, ...]:
     """Return the names that `camera_sensitivity` knows."""
-    return tuple(_CAMERA_FILES)
+    return (*_CAMERA_FILES, LINEAR_SRGB)
 
 
 def illuminant_names() -> tuple[str, ...]:

@@ -117,3 +117,16 @@ def test_the_default_wavelengths_cannot_be_modified():
 def test_spectra_that_do_not_match_the_wavelengths_are_refused():
     with pytest.raises(ValueError, match="31 samples"):
         spectra.band_average(np.ones(30), "Nikon 5100 (NPL)", "D55")
+
+
+def test_linear_srgb_of_a_reflectance_is_that_of_its_xyz_under_d65():
+    wavelength = np.arange(400.0, 701.0, 10.0)
+    reflectance = 0.2 + 0.5 / (1.0 + np.exp(-(wavelength - 590.0) / 12.0))
+    rgb = spectra.band_average(reflectance, spectra.LINEAR_SRGB, "D65", wavelength_nm=wavelength)
+    fine = np.arange(400.0, 701.0, 1.0)
+    light = spectra.illuminant("D65", fine)
+    observer = spectra.color_matching_functions(fine)
+    xyz = (np.interp(fine, wavelength, reflectance) * light) @ observer
+    white = light @ observer
+    expected = (xyz / white * [0.9505, 1.0, 1.089]) @ spectra.XYZ_TO_LINEAR_SRGB.T
+    np.testing.assert_allclose(rgb, expected, atol=2e-3)

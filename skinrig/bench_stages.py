@@ -1,0 +1,96 @@
+"""Which stages can be measured, and running them."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from skinrig import bench_tissue
+from skinrig.benchmark import StageBenchmark, to_document
+from skinrig.console import Console, plain
+
+STAGES: dict[str, Callable[..., StageBenchmark]] = {
+    "layered-reflectance": bench_tissue.layered_reflectance,
+    "color-table": bench_tissue.table,
+}
+
+
+class BenchError(ValueError):
+    """A stage that cannot be measured."""
+
+
+def run_stages(
+    names: Sequence[str] | None,
+    *,
+    budget_s: float,
+    toy: bool,
+    out: Path | None,
+    console: Console,
+) -> dict[str, Any]:
+    """Measure stages and return the document of the run.
+
+    Parameters
+    ----------
+    names
+        Out of :data:`STAGES`; None runs all, as far as the budget goes.
+    budget_s
+        A stage that would begin after so many seconds is left out, and named.
+    toy
+        Smallest sizes, and no limit is judged: for checking that the benchmark runs.
+    out
+        Folder for ``bench.json``; None writes nothing.
+    console
+        Where results and progress go.
+
+    Raises
+    ------
+    BenchError
+        For an unknown stage.
+    """
+    chosen = list(names) if names else list(STAGES)
+    for name in chosen:
+        if name not in STAGES:
+            raise BenchError(f"stage: got {name!r}, expected one of {', '.join(STAGES)}")
+    start = time.perf_counter()
+    done: list[StageBenchmark] = []
+    left_out = []
+    for name in chosen:
+        if time.perf_counter() - start > budget_s:
+            left_out.append([name, f"the budget of {budget_s:g} s was used up"])
+            continue
+        console.progress(f"bench {name}")
+        done.append(STAGES[name](toy=toy))
+    document = to_document(done)
+    document["toy"] = toy
+    document["left_out"] = left_out
+    if toy:
+        for stage in document["stages"].values():
+            stage["limits"] = []
+        document["passed"] = True
+    for stage in done:
+        console.rows(
+            (stage.name, "seconds", "cold s", "peak MB", stage.error_name, "Cramér-Rao"),
+            [
+                (
+                    " ".join(f"{k}={v}" for k, v in point.knobs.items()),
+                    point.timing.seconds, point.timing.cold_s, point.timing.peak_memory_mb,
+                    point.error, point.cramer_rao_bound or "",
+                )
+                for point in stage.points
+            ],
+        )  # fmt: skip
+        for limit in () if toy else stage.limits:
+            word = "kept" if limit.passed else "MISSED"
+            console.say(
+                f"{word}: {limit.name}: {limit.got:.4g} {limit.unit} "
+                f"({limit.sense} {limit.bound:g})"
+            )
+        console.say()
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(plain(document), indent=1, sort_keys=True)
+        (out / "bench.json").write_text(text + "\n", encoding="utf-8")
+    return document

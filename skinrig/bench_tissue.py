@@ -1,0 +1,106 @@
+"""Benchmarks of the layered reflectance and of the color table."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import color_table, metrics, spectra, tissue_optics
+from skinrig.benchmark import Limit, Point, StageBenchmark, measure
+from skinrig.evaluation import BANDS
+
+Floats = NDArray[np.float64]
+
+
+def layered_reflectance(*, toy: bool) -> StageBenchmark:
+    """Compare the tiers of the layered reflectance with the simulator's Monte Carlo table."""
+    from rigsim.skin_table import SkinTable
+
+    rng = np.random.default_rng(0)
+    truth = SkinTable.load()
+    count = 24 if toy else 200
+    # at the nodes of the Monte Carlo table, where it has no interpolation error
+    rows = rng.integers(2, truth.c_m.size, count)
+    columns = rng.integers(2, truth.c_hd.size, count)
+    c_m, c_hd = truth.c_m[rows], truth.c_hd[columns]
+    reference = truth.reflectance[rows, columns]
+    reference_error = 100 * np.median(truth.standard_error[rows, columns] / reference)
+    tiers: list[dict[str, str | float]] = [{"tier": "diffusion"}]
+    for g in (0.0, tissue_optics.ANISOTROPY_SKIN):
+        for directions in (4, 8) if toy else (4, 8, 16, 24):
+            tiers.append({"tier": "adding_doubling", "g": g, "directions": directions})
+    points = []
+    by_band: dict[str, float] = {}
+    for knobs in tiers:
+
+        def evaluate(knobs: dict[str, str | float] = knobs) -> Floats:
+            if knobs["tier"] == "diffusion":
+                return tissue_optics.two_layer_reflectance(
+                    truth.wavelength_nm, c_m, c_hd, tier="diffusion"
+                )
+            return tissue_optics.two_layer_reflectance(
+                truth.wavelength_nm, c_m, c_hd, anisotropy=float(knobs["g"]),
+                directions=int(knobs["directions"]),
+            )  # fmt: skip
+
+        timing = measure(evaluate, repeats=1 if toy else 3)
+        relative = 100 * np.abs(evaluate() / reference - 1)
+        median, interval = metrics.median_with_interval(relative, rng=rng)
+        points.append(Point(knobs, timing, median, interval))
+        by_band = {
+            f"C_m {low:g}–{high:g}": float(np.median(relative[(c_m >= low) & (c_m < high)]))
+            for low, high in BANDS
+            if ((c_m >= low) & (c_m < high)).any()
+        }
+    return StageBenchmark(
+        "layered-reflectance",
+        "median error of R, %",
+        "Monte Carlo transport with the full phase function",
+        float(reference_error),
+        tuple(points),
+        by_band=by_band,
+    )
+
+
+def table(*, toy: bool) -> StageBenchmark:
+    """Measure the color table's interpolation error in Delta E 2000 over its size."""
+    rng = np.random.default_rng(0)
+    count = 40 if toy else 400
+    c_m = 0.5 * rng.random(count) ** 3
+    c_hd = 0.32 * rng.random(count) ** 3
+    wavelength = spectra.WAVELENGTH_NM
+    direct = tissue_optics.two_layer_reflectance(wavelength, c_m, c_hd)
+    reference = _lab(spectra.band_average(direct, spectra.LINEAR_SRGB, "D65"))
+    points = []
+    smallest = float("nan")
+    for size in (8, 16, 32, 64) if toy else (8, 16, 32, 64, 128, 256, 512):
+
+        def build(size: int = size) -> color_table.ColorTable:
+            return color_table.build(spectra.LINEAR_SRGB, "D65", size=size)
+
+        timing = measure(build, repeats=1 if toy else 3)
+        difference = metrics.delta_e_2000(_lab(build().lookup(c_m, c_hd)), reference)
+        worst = float(difference.max())
+        _, interval = metrics.median_with_interval(difference, rng=rng)
+        points.append(Point({"size": size}, timing, worst, (interval[0], worst)))
+        if worst < 0.5 and not np.isfinite(smallest):
+            smallest = size
+    limit = Limit("smallest table with every Delta E 2000 below 0.5", smallest, 128, "<=", "nodes")
+    return StageBenchmark(
+        "color-table",
+        "largest Delta E 2000",
+        "direct evaluation of the layered model, no table",
+        0.0,
+        tuple(points),
+        (limit,),
+    )
+
+
+def _lab(linear_srgb: Floats) -> Floats:
+    """CIE Lab under D65 of linear sRGB, (..., 3)."""
+    xyz = linear_srgb @ np.linalg.inv(spectra.XYZ_TO_LINEAR_SRGB).T
+    ratio = xyz / np.linalg.inv(spectra.XYZ_TO_LINEAR_SRGB).sum(axis=1)
+    bend = (6 / 29) ** 3
+    f = np.where(ratio > bend, np.cbrt(ratio), ratio / (3 * (6 / 29) ** 2) + 4 / 29)
+    x, y, z = np.moveaxis(f, -1, 0)
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
