@@ -43,20 +43,19 @@ _CAMERA_FILES = {
 _DAYLIGHT_NOMINAL_K = {"D50": 5000.0, "D55": 5500.0, "D65": 6500.0}
 
 
-class SpectrumNameError(KeyError, ValueError):
-    """No spectrum of that name is stored."""
-
-    LINEAR_SRGB = "linear sRGB"
-
-
+LINEAR_SRGB = "linear sRGB"
+"""Name of the pseudo camera whose channels are the sRGB primaries."""
 XYZ_TO_LINEAR_SRGB: FloatArray = np.array(
     [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
 )
 """XYZ under D65 to linear sRGB, IEC 61966-2-1:1999."""
 
 
-def __str__(self) -> str:
-    return str(self.args[0])
+class SpectrumNameError(KeyError, ValueError):
+    """No spectrum of that name is stored."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
 
 
 def hemoglobin_extinction(
