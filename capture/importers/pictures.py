@@ -18,6 +18,7 @@ Encoding = Literal["raw", "linear", "sRGB"]
 
 MAX_BYTES = 2**30
 MAX_PICTURE_PIXELS = 2**26  # four raw cells each: the largest frame a session takes
+MAX_PICTURE_SIDE = 32_767
 WHITE_DN = 65_535
 FLOAT_BLACK_DN = 1_024  # room for the negative values of floating-point pictures
 FLOAT_HEADROOM = 1.02  # nothing in a floating-point picture saturates, so its top stays below white
@@ -130,13 +131,17 @@ def _head(file: Path, where: str) -> bytes:
 
 
 def _check_size(width: int, height: int, where: str) -> None:
-    if width < 1 or height < 1 or width * height > MAX_PICTURE_PIXELS:
+    if (
+        min(width, height) < 1
+        or max(width, height) > MAX_PICTURE_SIDE
+        or (width * height > MAX_PICTURE_PIXELS)
+    ):
         raise _error(
             "is absurd in size",
             where,
             "size",
             f"{width} x {height} pixels",
-            f"1 to {MAX_PICTURE_PIXELS} pixels",
+            f"sides of 1 to {MAX_PICTURE_SIDE}, at most {MAX_PICTURE_PIXELS} pixels",
         )
 
 
@@ -156,6 +161,8 @@ def _raw(file: Path, where: str) -> Photo:
         frame = raw.read(file)
     except raw.RawError as exc:
         raise PhotoError(exc.what, where=where, faults=exc.faults, advice=_ADVICE) from exc
+    except NotImplementedError as exc:  # LibRaw's word for a filter array it cannot describe
+        raise _error("has an unknown filter array", where, "cell", str(exc), "2 x 2") from exc
     notes = []
     if frame.noise_profile is None:
         black = float(np.mean(frame.black))

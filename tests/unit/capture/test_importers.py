@@ -404,3 +404,32 @@ def test_a_public_domain_portrait_is_imported(tmp_path):
     assert image.rgb.shape == (512, 512, 3)
     np.testing.assert_allclose(image.rgb, decoded(portrait), atol=1e-5)
     assert done.frames == 1
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "exr", "dng"])
+def test_random_damage_gives_our_error_or_a_picture_and_never_another_error(suffix, tmp_path):
+    """60 seeded files each with up to five wrong bytes near the head, or cut short."""
+    rng = np.random.default_rng([9, len(suffix), ord(suffix[0])])
+    rgb = rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "tif":
+        tifffile.imwrite(path, rgb.astype(np.uint16), photometric="rgb")
+    elif suffix == "exr":
+        OpenEXR.File({}, {"RGB": rgb.astype(np.float32)}).write(str(path))
+    elif suffix == "dng":
+        raw.write_dng(path, rgb[..., 0].astype(np.uint16), pattern="RGGB", black=0, white=300)
+    else:
+        save_png(path, rgb)
+    whole = path.read_bytes()
+    refused = 0
+    for _ in range(60):
+        data = bytearray(whole)
+        for at in rng.integers(0, min(len(data), 600), rng.integers(1, 6)):
+            data[at] = int(rng.integers(0, 256))
+        keep = int(rng.integers(len(data) // 2, len(data))) if rng.random() < 0.3 else len(data)
+        path.write_bytes(bytes(data[:keep]))
+        try:
+            assert read_photo(path).frame.cfa.size > 0
+        except PhotoError:
+            refused += 1
+    assert refused > 10
