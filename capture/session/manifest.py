@@ -21,6 +21,7 @@ from capture.rig import ID_RULE, Rig, is_id
 from capture.session.errors import SessionDamage, SessionError
 
 SCHEMA = "skinrig.session/1"
+ANY_USE = "any"
 Source = Literal["measured", "simulated"]
 
 _SEAL = "seal"
@@ -37,8 +38,8 @@ class Subject:
     pseudonym : str
         1 to 64 letters, digits, ``_ . -``; no space, so that a full name is refused.
     consent_scope : tuple of str
-        What the data may be used for, e.g. ``("research", "publication")``; empty for nothing
-        beyond the capture itself.
+        What the data may be used for, e.g. ``("research", "publication")``; ``("any",)`` for
+        every use, as of a subject that is no person; empty for nothing beyond the capture itself.
     consent_expires : date or None
         Last day of the consent; None where it has no end.
 

@@ -117,8 +117,6 @@ def _state(place: Path, contents: Contents) -> list[str]:
 
 def _consent(contents: Contents, today: date) -> list[str]:
     subject = contents.manifest.subject
-    if contents.manifest.source == "simulated":
-        return []
     who = f"subject {subject.pseudonym}"
     if not subject.consent_scope:
         return [f"{who}: no consent beyond the capture is recorded"]

@@ -14,7 +14,7 @@ from capture.session.contents import Contents
 from capture.session.errors import ConsentError, SessionDamage
 from capture.session.frames import FrameRecord, check_frame
 from capture.session.journal import FrameLine
-from capture.session.manifest import Manifest, Subject
+from capture.session.manifest import ANY_USE, Manifest, Subject
 
 
 class SessionView:
@@ -75,12 +75,10 @@ class SessionView:
         return frame
 
     def export_allowed(self, scope: str, *, today: date | None = None) -> bool:
-        """Return whether the subject's consent covers ``scope`` today; nobody owns a simulation."""
-        if self.source == "simulated":
-            return True
+        """Return whether the subject's consent covers ``scope`` on the day; "any" covers all."""
         expires = self.subject.consent_expires
         in_time = expires is None or (today or datetime.now(UTC).date()) <= expires
-        return in_time and scope in self.subject.consent_scope
+        return in_time and bool({scope, ANY_USE} & set(self.subject.consent_scope))
 
     def require_consent(self, scope: str, *, today: date | None = None) -> None:
         """Raise `ConsentError` where `export_allowed` is False."""

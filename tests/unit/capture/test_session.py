@@ -345,9 +345,11 @@ def test_consent_ends_with_its_scope_and_its_last_day(session, scope, today, all
             session.require_consent(scope, today=today)
 
 
-def test_nobody_has_to_agree_to_a_simulation(tmp_path):
-    with create(tmp_path / "s", source="simulated", subject=Subject("virtual-III")) as made:
-        assert made.export_allowed("publication")
+def test_consent_to_any_use_covers_every_scope_until_its_last_day(tmp_path):
+    subject = Subject("virtual-III", ("any",), date(2031, 1, 1))
+    with create(tmp_path / "s", source="simulated", subject=subject) as made:
+        assert made.export_allowed("publication", today=date(2031, 1, 1))
+        assert not made.export_allowed("publication", today=date(2031, 1, 2))
 
 
 def test_verify_warns_of_expired_and_of_missing_consent(closed, tmp_path):
