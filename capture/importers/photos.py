@@ -24,6 +24,8 @@ logger = logging.getLogger(__name__)
 
 RIG_NAME = "imported"
 UNKNOWN_SERIAL = "unknown"
+RAW_CURVES = "Nikon 5100 (NPL)"  # what stands in for a camera nobody measured
+PICTURE_CURVES = "linear sRGB"
 SIDECARS = frozenset(
     ".txt .md .csv .json .xmp .thm .pp3 .dop .xml .html .pdf .zip .mov .mp4 .lp".split()
 )
@@ -75,7 +77,7 @@ def import_photos(
     out: str | Path,
     rig: Rig | None = None,
     camera_serial: str = UNKNOWN_SERIAL,
-    sensitivity: str = "Nikon 5100 (NPL)",
+    sensitivity: str | None = None,
     illuminant: str | None = None,
     kind: Kind = "subject",
     subject: Subject | None = None,
@@ -98,10 +100,11 @@ def import_photos(
         be raw files of that camera's size. Default: a rig made up from what the files say.
     camera_serial : str
         Serial number to record, for calibrations; without `rig` only.
-    sensitivity : str
+    sensitivity : str, optional
         Name of the camera's spectral sensitivity, see ``model.spectra``; without `rig` only.
+        Default "linear sRGB" for pictures, that of a common camera for raw files.
     illuminant : str, optional
-        Name of the light; default "D65" for display pictures, "D55" for raw ones.
+        Name of the light; default "D65" for pictures, "D55" for raw files.
     kind : {"subject", "chart", "flat", "dark"}
         What the photographs show.
     subject : Subject, optional
@@ -123,7 +126,7 @@ def import_photos(
     clock = now or (lambda: datetime.now(UTC))
     files, ignored = _files(Path(directory))
     entries = _inspect(files)
-    light = illuminant or ("D65" if any(e.encoding == "sRGB" for e in entries) else "D55")
+    light = illuminant or ("D65" if any(e.encoding != "raw" for e in entries) else "D55")
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
     steps = _steps(entries, views, kind)
     assumed = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
@@ -231,7 +234,11 @@ def _entry(file: Path, photo: Photo) -> _Entry:
 
 
 def _rig(
-    entries: Sequence[_Entry], rig: Rig | None, serial: str, sensitivity: str, illuminant: str
+    entries: Sequence[_Entry],
+    rig: Rig | None,
+    serial: str,
+    sensitivity: str | None,
+    illuminant: str,
 ) -> tuple[Rig, list[str]]:
     """Return the session's rig and the view of every photograph."""
     if rig is not None:
@@ -271,7 +278,7 @@ def _rig(
     return made, [names[entry.camera] for entry in entries]
 
 
-def _view(name: str, entry: _Entry, serial: str, sensitivity: str) -> View:
+def _view(name: str, entry: _Entry, serial: str, sensitivity: str | None) -> View:
     height, width = entry.shape
     black, white = entry.levels
     return View(
@@ -291,7 +298,8 @@ def _view(name: str, entry: _Entry, serial: str, sensitivity: str) -> View:
         cfa=entry.pattern,  # type: ignore[arg-type]
         black_level=black,
         white_level=white,
-        spectral_sensitivity=sensitivity,
+        spectral_sensitivity=sensitivity
+        or (RAW_CURVES if entry.encoding == "raw" else PICTURE_CURVES),
         analyser_axis_deg=0.0,
         full_well_e=20_000.0,
         read_noise_e=10.0,

@@ -177,6 +177,7 @@ def test_an_imported_session_is_whole_closed_and_says_what_was_assumed(picture, 
     assert session.source == "measured"
     assert session.manifest.extra["assumed"] == done.assumed
     assert session.rig.lights[0].illuminant == "D65"
+    assert session.rig.views[0].spectral_sensitivity == "linear sRGB"
     (record,) = session.frames("subject", state="neutral", polarizer="crossed")
     np.testing.assert_allclose(linear(session.read(record)).rgb, decoded(picture), atol=1e-5)
     for needed in ("sRGB curve", "as if the photograph were crossed", "spectral sensitivity"):
