@@ -1,8 +1,8 @@
 """A seeded, face-like head: blended solids, met by rays from inside, on a regular texture grid.
 
 The head is the zero set of a signed distance bound made of ellipsoids and capsules joined by
-smooth minima, so its shape and its normals are smooth and known without a mesh. Eyes are closed:
-everything that the camera sees is skin. Dimensions are near the means of adults in
+smooth minima, so its shape and its normals are smooth and known without a mesh. Eyes are
+closed. Dimensions are near the means of adults in
 Young 1993 (head and face anthropometry, DOT/FAA/AM-93/10).
 """
 

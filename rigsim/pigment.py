@@ -16,17 +16,19 @@ MELANIN_LIMIT: Final = 0.5
 
 MELANIN_PRESETS: Final[Mapping[str, float]] = {
     "palest": 0.005,
-    "I": 0.012,
-    "II": 0.03,
-    "III": 0.065,
-    "IV": 0.13,
-    "V": 0.22,
-    "VI": 0.33,
+    "I": 0.007,
+    "II": 0.014,
+    "III": 0.028,
+    "IV": 0.047,
+    "V": 0.085,
+    "VI": 0.17,
     "darkest": 0.45,
 }
-"""Volume fraction of melanosomes of each preset. Between the ends they follow the ranges of light
-(1.3-6.3 %), moderately (11-16 %) and darkly (18-43 %) pigmented adults in Jacques 1998, "Skin
-optics summary", Oregon Medical Laser Center; the ends are those of the range to be covered."""
+"""Volume fraction of melanosomes of each preset, for an epidermis of 0.25 mm. The ranges that
+Jacques 1998 ("Skin optics summary", Oregon Medical Laser Center) gives for lightly (1.3-6.3 %),
+moderately (11-16 %) and darkly (18-43 %) pigmented adults belong to a real epidermis of about
+0.07 mm, so they are divided by 3.5 here; the two ends are those of the range to be covered, and
+the darkest reflects less than real skin does."""
 
 
 def melanin_map(

@@ -66,6 +66,44 @@ def height_um(
     return height
 
 
+def hair_map(points_mm: Float32Array, *, seed: int) -> Float32Array:
+    """Draw brows and lashes.
+
+    Parameters
+    ----------
+    points_mm
+        Points on the mean head, shape (..., 3).
+    seed
+        Any integer.
+
+    Returns
+    -------
+    ndarray of float32
+        Part that hair covers, shape (...), 0 to 1; zero on bare skin.
+    """
+    rng = np.random.default_rng([seed, 4])
+    x, y = np.abs(points_mm[..., 0]), points_mm[..., 1]
+    front = points_mm[..., 2] > -40.0
+    # The brow: an arch, thick near the nose and thin at the temple.
+    along = np.clip((x - 11.0) / 36.0, 0.0, 1.0)
+    arch = 38.5 + float(rng.uniform(2.5, 4.5)) * np.sin(2.4 * along) - 3.0 * along**3
+    thick = (1.0 - 0.65 * along) * float(rng.uniform(3.0, 4.2))
+    brow = np.exp(-(((y - arch) / thick) ** 4))
+    brow *= _rise((x - 10.5) / 2.5) * _rise((49.0 - x) / 2.5)
+    strands = points_mm * np.array([0.45, 1.0, 0.5], np.float32)
+    brow *= np.clip(0.72 + 0.3 * smooth_noise(strands, (2.2, 1.1), seed=seed + 91), 0.2, 1.0)
+    # The lashes of closed eyes lie along the line between the lids.
+    line = 16.6 + 0.011 * (x - 31.0) ** 2
+    lash = 0.85 * np.exp(-(((y - line) / 0.9) ** 2)) * _rise((x - 17.0) / 1.5)
+    lash *= _rise((46.0 - x) / 1.5)
+    cover = np.maximum(brow, lash) * front
+    return np.where(cover > 0.02, cover, 0.0).astype(np.float32)
+
+
+def _rise(t: NDArray[np.floating]) -> NDArray[np.floating]:
+    return 0.5 * (1.0 + np.tanh(t))
+
+
 def roughness_map(
     points_mm: Float32Array, regions: Mapping[str, Float32Array], *, seed: int
 ) -> Float32Array:

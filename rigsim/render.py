@@ -147,7 +147,9 @@ class Caster:
         return out
 
 
-def camera_rays(view: View, *, subpixels: int = 1) -> tuple[Float32Array, Float32Array]:
+def camera_rays(
+    view: View, *, subpixels: int = 1, rows: tuple[int, int] | None = None
+) -> tuple[Float32Array, Float32Array]:
     """Return the rays of a pinhole camera through its pixels or a regular grid inside them.
 
     Parameters
@@ -156,6 +158,8 @@ def camera_rays(view: View, *, subpixels: int = 1) -> tuple[Float32Array, Float3
         The camera; pixel (0, 0) is the top left one.
     subpixels
         Rays along each side of a pixel.
+    rows
+        First row and the one after the last; ``None`` takes all.
 
     Returns
     -------
@@ -168,7 +172,8 @@ def camera_rays(view: View, *, subpixels: int = 1) -> tuple[Float32Array, Float3
     right, up, back = (np.array(axis) for axis in view.axes)
     # Pixel (0, 0)'s centre is (0, 0); the optical axis meets the middle of the sensor.
     x = (np.arange(view.width_px * k) + 0.5) / k - 0.5 - 0.5 * (view.width_px - 1)
-    y = (np.arange(view.height_px * k) + 0.5) / k - 0.5 - 0.5 * (view.height_px - 1)
+    first, last = (0, view.height_px) if rows is None else rows
+    y = (np.arange(first * k, last * k) + 0.5) / k - 0.5 - 0.5 * (view.height_px - 1)
     way = x[None, :, None] * right - y[:, None, None] * up - view.focal_px * back
     way /= np.linalg.norm(way, axis=-1, keepdims=True)
     directions = way.astype(np.float32)
@@ -176,7 +181,9 @@ def camera_rays(view: View, *, subpixels: int = 1) -> tuple[Float32Array, Float3
     return origins, directions
 
 
-def g_buffer(caster: Caster, view: View, *, subpixels: int = 1) -> GBuffer:
+def g_buffer(
+    caster: Caster, view: View, *, subpixels: int = 1, rows: tuple[int, int] | None = None
+) -> GBuffer:
     """Look at a mesh through a camera.
 
     Parameters
@@ -187,13 +194,15 @@ def g_buffer(caster: Caster, view: View, *, subpixels: int = 1) -> GBuffer:
         The camera.
     subpixels
         Rays along each side of a pixel; buffers are that much larger.
+    rows
+        First row of pixels and the one after the last; ``None`` takes all.
 
     Returns
     -------
     GBuffer
         Point samples; nothing is averaged over a pixel.
     """
-    origins, directions = camera_rays(view, subpixels=subpixels)
+    origins, directions = camera_rays(view, subpixels=subpixels, rows=rows)
     shape = directions.shape[:2]
     prim, weight = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
     mesh = caster.mesh

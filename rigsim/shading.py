@@ -51,6 +51,7 @@ def specular_stokes(
     light_absorbs: ArrayLike,
     image_right: ArrayLike,
     extinction: float = math.inf,
+    metal: float = 0.0,
 ) -> Float32Array:
     """Return the surface reflection of filtered light as Stokes vectors.
 
@@ -68,6 +69,9 @@ def specular_stokes(
         The image's x axis, unit vector, shape (3,).
     extinction
         Extinction ratio of the light's film, > 1.
+    metal
+        When above 0, facets are an ideal metal of this reflectance at every angle, and ``eta`` does
+        not matter: both amplitudes are its root, with the signs of normal incidence.
 
     Returns
     -------
@@ -84,16 +88,11 @@ def specular_stokes(
             f"alpha: got {rough.min()} to {rough.max()}, "
             f"expected {ALPHA_RANGE[0]} to {ALPHA_RANGE[1]}"
         )
-    return _specular(
-        n,
-        light,
-        v,
-        rough,
-        float(eta),
-        _vector(light_absorbs),
-        _vector(image_right),
-        1.0 / extinction,
-    )
+    if not 0.0 <= metal <= 1.0:
+        raise ShadingError(f"metal: got {metal}, expected a reflectance from 0 to 1")
+    absorbs, right = _vector(light_absorbs), _vector(image_right)
+    root = math.sqrt(metal)
+    return _specular(n, light, v, rough, float(eta), absorbs, right, 1.0 / extinction, root)
 
 
 def entry_transmittance(
@@ -360,7 +359,7 @@ def _smith(cosine, alpha):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, cache=True)
-def _specular(normal, light, camera, alpha, eta, absorbs, right, leak):  # type: ignore[no-untyped-def]
+def _specular(normal, light, camera, alpha, eta, absorbs, right, leak, metal):  # type: ignore[no-untyped-def]
     out = np.zeros((normal.shape[0], 3), np.float32)
     for i in prange(normal.shape[0]):
         n0, n1, n2 = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
@@ -381,6 +380,8 @@ def _specular(normal, light, camera, alpha, eta, absorbs, right, leak):  # type:
         inside = math.sqrt(max(0.0, 1.0 - (1.0 - hl * hl) / (eta * eta)))
         rs = (hl - eta * inside) / (hl + eta * inside)
         rp = (eta * hl - inside) / (eta * hl + inside)
+        if metal > 0.0:
+            rs, rp = -metal, metal
         # s = h x l across the plane of incidence; light, camera and facet in line leave it free.
         s0, s1, s2 = h1 * l2 - h2 * l1, h2 * l0 - h0 * l2, h0 * l1 - h1 * l0
         length = math.sqrt(s0 * s0 + s1 * s1 + s2 * s2)

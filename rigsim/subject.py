@@ -45,6 +45,8 @@ class Subject:
     """GGX alpha of the surface, 0.15 to 0.5."""
     height_um: Float32Array
     """Pores and wrinkles over the mesh, um."""
+    hair: Float32Array
+    """Part of each texel that brows and lashes cover, 0 to 1."""
     normal: Float32Array
     """Unit normals of mesh and relief, shape (N, N, 3), rig frame."""
 
@@ -145,6 +147,7 @@ def make_subject(
         perfusion=perfuse(points, regions, seed=seed, amount=blood),
         roughness=relief.roughness_map(points, regions, seed=seed),
         height_um=height,
+        hair=relief.hair_map(points, seed=seed),
         normal=relief.relief_normals(atlas, height),
     )
 

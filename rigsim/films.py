@@ -1,0 +1,93 @@
+"""The polarizing films of a simulated rig as they really are: leaky, and not quite aligned."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Light, Rig, View
+from rigsim.shading import axis_in_plane
+
+Polarizer = Literal["parallel", "crossed"]
+
+READING_DEG = {"parallel": 0.0, "crossed": 90.0}
+"""Reading of the analyser's rotator in each state."""
+
+
+class FilmError(ValueError):
+    """A film or a state of the polarizers is described wrongly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Films:
+    """Truth about the films; calibration has to find it out."""
+
+    light_extinction: float
+    """Extinction ratio of the film before each light, > 1; real film has 1e3 to 1e4."""
+    analyser_extinction: float
+    """Extinction ratio of the film before the camera, > 1."""
+    analyser_zero_deg: float
+    """What the rotator's reading lacks to the true angle, degrees, -10 to 10."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        for name in ("light_extinction", "analyser_extinction"):
+            value = getattr(self, name)
+            if not value > 1.0:
+                raise FilmError(f"{name}: got {value}, expected > 1 (inf is ideal film)")
+        if not -10.0 <= self.analyser_zero_deg <= 10.0:
+            raise FilmError(f"analyser_zero_deg: got {self.analyser_zero_deg}, expected -10 to 10")
+
+    def passes_deg(self, view: View, polarizer: str, analyser_deg: float | None) -> float:
+        """Return the true passing axis of the analyser, degrees from the image's x axis.
+
+        Parameters
+        ----------
+        view
+            The camera; its nominal axis belongs to reading 0.
+        polarizer
+            "parallel" or "crossed".
+        analyser_deg
+            Reading of the rotator; ``None`` takes that of the state.
+        """
+        if polarizer not in READING_DEG:
+            raise FilmError(f"polarizer: got {polarizer!r}, expected parallel or crossed")
+        reading = READING_DEG[polarizer] if analyser_deg is None else analyser_deg
+        if not math.isfinite(reading):
+            raise FilmError(f"analyser_deg: got {reading}, expected a finite angle")
+        return view.analyser_axis_deg + reading + self.analyser_zero_deg
+
+
+IDEAL = Films(math.inf, math.inf, 0.0)
+"""Films that leak nothing and stand exactly."""
+
+
+def films_of(rig: Rig) -> Films:
+    """Return the films of a rig; they follow from its cameras' serial numbers.
+
+    Parameters
+    ----------
+    rig
+        The rig.
+
+    Returns
+    -------
+    Films
+        Extinction ratios of 1500 to 6000 and a zero within about a degree.
+    """
+    serials = "|".join(view.serial for view in rig.views)
+    digest = hashlib.sha256(f"films of {serials}".encode()).digest()
+    rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
+    light, analyser = np.exp(rng.uniform(math.log(1500.0), math.log(6000.0), 2))
+    zero = float(np.clip(rng.normal(0.0, 0.5), -1.2, 1.2))
+    return Films(float(light), float(analyser), zero)
+
+
+def absorbing_axis(light: Light) -> NDArray[np.float64]:
+    """Return the absorbing axis of a light's film, which faces the rig's origin; shape (3,)."""
+    return axis_in_plane(light.polarizer_axis_deg + 90.0, light.position_mm, (0.0, 1.0, 0.0))

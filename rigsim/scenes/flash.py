@@ -1,0 +1,351 @@
+"""The cross-polarized flash rig: two flashes and a camera before a face or a target.
+
+Light that enters the skin is gathered in the face's texture, spread there, and seen by the camera
+through the surface; the surface's own reflection is added per pixel. Both are kept as Stokes
+vectors, so that every angle of the analyser is one weighted sum away.
+
+The unit of light is fixed by the rig alone: a perfect white diffuser at the rig's origin that faces
+the camera gives `METER_LEVEL` of full scale in the strongest channel at power 1, behind parallel as
+behind crossed films, whatever stands there later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Rig, RigError, View
+from model import spectra
+from rigsim import shading
+from rigsim.films import Films, films_of
+from rigsim.lateral import line_spread_mm
+from rigsim.mesh import Float32Array
+from rigsim.render import Caster, camera_rays
+from rigsim.scenes.picture import Look, Picture
+from rigsim.scenes.skin_glow import SkinGlow, light_skin
+from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.subject import Subject
+from rigsim.targets import Target
+from rigsim.variant import VariantChoice
+
+METER_LEVEL: Final = 0.8
+"""Fraction of full scale of the white reference in its strongest channel at power 1."""
+
+FLAT_LEVEL: Final = 0.9
+"""Fraction of full scale of the integrating sphere in its strongest channel at power 1."""
+
+HAIR_LIMIT: Final = 0.02
+"""Pixels with more hair than this part are not skin."""
+
+POWER_DEVIATION: Final = 0.002
+"""Relative standard deviation of a flash's energy from pop to pop."""
+
+
+class SceneError(ValueError):
+    """A scene is asked for something that it does not hold."""
+
+
+class Pop(Protocol):
+    """A fired flash, as the world reports it."""
+
+    @property
+    def token(self) -> object:
+        """What the host called it."""
+
+    @property
+    def power(self) -> float:
+        """Fraction of full energy, 0 to 1."""
+
+    @property
+    def polarizer(self) -> str:
+        """State of the analyser: "parallel" or "crossed"."""
+
+    @property
+    def analyser_deg(self) -> float | None:
+        """Reading of the analyser's rotator in degrees; ``None`` for that of the state."""
+
+
+class FlashScene:
+    """One subject or target before the flash rig, in one state.
+
+    Parameters
+    ----------
+    rig
+        The flash rig; its lights must share one spectrum.
+    subject
+        A face or a target.
+    state
+        State of the face's blood, see `rigsim.perfusion.STATES`; targets have none.
+    sensor
+        Sensor of every view; ``None`` takes what each view states.
+    films
+        The polarizing films; ``None`` takes the rig's own, which its serial numbers decide.
+    seed
+        Seeds what differs from pop to pop.
+    lateral
+        Whether light spreads inside the skin.
+    subpixels
+        Rays along each side of a pixel.
+    choice
+        Mitsuba variant; ``None`` chooses.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        subject: Subject | Target,
+        *,
+        state: str = "neutral",
+        sensor: Sensor | None = None,
+        films: Films | None = None,
+        seed: int = 0,
+        lateral: bool = True,
+        subpixels: int = 2,
+        choice: VariantChoice | None = None,
+    ) -> None:
+        spectra_names = {light.illuminant for light in rig.lights}
+        if len(spectra_names) > 1:
+            raise SceneError(
+                f"lights: got the spectra {', '.join(sorted(spectra_names))}, expected one"
+            )
+        if subpixels < 1:
+            raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
+        self.rig = rig
+        self.subject = subject
+        self.state = state
+        self.films = films_of(rig) if films is None else films
+        self.seed = seed
+        self.lateral = lateral
+        self.subpixels = subpixels
+        self._illuminant = rig.lights[0].illuminant
+        self._sensors = {
+            view.name: sensor_of(view) if sensor is None else sensor for view in rig.views
+        }
+        self._weights = _light_weights(rig)
+        self._caster = Caster(subject.mesh, choice=choice)
+        self._glow: dict[str, SkinGlow] = {}
+        self._pictures: dict[str, Picture] = {}
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """What this scene does not build, with the reason."""
+        out = [
+            ("light between skin and skin", "adds below 1 % beside the nose and in the sockets"),
+            ("depth of field and lens blur", "the lens is stopped down; pixels are larger"),
+            ("ambient light", "the room is dark and the flash is short"),
+        ]
+        if isinstance(self.subject, Subject):
+            out += [
+                ("eyes, teeth and hair on the head", "the eyes are closed; only skin is estimated"),
+                ("movement of the face with the states", "states change the blood only"),
+                ("kernels that vary over the face", "one lateral profile, of its median skin"),
+                ("polarized single scattering", "light from inside is taken as depolarized"),
+            ]
+            if not self.lateral:
+                out.append(("light spreading sideways in skin", "lateral=False asks for it"))
+        return out
+
+    def white_rgb(self, view_name: str | None = None) -> Float32Array:
+        """Return the camera RGB of the white reference at power 1, fraction of full scale, (3,)."""
+        view = self._view(view_name)
+        white = spectra.camera_white(view.spectral_sensitivity, self._illuminant)
+        return np.asarray(METER_LEVEL * white / white.max(), np.float32)
+
+    def sensor(self, view_name: str | None = None) -> Sensor:
+        """Return the sensor of a view."""
+        return self._sensors[self._view(view_name).name]
+
+    def radiance(
+        self,
+        polarizer: str = "crossed",
+        analyser_deg: float | None = None,
+        *,
+        view_name: str | None = None,
+    ) -> Float32Array:
+        """Return the light on the sensor at power 1, without noise and vignetting.
+
+        Parameters
+        ----------
+        polarizer
+            "parallel" or "crossed".
+        analyser_deg
+            Reading of the analyser's rotator in degrees; ``None`` takes that of the state.
+        view_name
+            Which camera; ``None`` takes the first.
+
+        Returns
+        -------
+        ndarray of float32
+            Camera RGB without white balance, shape (H, W, 3), fraction of full scale.
+        """
+        view = self._view(view_name)
+        passes_deg = self.films.passes_deg(view, polarizer, analyser_deg)
+        white = self.white_rgb(view.name)
+        shape = (view.height_px, view.width_px, 3)
+        if isinstance(self.subject, Target) and self.subject.kind == "cap":
+            return np.zeros(shape, np.float32)
+        if isinstance(self.subject, Target) and self.subject.kind == "source":
+            level = np.float32(FLAT_LEVEL / METER_LEVEL) * white
+            return np.broadcast_to(level, shape).copy()
+        picture = self._picture(view)
+        diffuse = self._analysed(np.moveaxis(picture.diffuse, 2, 3), view, passes_deg)
+        specular = self._analysed(picture.specular, view, passes_deg)
+        return np.maximum((diffuse + specular[..., None]) * white, 0.0)
+
+    def exposure(
+        self, view_name: str, *, pops: Sequence[Pop], exposure_s: float, seed: int
+    ) -> NDArray[np.uint16]:
+        """Expose a camera once.
+
+        Parameters
+        ----------
+        view_name
+            Which camera.
+        pops
+            The flashes that fired while the shutter was open; none gives a dark frame.
+        exposure_s
+            Exposure time, s.
+        seed
+            Seed of this exposure's noise.
+
+        Returns
+        -------
+        ndarray of uint16
+            Raw DN, shape (H, W).
+        """
+        view = self._view(view_name)
+        rng = np.random.default_rng([self.seed, seed])
+        light = np.zeros((view.height_px, view.width_px, 3), np.float32)
+        for pop in pops:
+            if not 0.0 <= pop.power <= 1.0:
+                raise SceneError(f"power of pop {pop.token!r}: got {pop.power}, expected 0 to 1")
+            energy = pop.power * (1.0 + POWER_DEVIATION * rng.standard_normal())
+            image = self.radiance(pop.polarizer, pop.analyser_deg, view_name=view.name)
+            light += np.float32(energy) * image
+        sensor = self._sensors[view.name]
+        return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
+
+    def truth(self, view_name: str | None = None) -> dict[str, NDArray[np.generic]]:
+        """Return what an estimator should find, at the sensor's resolution.
+
+        Parameters
+        ----------
+        view_name
+            Which camera; ``None`` takes the first.
+
+        Returns
+        -------
+        dict
+            Maps of shape (H, W[, 3]), float32, averaged over each pixel's covered part:
+
+            ``melanin``, ``hemoglobin``: volume fractions, sharp;
+            ``melanin_blurred``, ``hemoglobin_blurred``: the fractions of even skin that would look
+            as the skin looks after its light has spread, all else known;
+            ``reflectance``, ``reflectance_blurred``: white-balanced diffuse reflectance, (H, W, 3);
+            ``shading``: what reflectance times `white_rgb` is multiplied with in the crossed image
+            at power 1, without specular leak and spreading of light;
+            ``irradiance``: light on the surface over light on the white reference;
+            ``diffuse``, ``specular``: camera RGB without analyser at power 1 in fraction of full
+            scale, light from inside and from the surface, (H, W, 3); crossed is about half the
+            first, parallel half the first and the second;
+            ``normals``: unit, rig frame, with relief; ``position_mm``: rig frame;
+            ``roughness``: GGX alpha; ``uv``: texture coordinates, (H, W, 2);
+            ``hair``: part covered by hair (brows, lashes);
+            ``mask``: bool, pixels wholly on skin.
+
+        Raises
+        ------
+        SceneError
+            A target stands there; only faces have these maps.
+        """
+        if not isinstance(self.subject, Subject):
+            raise SceneError(f"truth: got the target {self.subject.name!r}, expected a face")
+        view = self._view(view_name)
+        picture = self._picture(view)
+        white = self.white_rgb(view.name)
+        passes_deg = self.films.passes_deg(view, "crossed", None)
+        truth: dict[str, NDArray[np.generic]] = dict(picture.maps)
+        truth["shading"] = self._analysed(picture.shading, view, passes_deg)
+        truth["diffuse"] = picture.diffuse[:, :, 0] * white
+        truth["specular"] = picture.specular[:, :, :1] * white
+        truth["mask"] = (picture.coverage > 1.0 - 1e-6) & (picture.maps["hair"] < HAIR_LIMIT)
+        return truth
+
+    def resolution_mm(self, view_name: str | None = None) -> NDArray[np.float64]:
+        """Return the widths from 10 to 90 % of an edge that lateral transport blurs, mm, (3,)."""
+        glow = self._skin_glow(self._view(view_name))
+        return line_spread_mm(glow.kernels.sigmas_mm, glow.kernels.weights)
+
+    def _view(self, name: str | None) -> View:
+        if name is None:
+            return self.rig.views[0]
+        try:
+            return self.rig.view(name)
+        except RigError as error:
+            raise SceneError(str(error)) from error
+
+    def _analysed(self, stokes: Float32Array, view: View, passes_deg: float) -> Float32Array:
+        """Apply the analyser to Stokes vectors of shape (H, W, 3) or (H, W, 3 RGB, 3)."""
+        to_camera = -camera_rays(view)[1]
+        right, up, _ = view.axes
+        if stokes.ndim == 4:
+            to_camera = to_camera[:, :, None]
+        return shading.analyse(
+            stokes,
+            to_camera,
+            passes_deg=passes_deg,
+            image_right=right,
+            image_up=up,
+            extinction=self.films.analyser_extinction,
+        )
+
+    def _skin_glow(self, view: View) -> SkinGlow:
+        if not isinstance(self.subject, Subject):
+            raise SceneError(f"skin: got the target {self.subject.name!r}, expected a face")
+        camera = view.spectral_sensitivity
+        if camera not in self._glow:
+            self._glow[camera] = light_skin(
+                self.subject,
+                self.state,
+                self.rig.lights,
+                self._weights,
+                self.films,
+                caster=self._caster,
+                camera=camera,
+                lateral_transport=self.lateral,
+            )
+        return self._glow[camera]
+
+    def _picture(self, view: View) -> Picture:
+        if view.name not in self._pictures:
+            look = Look(self.rig, view, self.films, self._weights, self.subpixels)
+            if isinstance(self.subject, Subject):
+                picture = look.at_skin(
+                    self._caster,
+                    self.subject,
+                    self.state,
+                    self._skin_glow(view),
+                    lateral_transport=self.lateral,
+                )
+            else:
+                picture = look.at_target(self._caster, self.subject)
+            self._pictures[view.name] = picture
+        return self._pictures[view.name]
+
+
+def _light_weights(rig: Rig) -> NDArray[np.float64]:
+    """Return each light's energy over the sum that a plate at the origin gets, mm^2."""
+    energy, share = [], []
+    view_axis = np.asarray(rig.views[0].axes[2])
+    for light in rig.lights:
+        place = np.asarray(light.position_mm)
+        squared = float(place @ place)
+        energy.append(light.energy_ws)
+        share.append(light.energy_ws * float(place @ view_axis) / squared**1.5)
+    total = float(np.sum(share))
+    if not total > 0.0:
+        raise SceneError("lights: none shines on a plate at the origin that faces the camera")
+    return np.asarray(energy) / total

@@ -1,0 +1,203 @@
+"""Light that comes back from inside the skin, laid out in the texture of a face."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Light
+from model import spectra
+from rigsim import lateral, shading
+from rigsim.films import Films, absorbing_axis
+from rigsim.lateral_kernels import GaussianSum
+from rigsim.mesh import Float32Array
+from rigsim.render import Caster, visibility
+from rigsim.skin_color import skin_color
+from rigsim.skin_layers import ETA
+from rigsim.skin_table import SkinTable
+from rigsim.subject import Subject
+
+SIGMAS_MM: Final = (0.02, 0.06, 0.15, 0.35, 0.8, 1.8, 4.0)
+"""Widths of the Gaussians that stand for the lateral profiles, mm."""
+
+HAIR_REFLECTANCE: Final = (0.045, 0.032, 0.025)
+"""White-balanced reflectance of dark brown hair, seen as a matt cover."""
+
+SHADOW_SAMPLES: Final = 8
+"""Points on each flash that cast shadows."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SkinGlow:
+    """Light on and out of a face; textures of shape (N, N[, C])."""
+
+    visible: Float32Array
+    """Part of each light's disc that is seen, shape (N, N, L), 0 to 1."""
+    irradiance: Float32Array
+    """Light that falls on the surface relative to what a plate at the rig's origin gets that faces
+    the camera, without any film, shape (N, N)."""
+    entered: Float32Array
+    """Filtered light that enters, in the same unit, shape (N, N)."""
+    reflectance: Float32Array
+    """Sharp white-balanced diffuse reflectance of the skin, shape (N, N, 3)."""
+    sharp: Float32Array
+    """Light that would leave where it entered, before the surface's exit: ``entered`` times
+    reflectance times the interior's scale, shape (N, N, 3)."""
+    spread: Float32Array
+    """The same with lateral transport unless it is left out, and behind hair."""
+    kernels: GaussianSum
+    """Lateral profile of each channel at the face's typical skin."""
+
+
+def light_skin(
+    subject: Subject,
+    state: str,
+    lights: tuple[Light, ...],
+    weights: NDArray[np.float64],
+    films: Films,
+    *,
+    caster: Caster,
+    camera: str,
+    lateral_transport: bool,
+) -> SkinGlow:
+    """Light a face.
+
+    Parameters
+    ----------
+    subject, state
+        Whose skin, in which state.
+    lights
+        The flashes; all of one spectrum.
+    weights
+        Energy of each light over the sum that a plate at the origin gets, mm^2, shape (L,).
+    films
+        The lights' films.
+    caster
+        The face's mesh.
+    camera
+        Name of the camera's sensitivity.
+    lateral_transport
+        Whether light spreads inside the skin.
+
+    Returns
+    -------
+    SkinGlow
+        Textures.
+    """
+    atlas = subject.atlas
+    size = atlas.size
+    position = atlas.position_mm.reshape(-1, 3)
+    normal = subject.normal.reshape(-1, 3)
+    mesh_normal = atlas.normal.reshape(-1, 3)
+    visible = np.empty((size * size, len(lights)), np.float32)
+    irradiance = np.zeros(size * size, np.float32)
+    entered = np.zeros(size * size, np.float32)
+    for k, light in enumerate(lights):
+        visible[:, k] = visibility(
+            caster,
+            position,
+            mesh_normal,
+            light.position_mm,
+            radius_mm=light.radius_mm,
+            samples=SHADOW_SAMPLES,
+        )
+        to_light, falloff = toward(light, position)
+        cosine = np.maximum(np.einsum("ij,ij->i", normal, to_light), 0.0)
+        falling = np.float32(weights[k]) * falloff * cosine * visible[:, k]
+        irradiance += falling
+        entered += falling * shading.entry_transmittance(
+            normal,
+            to_light,
+            eta=ETA,
+            light_absorbs=absorbing_axis(light),
+            extinction=films.light_extinction,
+        )
+    covered = atlas.covered.reshape(-1)
+    irradiance[~covered] = 0.0
+    entered[~covered] = 0.0
+    melanin, blood = subject.melanin, subject.hemoglobin(state)
+    reflectance = skin_color(camera, lights[0].illuminant).rgb(melanin, blood)
+    within = entered.reshape(size, size)
+    scale = np.float32(shading.interior_scale(ETA))
+    sharp = scale * within[..., None] * reflectance
+    kernels = typical_kernels(subject, state, camera, lights[0].illuminant)
+    spread = sharp
+    if lateral_transport:
+        spread = scale * spread_through_pigment(
+            subject, state, reflectance, within, kernels, camera, lights[0].illuminant
+        )
+    hair = subject.hair[..., None]
+    # Hair is dark and matt, and lets no light into the skin below it.
+    over = scale * within[..., None] * np.asarray(HAIR_REFLECTANCE, np.float32) * hair
+    spread = (1.0 - hair) * spread + over
+    return SkinGlow(
+        visible.reshape(size, size, len(lights)),
+        irradiance.reshape(size, size),
+        within,
+        reflectance,
+        sharp,
+        spread,
+        kernels,
+    )
+
+
+def spread_through_pigment(
+    subject: Subject,
+    state: str,
+    reflectance: Float32Array,
+    entered: Float32Array,
+    kernels: GaussianSum,
+    camera: str,
+    light: str,
+) -> Float32Array:
+    """Return the light that leaves after it has spread, per unit of the interior's scale.
+
+    Parameters
+    ----------
+    subject, state
+        Whose skin, in which state.
+    reflectance
+        Sharp reflectance, shape (N, N, 3).
+    entered
+        Light that enters, shape (N, N).
+    kernels
+        Lateral profile.
+    camera, light
+        Names known to `model.spectra`.
+
+    Returns
+    -------
+    ndarray of float32
+        Shape (N, N, 3).
+
+    Notes
+    -----
+    Melanin lies above the scattering dermis, so light passes it where it enters and again where it
+    leaves: its pattern acts once before and once after the spreading, as m = sqrt(R(C_m, C_hd) /
+    R(0, C_hd)) each time. Blood acts inside, before the spreading.
+    """
+    table = skin_color(camera, light)
+    without = table.rgb(np.zeros_like(subject.melanin), subject.hemoglobin(state))
+    pigment = np.sqrt(reflectance / without)
+    inside = pigment * without * entered[..., None]
+    return pigment * lateral.spread_light(inside, subject.atlas, kernels.sigmas_mm, kernels.weights)
+
+
+def typical_kernels(subject: Subject, state: str, camera: str, light: str) -> GaussianSum:
+    """Return the lateral profile of a face's median skin as Gaussians per channel."""
+    table = SkinTable.load()
+    covered = subject.atlas.covered
+    melanin = float(np.median(subject.melanin[covered]))
+    blood = float(np.median(subject.hemoglobin(state)[covered]))
+    weights = spectra.band_weights(camera, light, table.wavelength_nm)
+    return table.lateral_kernels(melanin, blood, weights).gaussians(SIGMAS_MM)
+
+
+def toward(light: Light, position_mm: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Return unit vectors to a light and the inverse square of its distance in 1/mm^2."""
+    way = np.asarray(light.position_mm, np.float32) - position_mm
+    squared = np.einsum("...j,...j->...", way, way)
+    return way / np.sqrt(squared)[..., None], np.float32(1.0) / squared
