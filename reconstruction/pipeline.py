@@ -21,6 +21,7 @@ from capture.calibration.white import WhiteReference
 from capture.session import Session
 from model import color_table, store
 from model.skin import UNITS, SkinAppearance, SkinMap
+from model.tissue_optics import ANISOTROPY_SKIN
 from reconstruction import chromophores, model_error, polarization, stages, tsumura
 
 REVISION = 1
@@ -155,7 +156,9 @@ def reconstruct(
 def _inputs(
     session: Session, calibration: str | Path | None, state: str, on_date: date | None
 ) -> Inputs:
-    rig, view = session.rig, session.rig.views[0]
+    rig = session.rig
+    shots = session.frames("subject", state=state)
+    view = rig.view(shots[0].camera) if shots else rig.views[0]
     when = on_date or session.manifest.created_at.date()
     assumed = [str(text) for text in session.manifest.extra.get("assumed", [])]
     hashes = {"session": session.content_hash}
@@ -312,7 +315,7 @@ ASSUMED_WHITE = 0.8
 
 
 def _assumed_white(inputs: Inputs) -> Float32:
-    record = inputs.session.frames("subject")[0]
+    record = inputs.session.frames("subject", state=inputs.state)[0]
     neutral = inputs.session.read(record).neutral
     level = np.full(3, ASSUMED_WHITE)
     if neutral is not None:
@@ -332,7 +335,7 @@ def _map3(
 
 
 def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
-    table = color_table.build(inputs.camera, inputs.illuminant)
+    table = color_table.build(inputs.camera, inputs.illuminant, anisotropy=ANISOTROPY_SKIN)
     found = chromophores.invert(
         np.where(diffuse.valid[..., None], diffuse.values, np.nan),
         table,

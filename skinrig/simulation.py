@@ -131,6 +131,8 @@ def simulate_session(
         "rig": rig_name, "width_px": width, "subject": subject, "target": target or "",
         "mesh": str(mesh or ""), "states": list(states), "repeats": repeats,
     }  # fmt: skip
+    # what cannot be built must fail before a folder is made
+    scenes = _scenes(rig, target, subject, mesh, states, seed)
     if resume:
         session = Session.resume(path)
         if session.manifest.extra.get("simulation") != asked or session.seed != seed:
@@ -152,7 +154,6 @@ def simulate_session(
             extra={"simulation": asked},
             now=None if created is None else (lambda: created),
         )
-    scenes = _scenes(rig, target, subject, mesh, states, seed)
     rig_seconds = _drive(session, rig, scenes, seed, progress)
     truth = None
     if target is None:

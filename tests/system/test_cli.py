@@ -1,0 +1,93 @@
+"""The command line as a user meets it: exit codes, one JSON document, no traceback."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from skinrig.cli import app, main
+
+COMMANDS = sorted(
+    [
+        command.name or command.callback.__name__.replace("_", "-")
+        for command in app.registered_commands
+    ]
+    + ["import"]
+)
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself_with_an_example(command, capsys):
+    argv = [command, "--help"] if command != "import" else ["import", "photos", "--help"]
+    assert main(argv) == 0
+    assert f"Example: skinrig {command}" in capsys.readouterr().out
+
+
+def test_the_promised_commands_are_there():
+    promised = {
+        "simulate", "capture", "serve", "calibrate", "reconstruct", "import", "report", "bench",
+        "verify", "doctor", "demo",
+    }  # fmt: skip
+    assert promised <= set(COMMANDS)
+
+
+@pytest.mark.parametrize(
+    ("argv", "code", "says"),
+    [
+        (["nonsense"], 2, "nonsense"),
+        (["simulate"], 2, "Missing"),
+        (["verify", "nothing"], 3, "nothing"),
+        (["report", "nothing"], 3, "does not exist"),
+        (["simulate", "teapot", "--out", "x"], 3, "teapot"),
+        (["simulate", "flash", "--out", "x", "--size", "huge"], 3, "huge"),
+        (["simulate", "flash", "--out", "x", "--target", "moon"], 3, "moon"),
+        (["simulate", "flash", "--out", "x", "--subject", "green"], 3, "green"),
+        (["reconstruct", "nothing", "--want", "melanin", "--out", "x"], 3, "nothing"),
+        (["calibrate", "sensor", "nothing"], 3, "nothing"),
+        (["bench", "--stage", "coffee"], 3, "coffee"),
+        (["capture", "flash", "--out", "x"], 3, "--port flash=URL"),
+        (["capture", "flash", "--out", "x", "--port", "flash"], 3, "NAME=URL"),
+        (["demo", "--rigs", "submarine"], 3, "submarine"),
+        (["import", "photos", "nothing", "--out", "x"], 3, "nothing"),
+    ],
+)
+def test_bad_input_gives_one_clear_error_and_its_exit_code(
+    argv, code, says, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(argv) == code
+    out, err = capsys.readouterr()
+    assert says in out + err
+    assert "Traceback" not in out + err
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_box_that_is_not_there_is_a_device_failure(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    argv = ["capture", "flash", "--out", "x", "--port", "flash=/dev/no-such-port"]
+    assert main([*argv, "--camera", "cam=hotfolder:none"]) == 4
+    assert "no-such-port" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_dry_run_prints_the_plan_and_opens_nothing(capsys):
+    assert main(["capture", "flash", "--out", "x", "--dry-run", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == "skinrig.capture/1"
+    assert document["captured"] == 0
+    assert document["steps"] > 1
+
+
+def test_no_argument_shows_where_to_begin(capsys):
+    assert main([]) in (0, 2)
+    out, err = capsys.readouterr()
+    assert "skinrig demo" in out + err
+
+
+@pytest.mark.parametrize(
+    "command", re.findall(r"^skinrig (\w+)", (ROOT / "README.md").read_text(), re.MULTILINE)
+)
+def test_the_readme_names_commands_that_exist(command):
+    assert command in COMMANDS
