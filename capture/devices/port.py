@@ -292,8 +292,9 @@ class Port:
     def listen(self, seconds: float) -> list[Event]:
         """Let `seconds` pass on the line and return the events that came, oldest first."""
         self._check_thread()
-        for _ in self._received(seconds):
-            self.statistics.stale += 1  # an answer nobody waits for
+        for frame in self._received(seconds):
+            # an answer nobody waits for is stale
+            self.statistics.stale += isinstance(frame, Reply)
         events = list(self.events)
         self.events.clear()
         return events

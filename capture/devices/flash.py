@@ -1,0 +1,421 @@
+"""The flash box: one method a command, units in and out, no policy.
+
+Nothing lights unless the box is armed, and an armed box that hears nothing for its lease goes dark
+and disarms itself. After `BoxRebooted` call `hello` and set everything up again: the box has
+forgotten it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Self
+
+from . import wire
+from .port import BadAnswer, Clock, Hello, LinkLost, Port, PortTimeout, WrongDevice
+
+__all__ = ["ChargeState", "FlashBox", "FlashReport", "Status", "find_box"]
+
+KIND = "flash"
+Polarizer = Literal["parallel", "crossed"]
+_STOPS: Mapping[str, Polarizer] = {"PAR": "parallel", "CROS": "crossed"}
+_SHORTEST_WAIT_S = 0.02
+_LISTEN_S = 0.2
+"""Longest silence while waiting; shorter than the shortest lease."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlashReport:
+    """What the box says of a pop."""
+
+    token: str
+    """Name that was given to it."""
+    t_box_s: float
+    """Time on the box's clock, s since its power-up."""
+    power: float
+    """Energy relative to a full pop, 0 to 1."""
+    polarizer: Polarizer
+    """Stop that was last asked for."""
+    analyser_deg: float
+    """Reading of the rotator, degrees; 0 parallel, 90 crossed."""
+    count: int
+    """Pops since the box was made, this one included."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChargeState:
+    """Whether a pop is possible."""
+
+    charge: float
+    """Energy in the capacitor, 0 to 1 of a full pop."""
+    ready: bool
+    """Whether an armed box would fire now."""
+    ready_in_s: float
+    """When it would, s; 0 when ready."""
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """The bits of ``STAT?``."""
+
+    bits: int
+    """Their sum."""
+
+    @property
+    def armed(self) -> bool:
+        """Whether light is allowed."""
+        return bool(self.bits & 1)
+
+    @property
+    def tripped(self) -> bool:
+        """Whether the lease ran out since the box was last armed."""
+        return bool(self.bits & 2)
+
+    @property
+    def errors_waiting(self) -> bool:
+        """Whether `FlashBox.errors` would find something."""
+        return bool(self.bits & 4)
+
+    @property
+    def turning(self) -> bool:
+        """Whether the analyser turns."""
+        return bool(self.bits & 16)
+
+    @property
+    def lit(self) -> bool:
+        """Whether a modelling lamp is on."""
+        return bool(self.bits & 64)
+
+    @property
+    def too_hot(self) -> bool:
+        """Whether the lamps' driver has tripped."""
+        return bool(self.bits & 128)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the emergency stop is open."""
+        return bool(self.bits & 256)
+
+
+class FlashBox:
+    """Driver of the flash box.
+
+    Parameters
+    ----------
+    port
+        Open; owned by the driver from now on.
+    serial
+        Serial number that the box must have; empty: any.
+
+    Raises
+    ------
+    WrongDevice
+        When the box is no flash box, or another one.
+    """
+
+    def __init__(self, port: Port, *, serial: str = "") -> None:
+        self._port = port
+        try:
+            self.hello(serial=serial)
+        except BaseException:
+            port.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # identity ---------------------------------------------------------------------------------
+
+    def hello(self, *, serial: str = "") -> Hello:
+        """Introduce the host, learn the epoch and read the limits."""
+        hello = self._port.hello()
+        if hello.kind != KIND:
+            raise WrongDevice(
+                f"{self._port.url}: got a {hello.kind!r} box with serial {hello.serial}, expected "
+                f"a {KIND!r} box; exchange the addresses"
+            )
+        if serial and hello.serial != serial:
+            raise WrongDevice(
+                f"{self._port.url}: got the flash box {hello.serial}, expected {serial}; exchange "
+                "the addresses"
+            )
+        self._identity = hello
+        self._limits = self._capabilities()
+        return hello
+
+    @property
+    def port(self) -> Port:
+        """The port, for its statistics and events."""
+        return self._port
+
+    @property
+    def identity(self) -> Hello:
+        """Who answered the last hello."""
+        return self._identity
+
+    @property
+    def limits(self) -> Mapping[str, Any]:
+        """What the box allows (``SYST:CAP?``), units in the names; read at hello."""
+        return self._limits
+
+    def _capabilities(self) -> Mapping[str, Any]:
+        payload = self._port.ask("SYST:CAP?")
+        try:
+            limits = json.loads(wire.unseal(payload))
+        except ValueError as exc:
+            raise self._bad("SYST:CAP?", payload, "sealed JSON") from exc
+        if not isinstance(limits, dict):
+            raise self._bad("SYST:CAP?", payload, "a JSON object")
+        return limits
+
+    def identify(self) -> str:
+        """Return maker, model, serial number and firmware."""
+        return self._port.ask("*IDN?")
+
+    # arming -----------------------------------------------------------------------------------
+
+    def arm(self) -> None:
+        """Allow light; the lease begins."""
+        self._port.ask("SYST:ARM")
+
+    def dark(self) -> None:
+        """Put all light out and disarm, at once."""
+        self._port.ask("SAFE")
+
+    def is_armed(self) -> bool:
+        """Tell whether light is allowed."""
+        return self._flag("SYST:ARM?")
+
+    def set_lease(self, lease_s: float) -> None:
+        """Set after how much silence, in s, the box goes dark (0.3 to 5)."""
+        self._port.ask(f"SYST:WDOG {round(lease_s * 1e3)}")
+
+    def lease_s(self) -> float:
+        """Return after how much silence, in s, the box goes dark."""
+        return self._number("SYST:WDOG?") / 1e3
+
+    def ping(self) -> float:
+        """Return the box's clock, in s since its power-up; renews the lease."""
+        return self._number("SYST:PING?") / 1e6
+
+    def reset(self) -> None:
+        """Go dark, disarm, and return to the settings of power-up."""
+        self._port.ask("*RST")
+
+    def status(self) -> Status:
+        """Return the status bits."""
+        return Status(int(self._number("STAT?")))
+
+    def errors(self) -> list[tuple[int, str]]:
+        """Return and remove the queued errors, oldest first."""
+        found: list[tuple[int, str]] = []
+        for _ in range(64):
+            payload = self._port.ask("SYST:ERR?")
+            code, comma, text = payload.partition(",")
+            if not comma or not code.removeprefix("-").isdecimal():
+                raise self._bad("SYST:ERR?", payload, 'code,"text"')
+            if int(code) == 0:
+                break
+            found.append((int(code), text.strip('"')))
+        return found
+
+    def clear_errors(self) -> None:
+        """Empty the error queue."""
+        self._port.ask("*CLS")
+
+    # analyser ---------------------------------------------------------------------------------
+
+    def set_polarizer(self, polarizer: str) -> None:
+        """Begin to turn the analyser to "parallel" or "crossed"."""
+        words = {stop: word for word, stop in _STOPS.items()}
+        if polarizer not in words:
+            raise ValueError(f"polarizer: got {polarizer!r}, expected 'parallel' or 'crossed'")
+        self._port.ask(f"FLAS:POL {words[polarizer]}")
+
+    def polarizer(self) -> Polarizer:
+        """Return the stop that was last asked for."""
+        return self._stop("FLAS:POL?", self._port.ask("FLAS:POL?"))
+
+    def set_analyser(self, angle_deg: float) -> None:
+        """Begin to turn the analyser to a reading, in degrees."""
+        self._port.ask(f"FLAS:POL:ANG {_decimal('angle_deg', angle_deg)}")
+
+    def analyser_deg(self) -> float:
+        """Return the reading that the analyser has or turns to, in degrees."""
+        return self._number("FLAS:POL:ANG?")
+
+    def settled(self) -> bool:
+        """Tell whether the analyser stands still."""
+        return self._flag("*OPC?")
+
+    # flash ------------------------------------------------------------------------------------
+
+    def set_power(self, power: float) -> None:
+        """Set the power of the next pops, 0 to 1 of full."""
+        self._port.ask(f"FLAS:POW {_decimal('power', power)}")
+
+    def power(self) -> float:
+        """Return the power of the next pop, 0 to 1 of full."""
+        return self._number("FLAS:POW?")
+
+    def charge_state(self) -> ChargeState:
+        """Tell whether a pop is possible, and when it will be."""
+        payload = self._port.ask("FLAS:CHAR?")
+        fields = payload.split(",")
+        try:
+            charge, ready, wait_ms = float(fields[0]), int(fields[1]), int(fields[2])
+        except (ValueError, IndexError) as exc:
+            raise self._bad("FLAS:CHAR?", payload, "charge,ready,ms") from exc
+        return ChargeState(charge, ready == 1, wait_ms / 1e3)
+
+    def wait_charged(self, timeout_s: float) -> None:
+        """Wait until a pop is possible: charged, recovered, and the analyser at rest.
+
+        Time passes by listening to the line, so that it is the box's time whatever the box is, and
+        the lease is renewed.
+
+        Raises
+        ------
+        PortTimeout
+            When the box is not ready in `timeout_s`.
+        """
+        waited_s = 0.0
+        while not (state := self.charge_state()).ready:
+            if waited_s >= timeout_s:
+                raise PortTimeout(
+                    f"{self._port.url}: the flash is not ready after {timeout_s:g} s (charge "
+                    f"{state.charge:.2f}); check its mains and its emergency stop"
+                )
+            pause_s = min(max(state.ready_in_s, _SHORTEST_WAIT_S), _LISTEN_S)
+            self._port.listen(pause_s)
+            waited_s += pause_s
+
+    def fire(self, token: str) -> FlashReport:
+        """Pulse the camera line and pop once.
+
+        A retry on the line never pops twice. After `PortTimeout` or `LinkLost` it is not known
+        whether it popped: `last_pop` tells, unless the box has rebooted.
+        """
+        return self._report("FLAS:FIRE", self._port.ask(f"FLAS:FIRE {token}"))
+
+    def last_pop(self) -> FlashReport | None:
+        """Return the report of the last pop since power-up, None when there was none."""
+        payload = self._port.ask("FLAS:LAST?")
+        return None if payload == "NONE" else self._report("FLAS:LAST?", payload)
+
+    def count(self) -> int:
+        """Return the number of pops since the box was made."""
+        return int(self._number("FLAS:COUN?"))
+
+    def trigger_cameras(self, token: str) -> float:
+        """Pulse the camera line without light; return the box's time of the pulse, in s."""
+        payload = self._port.ask(f"CAM:TRIG {token}")
+        name, _, t_us = payload.partition(",")
+        if name != token or not t_us.isdecimal():
+            raise self._bad("CAM:TRIG", payload, "token,us")
+        return int(t_us) / 1e6
+
+    # lamps ------------------------------------------------------------------------------------
+
+    def lamp_on(self, seconds: float) -> None:
+        """Light the modelling lamps for `seconds` (at most 0.5) from now."""
+        self._port.ask(f"FLAS:LAMP ON,{_decimal('seconds', seconds * 1e3)}")
+
+    def lamp_off(self) -> None:
+        """Put the modelling lamps out."""
+        self._port.ask("FLAS:LAMP OFF")
+
+    def lamp_lit(self) -> bool:
+        """Tell whether the modelling lamps are on."""
+        return self._flag("FLAS:LAMP?")
+
+    def close(self) -> None:
+        """Go dark if the box still answers, and close the port."""
+        try:
+            if self._port.boot != wire.UNKNOWN_BOOT:
+                self.dark()
+        except (LinkLost, PortTimeout):
+            pass  # its lease puts the light out
+        finally:
+            self._port.close()
+
+    # answers ----------------------------------------------------------------------------------
+
+    def _bad(self, text: str, payload: str, expected: str) -> BadAnswer:
+        return BadAnswer(
+            f"{self._port.url}: {text!r} was answered with {payload!r}, expected {expected}"
+        )
+
+    def _number(self, text: str) -> float:
+        payload = self._port.ask(text)
+        try:
+            value = float(payload)
+        except ValueError as exc:
+            raise self._bad(text, payload, "a number") from exc
+        if not math.isfinite(value):
+            raise self._bad(text, payload, "a finite number")
+        return value
+
+    def _flag(self, text: str) -> bool:
+        payload = self._port.ask(text)
+        if payload not in ("0", "1"):
+            raise self._bad(text, payload, "0 or 1")
+        return payload == "1"
+
+    def _stop(self, text: str, payload: str) -> Polarizer:
+        if payload not in _STOPS:
+            raise self._bad(text, payload, "PAR or CROS")
+        return _STOPS[payload]
+
+    def _report(self, text: str, payload: str) -> FlashReport:
+        fields = payload.split(",")
+        try:
+            token, t_us, power, stop, angle_deg, count = fields
+            return FlashReport(
+                token,
+                int(t_us) / 1e6,
+                float(power),
+                self._stop(text, stop),
+                float(angle_deg),
+                int(count),
+            )
+        except ValueError as exc:
+            raise self._bad(text, payload, "token,us,power,PAR|CROS,degrees,count") from exc
+
+
+def find_box(urls: Iterable[str], serial: str, *, clock: Clock | None = None) -> FlashBox:
+    """Return the flash box with a serial number, wherever it is plugged in.
+
+    Parameters
+    ----------
+    urls
+        Ports to look at, e.g. all of ``/dev/serial/by-id``.
+    serial
+        Its serial number.
+    clock
+        See `Port`.
+
+    Raises
+    ------
+    WrongDevice
+        When it is on none of them; what was found is listed.
+    """
+    found = []
+    for url in urls:
+        try:
+            return FlashBox(Port(url, clock=clock), serial=serial)
+        except (LinkLost, PortTimeout, WrongDevice) as exc:
+            found.append(str(exc))
+    seen = "\n  ".join(found) or "no ports"
+    raise WrongDevice(f"no flash box {serial} was found; looked at:\n  {seen}")
+
+
+def _decimal(field: str, value: float) -> str:
+    if not math.isfinite(value):
+        raise ValueError(f"{field}: got {value}, expected a finite number")
+    return f"{value:.6f}".rstrip("0").rstrip(".")

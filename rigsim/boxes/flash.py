@@ -1,0 +1,377 @@
+"""The flash box: two heads fired together, modelling lamps, a turning analyser, a camera line.
+
+Its manual is its command table (`FlashUnit.commands`) and these rules. A pop takes its share of the
+capacitor's energy; the charger brings it back. ``FLAS:FIRE`` pulses the camera line and pops at the
+same instant. It is refused while the analyser turns (-213), before the tube has recovered (103: the
+recycle time is proportional to the last power), beyond the pops per minute (101), before the charge
+suffices (-213), with the emergency stop open (107), and fails with -240 when the tube does not
+ignite; the camera line has pulsed then, so that frame is dark. Modelling lamps carry their own end,
+go out before a pop, and their driver trips when too hot (102).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from capture.devices.wire import Code
+
+from .controller import Command, Refused, choice, number, word
+
+__all__ = ["FlashPop", "FlashUnit"]
+
+Polarizer = Literal["parallel", "crossed"]
+
+MIN_POWER = 1.0 / 256.0
+LAMP_MS = (1.0, 500.0)
+ANALYSER_DEG = (0.0, 180.0)
+POP_WINDOW_S = 60.0
+READINGS_DEG: dict[Polarizer, float] = {"parallel": 0.0, "crossed": 90.0}
+
+CHARGER_HEADROOM = 1.05
+"""Voltage the charger aims at, relative to full; it stops at full."""
+CHARGE_SHARE = 0.9
+"""Time from empty to full as a share of the recycle time."""
+LAMP_TAU_S = 20.0
+"""Time constant of the lamp driver's temperature, s."""
+HEAT_TRIP, HEAT_CLEAR = 0.8, 0.5
+"""Temperatures at which the lamp's driver trips and recovers; 1 is where it would settle."""
+
+MOVING, CHARGING, LAMP_ON, HOT, INTERLOCK = 16, 32, 64, 128, 256
+
+
+@dataclass(frozen=True, slots=True)
+class FlashPop:
+    """Light that came out."""
+
+    token: str
+    """Name that the host gave it."""
+    t_s: float
+    """World time, s."""
+    power: float
+    """Energy relative to a full pop, 0 to 1."""
+    polarizer: Polarizer
+    """Analyser at its parallel (0 degrees) or crossed (90 degrees) stop."""
+    analyser_deg: float | None
+    """Reading of the rotator in degrees when it stands elsewhere than at a stop asked for."""
+
+
+@dataclass(slots=True)
+class _Lamp:
+    lit: bool = False
+    end_s: float = math.inf
+    heat: float = 0.0
+    hot: bool = False
+
+
+class FlashUnit:
+    """State of the flash box behind its controller.
+
+    Parameters
+    ----------
+    on_pop
+        Called with each pop.
+    on_trigger
+        Called with the world time in s of each pulse on the camera line.
+    recycle_s
+        Least time after a full pop, s; proportional to the power.
+    pops_per_min
+        Most pops in any 60 s.
+    move_s
+        Time the analyser takes for 90 degrees, s.
+    misfire
+        Probability that the tube does not ignite.
+    slow_charge
+        How many times longer than normal the capacitor takes.
+    lamp_dead, heat, interlock
+        See `rigsim.faults.Faults`.
+    rng
+        Decides misfires.
+    """
+
+    kind = "flash"
+    model = "FLASH2"
+
+    def __init__(
+        self,
+        *,
+        on_pop: Callable[[FlashPop], None],
+        on_trigger: Callable[[float], None],
+        recycle_s: float,
+        pops_per_min: float,
+        move_s: float,
+        misfire: float = 0.0,
+        slow_charge: float = 1.0,
+        lamp_dead: bool = False,
+        heat: float = 0.0,
+        interlock: bool = False,
+        rng: np.random.Generator,
+    ) -> None:
+        self._on_pop = on_pop
+        self._on_trigger = on_trigger
+        self._recycle_s = recycle_s
+        self._pops_per_min = math.floor(pops_per_min)
+        self._s_per_deg = move_s / 90.0
+        headroom = math.log(CHARGER_HEADROOM / (CHARGER_HEADROOM - 1.0))
+        self._charge_tau_s = slow_charge * CHARGE_SHARE * recycle_s / headroom
+        self._misfire = misfire
+        self._lamp_dead = lamp_dead
+        self._rng = rng
+        self._now = 0.0
+        self.interlock = interlock
+        # what the box keeps without power: the count, heat, charge and the last pops
+        self.count = 0
+        self.lamp_times: deque[tuple[float, float]] = deque(maxlen=10_000)
+        self._lamp = _Lamp(heat=heat, hot=heat >= HEAT_TRIP)
+        self._lamp_since = 0.0
+        self._pops: deque[float] = deque(maxlen=max(1, self._pops_per_min))
+        self._volt = 1.0  # of full, at `_volt_at`; delivered charged
+        self._volt_at = 0.0
+        self._last_pop = -math.inf
+        self._last_power = 0.0
+        self.angle_deg = 0.0
+        self._settled_at = 0.0
+        self.reset(0.0, power_up=True)
+
+    # settings ---------------------------------------------------------------------------------
+
+    def reset(self, now: float, *, power_up: bool) -> None:
+        """Return to the settings of power-up: parallel, full power, dark."""
+        self.go_dark(now)
+        if power_up:
+            self._powered_at = now
+        self.power = 1.0
+        self.polarizer: Polarizer = "parallel"
+        self.analyser_deg: float | None = None
+        self.last_report = ""
+        self._turn(READINGS_DEG["parallel"], now)
+
+    def capabilities(self) -> Mapping[str, Any]:
+        """Return limits and counts, units in the names."""
+        return {
+            "power_min": MIN_POWER,
+            "power_max": 1.0,
+            "analyser_min_deg": ANALYSER_DEG[0],
+            "analyser_max_deg": ANALYSER_DEG[1],
+            "lamp_min_ms": LAMP_MS[0],
+            "lamp_max_ms": LAMP_MS[1],
+            "recycle_s": self._recycle_s,
+            "pops_per_min": self._pops_per_min,
+            "move_s_per_deg": self._s_per_deg,
+        }
+
+    def commands(self) -> Mapping[str, Command]:
+        """Return the command table: the manual of the box."""
+        return {
+            "FLAS:POL": Command(
+                self._set_polarizer, "PAR|CROS", manual="turn the analyser to a stop"
+            ),
+            "FLAS:POL?": Command(self._get_polarizer, manual="PAR or CROS, the last stop asked"),
+            "FLAS:POL:ANG": Command(
+                self._set_angle, "<deg>", manual="turn the analyser to a reading, 0 to 180 degrees"
+            ),
+            "FLAS:POL:ANG?": Command(self._get_angle, manual="reading aimed at, degrees"),
+            "FLAS:POW": Command(self._set_power, "<share>", manual="power, 1/256 to 1 of full"),
+            "FLAS:POW?": Command(self._get_power, manual="power of the next pop"),
+            "FLAS:CHAR?": Command(
+                self._get_charge, manual="charge 0 to 1, ready 0 or 1, ready in ms"
+            ),
+            "FLAS:FIRE": Command(
+                self._fire,
+                "<token>",
+                armed=True,
+                manual="pulse the camera line and pop: token, box us, power, stop, degrees, count",
+            ),
+            "FLAS:LAST?": Command(self._get_last, manual="answer of the last pop, or NONE"),
+            "FLAS:COUN?": Command(self._get_count, manual="pops since the box was made"),
+            "FLAS:LAMP": Command(
+                self._set_lamp, "ON,<ms>|OFF", armed=True, manual="modelling lamps, 1 to 500 ms"
+            ),
+            "FLAS:LAMP?": Command(self._get_lamp, manual="1 lit, 0 dark"),
+            "CAM:TRIG": Command(
+                self._trigger, "<token>", manual="pulse the camera line without light: token, us"
+            ),
+        }
+
+    # time -------------------------------------------------------------------------------------
+
+    def deadline(self) -> float:
+        """Return when a lamp will go out by itself, in s; inf for never."""
+        if not self._lamp.lit:
+            return math.inf
+        span = (1.0 - self._lamp.heat) / (1.0 - HEAT_TRIP)
+        return min(self._lamp.end_s, self._now + LAMP_TAU_S * math.log(max(span, 1.0)))
+
+    def advance(self, now: float) -> None:
+        """Let time pass up to `now`, in s."""
+        while (due := self.deadline()) <= now:
+            self._heat_until(due)
+            if self._lamp.heat >= HEAT_TRIP - 1e-9:
+                self._lamp.hot = True
+            self.go_dark(due)
+        self._heat_until(now)
+        if self._lamp.heat < HEAT_CLEAR:
+            self._lamp.hot = False
+
+    def _heat_until(self, now: float) -> None:
+        lamp = self._lamp
+        goal = 1.0 if lamp.lit else 0.0
+        lamp.heat = goal + (lamp.heat - goal) * math.exp(-max(0.0, now - self._now) / LAMP_TAU_S)
+        self._now = max(now, self._now)
+
+    def go_dark(self, now: float) -> None:
+        """Switch the lamps off."""
+        if self._lamp.lit:
+            self._lamp.lit = False
+            self._lamp.end_s = math.inf
+            self.lamp_times.append((self._lamp_since, now))
+
+    @property
+    def lit(self) -> bool:
+        """Whether a modelling lamp is on."""
+        return self._lamp.lit
+
+    def busy(self, now: float) -> bool:
+        """Tell whether the analyser is turning."""
+        return now < self._settled_at
+
+    def status_bits(self, now: float) -> int:
+        """Return 16 turning, 32 charging, 64 lamp on, 128 too hot, 256 emergency stop open."""
+        bits = MOVING * self.busy(now) + CHARGING * (self._wait_for_fire(now)[0] > 0.0)
+        bits += LAMP_ON * self._lamp.lit + HOT * self._lamp.hot + INTERLOCK * self.interlock
+        return bits
+
+    # analyser ---------------------------------------------------------------------------------
+
+    def _turn(self, reading_deg: float, now: float) -> None:
+        start = max(now, self._settled_at)
+        self._settled_at = start + abs(reading_deg - self.angle_deg) * self._s_per_deg
+        self.angle_deg = reading_deg
+
+    def _set_polarizer(self, arguments: str, now: float) -> str:
+        stop = choice(arguments, ("PAR", "CROS"))
+        self.polarizer = "parallel" if stop == "PAR" else "crossed"
+        self.analyser_deg = None
+        self._turn(READINGS_DEG[self.polarizer], now)
+        return ""
+
+    def _get_polarizer(self, _: str, now: float) -> str:
+        return "PAR" if self.polarizer == "parallel" else "CROS"
+
+    def _set_angle(self, arguments: str, now: float) -> str:
+        self.analyser_deg = number(arguments, *ANALYSER_DEG, "degrees")
+        self._turn(self.analyser_deg, now)
+        return ""
+
+    def _get_angle(self, _: str, now: float) -> str:
+        return f"{self.angle_deg:.3f}"
+
+    # flash ------------------------------------------------------------------------------------
+
+    def _set_power(self, arguments: str, now: float) -> str:
+        self.power = number(arguments, MIN_POWER, 1.0, "of full power")
+        return ""
+
+    def _get_power(self, _: str, now: float) -> str:
+        return f"{self.power:.6f}"
+
+    def charge(self, now: float) -> float:
+        """Return the energy in the capacitor at `now`, 0 to 1 of a full pop."""
+        return self._voltage(now) ** 2
+
+    def _voltage(self, now: float) -> float:
+        gap = CHARGER_HEADROOM - self._volt
+        return min(
+            1.0, CHARGER_HEADROOM - gap * math.exp(-(now - self._volt_at) / self._charge_tau_s)
+        )
+
+    def _wait_for_fire(self, now: float) -> tuple[float, Code, str]:
+        """Return how long FIRE would be refused, in s, why, and in words."""
+        need = math.sqrt(self.power)
+        gap = (CHARGER_HEADROOM - self._voltage(now)) / (CHARGER_HEADROOM - need)
+        full = len(self._pops) == self._pops_per_min
+        waits = [
+            (self._settled_at - now, Code.IGNORED, "analyser turning"),
+            (self._last_pop + self._recycle_s * self._last_power - now, Code.RECYCLE, "tube"),
+            (self._pops[0] + POP_WINDOW_S - now if full else 0.0, Code.DUTY, "pops per minute"),
+            (self._charge_tau_s * math.log(max(gap, 1.0)), Code.IGNORED, "charging"),
+        ]
+        return max(waits, key=lambda wait: wait[0])
+
+    def _get_charge(self, _: str, now: float) -> str:
+        wait_ms = math.ceil(max(0.0, self._wait_for_fire(now)[0]) * 1e3)
+        return f"{self.charge(now):.4f},{int(wait_ms == 0)},{wait_ms}"
+
+    def _fire(self, arguments: str, now: float) -> str:
+        token = word(arguments)
+        if self.interlock:
+            raise Refused(Code.INTERLOCK)
+        wait_s, code, why = self._wait_for_fire(now)
+        # a clock of microseconds cannot tell a shorter wait from none
+        if wait_s > 1e-6:
+            raise Refused(code, f"{why}, {math.ceil(wait_s * 1e3)} ms")
+        self.go_dark(now)
+        self._on_trigger(now)
+        if self._rng.random() < self._misfire:
+            raise Refused(Code.HARDWARE, "the tube did not ignite")
+        self._volt = math.sqrt(max(0.0, self._voltage(now) ** 2 - self.power))
+        self._volt_at = self._last_pop = now
+        self._last_power = self.power
+        self._pops.append(now)
+        self.count += 1
+        self._on_pop(FlashPop(token, now, self.power, self.polarizer, self.analyser_deg))
+        self.last_report = ",".join(
+            (
+                token,
+                str(self._clock_us(now)),
+                self._get_power("", now),
+                self._get_polarizer("", now),
+                self._get_angle("", now),
+                str(self.count),
+            )
+        )
+        return self.last_report
+
+    def _get_last(self, _: str, now: float) -> str:
+        return self.last_report or "NONE"
+
+    def _get_count(self, _: str, now: float) -> str:
+        return str(self.count)
+
+    def _trigger(self, arguments: str, now: float) -> str:
+        token = word(arguments)
+        self._on_trigger(now)
+        return f"{token},{self._clock_us(now)}"
+
+    # lamps ------------------------------------------------------------------------------------
+
+    def _set_lamp(self, arguments: str, now: float) -> str:
+        what, _, length = arguments.partition(",")
+        if choice(what, ("ON", "OFF")) == "OFF":
+            if length:
+                raise Refused(Code.SYNTAX, "expected OFF")
+            self.go_dark(now)
+            return ""
+        span_ms = number(length, *LAMP_MS, "ms")
+        if self.interlock:
+            raise Refused(Code.INTERLOCK)
+        if self._lamp.hot:
+            raise Refused(Code.THERMAL, f"wait until below {HEAT_CLEAR:g}")
+        if self._lamp_dead:
+            raise Refused(Code.HARDWARE, "the lamp draws no current")
+        if not self._lamp.lit:
+            self._lamp.lit = True
+            self._lamp_since = now
+        self._lamp.end_s = now + span_ms / 1e3
+        return ""
+
+    def _get_lamp(self, _: str, now: float) -> str:
+        return str(int(self._lamp.lit))
+
+    def _clock_us(self, now: float) -> int:
+        return round((now - self._powered_at) * 1e6)

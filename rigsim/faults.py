@@ -1,0 +1,217 @@
+"""What can go wrong on the wire, in a box and in a camera: switches with numbers, seeded.
+
+`Faults` holds one switch per thing that can go wrong; all of them are off by default and each can
+be set in a ``sim://`` URL. `CATALOGUE` names the twenty kinds of trouble a rig must survive, which
+switches provoke each, and what is promised when it happens.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from capture.documents import near_miss
+
+__all__ = ["CATALOGUE", "NO_FAULTS", "FaultKind", "Faults"]
+
+_PROBABILITIES = (
+    "drop",
+    "flip",
+    "glue",
+    "cut",
+    "late",
+    "lose_answer",
+    "duplicate",
+    "babble",
+    "brownout",
+    "misfire",
+    "stale",
+    "drop_frame",
+    "wrong_camera",
+    "wrong_exposure",
+)
+_TIMES = (
+    "late_s",
+    "latency",
+    "boot_s",
+    "reset_after",
+    "unplug_after",
+    "replug_after",
+    "stall_after",
+    "stall_s",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Faults:
+    """Switches; probabilities are per byte, line or frame as each says, times in s.
+
+    Examples
+    --------
+    >>> Faults(drop=0.001, unplug_after=3.0).drop
+    0.001
+    >>> Faults.from_text({"dorp": "0.001"})
+    Traceback (most recent call last):
+        ...
+    ValueError: dorp: no such switch; did you mean drop?
+    """
+
+    drop: float = 0.0
+    """Probability that a byte is lost, either way."""
+    flip: float = 0.0
+    """Probability that one bit of a byte is flipped, either way."""
+    glue: float = 0.0
+    """Probability that the newline of a line is lost, so that two lines become one."""
+    cut: float = 0.0
+    """Probability that a line is cut somewhere and its rest, newline included, is lost."""
+    late: float = 0.0
+    """Probability that an answer comes late (and all behind it: the line keeps its order)."""
+    late_s: float = 0.6
+    """How late."""
+    lose_answer: float = 0.0
+    """Probability that an answer is lost after the act was done."""
+    duplicate: float = 0.0
+    """Probability that a line arrives twice, either way."""
+    babble: float = 0.0
+    """Probability that the box prints a line of its own before an answer."""
+    latency: float = 0.0
+    """Delay of the line one way, s."""
+    baud: float = 115_200.0
+    """Bits per second at ten bits per byte; 0: bytes take no time."""
+    reset_on_open: bool = False
+    """Opening the port resets the box, as the DTR line of many boards does."""
+    boot_s: float = 0.8
+    """How long the box is deaf after a reset, s."""
+    reset_after: float = math.inf
+    """The box resets without a word, once, so long after power-up, s."""
+    brownout: float = 0.0
+    """Probability that a line to the box finds its supply dipping: a reset without a word."""
+    unplug_after: float = math.inf
+    """The cable is pulled so long after the port was first opened, s."""
+    replug_after: float = math.inf
+    """... and put back so much later, s."""
+    stall_after: float = math.inf
+    """The box stops taking bytes so long after the port was first opened, s."""
+    stall_s: float = 2.0
+    """... for so long, s."""
+    serial: str = ""
+    """Serial number of another box behind the same name."""
+    protocol: int = 1
+    """Version of the protocol that the firmware speaks."""
+    lamp_dead: bool = False
+    """The modelling lamp draws no current."""
+    heat: float = 0.0
+    """How hot the lamp's driver is at power-up, 0 to 1; it trips at 0.8."""
+    misfire: float = 0.0
+    """Probability that the tube does not ignite."""
+    slow_charge: float = 1.0
+    """How many times longer the capacitor takes."""
+    interlock: bool = False
+    """The emergency-stop line is open."""
+    stale: float = 0.0
+    """Probability that a camera hands out its previous frame first."""
+    drop_frame: float = 0.0
+    """Probability that a frame is lost."""
+    wrong_camera: float = 0.0
+    """Probability that a frame bears another camera's serial number."""
+    wrong_exposure: float = 0.0
+    """Probability that a frame was taken one stop off."""
+    drift_ppm: float = 0.0
+    """Error of the camera's clock, microseconds per second."""
+
+    def __post_init__(self) -> None:
+        for field in _PROBABILITIES:
+            value = getattr(self, field)
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"{field}: got {value}, expected a probability from 0 to 1")
+        for field in _TIMES:
+            value = getattr(self, field)
+            if not value >= 0.0:
+                raise ValueError(f"{field}: got {value}, expected seconds >= 0")
+        if not 0.0 <= self.baud < math.inf:
+            raise ValueError(f"baud: got {self.baud}, expected 0 or bits per second")
+        if not 0.0 <= self.heat < 1.0:
+            raise ValueError(f"heat: got {self.heat}, expected 0 <= heat < 1")
+        if not 0.0 < self.slow_charge < math.inf:
+            raise ValueError(f"slow_charge: got {self.slow_charge}, expected more than 0")
+        if not abs(self.drift_ppm) < 1e5:
+            raise ValueError(f"drift_ppm: got {self.drift_ppm}, expected less than 1e5")
+
+    @classmethod
+    def from_text(cls, switches: Mapping[str, str]) -> Faults:
+        """Build from texts, as they stand in the query of a URL.
+
+        Raises
+        ------
+        ValueError
+            For an unknown switch, with the nearest known one, or a value out of range.
+        """
+        fields = {field.name: field for field in dataclasses.fields(cls)}
+        values: dict[str, float | int | bool | str] = {}
+        for name, text in switches.items():
+            if name not in fields:
+                hint = near_miss(name, list(fields)) or f"one of {', '.join(fields)}"
+                raise ValueError(f"{name}: no such switch; {hint}")
+            values[name] = _value(name, text, type(fields[name].default))
+        return cls(**values)  # type: ignore[arg-type]
+
+
+def _value(name: str, text: str, kind: type) -> float | int | bool | str:
+    if kind is str:
+        return text
+    if kind is bool:
+        if text not in ("0", "1"):
+            raise ValueError(f"{name}: got {text!r}, expected 0 or 1")
+        return text == "1"
+    try:
+        return int(text) if kind is int else float(text)
+    except ValueError as exc:
+        raise ValueError(f"{name}: got {text!r}, expected a number") from exc
+
+
+NO_FAULTS = Faults()
+
+
+@dataclass(frozen=True, slots=True)
+class FaultKind:
+    """One of the kinds of trouble a rig must survive."""
+
+    number: int
+    """1 to 20."""
+    what: str
+    """What happens."""
+    switches: tuple[str, ...]
+    """Fields of `Faults` that provoke it; empty where a test provokes it from outside."""
+    promise: str
+    """What is promised then."""
+
+
+CATALOGUE: tuple[FaultKind, ...] = (
+    FaultKind(1, "byte lost", ("drop",), "retried, done once"),
+    FaultKind(2, "bit flipped", ("flip",), "NAK or retried, done once"),
+    FaultKind(3, "line cut or glued to the next", ("glue", "cut"), "retried, done once"),
+    FaultKind(4, "answer late, after the timeout", ("late", "late_s"), "stale answers thrown away"),
+    FaultKind(5, "answer lost after the act", ("lose_answer",), "answer replayed, done once"),
+    FaultKind(6, "line twice", ("duplicate",), "done once"),
+    FaultKind(7, "babble or boot banner at any time", ("babble",), "thrown away"),
+    FaultKind(8, "reset when the port is opened", ("reset_on_open", "boot_s"), "hello waits"),
+    FaultKind(9, "reset without a word", ("reset_after", "brownout"), "BoxRebooted, dark"),
+    FaultKind(10, "cable pulled", ("unplug_after", "replug_after"), "LinkLost, reopen"),
+    FaultKind(11, "two hosts on one port", (), "PortBusy for the second"),
+    FaultKind(12, "box takes no bytes", ("stall_after", "stall_s"), "retried or PortTimeout"),
+    FaultKind(13, "host frozen or killed with a light on", (), "dark within the lease"),
+    FaultKind(14, "wrong box or firmware", ("serial", "protocol"), "WrongDevice"),
+    FaultKind(15, "lamp dead or driver too hot", ("lamp_dead", "heat"), "refused -240 or 102"),
+    FaultKind(16, "flash not charged, or misfire", ("slow_charge", "misfire"), "-213 or -240"),
+    FaultKind(17, "stepper stalls, home missed, force trip", (), "no such box yet"),
+    FaultKind(18, "pump leaks, shutter stuck", (), "no such box yet"),
+    FaultKind(
+        19,
+        "camera: stale, lost, foreign or wrongly exposed frame, clock drift",
+        ("stale", "drop_frame", "wrong_camera", "wrong_exposure", "drift_ppm"),
+        "frame not accepted, step taken again",
+    ),
+    FaultKind(20, "disk full or torn, program killed", (), "session resumes"),
+)
