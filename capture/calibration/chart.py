@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label
 
 from capture.calibration.colorimetry import chart_reference, xyz_to_linear_srgb
-from capture.calibration.store import CalibrationError
+from capture.calibration.record import CalibrationError
 
 __all__ = ["ChartError", "Patches", "find_chart", "measure_patches"]
 

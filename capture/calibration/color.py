@@ -17,7 +17,7 @@ from capture.calibration.colorimetry import (
     white_point,
     xyz_to_linear_srgb,
 )
-from capture.calibration.store import Calibration, Quantity, Source, default_validity
+from capture.calibration.record import Calibration, Quantity, Source, default_validity
 
 __all__ = [
     "ChartError",

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.calibration.store import CalibrationError
+from capture.calibration.record import CalibrationError
 
 __all__ = [
     "Blocks",

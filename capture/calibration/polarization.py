@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 from scipy.stats import t as student
 
-from capture.calibration.store import (
+from capture.calibration.record import (
     Calibration,
     CalibrationError,
     Quantity,

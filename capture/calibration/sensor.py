@@ -22,7 +22,7 @@ from capture.calibration.photon_transfer import (
     fit_curve,
     plane,
 )
-from capture.calibration.store import Calibration, Quantity, Source, default_validity
+from capture.calibration.record import Calibration, Quantity, Source, default_validity
 
 __all__ = ["FlatPair", "PhotonTransferError", "SensorCalibration", "photon_transfer"]
 

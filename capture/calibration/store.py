@@ -8,21 +8,32 @@ beside it, named by their digest. Numbers are keyed by the serial of the camera 
 import contextlib
 import hashlib
 import json
-import logging
 import math
 import os
-import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from datetime import date, timedelta
+from collections.abc import Mapping
+from datetime import date
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from capture.documents import InputError
+from capture.calibration.record import (
+    KINDS,
+    Calibration,
+    CalibrationDamaged,
+    CalibrationError,
+    CalibrationExpired,
+    CalibrationMismatch,
+    CalibrationMissing,
+    Quantity,
+    Source,
+    default_validity,
+    digest_arrays,
+    require_plain_name,
+)
+from capture.calibration.validity import Drift, drift, require
 
 __all__ = [
     "KINDS",
@@ -35,6 +46,7 @@ __all__ = [
     "CalibrationMissing",
     "Drift",
     "Quantity",
+    "Source",
     "default_validity",
     "digest_arrays",
     "drift",
@@ -43,181 +55,7 @@ __all__ = [
     "save",
 ]
 
-logger = logging.getLogger(__name__)
-
 SCHEMA = "skinrig.calibration/1"
-KINDS = ("sensor", "color", "polarization", "white", "geometry", "lights", "fibre")
-DEFAULT_VALIDITY_DAYS = 90
-
-Source: TypeAlias = Literal["measured", "simulated"]
-
-
-class CalibrationError(InputError):
-    """A calibration that cannot be used; the message says why and what to do."""
-
-
-class CalibrationMissing(CalibrationError, FileNotFoundError):
-    """The folder holds no calibration of this kind."""
-
-
-class CalibrationDamaged(CalibrationError):
-    """The file is not a calibration of this schema, or was altered after it was written."""
-
-
-class CalibrationExpired(CalibrationError):
-    """The calibration is used after (or before) the dates it holds for."""
-
-
-class CalibrationMismatch(CalibrationError):
-    """The calibration belongs to another rig, another device or another kind."""
-
-
-@dataclass(frozen=True, slots=True)
-class Quantity:
-    """One calibrated number or array with its standard error.
-
-    Attributes
-    ----------
-    value : ndarray of float64
-        Any shape; a scalar has shape ``()``. Unit: see the quantity's name.
-    stderr : ndarray of float64 or None
-        Standard error (68 %) of each element; None where the quantity is a choice or a count, not
-        a measurement.
-    interval : tuple of (float or None, float or None) or None
-        95 % interval of a scalar whose distribution is not symmetric; an open end is None.
-    """
-
-    value: NDArray[np.float64]
-    stderr: NDArray[np.float64] | None = None
-    interval: tuple[float | None, float | None] | None = None
-
-    def __post_init__(self) -> None:
-        """Convert to float64 arrays and refuse what is not finite or not of one shape."""
-        value = np.array(self.value, dtype=np.float64)
-        if not np.isfinite(value).all():
-            raise ValueError(f"Quantity.value: got {value.tolist()}, expected finite numbers")
-        object.__setattr__(self, "value", value)
-        if self.stderr is None:
-            return
-        stderr = np.array(self.stderr, dtype=np.float64)
-        if stderr.shape != value.shape or not np.isfinite(stderr).all() or (stderr < 0).any():
-            raise ValueError(
-                f"Quantity.stderr: got {stderr.tolist()}, expected finite numbers >= 0 of shape"
-                f" {value.shape}"
-            )
-        object.__setattr__(self, "stderr", stderr)
-
-
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """What one calibration run found, for whom, and until when.
-
-    Attributes
-    ----------
-    kind : str
-        One of `KINDS`.
-    rig : str
-        Name of the rig it was made on.
-    serials : tuple of str
-        Serials of the devices it holds for.
-    created, valid_until : datetime.date
-        First and last day on which it may be used.
-    source : {"measured", "simulated"}
-        Whether the frames came from instruments or from a simulation.
-    values : mapping of str to mapping of str to Quantity
-        ``values[serial][name]``.
-    maps : mapping of str to ndarray of float32, shape (H, W) or (H, W, C)
-        Images, by name; may be empty.
-    notes : mapping of str to str
-        Words that belong to the numbers: color names, the reference used, the method.
-    inputs : mapping of str to str
-        Digest of every frame that went in, by step or file name.
-    versions : mapping of str to str
-        Versions of the programs that made it.
-    """
-
-    kind: str
-    rig: str
-    serials: tuple[str, ...]
-    created: date
-    valid_until: date
-    source: Source
-    values: Mapping[str, Mapping[str, Quantity]]
-    maps: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    notes: Mapping[str, str] = field(default_factory=dict)
-    inputs: Mapping[str, str] = field(default_factory=dict)
-    versions: Mapping[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Check the fields against each other."""
-        if self.kind not in KINDS:
-            raise ValueError(f"Calibration.kind: got {self.kind!r}, expected one of {KINDS}")
-        if not self.serials:
-            raise ValueError("Calibration.serials: got none, expected at least one device serial")
-        if self.source not in ("measured", "simulated"):
-            raise ValueError(
-                f"Calibration.source: got {self.source!r}, expected 'measured' or 'simulated'"
-            )
-        if self.valid_until < self.created:
-            raise ValueError(
-                f"Calibration.valid_until: got {self.valid_until}, expected not before created"
-                f" ({self.created})"
-            )
-        unknown = sorted(set(self.values) - set(self.serials))
-        if unknown:
-            raise ValueError(
-                f"Calibration.values: got values of {unknown}, expected only of {self.serials}"
-            )
-        for name in self.maps:
-            _require_plain_name(name)
-
-    def quantity(self, serial: str, name: str) -> Quantity:
-        """Return one quantity of one device.
-
-        Raises
-        ------
-        CalibrationMismatch
-            If this calibration does not hold it.
-        """
-        if serial not in self.values:
-            raise CalibrationMismatch(
-                f"{self.kind} calibration of rig {self.rig!r}: no values of device {serial!r}, it"
-                f" holds {sorted(self.values)}; calibrate this device"
-            )
-        if name not in self.values[serial]:
-            raise CalibrationMismatch(
-                f"{self.kind} calibration of rig {self.rig!r}: no {name!r} of device {serial!r}, it"
-                f" holds {sorted(self.values[serial])}; calibrate again with this version"
-            )
-        return self.values[serial][name]
-
-
-@dataclass(frozen=True, slots=True)
-class Drift:
-    """How one number moved between two calibrations.
-
-    Attributes
-    ----------
-    serial, name : str
-        Device and quantity; elements of arrays are written ``name[i]``.
-    old, new, change : float
-        In the quantity's unit; ``change = new - old``.
-    sigmas : float or None
-        Change over its combined standard error; None where neither calibration states one.
-    """
-
-    serial: str
-    name: str
-    old: float
-    new: float
-    change: float
-    sigmas: float | None
-
-    def __str__(self) -> str:
-        """Return one line for a terminal."""
-        size = "no stated error" if self.sigmas is None else f"{self.sigmas:+.1f} sigma"
-        return f"{self.serial} {self.name}: {self.old:.6g} -> {self.new:.6g} ({size})"
-
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -253,46 +91,6 @@ class _CalibrationFile(_Strict):
     inputs: dict[str, str]
     versions: dict[str, str]
     sha256: str
-
-
-def digest_arrays(*arrays: NDArray[Any]) -> str:
-    """Return a digest of arrays' bytes, shapes and types, to name a calibration's inputs.
-
-    Parameters
-    ----------
-    *arrays : ndarray
-        Any shape and type.
-
-    Returns
-    -------
-    str
-        ``sha256:`` and 64 hexadecimal digits.
-
-    Examples
-    --------
-    >>> digest_arrays(np.zeros(3)) == digest_arrays(np.zeros(3))
-    True
-    >>> digest_arrays(np.zeros(3)) == digest_arrays(np.zeros((3, 1)))
-    False
-    """
-    state = hashlib.sha256()
-    for array in arrays:
-        state.update(f"{array.dtype.str}{array.shape}".encode())
-        state.update(np.ascontiguousarray(array).tobytes())
-    return f"sha256:{state.hexdigest()}"
-
-
-def default_validity(created: date, days: int = DEFAULT_VALIDITY_DAYS) -> date:
-    """Return the last day of validity of a calibration made on `created`.
-
-    Examples
-    --------
-    >>> default_validity(date(2026, 11, 21), days=9)
-    datetime.date(2026, 11, 30)
-    """
-    if days < 0:
-        raise ValueError(f"days: got {days}, expected >= 0")
-    return created + timedelta(days=days)
 
 
 def save(calibration: Calibration, directory: str | Path) -> Path:
@@ -405,105 +203,6 @@ def load(directory: str | Path, kind: str) -> Calibration:
         raise CalibrationDamaged(f"{path}: {exc}; calibrate again") from exc
 
 
-def require(
-    calibration: Calibration,
-    *,
-    rig: str,
-    serials: Iterable[str],
-    on_date: date,
-    kind: str | None = None,
-) -> Calibration:
-    """Return the calibration if it may be used here and today; say clearly why not otherwise.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The candidate.
-    rig : str
-        Name of the rig of the session to be corrected.
-    serials : iterable of str
-        Serials of the devices that made the session's frames.
-    on_date : datetime.date
-        Day of the session.
-    kind : str, optional
-        The kind wanted.
-
-    Raises
-    ------
-    CalibrationMismatch
-        If it belongs to another rig or another device, or is of another kind.
-    CalibrationExpired
-        If `on_date` lies outside its validity.
-    """
-    what = f"{calibration.kind} calibration of {calibration.created}"
-    if kind is not None and calibration.kind != kind:
-        raise CalibrationMismatch(f"{what}: is of kind {calibration.kind!r}, expected {kind!r}")
-    if calibration.rig != rig:
-        raise CalibrationMismatch(
-            f"{what}: made on rig {calibration.rig!r}, the session is of rig {rig!r}; calibrate"
-            f" rig {rig!r} and give its folder by --calibration"
-        )
-    missing = sorted(set(serials) - set(calibration.serials))
-    if missing:
-        raise CalibrationMismatch(
-            f"{what}: made with devices {sorted(calibration.serials)}, the session used"
-            f" {missing}; calibrate these devices"
-        )
-    if not calibration.created <= on_date <= calibration.valid_until:
-        raise CalibrationExpired(
-            f"{what}: valid from {calibration.created} to {calibration.valid_until}, the session"
-            f" is of {on_date}; run `skinrig calibrate {calibration.kind}` on frames of that time"
-        )
-    return calibration
-
-
-def drift(old: Calibration, new: Calibration) -> tuple[Drift, ...]:
-    """Compare two calibrations of one kind, number by number, largest change first.
-
-    Parameters
-    ----------
-    old, new : Calibration
-        Of the same kind and rig. Only quantities with the same shape in both are compared.
-
-    Returns
-    -------
-    tuple of Drift
-        Sorted by the size of ``sigmas``; those without stated errors come last.
-
-    Raises
-    ------
-    CalibrationMismatch
-        If the two are not of one kind and one rig.
-    """
-    if (old.kind, old.rig) != (new.kind, new.rig):
-        raise CalibrationMismatch(
-            f"drift: got {old.kind!r} of rig {old.rig!r} and {new.kind!r} of rig {new.rig!r},"
-            " expected two of one kind and one rig"
-        )
-    rows: list[Drift] = []
-    for serial in sorted(set(old.values) & set(new.values)):
-        for name in sorted(set(old.values[serial]) & set(new.values[serial])):
-            a, b = old.values[serial][name], new.values[serial][name]
-            if a.value.shape != b.value.shape:
-                continue
-            error = np.zeros(a.value.shape)
-            for q in (a, b):
-                if q.stderr is not None:
-                    error = np.hypot(error, q.stderr)
-            for index in np.ndindex(a.value.shape):
-                change = float(b.value[index] - a.value[index])
-                label = name + "".join(f"[{i}]" for i in index)
-                sigmas = change / float(error[index]) if error[index] > 0 else None
-                rows.append(
-                    Drift(
-                        serial, label, float(a.value[index]), float(b.value[index]), change, sigmas
-                    )
-                )
-    return tuple(
-        sorted(rows, key=lambda r: -1.0 if r.sigmas is None else abs(r.sigmas), reverse=True)
-    )
-
-
 def _quantity_document(quantity: Quantity) -> dict[str, Any]:
     return {
         "shape": list(quantity.value.shape),
@@ -560,11 +259,6 @@ def _parse(path: Path, raw: bytes) -> _CalibrationFile:
         raise CalibrationDamaged(f"{path}: {faults}; calibrate again") from exc
 
 
-def _require_plain_name(name: str) -> None:
-    if not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
-        raise ValueError(f"map name: got {name!r}, expected small letters, digits and _")
-
-
 def _write_atomically(path: Path, data: bytes) -> None:
     part = path.with_name(path.name + ".part")
     try:
@@ -609,7 +303,7 @@ def _write_map(folder: Path, stem: str, image: NDArray[np.float32]) -> dict[str,
 def _read_map(folder: Path, name: str, entry: _MapFile) -> NDArray[np.float32]:
     import OpenEXR
 
-    _require_plain_name(name)
+    require_plain_name(name)
     if Path(entry.file).name != entry.file:
         raise CalibrationDamaged(f"map {name}: file {entry.file!r} leaves the folder")
     path = folder / entry.file

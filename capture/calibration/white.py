@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capture.calibration.flat_field import fit_smooth_field
 from capture.calibration.photon_transfer import block_sums
-from capture.calibration.store import Calibration, Quantity, Source, default_validity
+from capture.calibration.record import Calibration, Quantity, Source, default_validity
 
 __all__ = ["WhiteReference", "white_reference"]
 

@@ -1,0 +1,219 @@
+"""What a calibration is in memory: numbers with their errors, for whom, until when."""
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import date, timedelta
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.documents import InputError
+
+__all__ = [
+    "KINDS",
+    "Calibration",
+    "CalibrationDamaged",
+    "CalibrationError",
+    "CalibrationExpired",
+    "CalibrationMismatch",
+    "CalibrationMissing",
+    "Quantity",
+    "Source",
+    "default_validity",
+    "digest_arrays",
+    "require_plain_name",
+]
+
+KINDS = ("sensor", "color", "polarization", "white", "geometry", "lights", "fibre")
+DEFAULT_VALIDITY_DAYS = 90
+
+Source: TypeAlias = Literal["measured", "simulated"]
+
+
+class CalibrationError(InputError):
+    """A calibration that cannot be used; the message says why and what to do."""
+
+
+class CalibrationMissing(CalibrationError, FileNotFoundError):
+    """The folder holds no calibration of this kind."""
+
+
+class CalibrationDamaged(CalibrationError):
+    """The file is not a calibration of this schema, or was altered after it was written."""
+
+
+class CalibrationExpired(CalibrationError):
+    """The calibration is used after (or before) the dates it holds for."""
+
+
+class CalibrationMismatch(CalibrationError):
+    """The calibration belongs to another rig, another device or another kind."""
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """One calibrated number or array with its standard error.
+
+    Attributes
+    ----------
+    value : ndarray of float64
+        Any shape; a scalar has shape ``()``. Unit: see the quantity's name.
+    stderr : ndarray of float64 or None
+        Standard error (68 %) of each element; None where the quantity is a choice or a count, not
+        a measurement.
+    interval : tuple of (float or None, float or None) or None
+        95 % interval of a scalar whose distribution is not symmetric; an open end is None.
+    """
+
+    value: NDArray[np.float64]
+    stderr: NDArray[np.float64] | None = None
+    interval: tuple[float | None, float | None] | None = None
+
+    def __post_init__(self) -> None:
+        """Convert to float64 arrays and refuse what is not finite or not of one shape."""
+        value = np.array(self.value, dtype=np.float64)
+        if not np.isfinite(value).all():
+            raise ValueError(f"Quantity.value: got {value.tolist()}, expected finite numbers")
+        object.__setattr__(self, "value", value)
+        if self.stderr is None:
+            return
+        stderr = np.array(self.stderr, dtype=np.float64)
+        if stderr.shape != value.shape or not np.isfinite(stderr).all() or (stderr < 0).any():
+            raise ValueError(
+                f"Quantity.stderr: got {stderr.tolist()}, expected finite numbers >= 0 of shape"
+                f" {value.shape}"
+            )
+        object.__setattr__(self, "stderr", stderr)
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What one calibration run found, for whom, and until when.
+
+    Attributes
+    ----------
+    kind : str
+        One of `KINDS`.
+    rig : str
+        Name of the rig it was made on.
+    serials : tuple of str
+        Serials of the devices it holds for.
+    created, valid_until : datetime.date
+        First and last day on which it may be used.
+    source : {"measured", "simulated"}
+        Whether the frames came from instruments or from a simulation.
+    values : mapping of str to mapping of str to Quantity
+        ``values[serial][name]``.
+    maps : mapping of str to ndarray of float32, shape (H, W) or (H, W, C)
+        Images, by name; may be empty.
+    notes : mapping of str to str
+        Words that belong to the numbers: color names, the reference used, the method.
+    inputs : mapping of str to str
+        Digest of every frame that went in, by step or file name.
+    versions : mapping of str to str
+        Versions of the programs that made it.
+    """
+
+    kind: str
+    rig: str
+    serials: tuple[str, ...]
+    created: date
+    valid_until: date
+    source: Source
+    values: Mapping[str, Mapping[str, Quantity]]
+    maps: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    notes: Mapping[str, str] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check the fields against each other."""
+        if self.kind not in KINDS:
+            raise ValueError(f"Calibration.kind: got {self.kind!r}, expected one of {KINDS}")
+        if not self.serials:
+            raise ValueError("Calibration.serials: got none, expected at least one device serial")
+        if self.source not in ("measured", "simulated"):
+            raise ValueError(
+                f"Calibration.source: got {self.source!r}, expected 'measured' or 'simulated'"
+            )
+        if self.valid_until < self.created:
+            raise ValueError(
+                f"Calibration.valid_until: got {self.valid_until}, expected not before created"
+                f" ({self.created})"
+            )
+        unknown = sorted(set(self.values) - set(self.serials))
+        if unknown:
+            raise ValueError(
+                f"Calibration.values: got values of {unknown}, expected only of {self.serials}"
+            )
+        for name in self.maps:
+            require_plain_name(name)
+
+    def quantity(self, serial: str, name: str) -> Quantity:
+        """Return one quantity of one device.
+
+        Raises
+        ------
+        CalibrationMismatch
+            If this calibration does not hold it.
+        """
+        if serial not in self.values:
+            raise CalibrationMismatch(
+                f"{self.kind} calibration of rig {self.rig!r}: no values of device {serial!r}, it"
+                f" holds {sorted(self.values)}; calibrate this device"
+            )
+        if name not in self.values[serial]:
+            raise CalibrationMismatch(
+                f"{self.kind} calibration of rig {self.rig!r}: no {name!r} of device {serial!r}, it"
+                f" holds {sorted(self.values[serial])}; calibrate again with this version"
+            )
+        return self.values[serial][name]
+
+
+def digest_arrays(*arrays: NDArray[Any]) -> str:
+    """Return a digest of arrays' bytes, shapes and types, to name a calibration's inputs.
+
+    Parameters
+    ----------
+    *arrays : ndarray
+        Any shape and type.
+
+    Returns
+    -------
+    str
+        ``sha256:`` and 64 hexadecimal digits.
+
+    Examples
+    --------
+    >>> digest_arrays(np.zeros(3)) == digest_arrays(np.zeros(3))
+    True
+    >>> digest_arrays(np.zeros(3)) == digest_arrays(np.zeros((3, 1)))
+    False
+    """
+    state = hashlib.sha256()
+    for array in arrays:
+        state.update(f"{array.dtype.str}{array.shape}".encode())
+        state.update(np.ascontiguousarray(array).tobytes())
+    return f"sha256:{state.hexdigest()}"
+
+
+def default_validity(created: date, days: int = DEFAULT_VALIDITY_DAYS) -> date:
+    """Return the last day of validity of a calibration made on `created`.
+
+    Examples
+    --------
+    >>> default_validity(date(2026, 11, 21), days=9)
+    datetime.date(2026, 11, 30)
+    """
+    if days < 0:
+        raise ValueError(f"days: got {days}, expected >= 0")
+    return created + timedelta(days=days)
+
+
+def require_plain_name(name: str) -> None:
+    """Raise ValueError unless a name can be part of a file's name."""
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
+        raise ValueError(f"map name: got {name!r}, expected small letters, digits and _")

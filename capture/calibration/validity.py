@@ -1,0 +1,137 @@
+"""Whether a calibration may be used here and today, and how it moved since the last one."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import date
+
+import numpy as np
+
+from capture.calibration.record import Calibration, CalibrationExpired, CalibrationMismatch
+
+__all__ = ["Drift", "drift", "require"]
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How one number moved between two calibrations.
+
+    Attributes
+    ----------
+    serial, name : str
+        Device and quantity; elements of arrays are written ``name[i]``.
+    old, new, change : float
+        In the quantity's unit; ``change = new - old``.
+    sigmas : float or None
+        Change over its combined standard error; None where neither calibration states one.
+    """
+
+    serial: str
+    name: str
+    old: float
+    new: float
+    change: float
+    sigmas: float | None
+
+    def __str__(self) -> str:
+        """Return one line for a terminal."""
+        size = "no stated error" if self.sigmas is None else f"{self.sigmas:+.1f} sigma"
+        return f"{self.serial} {self.name}: {self.old:.6g} -> {self.new:.6g} ({size})"
+
+
+def require(
+    calibration: Calibration,
+    *,
+    rig: str,
+    serials: Iterable[str],
+    on_date: date,
+    kind: str | None = None,
+) -> Calibration:
+    """Return the calibration if it may be used here and today; say clearly why not otherwise.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The candidate.
+    rig : str
+        Name of the rig of the session to be corrected.
+    serials : iterable of str
+        Serials of the devices that made the session's frames.
+    on_date : datetime.date
+        Day of the session.
+    kind : str, optional
+        The kind wanted.
+
+    Raises
+    ------
+    CalibrationMismatch
+        If it belongs to another rig or another device, or is of another kind.
+    CalibrationExpired
+        If `on_date` lies outside its validity.
+    """
+    what = f"{calibration.kind} calibration of {calibration.created}"
+    if kind is not None and calibration.kind != kind:
+        raise CalibrationMismatch(f"{what}: is of kind {calibration.kind!r}, expected {kind!r}")
+    if calibration.rig != rig:
+        raise CalibrationMismatch(
+            f"{what}: made on rig {calibration.rig!r}, the session is of rig {rig!r}; calibrate"
+            f" rig {rig!r} and give its folder by --calibration"
+        )
+    missing = sorted(set(serials) - set(calibration.serials))
+    if missing:
+        raise CalibrationMismatch(
+            f"{what}: made with devices {sorted(calibration.serials)}, the session used"
+            f" {missing}; calibrate these devices"
+        )
+    if not calibration.created <= on_date <= calibration.valid_until:
+        raise CalibrationExpired(
+            f"{what}: valid from {calibration.created} to {calibration.valid_until}, the session"
+            f" is of {on_date}; run `skinrig calibrate {calibration.kind}` on frames of that time"
+        )
+    return calibration
+
+
+def drift(old: Calibration, new: Calibration) -> tuple[Drift, ...]:
+    """Compare two calibrations of one kind, number by number, largest change first.
+
+    Parameters
+    ----------
+    old, new : Calibration
+        Of the same kind and rig. Only quantities with the same shape in both are compared.
+
+    Returns
+    -------
+    tuple of Drift
+        Sorted by the size of ``sigmas``; those without stated errors come last.
+
+    Raises
+    ------
+    CalibrationMismatch
+        If the two are not of one kind and one rig.
+    """
+    if (old.kind, old.rig) != (new.kind, new.rig):
+        raise CalibrationMismatch(
+            f"drift: got {old.kind!r} of rig {old.rig!r} and {new.kind!r} of rig {new.rig!r},"
+            " expected two of one kind and one rig"
+        )
+    rows: list[Drift] = []
+    for serial in sorted(set(old.values) & set(new.values)):
+        for name in sorted(set(old.values[serial]) & set(new.values[serial])):
+            a, b = old.values[serial][name], new.values[serial][name]
+            if a.value.shape != b.value.shape:
+                continue
+            error = np.zeros(a.value.shape)
+            for q in (a, b):
+                if q.stderr is not None:
+                    error = np.hypot(error, q.stderr)
+            for index in np.ndindex(a.value.shape):
+                change = float(b.value[index] - a.value[index])
+                label = name + "".join(f"[{i}]" for i in index)
+                sigmas = change / float(error[index]) if error[index] > 0 else None
+                rows.append(
+                    Drift(
+                        serial, label, float(a.value[index]), float(b.value[index]), change, sigmas
+                    )
+                )
+    return tuple(
+        sorted(rows, key=lambda r: -1.0 if r.sigmas is None else abs(r.sigmas), reverse=True)
+    )
