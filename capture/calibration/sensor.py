@@ -11,7 +11,9 @@ from datetime import date
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.calibration.darks import Darks, pool, reduce_darks
 from capture.calibration.flat_field import SmoothField, fit_smooth_field, pixel_response
+from capture.calibration.linearity import fit_linearity
 from capture.calibration.photon_transfer import (
     CurveFit,
     FlatPair,
@@ -29,7 +31,6 @@ __all__ = ["FlatPair", "PhotonTransferError", "SensorCalibration", "photon_trans
 Float = NDArray[np.float64]
 
 QUANTIZATION_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
-HOT_SIGMAS = 6.0
 FLAT_BLOCKS = 16  # samples of the flat field along the shorter side
 
 
@@ -202,19 +203,6 @@ _PER_COLOR = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Darks:
-    """Darks of one color: levels, temporal variance with its degrees of freedom, fixed pattern."""
-
-    black_dn: tuple[float, ...]  # per CFA position
-    black_stderr: float
-    variance_dn2: float
-    dof: float
-    dsnu_dn: tuple[float, float]
-    slope_dn_per_s: tuple[float, float] | None
-    good: tuple[NDArray[np.bool_], ...]  # per CFA position
-
-
 def photon_transfer(
     pairs: Sequence[FlatPair],
     darks: Sequence[NDArray[np.uint16]],
@@ -261,12 +249,12 @@ def photon_transfer(
     shape = _check_frames(pairs, darks, dark_exposures_s)
     colors = cfa_planes(pattern)
     fits: list[CurveFit] = []
-    dark_fits: list[_Darks] = []
+    dark_fits: list[Darks] = []
     linear: list[tuple[float, float, float, float]] = []
     prnu: list[tuple[float, float]] = []
     flats: list[SmoothField] = []
     for positions in colors.values():
-        dark = _reduce_darks(darks, dark_exposures_s, positions, pattern, block)
+        dark = reduce_darks(darks, dark_exposures_s, positions, pattern)
         levels = [
             [
                 block_statistics(
@@ -302,7 +290,7 @@ def photon_transfer(
             )
         fits.append(fit)
         dark_fits.append(dark)
-        linear.append(_linearity(usable, positions, pattern, dark))
+        linear.append(fit_linearity(usable, positions, pattern, dark))
         spread, field = _fixed_pattern(
             usable, positions, pattern, dark, block=block, degree=flat_degree, shape=shape
         )
@@ -336,123 +324,11 @@ def _check_frames(
     return height, width
 
 
-def _reduce_darks(
-    darks: Sequence[NDArray[np.uint16]],
-    exposures_s: Sequence[float] | None,
-    positions: tuple[tuple[int, int], ...],
-    pattern: str,
-    block: int,
-) -> _Darks:
-    n = len(darks)
-    black, good, means = [], [], np.zeros(n)
-    squares = dof = 0.0
-    spreads = []
-    for position in positions:
-        stack = np.stack([plane(dark, position, pattern) for dark in darks])
-        level = stack.mean(axis=(1, 2))
-        means += level / len(positions)
-        residual = stack - level[:, None, None]
-        average = residual.mean(axis=0)
-        scale = 1.4826 * float(np.median(np.abs(average - np.median(average))))
-        ok = np.abs(average - np.median(average)) <= max(HOT_SIGMAS * scale, 1.0)
-        black.append(float(stack[:, ok].mean()))
-        good.append(ok)
-        squares += float(((residual - average) ** 2)[:, ok].sum())
-        dof += (n - 1) * (int(ok.sum()) - 1)
-        spreads.append(_common_spread(residual[0::2].mean(0), residual[1::2].mean(0), ok))
-    variance = squares / dof
-    pixels = dof / (n - 1)
-    error = np.hypot(float(means.std(ddof=1)) / np.sqrt(n), np.sqrt(variance / (n * pixels)))
-    slope = None
-    if exposures_s is not None and len(set(exposures_s)) > 1:
-        t = np.asarray(exposures_s, dtype=np.float64)
-        centered = t - t.mean()
-        rate = float(centered @ means / (centered @ centered))
-        misfit = means - means.mean() - rate * centered
-        scatter = float(misfit @ misfit) / max(n - 2, 1)
-        sigma2 = max(scatter, variance / pixels)
-        slope = (rate, float(np.sqrt(sigma2 / (centered @ centered))))
-    return _Darks(
-        black_dn=tuple(black),
-        black_stderr=float(error),
-        variance_dn2=variance,
-        dof=dof,
-        dsnu_dn=_pool(spreads),
-        slope_dn_per_s=slope,
-        good=tuple(good),
-    )
-
-
-def _common_spread(a: Float, b: Float, ok: NDArray[np.bool_]) -> tuple[float, float]:
-    """Spread common to two independent averages: root of their covariance, with its error."""
-    x, y = a[ok] - a[ok].mean(), b[ok] - b[ok].mean()
-    covariance = float(x @ y) / (x.size - 1)
-    error = float(np.sqrt((x.var() * y.var() + covariance**2) / x.size))
-    if covariance <= 0:
-        return 0.0, float(np.sqrt(error))
-    spread = float(np.sqrt(covariance))
-    return spread, min(error / (2.0 * spread), float(np.sqrt(error)))
-
-
-def _pool(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    v, e = np.array(values).T
-    return float(v.mean()), float(np.sqrt((e**2).sum()) / e.size)
-
-
-def _linearity(
-    pairs: Sequence[FlatPair],
-    positions: tuple[tuple[int, int], ...],
-    pattern: str,
-    dark: _Darks,
-) -> tuple[float, float, float, float]:
-    """Nonlinearity with its error, and the largest deviation of a level with its error.
-
-    ``signal / light = a (1 + q light / light_max)``; the scatter is taken from the two frames of
-    the pairs and from the residuals, so that a light source that does not repeat well is honest.
-    """
-    light = np.array([pair.light for pair in pairs])
-    signals = np.array(
-        [
-            [
-                np.mean(
-                    [
-                        plane(frame, position, pattern)[ok].mean() - black
-                        for position, black, ok in zip(
-                            positions, dark.black_dn, dark.good, strict=True
-                        )
-                    ]
-                )
-                for frame in (pair.first, pair.second)
-            ]
-            for pair in pairs
-        ]
-    )
-    response = signals.mean(axis=1) / light
-    half_difference = (signals[:, 0] - signals[:, 1]) / (2.0 * signals.mean(axis=1))
-    design = np.stack([np.ones_like(light), light / light.max()], axis=1)
-    # an error of the black level weighs on the dark levels most
-    weight = 1.0 / (
-        1.0 + (dark.black_stderr / (signals.mean(axis=1) * max(half_difference.std(), 1e-6))) ** 2
-    )
-    normal = design.T @ (design * weight[:, None])
-    coefficients = np.linalg.solve(normal, design.T @ (weight * response))
-    misfit = response / (design @ coefficients) - 1.0
-    dof = (len(pairs) - 2) + len(pairs)
-    scatter = float((weight * misfit**2).sum() + (half_difference**2).sum()) / dof
-    a, q = float(coefficients[0]), float(coefficients[1] / coefficients[0])
-    covariance = np.linalg.inv(normal) * scatter * a**2
-    gradient = np.array([-q / a, 1.0 / a])
-    q_error = float(np.sqrt(gradient @ covariance @ gradient))
-    straight = float((weight * response).sum() / weight.sum())
-    deviation = float(np.abs(response / straight - 1.0).max())
-    return q, q_error, deviation, float(np.sqrt(scatter))
-
-
 def _fixed_pattern(
     pairs: Sequence[FlatPair],
     positions: tuple[tuple[int, int], ...],
     pattern: str,
-    dark: _Darks,
+    dark: Darks,
     *,
     block: int,
     degree: int,
@@ -485,7 +361,7 @@ def _fixed_pattern(
         shape=shape,
         degree=degree,
     )
-    return _pool(spreads), field
+    return pool(spreads), field
 
 
 def _assemble(
@@ -493,7 +369,7 @@ def _assemble(
     colors: tuple[str, ...],
     white_dn: int,
     fits: Sequence[CurveFit],
-    darks: Sequence[_Darks],
+    darks: Sequence[Darks],
     linear: Sequence[tuple[float, float, float, float]],
     prnu: Sequence[tuple[float, float]],
     flats: tuple[SmoothField, ...],
