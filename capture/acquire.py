@@ -27,7 +27,8 @@ from capture.devices.camera import (
     check_serials,
     next_frame,
 )
-from capture.devices.port import DeviceError
+from capture.devices.port import CommandRefused, DeviceError
+from capture.devices.wire import Code
 from capture.plan import Plan, Step
 from capture.rig import Rig, View
 from capture.session import Session
@@ -81,7 +82,7 @@ class Flash(Protocol):
         """Wait until the packs are charged for the power that is set."""
 
     def fire(self, token: str) -> Any:
-        """Fire once; the same token never fires twice."""
+        """Fire once; a retry on the line never fires twice."""
 
     def dark(self) -> None:
         """Put all light out and disarm."""
@@ -153,7 +154,7 @@ def run_plan(
         When a step fails three times, or the plan goes beyond what the box allows; this is found
         before anything flashes.
     DeviceError
-        When a box or camera is lost.
+        When a box or camera is lost; what was captured is safe in the session.
     Interrupted
         When ``interrupted`` said so.
     """
@@ -164,10 +165,11 @@ def run_plan(
     check_serials(cameras, [(view.name, view.serial) for view in rig.views])
     _check_limits(plan, box.limits)
     steps = _steps(session)
+    taken = {(record.step_id, record.camera): record.attempt for record in session.frames()}
     counts = {"steps": 0, "frames": 0, "stale": 0, "retakes": 0}
     state: str | None = None
     try:
-        box.arm()
+        box.dark()  # whatever was going on before
         for number, step in enumerate(steps, start=1):
             if interrupted is not None and interrupted():
                 raise Interrupted
@@ -178,7 +180,7 @@ def run_plan(
                     prompt(state)
             if progress is not None:
                 progress(f"{number}/{len(steps)} {step.id} {step.kind} {_index_text(step)}")
-            _take(step, rig, box, cameras, session, clock, counts)
+            _take(step, rig, box, cameras, session, taken, clock, counts)
     finally:
         _tear_down(box, cameras)
     return Acquired(**counts)
@@ -197,14 +199,23 @@ def _index_text(step: Step) -> str:
 
 
 def _check_limits(plan: Plan, limits: Mapping[str, Any]) -> None:
-    low = float(limits.get("power_min", 0.0))
-    high = float(limits.get("power_max", 1.0))
+    """Raise when a step asks for more than the box allows, before anything is sent."""
+    low, high = float(limits["power_min"]), float(limits["power_max"])
+    first, last = float(limits["analyser_min_deg"]), float(limits["analyser_max_deg"])
     for step in plan.steps:
-        power = float(step.settings.get("power", 0.0))
-        if step.kind != "dark" and power > 0 and not low <= power <= high:
+        power = float(step.settings.get("power", 1.0))
+        if step.kind == "dark" or power == 0.0:
+            continue
+        if not low <= power <= high:
             raise AcquisitionError(
                 f"step {step.id}: got power {power:g}, the box allows {low:g} to {high:g}; "
                 "nothing was fired: change the plan"
+            )
+        angle_deg = float(step.settings.get("analyser_deg", first))
+        if not first <= angle_deg <= last:
+            raise AcquisitionError(
+                f"step {step.id}: got analyser_deg {angle_deg:g}, the box allows {first:g} to "
+                f"{last:g}; nothing was fired: change the plan"
             )
 
 
@@ -214,6 +225,7 @@ def _take(
     box: Flash,
     cameras: Mapping[str, Camera],
     session: Session,
+    taken: Mapping[tuple[str, str], int],
     clock: Callable[[], float],
     counts: dict[str, int],
 ) -> None:
@@ -222,7 +234,10 @@ def _take(
     for attempt in range(1, MAX_ATTEMPTS + 1):
         try:
             report, frames, stale = _expose(step, rig, box, cameras, attempt)
-        except (FrameRefused, FrameTimeout) as error:
+        except (FrameRefused, FrameTimeout, CommandRefused) as error:
+            if isinstance(error, CommandRefused) and error.code != Code.HARDWARE:
+                raise
+            # a misfire has pulsed the camera line: its frame is dark and must go too
             log.warning("step %s, attempt %d: %s", step.id, attempt, error)
             refusals.append(str(error))
             counts["retakes"] += 1
@@ -247,6 +262,8 @@ def _take(
                 },
                 t_box_s=None if report is None else float(report.t_box_s),
                 t_host_s=clock(),
+                # a step of which only some cameras were kept is shot again with all of them
+                attempt=taken.get((step.id, name), 0) + 1,
             )
             counts["frames"] += 1
         counts["steps"] += 1
@@ -293,7 +310,12 @@ def _expose(
     for name, camera in chosen.items():
         if triggers[name] is Trigger.SOFTWARE:
             camera.fire()
-    report = box.fire(f"{step.id}.{attempt}") if lit_by_box else None
+    report = None
+    if lit_by_box:
+        # armed for this pop only: a read-out may outlast any lease
+        box.arm()
+        report = box.fire(f"{step.id}.{attempt}")
+        box.dark()
     frames: dict[str, Frame] = {}
     stale = 0
     for name, camera in chosen.items():

@@ -8,13 +8,16 @@ forgotten it.
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
 from . import wire
-from .port import BadAnswer, Clock, Hello, LinkLost, Port, PortTimeout, WrongDevice
+from .port import BadAnswer, Clock, DeviceError, Hello, LinkLost, Port, PortTimeout, WrongDevice
+
+log = logging.getLogger(__name__)
 
 __all__ = ["ChargeState", "FlashBox", "FlashReport", "Status", "find_box"]
 
@@ -339,8 +342,8 @@ class FlashBox:
         try:
             if self._port.boot != wire.UNKNOWN_BOOT:
                 self.dark()
-        except (LinkLost, PortTimeout):
-            pass  # its lease puts the light out
+        except DeviceError as exc:
+            log.warning("%s; the lease of the box puts its light out", exc)
         finally:
             self._port.close()
 
