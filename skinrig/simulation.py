@@ -262,16 +262,21 @@ def to_superpixels(values: NDArray[Any], mask: NDArray[np.bool_] | None = None) 
     return np.asarray(total / np.maximum(count, 1.0))
 
 
+_TRUTH_NAMES = {"diffuse": "diffuse_radiance", "specular": "specular_radiance", "shading": "light"}
+"""The simulator's light is in its own unit; an estimate's is relative to a white tile."""
+
+
 def _truth(maps: Mapping[str, NDArray[Any]], seed: int, session: str, state: str) -> SkinAppearance:
     mask = np.asarray(maps["mask"], bool)
     # a superpixel on the outline mixes skin and background: no truth is claimed for it
     whole = to_superpixels(mask.astype(float)) == 1.0
     kept = {}
     for name, values in maps.items():
-        if name == "mask":
+        if name == "mask" or np.ndim(values) == 3 and np.shape(values)[2] != 3:
             continue
         small = to_superpixels(np.asarray(values, np.float64), mask).astype(np.float32)
-        kept[name] = SkinMap(small, UNITS.get(name.removesuffix("_blurred"), "1"), valid=whole)
+        unit = "mm" if name.endswith("_mm") else UNITS.get(name.removesuffix("_blurred"), "1")
+        kept[_TRUTH_NAMES.get(name, name)] = SkinMap(small, unit, valid=whole)
     kept["mask"] = SkinMap(whole.astype(np.float32), "1")
     return SkinAppearance(
         kept,
