@@ -29,6 +29,8 @@ __all__ = [
     "camera_rays",
     "choose_variant",
     "g_buffer",
+    "load",
+    "look_at",
     "radiance",
     "visibility",
 ]
@@ -90,6 +92,7 @@ class Caster:
     def __init__(self, mesh: Mesh, *, choice: VariantChoice | None = None) -> None:
         self.mesh = mesh
         self.choice = choose_variant("rgb") if choice is None else choice
+        self.attributes = np.concatenate([mesh.vertices_mm, mesh.normals, mesh.uv], axis=1)
         self._tracer: _Tracer
         if self.choice.is_vectorized:
             self._tracer = _MitsubaTracer(mesh, self.choice)
@@ -174,9 +177,10 @@ def camera_rays(
     x = (np.arange(view.width_px * k) + 0.5) / k - 0.5 - 0.5 * (view.width_px - 1)
     first, last = (0, view.height_px) if rows is None else rows
     y = (np.arange(first * k, last * k) + 0.5) / k - 0.5 - 0.5 * (view.height_px - 1)
-    way = x[None, :, None] * right - y[:, None, None] * up - view.focal_px * back
-    way /= np.linalg.norm(way, axis=-1, keepdims=True)
-    directions = way.astype(np.float32)
+    across, down = x[:, None] * right - view.focal_px * back, y[:, None] * up
+    # The axes are perpendicular, so a ray's squared length is the sum of three squares.
+    length = np.sqrt(x[None, :] ** 2 + y[:, None] ** 2 + view.focal_px**2)
+    directions = ((across[None] - down[:, None]) / length[..., None]).astype(np.float32)
     origins = np.broadcast_to(np.asarray(view.position_mm, np.float32), directions.shape)
     return origins, directions
 
@@ -206,22 +210,20 @@ def g_buffer(
     shape = directions.shape[:2]
     prim, weight = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
     mesh = caster.mesh
-
-    def over(values: Float32Array) -> Float32Array:
-        return interpolate(values, mesh.faces, prim, weight).reshape(*shape, values.shape[-1])
-
-    corners = mesh.vertices_mm[mesh.faces]
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    position, normal, uv = np.split(
+        interpolate(caster.attributes, mesh.faces, prim, weight).reshape(*shape, 8), [3, 6], axis=-1
+    )
     mask = prim >= 0
+    corners = mesh.vertices_mm[mesh.faces[prim[mask]]]
     face_normal = np.zeros((len(prim), 3), np.float32)
-    face_normal[mask] = flat[prim[mask]]
+    face_normal[mask] = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     buffers = GBuffer(
         mask=mask.reshape(shape),
         prim=prim.reshape(shape),
-        position_mm=over(mesh.vertices_mm),
-        normal=_unit(over(mesh.normals)),
+        position_mm=position,
+        normal=_unit(normal),
         face_normal=_unit(face_normal.reshape(*shape, 3)),
-        uv=over(mesh.uv),
+        uv=uv,
         to_camera=-directions,
     )
     for name in ("position_mm", "normal", "face_normal", "uv"):
@@ -307,7 +309,8 @@ def radiance(
     Parameters
     ----------
     description
-        Mitsuba's scene dictionary; arrays and numbers only, no Mitsuba objects.
+        Mitsuba's scene dictionary, with numbers, texts and arrays only; a ``to_world`` is a 4 x 4
+        array.
     kind
         Variant kind, see `rigsim.variant.choose_variant`.
     samples
@@ -326,12 +329,49 @@ def radiance(
         The image holds values that are not finite.
     """
     mi = load(choose_variant(kind))
-    scene = mi.load_dict(dict(description))
+    scene = mi.load_dict(_with_transforms(mi, description))
     image = np.array(mi.TensorXf(mi.render(scene, spp=samples, seed=seed)).numpy(), np.float32)
     bad = int(np.count_nonzero(~np.isfinite(image).all(axis=-1)))
     if bad:
         raise RenderError(f"Mitsuba gave {bad} pixels that are not finite, expected none")
     return image
+
+
+def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:
+    """Return the transform that puts a sensor or a rectangle somewhere, facing somewhere.
+
+    Parameters
+    ----------
+    origin, target
+        Where it stands and what it faces (with its local +z), shape (3,).
+    up
+        Direction of its local +y, as far as possible, shape (3,).
+
+    Returns
+    -------
+    ndarray
+        Shape (4, 4), for ``to_world``; Mitsuba's local +x points to the left seen from behind.
+    """
+    place = np.asarray(origin, np.float64)
+    forward = np.asarray(target, np.float64) - place
+    forward /= np.linalg.norm(forward)
+    left = np.cross(np.asarray(up, np.float64), forward)
+    left /= np.linalg.norm(left)
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([left, np.cross(forward, left), forward, place])
+    return matrix
+
+
+def _with_transforms(mi: Any, description: Mapping[str, Any]) -> dict[str, Any]:
+    out = {}
+    for name, value in description.items():
+        if isinstance(value, Mapping):
+            out[name] = _with_transforms(mi, value)
+        elif name == "to_world":
+            out[name] = mi.ScalarTransform4f(np.asarray(value, np.float64))
+        else:
+            out[name] = value
+    return out
 
 
 def load(choice: VariantChoice) -> Any:
@@ -460,5 +500,7 @@ def _parts(count: int) -> list[slice]:
 
 
 def _unit(vectors: Float32Array) -> Float32Array:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0)
+    squared = np.einsum("...i,...i->...", vectors, vectors)
+    inverse = np.zeros_like(squared)
+    np.divide(np.float32(1.0), np.sqrt(squared), out=inverse, where=squared > 0.0)
+    return vectors * inverse[..., None]

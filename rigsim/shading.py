@@ -198,16 +198,12 @@ def analyser_frame(
     cos2, sin2 : ndarray of float32
         Shape (...). On the optical axis they belong to ``passes_deg`` itself.
     """
-    v = np.asarray(to_camera, np.float64)
+    v = np.asarray(to_camera, np.float32)
     right, up = _vector(image_right), _vector(image_up)
     angle = math.radians(passes_deg)
     absorbs = -math.sin(angle) * right + math.cos(angle) * up
-    passes = np.cross(absorbs, v)  # perpendicular to the ray and to the absorbing axis
-    h, g = _ray_frame(v, right)
-    x, y = np.sum(passes * h, axis=-1), np.sum(passes * g, axis=-1)
-    squared = x * x + y * y
-    cos2, sin2 = (x * x - y * y) / squared, 2.0 * x * y / squared
-    return cos2.astype(np.float32), sin2.astype(np.float32)
+    cos2, sin2 = _analyser(np.ascontiguousarray(v.reshape(-1, 3)), right, absorbs)
+    return cos2.reshape(v.shape[:-1]), sin2.reshape(v.shape[:-1])
 
 
 def fresnel_amplitudes(cos_incident: ArrayLike, eta: float) -> tuple[FloatArray, FloatArray]:
@@ -313,12 +309,6 @@ def axis_in_plane(angle_deg: float, facing: ArrayLike, up: ArrayLike) -> NDArray
     top = np.cross(beam, right)
     angle = math.radians(angle_deg)
     return np.asarray(math.cos(angle) * right + math.sin(angle) * top)
-
-
-def _ray_frame(v: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-    h = right - np.sum(v * right, axis=-1, keepdims=True) * v
-    h /= np.linalg.norm(h, axis=-1, keepdims=True)
-    return h, np.cross(v, h)
 
 
 def _vector(value: ArrayLike) -> NDArray[np.float64]:
@@ -471,3 +461,22 @@ def _exit(normal, camera, eta, right):  # type: ignore[no-untyped-def]
         out[i, 1] = half * (sx * sx - sy * sy)
         out[i, 2] = half * 2.0 * sx * sy
     return out
+
+
+@njit(parallel=True, cache=True)
+def _analyser(camera, right, absorbs):  # type: ignore[no-untyped-def]
+    cos2 = np.empty(camera.shape[0], np.float32)
+    sin2 = np.empty(camera.shape[0], np.float32)
+    for i in prange(camera.shape[0]):
+        v0, v1, v2 = float(camera[i, 0]), float(camera[i, 1]), float(camera[i, 2])
+        along = right[0] * v0 + right[1] * v1 + right[2] * v2
+        x0, x1, x2 = right[0] - along * v0, right[1] - along * v1, right[2] - along * v2
+        y0, y1, y2 = v1 * x2 - v2 * x1, v2 * x0 - v0 * x2, v0 * x1 - v1 * x0
+        # What passes is perpendicular to the ray and to the absorbing axis.
+        p0 = absorbs[1] * v2 - absorbs[2] * v1
+        p1 = absorbs[2] * v0 - absorbs[0] * v2
+        p2 = absorbs[0] * v1 - absorbs[1] * v0
+        px, py = p0 * x0 + p1 * x1 + p2 * x2, p0 * y0 + p1 * y1 + p2 * y2
+        squared = px * px + py * py
+        cos2[i], sin2[i] = (px * px - py * py) / squared, 2.0 * px * py / squared
+    return cos2, sin2

@@ -161,7 +161,7 @@ def _chart(*, texels: int = 2048) -> Target:
 _MAKERS: Final[Mapping[str, Callable[[], Target]]] = {
     "white": lambda: _even("white", "diffuse", WHITE_REFLECTANCE, 0.0),
     "chart": _chart,
-    "malus": lambda: _even("malus", "metal", 0.85, 0.45),
+    "malus": lambda: _even("malus", "metal", 0.42, 0.45),
     "flat": lambda: _even("flat", "source", 1.0, 0.0),
     "dark": lambda: _even("dark", "cap", 0.0, 0.0),
 }
