@@ -184,10 +184,16 @@ class CameraBody:
 
 
 class SimCamera:
-    """A handle on a simulated camera; see `capture.devices.camera.Camera`."""
+    """A handle on a simulated camera; see `capture.devices.camera.Camera`.
+
+    Parameters
+    ----------
+    body
+        The camera that it is a handle on.
+    """
 
     def __init__(self, body: CameraBody) -> None:
-        self._body = body
+        self.body = body
         view = body.view
         self._info = CameraInfo(
             serial=view.serial,
@@ -207,7 +213,7 @@ class SimCamera:
 
     def clock_s(self) -> float:
         """Return the time on the clock that stamps its frames, s."""
-        return self._body.clock_s()
+        return self.body.clock_s()
 
     def configure(self, want: Exposure) -> Exposure:
         """Set an exposure within what the camera can do, and return it."""
@@ -215,7 +221,7 @@ class SimCamera:
             min(max(want.exposure_s, EXPOSURE_S[0]), EXPOSURE_S[1]),
             min(max(want.iso, ISO[0]), ISO[1]),
         )
-        self._body.exposure = set_to
+        self.body.exposure = set_to
         return set_to
 
     def arm(self, count: int, trigger: Trigger) -> None:
@@ -224,20 +230,20 @@ class SimCamera:
             raise CameraError(f"count: got {count}, expected 1 or more")
         if trigger not in self._info.triggers:
             raise CameraError(f"camera {self._info.serial}: knows no {trigger} trigger")
-        self._body.arm(count, trigger)
+        self.body.arm(count, trigger)
 
     def fire(self) -> None:
         """Start one exposure."""
-        self._body.fire()
+        self.body.fire()
 
     def frame(self, timeout_s: float) -> Frame:
         """Return the next frame, or raise `FrameTimeout`."""
-        return self._body.develop(self._body.next_shot(timeout_s))
+        return self.body.develop(self.body.next_shot(timeout_s))
 
     def abort(self) -> None:
         """Give up what was armed."""
-        self._body.disarm()
+        self.body.disarm()
 
     def close(self) -> None:
         """Let go of the camera."""
-        self._body.disarm()
+        self.body.disarm()
