@@ -181,9 +181,8 @@ def _scenes(
     states: tuple[str, ...],
     seed: int,
 ) -> dict[str, Any]:
-    from rigsim.scenes.flash import FlashScene
-
     from rigsim import targets
+    from rigsim.scenes.flash import FlashScene
     from rigsim.subject import make_subject
 
     if target is not None:
@@ -201,12 +200,11 @@ def _drive(
     progress: Callable[[str], None] | None,
 ) -> float:
     """Run the session's plan through the drivers, on a world registered under its id."""
-    from capture.devices.flash import FlashBox
-    from rigsim.world import World
-
     from capture.acquire import run_plan
     from capture.devices.camera import open_camera
+    from capture.devices.flash import FlashBox
     from capture.devices.port import Port
+    from rigsim.world import World
 
     world = World(rig, seed=seed, clock="virtual", scene=next(iter(scenes.values())))
     name = world.register(session.id)
@@ -272,7 +270,7 @@ def _truth(maps: Mapping[str, NDArray[Any]], seed: int, session: str, state: str
     whole = to_superpixels(mask.astype(float)) == 1.0
     kept = {}
     for name, values in maps.items():
-        if name == "mask" or np.ndim(values) == 3 and np.shape(values)[2] != 3:
+        if name == "mask" or (np.ndim(values) == 3 and np.shape(values)[2] != 3):
             continue
         small = to_superpixels(np.asarray(values, np.float64), mask).astype(np.float32)
         unit = "mm" if name.endswith("_mm") else UNITS.get(name.removesuffix("_blurred"), "1")

@@ -1,0 +1,174 @@
+"""Broken inputs at the command line: one clear error each, exit code 3, nothing half written."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from capture import raw
+from skinrig.cli import main
+from skinrig.simulation import simulate_session
+
+pytestmark = pytest.mark.render
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sound")
+    return simulate_session("flash", folder / "session-flash", seed=5, width_px=64).session
+
+
+@pytest.fixture
+def session(sound, tmp_path):
+    copy = tmp_path / "session-flash"
+    shutil.copytree(sound, copy)
+    return copy
+
+
+def frames(session):
+    return sorted((session / "frames").iterdir())
+
+
+def truncate_frame(session):
+    frame = frames(session)[0]
+    frame.write_bytes(frame.read_bytes()[:-100])
+
+
+def empty_frame(session):
+    frames(session)[0].write_bytes(b"")
+
+
+def remove_frame(session):
+    frames(session)[1].unlink()
+
+
+def swap_frames(session):
+    first, second = frames(session)[:2]
+    held = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(held)
+
+
+def other_filter_array(session):
+    frame = frames(session)[0]
+    picture = raw.read(frame)
+    frame.write_bytes(
+        raw.encode_dng(picture.cfa, pattern="BGGR", black=picture.black, white=picture.white)
+    )
+
+
+def text_frame(session):
+    frames(session)[0].write_text("this is not a photograph")
+
+
+def link_frame(session):
+    frame = frames(session)[0]
+    moved = session.parent / "elsewhere.dng"
+    frame.rename(moved)
+    frame.symlink_to(moved)
+
+
+def flip_bit(session):
+    frame = frames(session)[2]
+    data = bytearray(frame.read_bytes())
+    data[-77] ^= 4
+    frame.write_bytes(bytes(data))
+
+
+def edit_manifest(change):
+    def broken(session):
+        path = session / "session.json"
+        document = json.loads(path.read_text())
+        change(document)
+        path.write_text(json.dumps(document))
+
+    broken.__name__ = change.__name__
+    return broken
+
+
+def schema_of_the_future(document):
+    document["schema"] = "skinrig.session/99"
+
+
+def unknown_key(document):
+    document["colour"] = "red"
+
+
+def manifest_is_no_json(session):
+    (session / "session.json").write_text("{")
+
+
+def manifest_is_missing(session):
+    (session / "session.json").unlink()
+
+
+def journal_line_lost(session):
+    path = session / "journal.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:1] + lines[2:]))
+
+
+def journal_names_a_file_outside(session):
+    path = session / "journal.jsonl"
+    path.write_bytes(path.read_bytes().replace(b"frames/", b"../../x/", 1))
+
+
+def journal_is_empty(session):
+    (session / "journal.jsonl").write_bytes(b"")
+
+
+def journal_is_noise(session):
+    noise = np.random.default_rng(12345).integers(0, 256, 500, dtype=np.uint8)
+    (session / "journal.jsonl").write_bytes(noise.tobytes())
+
+
+BREAKS = [
+    truncate_frame, empty_frame, remove_frame, swap_frames, other_filter_array, text_frame,
+    link_frame, flip_bit, edit_manifest(schema_of_the_future), edit_manifest(unknown_key),
+    manifest_is_no_json, manifest_is_missing, journal_line_lost, journal_names_a_file_outside,
+    journal_is_noise,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", BREAKS, ids=lambda f: f.__name__)
+def test_verify_finds_the_damage(session, damage, capsys):
+    damage(session)
+    assert main(["verify", str(session)]) == 3
+    out, err = capsys.readouterr()
+    assert "damaged" in out + err
+    assert "Traceback" not in out + err
+
+
+@pytest.mark.parametrize("damage", BREAKS, ids=lambda f: f.__name__)
+def test_reconstruct_refuses_or_is_not_touched_by_the_damage(session, damage, capsys, tmp_path):
+    damage(session)
+    code = main(["reconstruct", str(session), "--want", "melanin", "--out", str(tmp_path / "maps")])
+    out, err = capsys.readouterr()
+    assert code == 3, out + err
+    assert err.count("skinrig: ") == 1
+    assert "Traceback" not in out + err
+    assert not (tmp_path / "maps").exists()
+
+
+def test_a_sound_session_passes(session, capsys):
+    assert main(["verify", str(session)]) == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("name = 3", "name"),
+        ("nam = 'flash'", "nam"),
+        ("name = 'flash'\nrecycle_s = nan", "recycle_s"),
+        ("[[lights", "toml"),
+        ("", "name"),
+    ],
+)
+def test_a_broken_rig_file_is_refused_with_its_faults(text, says, tmp_path, capsys):
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    assert main(["capture", str(path), "--out", str(tmp_path / "x"), "--dry-run"]) == 3
+    err = capsys.readouterr().err.lower()
+    assert says in err
+    assert "traceback" not in err
