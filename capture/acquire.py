@@ -200,8 +200,9 @@ def _index_text(step: Step) -> str:
 
 def _check_limits(plan: Plan, limits: Mapping[str, Any]) -> None:
     """Raise when a step asks for more than the box allows, before anything is sent."""
-    low, high = float(limits["power_min"]), float(limits["power_max"])
-    first, last = float(limits["analyser_min_deg"]), float(limits["analyser_max_deg"])
+    low, high = float(limits.get("power_min", 0.0)), float(limits.get("power_max", 1.0))
+    first = float(limits.get("analyser_min_deg", 0.0))
+    last = float(limits.get("analyser_max_deg", 360.0))
     for step in plan.steps:
         power = float(step.settings.get("power", 1.0))
         if step.kind == "dark" or power == 0.0:

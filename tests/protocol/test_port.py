@@ -1,0 +1,326 @@
+"""Requests, retries and lost links, byte by byte, on a line that a script plays."""
+
+import errno
+import sys
+import termios
+import threading
+from collections import deque
+
+import pytest
+import serial
+
+from capture.devices import port as ports
+from capture.devices.port import (
+    BadAnswer,
+    BoxRebooted,
+    CommandRefused,
+    LinkLost,
+    Port,
+    PortBusy,
+    PortTimeout,
+    PortUrlError,
+    WrongDevice,
+)
+from capture.devices.wire import Event, Reply, Request, encode
+
+HELLO = "1,flash,FL-0001,1.0"
+
+
+class Line:
+    """A serial port that expects writes and plays what comes back after each."""
+
+    def __init__(self, script, **kwargs):
+        self.script = deque(script)
+        self.options = kwargs
+        self.arrived = bytearray()
+        self.closed = False
+
+    def write(self, data):
+        expected, answer = self.script.popleft()
+        assert data == expected
+        if isinstance(answer, BaseException):
+            raise answer
+        self.arrived += answer
+
+    @property
+    def in_waiting(self):
+        return len(self.arrived)
+
+    def read(self, size):
+        data = bytes(self.arrived[:size])
+        del self.arrived[:size]
+        return data
+
+    def reset_input_buffer(self):
+        self.arrived.clear()
+
+    def close(self):
+        self.closed = True
+
+
+class StillClock:
+    """A clock that a port cannot use: only silence on the line counts."""
+
+    def monotonic(self):
+        return 0.0
+
+    def sleep(self, seconds):
+        raise AssertionError
+
+
+@pytest.fixture
+def open_port(monkeypatch):
+    lines = []
+
+    def open_port(*script, first_seq=7, boot=0x9F3A, **kwargs):
+        greeting = (
+            b"\n" + encode(Request(first_seq, 0, "SYST:HELLO?")),
+            encode(Reply(first_seq, boot, 0, HELLO)),
+        )
+        line = Line([greeting, *script])
+
+        def serial_for_url(url, **options):
+            line.options = options
+            return line
+
+        monkeypatch.setattr(serial, "serial_for_url", serial_for_url)
+        port = Port("/dev/box", clock=StillClock(), first_seq=first_seq, retries=2, **kwargs)
+        port.line = line
+        port.hello()
+        lines.append(line)
+        return port
+
+    yield open_port
+    for line in lines:
+        assert not line.script, "the exchange was not finished"
+
+
+def ask(seq, text, *, boot=0x9F3A, retry=False):
+    return (b"\n" if retry else b"") + encode(Request(seq, boot, text))
+
+
+def say(seq, payload="", *, boot=0x9F3A, code=0):
+    return encode(Reply(seq, boot, code, payload))
+
+
+def test_hello_is_knocked_with_a_newline_and_teaches_the_epoch(open_port):
+    port = open_port()
+    assert port.boot == 0x9F3A
+    assert port.statistics.requests == 1
+
+
+def test_a_port_is_opened_exclusively_and_with_both_timeouts(open_port):
+    options = open_port().line.options
+    assert options["exclusive"] is True
+    assert options["timeout"] > 0.0
+    assert options["write_timeout"] > 0.0
+
+
+def test_requests_are_numbered_and_answered(open_port):
+    port = open_port((ask(8, "STAT?"), say(8, "0")), (ask(9, "*IDN?"), say(9, "x")))
+    assert port.ask("STAT?") == "0"
+    assert port.ask("*IDN?") == "x"
+    assert port.statistics.retries == 0
+
+
+def test_a_retry_is_the_same_bytes_after_a_newline(open_port):
+    port = open_port(
+        (ask(8, "FLAS:FIRE a"), b""),
+        (ask(8, "FLAS:FIRE a", retry=True), b""),
+        (ask(8, "FLAS:FIRE a", retry=True), say(8, "done")),
+    )
+    assert port.ask("FLAS:FIRE a") == "done"
+    assert port.statistics.retries == 2
+
+
+def test_a_nak_is_followed_by_a_retry_at_once(open_port):
+    port = open_port(
+        (ask(8, "SAFE"), encode(Event(0, 0x9F3A, "NAK", "204"))),
+        (ask(8, "SAFE", retry=True), say(8)),
+    )
+    assert port.ask("SAFE") == ""
+    assert port.statistics.naks == 1
+
+
+def test_silence_ends_in_a_timeout_that_is_a_timeout_error(open_port):
+    port = open_port(*[(ask(8, "SAFE", retry=k > 0), b"") for k in range(3)])
+    with pytest.raises(PortTimeout, match="after 3 attempts") as caught:
+        port.ask("SAFE")
+    assert isinstance(caught.value, TimeoutError)
+
+
+def test_an_answer_to_an_earlier_request_is_thrown_away(open_port):
+    port = open_port((ask(8, "STAT?"), say(7, "old") + say(8, "new")))
+    assert port.ask("STAT?") == "new"
+    assert port.statistics.stale == 1
+
+
+def test_babble_and_damaged_answers_are_thrown_away(open_port):
+    damaged = say(8, "5").replace(b"5", b"4", 1)
+    port = open_port((ask(8, "STAT?"), b"boot v1\r\n" + damaged + say(8, "5")))
+    assert port.ask("STAT?") == "5"
+    assert port.statistics.bad_lines == 2
+
+
+def test_endless_noise_ends_an_attempt_although_no_clock_runs(open_port):
+    noise = b"x" * 100_000
+    port = open_port(*[(ask(8, "STAT?", retry=k > 0), noise) for k in range(3)])
+    with pytest.raises(PortTimeout):
+        port.ask("STAT?")
+
+
+def test_a_refusal_carries_its_code(open_port):
+    port = open_port((ask(8, "FLAS:FIRE a"), say(8, "Not armed", code=-203)))
+    with pytest.raises(CommandRefused, match="nothing was done") as caught:
+        port.ask("FLAS:FIRE a")
+    assert caught.value.code == -203
+
+
+@pytest.mark.parametrize(
+    "answer", [say(8, "x", boot=0x1111), say(8, "Boot changed", boot=0x1111, code=201)]
+)
+def test_another_epoch_is_a_reboot_until_hello(open_port, answer):
+    hello = (b"\n" + encode(Request(9, 0, "SYST:HELLO?")), say(9, HELLO, boot=0x1111))
+    port = open_port((ask(8, "STAT?"), answer), hello, (ask(10, "STAT?", boot=0x1111), b""))
+    with pytest.raises(BoxRebooted):
+        port.ask("STAT?")
+    with pytest.raises(BoxRebooted, match="say hello"):
+        port.ask("STAT?")
+    assert port.hello().boot == 0x1111
+    port.line.script[-1] = (ask(10, "STAT?", boot=0x1111), say(10, "0", boot=0x1111))
+    assert port.ask("STAT?") == "0"
+    assert port.statistics.reboots == 1
+
+
+def test_events_are_kept_and_gaps_in_their_numbers_counted(open_port):
+    trips = [encode(Event(n, 0x9F3A, "WDOG:TRIP", "300")) for n in (0, 3)]
+    port = open_port((ask(8, "STAT?"), b"".join(trips) + say(8, "2")))
+    assert port.ask("STAT?") == "2"
+    assert [event.number for event in port.listen(0.1)] == [0, 3]
+    assert port.listen(0.1) == []
+    assert port.statistics.lost_events == 2
+
+
+FAILURES = [
+    serial.SerialException("device reports readiness to read but returned no data"),
+    OSError(errno.EIO, "Input/output error"),
+    termios.error(5, "Input/output error"),
+    TypeError("'NoneType' object cannot be interpreted as an integer"),
+    AttributeError("'NoneType' object has no attribute 'select'"),
+]
+
+
+@pytest.mark.parametrize("failure", FAILURES, ids=lambda f: type(f).__name__)
+@pytest.mark.parametrize("where", ["write", "read", "in_waiting", "reset_input_buffer"])
+def test_whatever_a_lost_device_raises_is_one_error(open_port, monkeypatch, failure, where):
+    port = open_port()
+    line = port.line
+
+    def fail(*_):
+        raise failure
+
+    monkeypatch.setattr(Line, where, property(fail) if where == "in_waiting" else fail)
+    if where != "write":
+        monkeypatch.setattr(Line, "write", lambda *_: None)
+    with pytest.raises(LinkLost) as caught:
+        port.hello() if where == "reset_input_buffer" else port.ask("STAT?")
+    assert caught.value.__cause__ is failure
+    assert isinstance(caught.value, ConnectionError)
+    assert line.closed
+    with pytest.raises(LinkLost, match="reopen"):
+        port.hello()
+
+
+def test_a_box_that_takes_no_bytes_is_tried_again_and_then_a_timeout(open_port):
+    stalled = serial.SerialTimeoutException("Write timeout")
+    port = open_port(*[(ask(8, "SAFE", retry=k > 0), stalled) for k in range(3)])
+    with pytest.raises(PortTimeout):
+        port.ask("SAFE")
+
+
+@pytest.mark.parametrize(
+    ("payload", "error"),
+    [("2,flash,FL-0001,1.0", WrongDevice), ("flash", BadAnswer), ("", BadAnswer)],
+)
+def test_a_greeting_that_is_not_understood_is_refused(monkeypatch, payload, error):
+    greeting = b"\n" + encode(Request(7, 0, "SYST:HELLO?"))
+    line = Line([(greeting, encode(Reply(7, 0x9F3A, 0, payload)))])
+    monkeypatch.setattr(serial, "serial_for_url", lambda url, **_: line)
+    with pytest.raises(error):
+        Port("/dev/box", clock=StillClock(), first_seq=7).hello()
+
+
+def test_a_box_that_never_answers_hello_is_a_timeout(monkeypatch):
+    greeting = b"\n" + encode(Request(7, 0, "SYST:HELLO?"))
+    line = Line([(greeting, b"")] * 4)
+    monkeypatch.setattr(serial, "serial_for_url", lambda url, **_: line)
+    with pytest.raises(PortTimeout, match="HELLO"):
+        Port("/dev/box", clock=StillClock(), first_seq=7).hello(patience_s=1.0)
+    assert not line.script
+
+
+def test_a_port_that_is_not_there_is_a_lost_link(tmp_path):
+    with pytest.raises(LinkLost, match="cannot open"):
+        Port(str(tmp_path / "ttyUSB0"))
+
+
+def test_a_port_that_another_program_holds_is_busy(monkeypatch):
+    def locked(url, **_):
+        raise serial.SerialException(errno.EAGAIN, "Could not exclusively lock port /dev/box")
+
+    monkeypatch.setattr(serial, "serial_for_url", locked)
+    with pytest.raises(PortBusy, match="another program"):
+        Port("/dev/box")
+
+
+@pytest.mark.parametrize("url", ["nonsense://box", "sim://flash?dorp=1", "sim://toaster"])
+def test_a_url_that_nobody_knows_is_named(url):
+    with pytest.raises(PortUrlError, match=r"nonsense|did you mean drop|expected 'flash'|flash"):
+        Port(url)
+
+
+def test_an_import_error_inside_a_url_handler_shows(monkeypatch, tmp_path):
+    package = tmp_path / "broken_handlers"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "protocol_broken.py").write_text("import no_such_library\n")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    class EntryPoint:
+        name, value = "broken", "broken_handlers"
+
+    monkeypatch.setattr(
+        ports.importlib.metadata, "entry_points", lambda *, group, name: [EntryPoint]
+    )
+    with pytest.raises(ModuleNotFoundError, match="no_such_library"):
+        Port("broken://box")
+    sys.modules.pop("broken_handlers", None)
+
+
+def test_a_port_belongs_to_the_thread_that_made_it(open_port):
+    port = open_port()
+    caught = []
+
+    def elsewhere():
+        try:
+            port.ask("STAT?")
+        except RuntimeError as error:
+            caught.append(error)
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join(10.0)
+    assert "two threads" in str(caught[0])
+
+
+def test_first_numbers_differ_from_run_to_run(monkeypatch):
+    monkeypatch.setattr(serial, "serial_for_url", lambda url, **_: Line([]))
+    numbers = {Port("/dev/box")._seq for _ in range(8)}
+    # two of eight equal by chance: 28 / 2**32
+    assert len(numbers) == 8
+
+
+@pytest.mark.parametrize(("field", "value"), [("timeout_s", 0.0), ("retries", -1)])
+def test_settings_that_make_no_sense_are_refused(field, value):
+    with pytest.raises(ValueError, match=field):
+        Port("/dev/box", **{field: value})
