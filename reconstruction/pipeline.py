@@ -334,12 +334,21 @@ def _map3(
     )  # fmt: skip
 
 
+def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+    shape = skin_map.values.shape[:2]
+    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
+
+
+def _stderr(skin_map: SkinMap) -> Float32:
+    return np.zeros_like(skin_map.values) if skin_map.stderr is None else skin_map.stderr
+
+
 def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     table = color_table.build(inputs.camera, inputs.illuminant, anisotropy=ANISOTROPY_SKIN)
     found = chromophores.invert(
-        np.where(diffuse.valid[..., None], diffuse.values, np.nan),
+        np.where(_valid(diffuse)[..., None], diffuse.values, np.nan),
         table,
-        variance=np.square(diffuse.stderr),
+        variance=np.square(_stderr(diffuse)),
         model_error=model_error.load(),
     )
     good = np.asarray(found.valid)
@@ -362,7 +371,7 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
 
 
 def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:
-    valid = diffuse.valid & (diffuse.values > 0).all(axis=-1)
+    valid = _valid(diffuse) & (diffuse.values > 0).all(axis=-1)
     found = tsumura.tsumura_ica(diffuse.values, valid)
     note = "independent component of optical density, no absolute scale"
     return {

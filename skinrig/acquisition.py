@@ -156,7 +156,7 @@ def _run(
 @contextlib.contextmanager
 def _stop_on_signal() -> Iterator[Any]:
     """Turn the first Ctrl-C into a stop between two steps; a second one interrupts at once."""
-    asked = []
+    asked: list[int] = []
 
     def note(number: int, frame: object) -> None:
         if asked:

@@ -193,10 +193,10 @@ def import_photos(
 
     Example: skinrig import photos portraits --out session-portraits
     """
-    from capture import importers
+    from capture.importers import import_photos as bring_in
 
     console = Console(json)
-    done = importers.import_photos(directory, out=out)
+    done = bring_in(directory, out=out)
     for text in done.assumed:
         console.say(f"assumed: {text}")
     console.say(f"{done.path}: {done.frames} photographs")

@@ -60,7 +60,7 @@ def test_a_changed_parameter_runs_again_what_depends_on_it_and_no_more():
 
 
 def test_an_unknown_map_is_named_with_those_that_can_be_made():
-    with pytest.raises(StageError, match="'melanine'.*expected one of .*map"):
+    with pytest.raises(StageError, match=r"'melanine'.*expected one of .*map"):
         run(graph([]), ["melanine"])
 
 
