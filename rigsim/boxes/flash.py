@@ -42,7 +42,7 @@ LAMP_TAU_S = 20.0
 HEAT_TRIP, HEAT_CLEAR = 0.8, 0.5
 """Temperatures at which the lamp's driver trips and recovers; 1 is where it would settle."""
 
-MOVING, CHARGING, LAMP_ON, HOT, INTERLOCK = 16, 32, 64, 128, 256
+MOVING, NOT_READY, LAMP_ON, HOT, INTERLOCK = 16, 32, 64, 128, 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,8 +241,8 @@ class FlashUnit:
         return now < self._settled_at
 
     def status_bits(self, now: float) -> int:
-        """Return 16 turning, 32 charging, 64 lamp on, 128 too hot, 256 emergency stop open."""
-        bits = MOVING * self.busy(now) + CHARGING * (self._wait_for_fire(now)[0] > 0.0)
+        """Return 16 turning, 32 no pop possible yet, 64 lamp on, 128 too hot, 256 emergency stop open."""
+        bits = MOVING * self.busy(now) + NOT_READY * (self._wait_for_fire(now)[0] > 0.0)
         bits += LAMP_ON * self._lamp.lit + HOT * self._lamp.hot + INTERLOCK * self.interlock
         return bits
 

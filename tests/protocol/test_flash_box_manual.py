@@ -1,0 +1,509 @@
+"""Every row of the flash box's manual, on the box itself: bytes and time in, bytes out."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+
+from capture.devices import wire
+from capture.devices.wire import Code, Event, Reply, Request
+from capture.rig import load_rig
+from rigsim.boxes.controller import CACHED_REPLIES, ERROR_QUEUE
+from rigsim.faults import Faults
+from rigsim.world import World
+
+RIG = load_rig("flash").resized(16)
+
+# header -> (text, needs arming, expected payload or a test of it)
+ANY = object()
+MANUAL = {
+    "*IDN?": ("*IDN?", False, "skinrig,FLASH2,FL-0001,1.0"),
+    "*RST": ("*RST", False, ""),
+    "*CLS": ("*CLS", False, ""),
+    "*OPC?": ("*OPC?", False, "1"),
+    "SYST:ERR?": ("SYST:ERR?", False, '0,"No error"'),
+    "SYST:HELLO?": ("SYST:HELLO?", False, "1,flash,FL-0001,1.0"),
+    "SYST:CAP?": ("SYST:CAP?", False, ANY),
+    "SYST:WDOG": ("SYST:WDOG 300", False, ""),
+    "SYST:WDOG?": ("SYST:WDOG?", False, "1000"),
+    "SYST:ARM": ("SYST:ARM", False, ""),
+    "SYST:ARM?": ("SYST:ARM?", False, "0"),
+    "SYST:PING?": ("SYST:PING?", False, "1000000"),
+    "SAFE": ("SAFE", False, ""),
+    "ABOR": ("ABOR", False, ""),
+    "STAT?": ("STAT?", False, "0"),
+    "FLAS:POL": ("FLAS:POL CROS", False, ""),
+    "FLAS:POL?": ("FLAS:POL?", False, "PAR"),
+    "FLAS:POL:ANG": ("FLAS:POL:ANG 22.5", False, ""),
+    "FLAS:POL:ANG?": ("FLAS:POL:ANG?", False, "0.000"),
+    "FLAS:POW": ("FLAS:POW 0.25", False, ""),
+    "FLAS:POW?": ("FLAS:POW?", False, "1.000000"),
+    "FLAS:CHAR?": ("FLAS:CHAR?", False, "1.0000,1,0"),
+    "FLAS:FIRE": ("FLAS:FIRE a1", True, "a1,1000000,1.000000,PAR,0.000,1"),
+    "FLAS:LAST?": ("FLAS:LAST?", False, "NONE"),
+    "FLAS:COUN?": ("FLAS:COUN?", False, "0"),
+    "FLAS:LAMP": ("FLAS:LAMP ON,200", True, ""),
+    "FLAS:LAMP?": ("FLAS:LAMP?", False, "0"),
+    "CAM:TRIG": ("CAM:TRIG d1", False, "d1,1000000"),
+}
+
+
+class Bench:
+    """A box at one second past power-up, spoken to in frames with the right numbers."""
+
+    def __init__(self, **faults):
+        self.world = World(RIG, seed=3, faults=Faults(**faults))
+        self.box = self.world.box("flash")
+        self.unit = self.box.device
+        self.now = 1.0
+        self.seq = 100
+
+    def raw(self, data):
+        return self.box.feed(data, self.now)
+
+    def frame(self, text, *, seq=None, boot=None):
+        self.seq += seq is None
+        return wire.encode(
+            Request(self.seq if seq is None else seq, self.box.boot if boot is None else boot, text)
+        )
+
+    def reply(self, text, **fields):
+        lines = [wire.decode(line) for line in self.raw(self.frame(text, **fields)).splitlines()]
+        (reply,) = [frame for frame in lines if isinstance(frame, Reply)]
+        return reply
+
+    def ask(self, text):
+        reply = self.reply(text)
+        assert reply.code == Code.OK, reply
+        return reply.payload
+
+    def code(self, text):
+        return self.reply(text).code
+
+    def bare(self, line):
+        return self.raw(line + b"\n")
+
+
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+def test_the_manual_is_complete(bench):
+    assert set(MANUAL) == set(bench.box.commands)
+    assert all(command.manual for command in bench.box.commands.values())
+
+
+@pytest.mark.parametrize("header", MANUAL)
+def test_a_framed_command_is_answered_as_its_manual_says(bench, header):
+    text, armed, expected = MANUAL[header]
+    if armed:
+        bench.ask("SYST:ARM")
+    payload = bench.ask(text)
+    assert expected is ANY or payload == expected
+
+
+@pytest.mark.parametrize("header", [h for h in MANUAL if h.endswith("?")])
+def test_a_bare_query_is_answered_plainly(bench, header):
+    text, _, expected = MANUAL[header]
+    answer = bench.bare(text.encode())
+    assert answer.endswith(b"\n")
+    assert expected is ANY or answer == expected.encode() + b"\n"
+
+
+@pytest.mark.parametrize(
+    "header", [h for h in MANUAL if not h.endswith("?") and h not in ("SAFE", "ABOR", "*CLS")]
+)
+def test_a_bare_command_is_refused_and_queued(bench, header):
+    bench.ask("SYST:ARM")
+    before = vars(bench.unit).copy()
+    assert bench.bare(MANUAL[header][0].encode()) == b""
+    assert bench.bare(b"SYST:ERR?") == b'203,"Unframed command"\n'
+    assert vars(bench.unit) == before
+
+
+@pytest.mark.parametrize("line", [b"SAFE", b"ABOR", b"abor\r"])
+def test_anybody_may_put_the_light_out(bench, line):
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:LAMP ON,500")
+    bench.bare(line)
+    assert not bench.unit.lit
+    assert bench.ask("SYST:ARM?") == "0"
+
+
+@pytest.mark.parametrize(
+    ("header", "arguments"), [(h, "" if " " in MANUAL[h][0] else " 1") for h in MANUAL]
+)
+def test_missing_or_surplus_arguments_are_a_syntax_error(bench, header, arguments):
+    bench.ask("SYST:ARM")
+    assert bench.code(header + arguments) == Code.SYNTAX
+
+
+BAD_NUMBERS = ["x", "1e3", "nan", "inf", "-", "1.", ".5", "0x10", "1,2", "9999999999"]
+
+
+@pytest.mark.parametrize("text", BAD_NUMBERS)
+@pytest.mark.parametrize("header", ["SYST:WDOG", "FLAS:POL:ANG", "FLAS:POW"])
+def test_what_is_no_plain_number_is_a_syntax_error(bench, header, text):
+    assert bench.code(f"{header} {text}") == Code.SYNTAX
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "SYST:WDOG 299", "SYST:WDOG 5001", "FLAS:POL:ANG -0.1", "FLAS:POL:ANG 180.1",
+        "FLAS:POW 0", "FLAS:POW 1.000001", "FLAS:LAMP ON,0", "FLAS:LAMP ON,501",
+    ],
+)  # fmt: skip
+def test_what_is_out_of_range_is_refused_and_nothing_changes(bench, text):
+    bench.ask("SYST:ARM")
+    before = bench.unit.power, bench.unit.angle_deg, bench.ask("SYST:WDOG?"), bench.unit.lit
+    assert bench.code(text) == Code.OUT_OF_RANGE
+    after = bench.unit.power, bench.unit.angle_deg, bench.ask("SYST:WDOG?"), bench.unit.lit
+    assert after == before
+
+
+@pytest.mark.parametrize("text", ["FLAS:FIRE a b", "FLAS:FIRE " + "x" * 49, "FLAS:LAMP UP,5"])
+def test_bad_words_are_a_syntax_error(bench, text):
+    bench.ask("SYST:ARM")
+    assert bench.code(text) == Code.SYNTAX
+    assert bench.unit.count == 0
+
+
+def test_an_unknown_header_is_undefined_framed_or_bare(bench):
+    assert bench.code("FLAS:EXPLODE") == Code.UNDEFINED_HEADER
+    bench.bare(b"FLAS:EXPLODE")
+    bench.bare("caf\xe9?".encode())
+    assert [bench.bare(b"SYST:ERR?")[:5] for _ in range(4)] == [b"-113,"] * 3 + [b'0,"No']
+
+
+def test_settings_are_read_back(bench):
+    for text, query, payload in [
+        ("FLAS:POL CROS", "FLAS:POL?", "CROS"), ("FLAS:POL CROS", "FLAS:POL:ANG?", "90.000"),
+        ("FLAS:POL:ANG 30", "FLAS:POL:ANG?", "30.000"), ("FLAS:POW 0.5", "FLAS:POW?", "0.500000"),
+        ("SYST:WDOG 500", "SYST:WDOG?", "500"), ("SYST:ARM", "SYST:ARM?", "1"),
+        ("SYST:ARM", "STAT?", "49"), ("*RST", "FLAS:POW?", "1.000000"),
+    ]:  # fmt: skip
+        bench.ask(text)
+        assert bench.ask(query) == payload, text
+
+
+def test_the_data_dictionary_carries_its_own_checksum(bench):
+    payload = bench.ask("SYST:CAP?")
+    limits = json.loads(wire.unseal(payload))
+    assert limits["kind"] == "flash"
+    assert limits["recycle_s"] == RIG.recycle_s
+    assert limits["pops_per_min"] == RIG.max_pops_per_min
+    assert (limits["lease_min_ms"], limits["lease_max_ms"]) == (300, 5000)
+
+
+# protocol -------------------------------------------------------------------------------------
+
+
+def test_a_repeated_frame_is_answered_again_and_not_done_again(bench):
+    bench.ask("SYST:ARM")
+    frame = bench.frame("FLAS:FIRE a1")
+    assert bench.raw(frame) == bench.raw(frame) == bench.raw(b"\n" + frame)
+    assert bench.unit.count == 1
+
+
+def test_the_last_eight_answers_are_remembered(bench):
+    bench.ask("SYST:ARM")
+    fire = bench.frame("FLAS:FIRE a1")
+    first = bench.raw(fire)
+    for _ in range(CACHED_REPLIES - 1):
+        bench.ask("SYST:PING?")
+    assert bench.raw(fire) == first
+    assert bench.unit.count == 1
+
+
+def test_a_number_with_another_text_is_refused(bench):
+    bench.ask("SYST:ARM")
+    assert bench.reply("FLAS:POW 0.5", seq=bench.seq).code == Code.SEQ_REUSED
+    assert bench.unit.power == 1.0
+
+
+def test_a_refusal_is_repeated_too(bench):
+    frame = bench.frame("FLAS:FIRE a1")
+    first = bench.raw(frame)
+    bench.ask("SYST:ARM")
+    assert bench.raw(frame) == first
+    assert bench.unit.count == 0
+
+
+def test_a_frame_of_another_epoch_is_refused_with_the_new_one(bench):
+    reply = bench.reply("FLAS:POW 0.5", boot=bench.box.boot ^ 1)
+    assert (reply.code, reply.boot) == (Code.BOOT_CHANGED, bench.box.boot)
+    assert bench.unit.power == 1.0
+
+
+def test_hello_needs_no_epoch_and_nothing_else_goes_without(bench):
+    assert bench.reply("SYST:HELLO?", boot=0).code == Code.OK
+    assert bench.reply("*IDN?", boot=0).code == Code.BOOT_CHANGED
+
+
+@pytest.mark.parametrize("damage", [b"@9", b"=1:0001 0*0000", b"FLAS:FIRE a*0000", b"@" * 600])
+def test_a_damaged_frame_is_answered_by_an_event_without_a_number(bench, damage):
+    event = wire.decode(bench.raw(damage + b"\n").rstrip())
+    assert isinstance(event, Event)
+    assert (event.name, event.payload) == ("NAK", "204")
+    assert bench.ask("SYST:ERR?") == '0,"No error"'
+
+
+def test_overlong_lines_are_dropped_without_an_answer(bench):
+    assert bench.raw(b"@" + b"x" * 5000) == b""
+    assert bench.raw(b"\n") == b""
+    assert bench.ask("STAT?") == "0"
+
+
+def test_errors_queue_up_to_sixteen_and_then_overflow(bench):
+    for _ in range(ERROR_QUEUE + 4):
+        bench.code("NONSENSE")
+    codes = [int(bench.ask("SYST:ERR?").split(",")[0]) for _ in range(ERROR_QUEUE + 1)]
+    assert codes == [Code.UNDEFINED_HEADER] * 15 + [Code.QUEUE_OVERFLOW, 0]
+
+
+def test_cls_empties_the_queue_and_the_status_shows_it(bench):
+    bench.code("NONSENSE")
+    assert bench.ask("STAT?") == "4"
+    bench.ask("*CLS")
+    assert bench.ask("STAT?") == "0"
+
+
+# arming and lease -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", ["FLAS:FIRE a", "FLAS:LAMP ON,100", "FLAS:LAMP OFF"])
+def test_light_needs_arming(bench, text):
+    assert bench.code(text) == Code.NOT_ARMED
+    assert bench.unit.count == 0
+
+
+def test_silence_for_a_lease_makes_dark_and_disarms(bench):
+    bench.ask("SYST:WDOG 300")
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:LAMP ON,500")
+    assert bench.box.advance(1.2999) == b""
+    assert bench.unit.lit
+    event = wire.decode(bench.box.advance(1.3).rstrip())
+    assert (event.name, event.payload) == ("WDOG:TRIP", "300")
+    assert not bench.unit.lit
+    assert bench.unit.lamp_times[-1] == pytest.approx((1.0, 1.3))
+    bench.now = 1.4
+    assert bench.code("FLAS:FIRE a") == Code.WATCHDOG_TRIPPED
+    assert int(bench.ask("STAT?")) & 3 == 2
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:FIRE a")
+
+
+@pytest.mark.parametrize("line", [b"STAT?\n", b"@1:9999 STAT?*0000\n", b"x" * 50 + b"\n", b""])
+def test_only_valid_frames_renew_the_lease(bench, line):
+    bench.ask("SYST:ARM")
+    bench.now = 1.9
+    bench.raw(line)
+    bench.now = 2.1
+    assert bench.ask("SYST:ARM?") == "0"
+
+
+def test_valid_frames_renew_the_lease(bench):
+    bench.ask("SYST:ARM")
+    for k in range(1, 9):
+        bench.now = 1.0 + 0.9 * k
+        bench.ask("SYST:PING?")
+    assert bench.ask("SYST:ARM?") == "1"
+
+
+# flash ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("power", [1.0, 0.5, 0.125])
+def test_a_tube_recycles_in_proportion_to_its_last_power(bench, power):
+    bench.ask("SYST:ARM")
+    bench.ask(f"FLAS:POW {power}")
+    bench.ask("FLAS:FIRE a")
+    bench.now = 1.0 + 1.5 * power - 0.001
+    bench.ask("SYST:ARM")
+    assert bench.code("FLAS:FIRE b") == Code.RECYCLE
+    bench.now = 1.0 + 1.5 * power
+    assert bench.code("FLAS:FIRE c") == Code.OK
+
+
+def test_no_minute_sees_more_pops_than_allowed(bench):
+    bench.ask("FLAS:POW 0.01")
+    pops = []
+    while bench.now < 130.0:
+        bench.ask("SYST:ARM")
+        code = bench.code("FLAS:FIRE a")
+        assert code in (Code.OK, Code.DUTY)
+        pops += [bench.now] if code == Code.OK else []
+        bench.now += 0.5
+    windows = [sum(start <= t < start + 60.0 for t in pops) for start in pops]
+    assert max(windows) == RIG.max_pops_per_min
+
+
+def test_charge_falls_by_the_power_and_comes_back_in_less_than_the_recycle_time(bench):
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:POW 0.4")
+    bench.ask("FLAS:FIRE a")
+    assert bench.unit.charge(bench.now) == pytest.approx(0.6)
+    rising = [bench.unit.charge(bench.now + t) for t in np.linspace(0.0, 1.5, 50)]
+    assert all(b >= a for a, b in itertools.pairwise(rising))
+    assert rising[-1] == 1.0
+
+
+def test_the_charge_answer_tells_when_a_pop_is_possible(bench):
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:FIRE a")
+    _, ready, wait_ms = bench.ask("FLAS:CHAR?").split(",")
+    assert (ready, wait_ms) == ("0", "1500")
+    bench.now += int(wait_ms) / 1e3
+    assert bench.ask("FLAS:CHAR?") == "1.0000,1,0"
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:FIRE b")
+
+
+def test_a_slow_charger_delays_the_pop_beyond_the_recycle_time():
+    bench = Bench(slow_charge=4.0)
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:FIRE a")
+    bench.now += 2.0
+    bench.ask("SYST:ARM")
+    assert bench.code("FLAS:FIRE b") == Code.IGNORED
+    bench.now += 4.0
+    bench.ask("SYST:ARM")
+    assert bench.code("FLAS:FIRE c") == Code.OK
+
+
+def test_no_pop_while_the_analyser_turns(bench):
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:POL CROS")
+    assert bench.ask("*OPC?") == "0"
+    assert int(bench.ask("STAT?")) & 16
+    assert bench.code("FLAS:FIRE a") == Code.IGNORED
+    bench.now += RIG.polarizer_move_s
+    assert bench.ask("*OPC?") == "1"
+    assert bench.ask("FLAS:FIRE b").split(",")[3:5] == ["CROS", "90.000"]
+
+
+def test_turning_time_is_in_proportion_to_the_angle(bench):
+    bench.ask("FLAS:POL:ANG 45")
+    bench.now += 0.5 * RIG.polarizer_move_s - 0.001
+    assert bench.ask("*OPC?") == "0"
+    bench.now += 0.002
+    assert bench.ask("*OPC?") == "1"
+
+
+def test_a_pop_tells_the_world_what_the_box_reports(bench):
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:POL:ANG 30")
+    bench.ask("FLAS:POW 0.25")
+    bench.now = 1.5
+    report = bench.ask("FLAS:FIRE n.7")
+    assert report == "n.7,1500000,0.250000,PAR,30.000,1"
+    assert bench.ask("FLAS:LAST?") == report
+    (pop,) = bench.world.pops
+    assert (pop.token, pop.t_s, pop.power, pop.analyser_deg) == ("n.7", 1.5, 0.25, 30.0)
+    assert pop.polarizer == "parallel"
+
+
+def test_a_misfire_is_a_hardware_error_and_no_light(bench):
+    bench = Bench(misfire=1.0)
+    bench.ask("SYST:ARM")
+    assert bench.code("FLAS:FIRE a") == Code.HARDWARE
+    assert (bench.world.pops, bench.unit.count) == ([], 0)
+
+
+def test_an_open_emergency_stop_forbids_light():
+    bench = Bench(interlock=True)
+    bench.ask("SYST:ARM")
+    assert bench.code("FLAS:FIRE a") == Code.INTERLOCK
+    assert bench.code("FLAS:LAMP ON,10") == Code.INTERLOCK
+    assert int(bench.ask("STAT?")) & 256
+
+
+# lamps ----------------------------------------------------------------------------------------
+
+
+def test_a_lamp_carries_its_own_end(bench):
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:LAMP ON,200")
+    bench.box.advance(1.1999)
+    assert bench.unit.lit
+    bench.box.advance(1.2)
+    assert not bench.unit.lit
+
+
+def test_a_lamp_is_renewed_put_out_and_goes_out_before_a_pop(bench):
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:LAMP ON,200")
+    bench.now = 1.1
+    bench.ask("FLAS:LAMP ON,200")
+    bench.box.advance(1.25)
+    bench.now = 1.25
+    assert bench.ask("FLAS:LAMP?") == "1"
+    bench.ask("FLAS:LAMP OFF")
+    assert bench.ask("FLAS:LAMP?") == "0"
+    bench.ask("FLAS:LAMP ON,200")
+    bench.ask("FLAS:FIRE a")
+    assert bench.ask("FLAS:LAMP?") == "0"
+
+
+def test_a_lamp_kept_on_trips_on_heat_and_recovers(bench):
+    bench.ask("SYST:ARM")
+    start = bench.now
+    while bench.code("FLAS:LAMP ON,500") == Code.OK:
+        bench.now += 0.4
+        bench.box.advance(bench.now)
+    # 0.8 of the final temperature: tau ln 5 = 32.2 s
+    assert bench.now - start == pytest.approx(32.2, abs=0.5)
+    assert bench.code("FLAS:LAMP ON,500") == Code.THERMAL
+    assert int(bench.ask("STAT?")) & 128
+    # down to 0.5: tau ln(0.8 / 0.5) = 9.4 s
+    bench.now += 9.5
+    bench.ask("SYST:ARM")
+    assert bench.code("FLAS:LAMP ON,500") == Code.OK
+
+
+@pytest.mark.parametrize(
+    ("fault", "code"), [({"lamp_dead": True}, Code.HARDWARE), ({"heat": 0.9}, Code.THERMAL)]
+)
+def test_a_dead_or_hot_lamp_is_named(fault, code):
+    bench = Bench(**fault)
+    bench.ask("SYST:ARM")
+    assert bench.code("FLAS:LAMP ON,100") == code
+    assert not bench.unit.lit
+
+
+# power ----------------------------------------------------------------------------------------
+
+
+def test_a_reset_draws_another_epoch_forgets_settings_and_keeps_the_count(bench):
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:FIRE a")
+    bench.ask("FLAS:POW 0.5")
+    before = bench.box.boot
+    bench.box.power_cycle(bench.now, boot_s=0.8, announce=False)
+    assert bench.bare(b"*IDN?") == b""
+    bench.now += 0.8
+    assert bench.box.boot not in (before, 0)
+    assert [bench.ask(q) for q in ("FLAS:POW?", "SYST:ARM?", "FLAS:COUN?", "FLAS:LAST?")] == [
+        "1.000000", "0", "1", "NONE",
+    ]  # fmt: skip
+    assert bench.ask("SYST:PING?") == "800000"
+
+
+def test_a_reset_that_is_announced_prints_a_banner_and_an_event(bench):
+    bench.box.power_cycle(bench.now, boot_s=0.8, announce=True)
+    banner, line = bench.box.advance(1.8).splitlines()
+    assert banner == b"FLASH2 1.0 ready"
+    assert wire.decode(line) == Event(0, bench.box.boot, "BOOT", "POWER")
+
+
+def test_a_reset_does_not_charge_or_cool_anything(bench):
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:FIRE a")
+    bench.box.power_cycle(bench.now, boot_s=0.1, announce=False)
+    bench.now += 0.2
+    bench.ask("SYST:ARM")
+    assert bench.code("FLAS:FIRE b") == Code.RECYCLE
