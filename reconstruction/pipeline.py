@@ -253,8 +253,9 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
             raise PipelineError(f"{polarizer} frames: differ in size, expected one camera setting")
         power = [float(record.settings.get("power", 1.0)) for record in shots]
         total = sum(power)
-        rgb = sum(image.rgb.astype(np.float64) for image in linear) - len(linear) * dark
-        variance = sum(image.variance.astype(np.float64) for image in linear)
+        rgb = np.sum([image.rgb for image in linear], axis=0, dtype=np.float64)
+        rgb = rgb - len(linear) * dark
+        variance = np.sum([image.variance for image in linear], axis=0, dtype=np.float64)
         variance = variance + len(linear) ** 2 * dark_variance
         images[polarizer] = Image(
             (rgb / total).astype(np.float32),
@@ -286,7 +287,10 @@ def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping
             extinction=None if leak is None else 1.0 / np.maximum(leak, 1e-9),
             variance=(parallel.variance, crossed.variance),
         )
-        specular, specular_error = separated.specular, separated.stderr_specular
+        if separated.stderr is None or separated.stderr_specular is None:
+            raise PipelineError("separation: gave no standard errors; give it variances")
+        specular = separated.specular.astype(np.float32)
+        specular_error = separated.stderr_specular.astype(np.float32)
         specular_valid = np.asarray(separated.valid)
         # a highlight that saturates the parallel image leaves the crossed one usable
         alone = crossed.valid & ~specular_valid

@@ -109,10 +109,9 @@ def _run(
     resume: bool,
     console: Console,
 ) -> Mapping[str, Any]:
-    from capture.devices.flash import FlashBox
-
     from capture.acquire import run_plan
     from capture.devices.camera import open_camera
+    from capture.devices.flash import FlashBox
     from capture.devices.port import Port
 
     with contextlib.ExitStack() as stack:
