@@ -236,7 +236,9 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
     """Average the repeats of each polarizer state and subtract the darks."""
     session = inputs.session
     darks = [raw.linear_rgb(session.read(record)) for record in session.frames("dark")]
-    dark = np.mean([d.rgb for d in darks], axis=0, dtype=np.float64) if darks else 0.0
+    dark: NDArray[np.float64] | float = (
+        np.mean([d.rgb for d in darks], axis=0, dtype=np.float64) if darks else 0.0
+    )
     dark_variance = (
         np.mean([d.variance for d in darks], axis=0, dtype=np.float64) / len(darks)
         if darks
@@ -253,9 +255,9 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
             raise PipelineError(f"{polarizer} frames: differ in size, expected one camera setting")
         power = [float(record.settings.get("power", 1.0)) for record in shots]
         total = sum(power)
-        rgb = np.sum([image.rgb for image in linear], axis=0, dtype=np.float64)
+        rgb: NDArray[Any] = np.sum([image.rgb for image in linear], axis=0, dtype=np.float64)
         rgb = rgb - len(linear) * dark
-        variance = np.sum([image.variance for image in linear], axis=0, dtype=np.float64)
+        variance: NDArray[Any] = np.sum([image.variance for image in linear], axis=0, dtype=np.float64)
         variance = variance + len(linear) ** 2 * dark_variance
         images[polarizer] = Image(
             (rgb / total).astype(np.float32),

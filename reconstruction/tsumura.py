@@ -1,0 +1,142 @@
+"""Melanin and hemoglobin by independent component analysis: the published baseline.
+
+No model of skin and no scale: optical density, freed of the brightness that is common to the
+channels, is unmixed into two independent components.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from model import spectra
+
+Floats = NDArray[np.float32]
+
+MAX_SAMPLES = 20_000
+"""Pixels that the components are found from; the maps are then made for all."""
+MIN_SAMPLES = 50
+
+
+class UnmixingError(ValueError):
+    """Colors that hold no two components."""
+
+
+@dataclass(frozen=True, slots=True)
+class PigmentMaps:
+    """Relative pigment maps.
+
+    Attributes
+    ----------
+    melanin, hemoglobin
+        (H, W) float32, without scale: mean 0 and deviation 1 over the valid pixels.
+    valid
+        (H, W) bool.
+    axes
+        (2, 3): directions of melanin and hemoglobin in optical density without brightness,
+        unit length.
+    """
+
+    melanin: Floats
+    hemoglobin: Floats
+    valid: NDArray[np.bool_]
+    axes: NDArray[np.float64]
+
+
+def tsumura_ica(rgb: NDArray[np.floating], valid: NDArray[np.bool_]) -> PigmentMaps:
+    """Unmix skin colors into two independent pigments.
+
+    Parameters
+    ----------
+    rgb
+        (H, W, 3) linear, of any scale for each channel.
+    valid
+        (H, W); colors must be above 0 there.
+
+    Returns
+    -------
+    PigmentMaps
+
+    Raises
+    ------
+    UnmixingError
+        When there are too few pixels, or their colors differ in brightness only.
+
+    Notes
+    -----
+    Which component is which, and its sign, is told by the absorption of the pigments in broad
+    red, green and blue bands.
+
+    References
+    ----------
+    Tsumura, Haneishi, Miyake 1999, doi 10.1364/JOSAA.16.002169; brightness taken out as in
+    Tsumura et al. 2003, doi 10.1145/882262.882344.
+    """
+    from sklearn.decomposition import FastICA
+
+    image = np.asarray(rgb, np.float64)
+    if image.ndim != 3 or image.shape[2] != 3 or valid.shape != image.shape[:2]:
+        raise ValueError(
+            f"rgb, valid: got shapes {image.shape} and {valid.shape}, expected (H, W, 3) and (H, W)"
+        )
+    good = valid & np.isfinite(image).all(axis=-1) & (image > 0).all(axis=-1)
+    count = int(np.count_nonzero(good))
+    if count < MIN_SAMPLES:
+        raise UnmixingError(f"valid: got {count} usable pixels, expected at least {MIN_SAMPLES}")
+    density = -np.log(image[good])
+    chroma = density @ _BASIS.T  # (N, 2)
+    center = chroma.mean(axis=0)
+    spread = np.linalg.svd(
+        (chroma - center)[:: max(1, count // MAX_SAMPLES)], compute_uv=False, full_matrices=False
+    )
+    if not spread[1] > 1e-6 * max(spread[0], 1e-12):
+        raise UnmixingError("rgb: the colors vary in brightness or along one direction only")
+    samples = chroma[:: max(1, count // MAX_SAMPLES)]
+    with threadpool_limits(1):
+        unmix = FastICA(2, whiten="unit-variance", random_state=0, max_iter=1000, tol=1e-3)
+        unmix.fit(samples)
+    mixing = unmix.mixing_ / np.linalg.norm(unmix.mixing_, axis=0)  # columns in the plane
+    expected = np.stack([_plane(v) for v in _pigments()])
+    match = expected @ mixing  # (pigment, component)
+    straight = abs(match[0, 0]) + abs(match[1, 1]) >= abs(match[0, 1]) + abs(match[1, 0])
+    order = (0, 1) if straight else (1, 0)
+    sources = unmix.transform(chroma)
+    maps = []
+    axes = np.zeros((2, 3))
+    for pigment, component in enumerate(order):
+        sign = 1.0 if match[pigment, component] >= 0 else -1.0
+        values = sign * sources[:, component]
+        values = (values - values.mean()) / values.std()
+        full = np.zeros(image.shape[:2], np.float32)
+        full[good] = values
+        maps.append(full)
+        axes[pigment] = sign * mixing[:, component] @ _BASIS
+    return PigmentMaps(maps[0], maps[1], good, axes)
+
+
+_BASIS = np.array([[1.0, 0.0, -1.0], [-0.5, 1.0, -0.5]])
+_BASIS /= np.linalg.norm(_BASIS, axis=1, keepdims=True)
+"""Two unit vectors across (1, 1, 1): density without brightness."""
+
+
+def _plane(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    inside = _BASIS @ vector
+    return np.asarray(inside / np.linalg.norm(inside))
+
+
+def _pigments() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean absorption of melanin and of blood in red, green and blue, (3,) each."""
+    wavelength = spectra.WAVELENGTH_NM
+    oxygenated, deoxygenated = spectra.hemoglobin_extinction(wavelength)
+    blood = 0.75 * oxygenated + 0.25 * deoxygenated
+    melanin = spectra.eumelanin_absorption(wavelength)
+    bands = [(wavelength >= low) & (wavelength < high)
+             for low, high in ((580, 701), (500, 580), (400, 500))]  # fmt: skip
+    # skin lets little of the strongest absorption out: density grows about as the root
+    return (
+        np.array([np.sqrt(melanin[band]).mean() for band in bands]),
+        np.array([np.sqrt(blood[band]).mean() for band in bands]),
+    )
