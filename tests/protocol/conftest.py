@@ -1,0 +1,80 @@
+"""Worlds, and the same box and camera behind every transport."""
+
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from capture.devices.camera import open_camera
+from capture.devices.flash import FlashBox
+from capture.devices.port import Port
+from capture.rig import load_rig
+from rigsim.faults import Faults
+from rigsim.serve import serve
+from rigsim.world import World
+
+NAMES = (f"protocol-{number}" for number in itertools.count())
+
+
+class Photometer:
+    """A scene whose every pixel tells how much light popped while the shutter was open."""
+
+    def __init__(self, rig):
+        self.rig = rig
+
+    def exposure(self, view_name, *, pops, exposure_s, seed):
+        view = self.rig.view(view_name)
+        level = view.black_level + round(10_000 * sum(pop.power for pop in pops))
+        return np.full((view.height_px, view.width_px), level, np.uint16)
+
+
+def quick_rig():
+    """The flash rig, small, with a camera that reads out in 50 ms."""
+    import dataclasses
+
+    rig = load_rig("flash").resized(16)
+    view = dataclasses.replace(rig.views[0], readout_s=0.05)
+    return dataclasses.replace(rig, views=(view,), polarizer_move_s=0.1)
+
+
+@pytest.fixture
+def rig():
+    return quick_rig()
+
+
+@pytest.fixture(params=["sim", "pty", "tcp"])
+def bench(request, rig):
+    """A world with a box and a camera behind one transport; closes what it opened."""
+    if request.param == "sim":
+        world = World(rig, seed=5, scene=Photometer(rig))
+        name = world.register(next(NAMES))
+        addresses = {"flash": f"sim://flash?world={name}", "cam": f"sim://{name}/cam"}
+        yield from _bench(world, addresses, request.param)
+        world.unregister()
+        return
+    world = World(rig, seed=5, clock="real", scene=Photometer(rig), faults=Faults(baud=0.0))
+    with serve(rig, world=world, pty=request.param == "pty") as served:
+        yield from _bench(world, served.addresses, request.param)
+
+
+def _bench(world, addresses, transport):
+    opened = []
+
+    def box(**settings):
+        opened.append(FlashBox(Port(addresses["flash"], clock=_clock(world)), **settings))
+        return opened[-1]
+
+    def camera():
+        opened.append(open_camera(addresses["cam"]))
+        return opened[-1]
+
+    yield SimpleNamespace(
+        world=world, addresses=addresses, transport=transport, box=box, camera=camera
+    )
+    for device in opened:
+        device.close()
+
+
+def _clock(world):
+    return world.clock if world.virtual else None
