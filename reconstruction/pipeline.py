@@ -256,9 +256,11 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
         power = [float(record.settings.get("power", 1.0)) for record in shots]
         total = sum(power)
         rgb: NDArray[Any] = np.sum([image.rgb for image in linear], axis=0, dtype=np.float64)
-        rgb = rgb - len(linear) * dark
-        variance: NDArray[Any] = np.sum([image.variance for image in linear], axis=0, dtype=np.float64)
-        variance = variance + len(linear) ** 2 * dark_variance
+        rgb -= len(linear) * dark
+        variance: NDArray[Any] = np.sum(
+            [image.variance for image in linear], axis=0, dtype=np.float64
+        )
+        variance += len(linear) ** 2 * dark_variance
         images[polarizer] = Image(
             (rgb / total).astype(np.float32),
             (variance / total**2).astype(np.float32),

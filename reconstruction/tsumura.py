@@ -7,12 +7,14 @@ channels, is unmixed into two independent components.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from model import spectra
+from model import color_table, spectra
+from model.tissue_optics import ANISOTROPY_SKIN
 
 Floats = NDArray[np.float32]
 
@@ -67,8 +69,8 @@ def tsumura_ica(rgb: NDArray[np.floating], valid: NDArray[np.bool_]) -> PigmentM
 
     Notes
     -----
-    Which component is which, and its sign, is told by the absorption of the pigments in broad
-    red, green and blue bands.
+    Which component is which, and its sign, is told by how the density of middling skin grows
+    with either pigment.
 
     References
     ----------
@@ -127,16 +129,9 @@ def _plane(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(inside / np.linalg.norm(inside))
 
 
+@cache
 def _pigments() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean absorption of melanin and of blood in red, green and blue, (3,) each."""
-    wavelength = spectra.WAVELENGTH_NM
-    oxygenated, deoxygenated = spectra.hemoglobin_extinction(wavelength)
-    blood = 0.75 * oxygenated + 0.25 * deoxygenated
-    melanin = spectra.eumelanin_absorption(wavelength)
-    bands = [(wavelength >= low) & (wavelength < high)
-             for low, high in ((580, 701), (500, 580), (400, 500))]  # fmt: skip
-    # skin lets little of the strongest absorption out: density grows about as the root
-    return (
-        np.array([np.sqrt(melanin[band]).mean() for band in bands]),
-        np.array([np.sqrt(blood[band]).mean() for band in bands]),
-    )
+    """How density grows with melanin and with blood in middling skin under daylight, (3,) each."""
+    table = color_table.build(spectra.LINEAR_SRGB, "D65", size=32, anisotropy=ANISOTROPY_SKIN)
+    growth = -table.jacobian(0.04, 0.03) / table.lookup(0.04, 0.03)[:, None]
+    return growth[:, 0], growth[:, 1]
