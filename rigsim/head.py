@@ -252,75 +252,98 @@ def _flipped(solid: _Solid) -> _Solid:
 
 def _pack(
     parts: list[_Part], grooves: list[_Groove]
-) -> tuple[FloatArray, NDArray[np.int64], FloatArray, FloatArray]:
-    """Return the anatomy as arrays: solids, their part, parts, groove segments."""
-    solids, member, rows = [], [], []
-    for index, part in enumerate(parts):
-        rows.append((part.blend_mm, float(part.carve)))
-        for solid in part.solids:
-            solids.append((*solid.a, *solid.b, *solid.radii, *solid.ends))
-            member.append(index)
-    segments = [
-        (*groove.line[k], *groove.line[k + 1], groove.depth_mm, groove.width_mm, float(k == 0))
-        for groove in grooves
-        for k in range(len(groove.line) - 1)
-    ]
-    return np.array(solids), np.array(member), np.array(rows), np.array(segments)
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the anatomy as arrays: solids, parts, segments of grooves, grooves.
+
+    A part's row holds blend, carve, first and last solid, centre and radius of a ball around it; a
+    groove's row holds depth, width, first and last segment, and the box outside which it is flat.
+    """
+    solids, part_rows, segments, groove_rows = [], [], [], []
+    for part in parts:
+        first = len(solids)
+        solids += [(*one.a, *one.b, *one.radii, *one.ends) for one in part.solids]
+        ends = [(one.a, max(*one.radii, *one.ends)) for one in part.solids]
+        ends += [(one.b, max(one.ends)) for one in part.solids if one.radii[0] == 0.0]
+        points = np.array([point for point, _ in ends])
+        center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        radius = max(
+            float(np.linalg.norm(point - center)) + reach
+            for point, (_, reach) in zip(points, ends, strict=True)
+        )
+        row = (part.blend_mm, float(part.carve), float(first), float(len(solids)))
+        part_rows.append((*row, *center, radius))
+    for groove in grooves:
+        first = len(segments)
+        line = np.array(groove.line)
+        segments += [(*line[k], *line[k + 1]) for k in range(len(line) - 1)]
+        # Beyond 3.5 widths a furrow is shallower than a nanometre.
+        low, high = (
+            line.min(axis=0) - 3.5 * groove.width_mm,
+            line.max(axis=0) + 3.5 * groove.width_mm,
+        )
+        row = (groove.depth_mm, groove.width_mm, float(first), float(len(segments)))
+        groove_rows.append((*row, *low, *high))
+    return np.array(solids), np.array(part_rows), np.array(segments), np.array(groove_rows)
 
 
 @njit(cache=True)
-def _distance(x, y, z, solids, member, parts, segments):  # type: ignore[no-untyped-def]
+def _solid_distance(x, y, z, s):  # type: ignore[no-untyped-def]
+    px, py, pz = x - s[0], y - s[1], z - s[2]
+    if s[6] > 0.0:
+        k0 = math.sqrt((px / s[6]) ** 2 + (py / s[7]) ** 2 + (pz / s[8]) ** 2)
+        k1 = math.sqrt((px / s[6] ** 2) ** 2 + (py / s[7] ** 2) ** 2 + (pz / s[8] ** 2) ** 2)
+        # At the centre k1 = 0; the nearest surface is the shortest radius away.
+        return k0 * (k0 - 1.0) / k1 if k1 > 1e-12 else -min(s[6], s[7], s[8])
+    ax, ay, az = s[3] - s[0], s[4] - s[1], s[5] - s[2]
+    t = (px * ax + py * ay + pz * az) / (ax * ax + ay * ay + az * az)
+    t = min(max(t, 0.0), 1.0)
+    d = math.sqrt((px - t * ax) ** 2 + (py - t * ay) ** 2 + (pz - t * az) ** 2)
+    return d - (s[9] + t * (s[10] - s[9]))
+
+
+@njit(cache=True)
+def _distance(x, y, z, solids, parts, segments, grooves):  # type: ignore[no-untyped-def]
     """Return a bound of the signed distance in mm, negative inside."""
-    total, own, part = 1e9, 1e9, 0
-    for i in range(solids.shape[0] + 1):
-        if i == solids.shape[0] or member[i] != part:
-            k = parts[part, 0]
-            # Polynomial smooth minimum, or smooth maximum with the complement when carved.
-            if part == 0:
-                total = own
-            elif parts[part, 1] > 0.0:
-                h = max(k - abs(total + own), 0.0) / k
-                total = max(total, -own) + 0.25 * k * h * h
-            else:
-                h = max(k - abs(total - own), 0.0) / k
-                total = min(total, own) - 0.25 * k * h * h
-            if i == solids.shape[0]:
-                break
-            own, part = 1e9, member[i]
-        s = solids[i]
-        px, py, pz = x - s[0], y - s[1], z - s[2]
-        if s[6] > 0.0:
-            k0 = math.sqrt((px / s[6]) ** 2 + (py / s[7]) ** 2 + (pz / s[8]) ** 2)
-            k1 = math.sqrt((px / s[6] ** 2) ** 2 + (py / s[7] ** 2) ** 2 + (pz / s[8] ** 2) ** 2)
-            # At the centre k1 = 0; the nearest surface is the shortest radius away.
-            d = k0 * (k0 - 1.0) / k1 if k1 > 1e-12 else -min(s[6], s[7], s[8])
+    total = 1e9
+    for p in range(parts.shape[0]):
+        k, carve = parts[p, 0], parts[p, 1] > 0.0
+        away = math.sqrt((x - parts[p, 4]) ** 2 + (y - parts[p, 5]) ** 2 + (z - parts[p, 6]) ** 2)
+        # Parts out of reach change nothing; two more millimetres, as bounds are not distances.
+        beyond = 0.7 * (away - parts[p, 7]) - k - 2.0
+        if p > 0 and (beyond > -total if carve else beyond > total):
+            continue
+        own = 1e9
+        for i in range(int(parts[p, 2]), int(parts[p, 3])):
+            own = min(own, _solid_distance(x, y, z, solids[i]))
+        # Polynomial smooth minimum, or smooth maximum with the complement when carved.
+        if p == 0:
+            total = own
+        elif carve:
+            h = max(k - abs(total + own), 0.0) / k
+            total = max(total, -own) + 0.25 * k * h * h
         else:
-            ax, ay, az = s[3] - s[0], s[4] - s[1], s[5] - s[2]
-            t = (px * ax + py * ay + pz * az) / (ax * ax + ay * ay + az * az)
-            t = min(max(t, 0.0), 1.0)
-            d = math.sqrt((px - t * ax) ** 2 + (py - t * ay) ** 2 + (pz - t * az) ** 2)
-            d -= s[9] + t * (s[10] - s[9])
-        own = min(own, d)
+            h = max(k - abs(total - own), 0.0) / k
+            total = min(total, own) - 0.25 * k * h * h
     # Furrows count where the face looks to the front.
     if z > GROOVE_DEPTH_MM:
         fade = min((z - GROOVE_DEPTH_MM) / 10.0, 1.0)
-        nearest, depth, width = 1e9, 0.0, 1.0
-        for j in range(segments.shape[0]):
-            g = segments[j]
-            if g[6] > 0.0:
-                total += fade * depth * math.exp(-nearest / (width * width))
-                nearest = 1e9
-            depth, width = g[4], g[5]
-            ax, ay = g[2] - g[0], g[3] - g[1]
-            t = ((x - g[0]) * ax + (y - g[1]) * ay) / (ax * ax + ay * ay)
-            t = min(max(t, 0.0), 1.0)
-            nearest = min(nearest, (x - g[0] - t * ax) ** 2 + (y - g[1] - t * ay) ** 2)
-        total += fade * depth * math.exp(-nearest / (width * width))
+        for q in range(grooves.shape[0]):
+            g = grooves[q]
+            if x < g[4] or y < g[5] or x > g[6] or y > g[7]:
+                continue
+            nearest = 1e9
+            for j in range(int(g[2]), int(g[3])):
+                s = segments[j]
+                ax, ay = s[2] - s[0], s[3] - s[1]
+                t = ((x - s[0]) * ax + (y - s[1]) * ay) / (ax * ax + ay * ay)
+                t = min(max(t, 0.0), 1.0)
+                nearest = min(nearest, (x - s[0] - t * ax) ** 2 + (y - s[1] - t * ay) ** 2)
+            total += fade * g[0] * math.exp(-nearest / (g[1] * g[1]))
     return total
 
 
 @njit(parallel=True, cache=True)
-def _meet(start, way, solids, member, parts, segments):  # type: ignore[no-untyped-def]
+def _meet(start, way, solids, parts, segments, grooves):  # type: ignore[no-untyped-def]
     """Walk each ray inwards to the outermost surface point; return points and normals."""
     points, normals = np.empty_like(start), np.empty_like(start)
     step = 0.1
@@ -329,18 +352,18 @@ def _meet(start, way, solids, member, parts, segments):  # type: ignore[no-untyp
         for _ in range(400):
             x, y = start[i, 0] + t * way[i, 0], start[i, 1] + t * way[i, 1]
             z = start[i, 2] + t * way[i, 2]
-            d = _distance(x, y, z, solids, member, parts, segments)
+            d = _distance(x, y, z, solids, parts, segments, grooves)
             if abs(d) < 1e-4 or t < 5.0:
                 break
             t -= 0.6 * d
         x, y = start[i, 0] + t * way[i, 0], start[i, 1] + t * way[i, 1]
         z = start[i, 2] + t * way[i, 2]
-        gx = _distance(x + step, y, z, solids, member, parts, segments)
-        gx -= _distance(x - step, y, z, solids, member, parts, segments)
-        gy = _distance(x, y + step, z, solids, member, parts, segments)
-        gy -= _distance(x, y - step, z, solids, member, parts, segments)
-        gz = _distance(x, y, z + step, solids, member, parts, segments)
-        gz -= _distance(x, y, z - step, solids, member, parts, segments)
+        gx = _distance(x + step, y, z, solids, parts, segments, grooves)
+        gx -= _distance(x - step, y, z, solids, parts, segments, grooves)
+        gy = _distance(x, y + step, z, solids, parts, segments, grooves)
+        gy -= _distance(x, y - step, z, solids, parts, segments, grooves)
+        gz = _distance(x, y, z + step, solids, parts, segments, grooves)
+        gz -= _distance(x, y, z - step, solids, parts, segments, grooves)
         length = math.sqrt(gx * gx + gy * gy + gz * gz)
         points[i, 0], points[i, 1], points[i, 2] = x, y, z
         normals[i, 0], normals[i, 1], normals[i, 2] = gx / length, gy / length, gz / length

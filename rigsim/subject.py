@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -129,7 +130,7 @@ def make_subject(
     if not 0.1 <= blood <= 4.0:
         raise SubjectError(f"blood: got {blood}, expected 0.1 to 4")
     if mesh is None:
-        surface = build_head(np.random.default_rng([seed, 0]))
+        surface = _head(seed)
     elif isinstance(mesh, Mesh):
         surface = mesh
     else:
@@ -150,6 +151,11 @@ def make_subject(
         hair=relief.hair_map(points, seed=seed),
         normal=relief.relief_normals(atlas, height),
     )
+
+
+@lru_cache(maxsize=4)
+def _head(seed: int) -> Mesh:
+    return build_head(np.random.default_rng([seed, 0]))
 
 
 def _typical_texel_mm(atlas: Atlas) -> float:

@@ -23,7 +23,7 @@ from rigsim.subject import Subject
 SIGMAS_MM: Final = (0.02, 0.06, 0.15, 0.35, 0.8, 1.8, 4.0)
 """Widths of the Gaussians that stand for the lateral profiles, mm."""
 
-HAIR_REFLECTANCE: Final = (0.045, 0.032, 0.025)
+HAIR_REFLECTANCE: Final = (0.016, 0.011, 0.008)
 """White-balanced reflectance of dark brown hair, seen as a matt cover."""
 
 SHADOW_SAMPLES: Final = 8

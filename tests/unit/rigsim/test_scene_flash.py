@@ -1,0 +1,291 @@
+"""The flash scene: light where geometry says, films as Malus says, truth that fits the images."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from capture.calibration.chart import find_chart
+from capture.rig import Rig, load_rig
+from rigsim.films import IDEAL, FilmError, Films, films_of
+from rigsim.scenes.flash import FLAT_LEVEL, METER_LEVEL, FlashScene, SceneError
+from rigsim.sensor import sensor_of
+from rigsim.subject import Subject, make_subject
+from rigsim.targets import make_target, patch_centers_mm
+from rigsim.variant import VariantChoice
+
+# Embree traces the rays, so these tests need no Mitsuba.
+EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
+WIDTH = 252
+
+
+@dataclass(frozen=True)
+class Fired:
+    """A pop as the world reports it."""
+
+    token: str = "t1"
+    power: float = 1.0
+    polarizer: str = "crossed"
+    analyser_deg: float | None = None
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig("flash").resized(WIDTH)
+
+
+@pytest.fixture(scope="module")
+def face() -> Subject:
+    return make_subject("II", seed=4, size=256)
+
+
+def scene_of(rig: Rig, subject, **kwargs) -> FlashScene:
+    return FlashScene(rig, subject, **({"choice": EMBREE, "subpixels": 1} | kwargs))
+
+
+@pytest.fixture(scope="module")
+def ideal(rig: Rig, face: Subject) -> FlashScene:
+    return scene_of(rig, face, films=IDEAL, lateral=False)
+
+
+@pytest.fixture(scope="module")
+def real(rig: Rig, face: Subject) -> FlashScene:
+    return scene_of(rig, face, subpixels=2)
+
+
+def test_a_white_tile_gives_the_metered_level_behind_parallel_and_crossed_films(rig):
+    scene = scene_of(rig, make_target("white"), films=IDEAL)
+    crossed, parallel = scene.radiance("crossed"), scene.radiance("parallel")
+    middle = crossed[rig.views[0].height_px // 2, WIDTH // 2]
+    np.testing.assert_allclose(middle, 0.99 * scene.white_rgb(), rtol=1e-3)
+    assert middle.max() == pytest.approx(0.99 * METER_LEVEL, rel=1e-3)
+    np.testing.assert_allclose(parallel, crossed, rtol=1e-5)
+
+
+def test_light_on_the_tile_falls_with_cosine_and_inverse_square(rig):
+    scene = scene_of(rig, make_target("white"), films=IDEAL)
+    view = rig.views[0]
+    image = scene.radiance("crossed")[..., 1] / (0.99 * scene.white_rgb()[1])
+    step_mm = view.distance_mm / view.focal_px
+    x = (np.arange(view.width_px) - 0.5 * (view.width_px - 1)) * step_mm
+    y = -(np.arange(view.height_px) - 0.5 * (view.height_px - 1)) * step_mm
+
+    def irradiance(px, py):
+        total = 0.0
+        for light in rig.lights:
+            lx, ly, lz = light.position_mm
+            total = total + lz / ((px - lx) ** 2 + (py - ly) ** 2 + lz**2) ** 1.5
+        return total
+
+    expected = irradiance(x[None, :], y[:, None]) / irradiance(0.0, 0.0)
+    np.testing.assert_allclose(image, expected, rtol=1e-4)
+
+
+def test_a_light_on_the_right_makes_the_right_side_bright(rig, face):
+    right = dataclasses.replace(rig, lights=(rig.light("right"),))
+    scene = scene_of(right, face, lateral=False)
+    image = scene.radiance("crossed").sum(axis=-1)
+    assert image[:, WIDTH // 2 :].sum() > 1.1 * image[:, : WIDTH // 2].sum()
+    shine = scene.truth()["specular"][..., 1]
+    columns = np.arange(WIDTH)
+    assert (shine * columns).sum() / shine.sum() > WIDTH / 2 + 5
+
+
+def test_row_0_shows_the_top_of_the_face_and_column_0_its_left(real):
+    truth = real.truth()
+    rows, columns = np.nonzero(truth["mask"])
+    y, x = truth["position_mm"][rows, columns, 1], truth["position_mm"][rows, columns, 0]
+    assert np.corrcoef(rows, y)[0, 1] < -0.99
+    assert np.corrcoef(columns, x)[0, 1] > 0.99
+    # The brows are above the middle of the image.
+    hair_rows = np.nonzero(truth["hair"] > 0.5)[0]
+    assert 0.2 < hair_rows.mean() / truth["hair"].shape[0] < 0.45
+
+
+def test_the_crossed_image_is_shading_times_reflectance_but_for_what_leaks(ideal):
+    """Without lateral transport and with ideal films, what exceeds the product is the specular
+    leak of skew directions: positive, and below 1 % of the white reference."""
+    truth = ideal.truth()
+    product = truth["shading"][..., None] * truth["reflectance"] * ideal.white_rgb()
+    rest = (ideal.radiance("crossed") - product)[truth["mask"]]
+    # Texels are blended after the product is taken, which shows at the borders of moles and hair.
+    assert np.quantile(np.abs(rest), 0.9) < 5e-4 * METER_LEVEL
+    assert np.quantile(rest, 0.02) > -5e-4 * METER_LEVEL
+    assert np.abs(rest).max() < 0.01 * METER_LEVEL
+
+
+def test_skin_that_faces_the_camera_is_brighter_than_a_lambertian_one_of_its_reflectance(ideal):
+    """Expected: T(0)^2 / (T(0) T_average) = 1.053 in the middle of the forehead."""
+    truth = ideal.truth()
+    facing = truth["mask"] & (truth["normals"][..., 2] > 0.995)
+    ratio = truth["shading"][facing] / truth["irradiance"][facing]
+    assert ratio.mean() == pytest.approx(0.97222 / 0.92319, rel=5e-3)
+
+
+def test_both_images_split_into_light_from_inside_and_from_the_surface(ideal):
+    """Near the axis: crossed = d / 2, parallel = d / 2 + s; far off it parallel is not."""
+    truth = ideal.truth()
+    crossed, parallel = ideal.radiance("crossed"), ideal.radiance("parallel")
+    near = truth["mask"] & (truth["normals"][..., 2] > 0.98)
+    half = 0.5 * truth["diffuse"]
+    np.testing.assert_allclose(crossed[near], half[near], rtol=0.01)
+    np.testing.assert_allclose(parallel[near], (half + truth["specular"])[near], rtol=0.01)
+    far = truth["mask"] & (truth["normals"][..., 2] < 0.5) & (truth["irradiance"] > 0.05)
+    off = np.abs(parallel - half - truth["specular"])[far] / half[far]
+    assert np.quantile(off, 0.9) > 0.01
+
+
+def test_images_behind_crossed_analysers_add_up_to_a_constant(real):
+    sums = [
+        real.radiance("parallel", angle) + real.radiance("parallel", angle + 90.0)
+        for angle in (0.0, 17.0, 45.0)
+    ]
+    # Film absorbs along an axis in its plane: off the optical axis two films at 90 degrees pass
+    # axes that are not quite perpendicular, by up to 0.013 rad in the corner of this image.
+    np.testing.assert_allclose(sums[1], sums[0], rtol=3e-3, atol=1e-6)
+    np.testing.assert_allclose(sums[2], sums[0], rtol=3e-3, atol=1e-6)
+
+
+def test_the_metal_target_goes_dark_behind_the_crossed_analyser_as_the_films_say(rig):
+    films = Films(light_extinction=2000.0, analyser_extinction=3000.0, analyser_zero_deg=1.0)
+    scene = scene_of(rig, make_target("malus"), films=films)
+    middle = np.s_[rig.views[0].height_px // 2, WIDTH // 2]
+    angles = np.arange(0.0, 181.0, 15.0)
+    curve = np.array([scene.radiance("parallel", a)[middle][1] for a in angles])
+    leak = 1.0 / 2000.0 + 1.0 / 3000.0
+    shape = np.cos(np.deg2rad(angles + 1.0)) ** 2
+    expected = curve[0] / shape[0] * (shape + leak * (1.0 - shape))
+    np.testing.assert_allclose(curve, expected, atol=2e-4 * curve[0])
+    assert curve[6] / curve[0] == pytest.approx(leak + math.sin(math.radians(1.0)) ** 2, rel=0.1)
+
+
+def test_the_flat_is_even_and_unpolarized_and_the_cap_is_dark(rig):
+    flat, dark = scene_of(rig, make_target("flat")), scene_of(rig, make_target("dark"))
+    image = flat.radiance("parallel")
+    assert image.max() == pytest.approx(FLAT_LEVEL)
+    assert np.ptp(image, axis=(0, 1)).max() == 0.0
+    np.testing.assert_array_equal(image, flat.radiance("crossed", 33.0))
+    assert not dark.radiance("crossed").any()
+
+
+def test_the_chart_is_found_where_it_stands(rig):
+    scene = scene_of(rig.resized(504), make_target("chart"), subpixels=2)
+    view = scene.rig.views[0]
+    found = find_chart(scene.radiance("crossed") / scene.white_rgb())
+    scale = view.focal_px / view.distance_mm
+    x = patch_centers_mm()[:, 0] * scale + 0.5 * (view.width_px - 1)
+    y = 0.5 * (view.height_px - 1) - patch_centers_mm()[:, 1] * scale
+    np.testing.assert_allclose(found, np.column_stack([x, y]), atol=0.6)
+
+
+def test_exposures_scale_with_the_power_of_the_pops_and_add_up(rig, face):
+    quiet = dataclasses.replace(
+        sensor_of(rig.views[0], prnu=0.0, dsnu_e=0.0, vignetting=0.0, dark_e_per_s=0.0),
+        read_noise_e=0.0,
+    )
+    scene = scene_of(rig, make_target("white"), sensor=quiet, films=IDEAL)
+
+    def mean(*pops: Fired) -> float:
+        frame = scene.exposure("cam", pops=pops, exposure_s=0.01, seed=3)
+        return float(frame.mean()) - quiet.black
+
+    one, half = mean(Fired()), mean(Fired(power=0.5))
+    assert half / one == pytest.approx(0.5, rel=0.01)
+    assert mean(Fired(power=0.5), Fired(token="t2", power=0.3)) / one == pytest.approx(
+        0.8, rel=0.01
+    )
+
+
+def test_without_a_pop_the_frame_is_dark(real, rig):
+    frame = real.exposure("cam", pops=(), exposure_s=0.01, seed=1)
+    view = rig.views[0]
+    noise_dn = math.hypot(view.read_noise_e, 1.0) / view.gain_e_per_dn
+    assert abs(frame.mean() - view.black_level) < 5.0 * noise_dn / math.sqrt(frame.size)
+    assert frame.std() == pytest.approx(math.hypot(noise_dn, math.sqrt(1 / 12)), rel=0.05)
+
+
+def test_the_same_seed_gives_the_same_frame_and_another_seed_another(real):
+    frames = [
+        real.exposure("cam", pops=(Fired(),), exposure_s=0.01, seed=seed) for seed in (1, 1, 2)
+    ]
+    np.testing.assert_array_equal(frames[0], frames[1])
+    assert (frames[0] != frames[2]).mean() > 0.5
+
+
+def test_exercise_reddens_the_cheeks_and_leaves_the_melanin(rig, face, ideal):
+    tired = scene_of(rig, face, state="exercise", films=IDEAL, lateral=False)
+    before, after = ideal.truth(), tired.truth()
+    np.testing.assert_array_equal(before["melanin"], after["melanin"])
+    x, y = before["position_mm"][..., 0], before["position_mm"][..., 1]
+    cheeks = before["mask"] & (np.abs(np.abs(x) - 45.0) < 8.0) & (np.abs(y + 8.0) < 8.0)
+    assert (after["hemoglobin"][cheeks] > 1.15 * before["hemoglobin"][cheeks]).all()
+    ratio = tired.radiance("crossed")[cheeks] / ideal.radiance("crossed")[cheeks]
+    assert ratio[:, 1].mean() < 0.97
+    assert ratio[:, 0].mean() > ratio[:, 1].mean()
+
+
+def test_lateral_transport_smooths_what_is_seen_and_keeps_the_sharp_truth(real, ideal):
+    truth = real.truth()
+    inside = truth["mask"]
+    # Texels are 1 mm here. Melanin lies above the spreading and stays half sharp.
+    for name, factor in (("melanin", 0.99), ("hemoglobin", 0.95)):
+        sharp, blurred = truth[name][inside], truth[f"{name}_blurred"][inside]
+        assert blurred.mean() == pytest.approx(sharp.mean(), rel=0.03)
+
+        def detail(m: np.ndarray) -> float:
+            both = inside[:, 1:] & inside[:, :-1]
+            return float(np.std(np.log(m[:, 1:][both] / m[:, :-1][both])))
+
+        assert detail(truth[f"{name}_blurred"]) < factor * detail(truth[name])
+    red, green, blue = real.resolution_mm()
+    assert 0.2 < blue < green < red < 3.0
+    np.testing.assert_array_equal(ideal.truth()["hemoglobin"], ideal.truth()["hemoglobin_blurred"])
+
+
+def test_truth_is_finite_and_normals_are_unit_vectors_towards_the_camera(real):
+    truth = real.truth()
+    shape = real.rig.views[0].height_px, WIDTH
+    for name, values in truth.items():
+        assert values.shape[:2] == shape, name
+        assert np.isfinite(values).all(), name
+    inside = truth["mask"]
+    np.testing.assert_allclose(np.linalg.norm(truth["normals"][inside], axis=-1), 1.0, atol=1e-5)
+    assert (truth["normals"][inside][:, 2] > 0.0).mean() > 0.95
+    assert 0.2 < inside.mean() < 0.8
+    assert truth["hair"][inside].max() < 0.02
+
+
+def test_the_films_of_a_rig_follow_from_its_serial_number(rig):
+    films = films_of(rig)
+    assert films == films_of(rig)
+    assert 1500.0 <= films.light_extinction <= 6000.0
+    assert abs(films.analyser_zero_deg) <= 1.2
+    view = dataclasses.replace(rig.views[0], serial="SR-0002")
+    assert films_of(dataclasses.replace(rig, views=(view,))) != films
+
+
+def test_what_is_left_out_is_said_with_its_reason(real, ideal, rig):
+    for scene in (real, ideal, scene_of(rig, make_target("white"))):
+        assert len(scene.left_out) >= 3
+        assert all(what and why for what, why in scene.left_out)
+    assert len(ideal.left_out) == len(real.left_out) + 1
+
+
+def test_wrong_wishes_are_named(rig, face, real):
+    mixed = dataclasses.replace(
+        rig, lights=(rig.lights[0], dataclasses.replace(rig.lights[1], illuminant="A"))
+    )
+    with pytest.raises(SceneError, match="expected one"):
+        scene_of(mixed, face)
+    with pytest.raises(SceneError, match="truth: got the target 'white'"):
+        scene_of(rig, make_target("white")).truth()
+    with pytest.raises(SceneError, match="no view 'cam2'"):
+        real.radiance("crossed", view_name="cam2")
+    with pytest.raises(FilmError, match="polarizer: got 'cross'"):
+        real.radiance("cross")
+    with pytest.raises(SceneError, match=r"power of pop 't1': got 1\.5"):
+        real.exposure("cam", pops=(Fired(power=1.5),), exposure_s=0.0, seed=0)
+    with pytest.raises(FilmError, match=r"light_extinction: got 1\.0"):
+        Films(1.0, 2.0, 0.0)
