@@ -1,0 +1,434 @@
+"""What every camera must do, over sim:// and over TCP."""
+
+import socket
+import threading
+
+import numpy as np
+import pytest
+
+from capture.devices import camera_wire
+from capture.devices.camera import (
+    CameraError,
+    CameraUrlError,
+    Exposure,
+    FrameRefused,
+    FrameTimeout,
+    StaleFrame,
+    Trigger,
+    WrongCamera,
+    WrongExposure,
+    check_frame,
+    next_frame,
+    open_camera,
+)
+from capture.devices.port import LinkLost
+from capture.devices.remote_camera import RemoteCamera
+from capture.rig import load_rig
+from rigsim.faults import Faults
+from rigsim.serve import serve
+from rigsim.world import World
+
+WANT = Exposure(0.008, 100)
+LIT, DARK = 10_512, 512
+
+
+def pop(box, token="a"):
+    box.wait_charged(5.0)
+    box.arm()
+    return box.fire(token)
+
+
+def test_a_camera_says_what_it_is(bench):
+    info = bench.camera().info
+    view = bench.world.rig.view("cam")
+    assert (info.serial, info.model) == (view.serial, view.camera_model)
+    assert (info.width_px, info.height_px, info.pattern) == (16, 10, "RGGB")
+    assert (info.black, info.white) == ((512.0,) * 4, 16383)
+    assert set(info.triggers) == {Trigger.SOFTWARE, Trigger.EDGE}
+
+
+def test_an_edge_exposes_with_the_light_of_its_pop(bench):
+    camera, box = bench.camera(), bench.box()
+    assert camera.configure(WANT) == WANT
+    camera.arm(1, Trigger.EDGE)
+    before = camera.clock_s()
+    pop(box)
+    frame, stale = next_frame(camera, seq=0, not_before_s=before, want=WANT, timeout_s=5.0)
+    assert stale == 0
+    assert frame.image.dtype == np.uint16
+    np.testing.assert_array_equal(frame.image, np.full((10, 16), LIT))
+    assert frame.t_end_s - frame.t_start_s == pytest.approx(0.008)
+    assert before <= frame.t_start_s <= camera.clock_s()
+
+
+def test_a_software_trigger_without_a_pop_is_dark(bench):
+    camera = bench.camera()
+    camera.configure(WANT)
+    camera.arm(1, Trigger.SOFTWARE)
+    before = camera.clock_s()
+    camera.fire()
+    frame, _ = next_frame(camera, seq=0, not_before_s=before, want=WANT, timeout_s=5.0)
+    np.testing.assert_array_equal(frame.image, np.full((10, 16), DARK))
+
+
+def test_a_dark_trigger_of_the_box_exposes_without_light(bench):
+    camera, box = bench.camera(), bench.box()
+    camera.configure(WANT)
+    camera.arm(1, Trigger.EDGE)
+    box.trigger_cameras("d")
+    assert camera.frame(5.0).image.max() == DARK
+
+
+def test_a_pop_before_the_shutter_opens_is_not_seen(bench):
+    camera, box = bench.camera(), bench.box()
+    pop(box)
+    camera.configure(WANT)
+    camera.arm(1, Trigger.SOFTWARE)
+    camera.fire()
+    assert camera.frame(5.0).image.max() == DARK
+
+
+def test_frames_are_counted_from_arming(bench):
+    camera = bench.camera()
+    camera.configure(WANT)
+    for _ in range(2):
+        camera.arm(2, Trigger.SOFTWARE)
+        for seq in range(2):
+            camera.fire()
+            assert camera.frame(5.0).seq == seq
+
+
+def test_without_a_trigger_no_frame_comes(bench):
+    camera, box = bench.camera(), bench.box()
+    with pytest.raises(FrameTimeout):
+        camera.frame(0.05)
+    camera.arm(1, Trigger.SOFTWARE)
+    pop(box)  # an edge is no software trigger
+    with pytest.raises(FrameTimeout):
+        camera.frame(0.05)
+
+
+def test_an_aborted_frame_never_comes(bench):
+    camera = bench.camera()
+    camera.configure(WANT)
+    camera.arm(1, Trigger.SOFTWARE)
+    camera.fire()
+    camera.abort()
+    with pytest.raises(FrameTimeout):
+        camera.frame(0.2)
+
+
+def test_a_camera_that_is_not_armed_or_reads_out_is_not_fired(bench):
+    camera = bench.camera()
+    with pytest.raises(CameraError, match="not armed"):
+        camera.fire()
+    camera.configure(Exposure(0.2, 100))
+    camera.arm(2, Trigger.SOFTWARE)
+    camera.fire()
+    with pytest.raises(CameraError, match="reading out"):
+        camera.fire()
+    camera.arm(1, Trigger.EDGE)
+    with pytest.raises(CameraError, match="not armed for software"):
+        camera.fire()
+
+
+def test_a_camera_sets_the_nearest_exposure_it_has(bench):
+    assert bench.camera().configure(Exposure(100.0, 1)) == Exposure(30.0, 50)
+
+
+@pytest.mark.parametrize(("count", "trigger"), [(0, Trigger.EDGE), (1, Trigger.LEVEL)])
+def test_what_a_camera_cannot_do_is_refused(bench, count, trigger):
+    with pytest.raises(CameraError):
+        bench.camera().arm(count, trigger)
+
+
+# faults of cameras ----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def faulty(rig):
+    """A camera on a virtual clock with faults; every frame is asked for and checked."""
+    worlds = []
+
+    def camera(**faults):
+        world = World(rig, seed=len(worlds), faults=Faults(**faults))
+        worlds.append(world)
+        world.register(f"faulty-{len(worlds)}")
+        return open_camera(f"sim://faulty-{len(worlds)}/cam")
+
+    yield camera
+    for world in worlds:
+        world.unregister()
+
+
+def shoot(camera):
+    camera.configure(WANT)
+    camera.arm(1, Trigger.SOFTWARE)
+    before = camera.clock_s()
+    camera.fire()
+    return before
+
+
+def test_a_stale_frame_is_noticed_by_its_time(faulty):
+    camera = faulty(stale=1.0)
+    first, dropped = next_frame(camera, seq=0, not_before_s=shoot(camera), want=WANT, timeout_s=1.0)
+    assert dropped == 0
+    second, dropped = next_frame(
+        camera, seq=0, not_before_s=shoot(camera), want=WANT, timeout_s=1.0
+    )
+    assert dropped == 1
+    assert second.t_start_s > first.t_end_s
+
+
+def test_a_lost_frame_is_a_timeout(faulty):
+    camera = faulty(drop_frame=1.0)
+    with pytest.raises(FrameTimeout):
+        next_frame(camera, seq=0, not_before_s=shoot(camera), want=WANT, timeout_s=1.0)
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"), [("wrong_camera", WrongCamera), ("wrong_exposure", WrongExposure)]
+)
+def test_a_foreign_or_wrongly_exposed_frame_is_refused(faulty, fault, error):
+    camera = faulty(**{fault: 1.0})
+    with pytest.raises(error):
+        next_frame(camera, seq=0, not_before_s=shoot(camera), want=WANT, timeout_s=1.0)
+
+
+@pytest.mark.parametrize("drift_ppm", [-500.0, 500.0])
+def test_a_drifting_clock_neither_hides_stale_frames_nor_refuses_good_ones(faulty, drift_ppm):
+    camera = faulty(drift_ppm=drift_ppm)
+    camera.body.world.clock.sleep(3600.0)
+    kept = []
+    for _ in range(5):
+        before = shoot(camera)
+        frame, dropped = next_frame(camera, seq=0, not_before_s=before, want=WANT, timeout_s=1.0)
+        assert dropped == 0
+        kept.append(frame)
+    with pytest.raises(StaleFrame):
+        check_frame(kept[-2], camera.info, seq=0, not_before_s=before, want=WANT)
+
+
+def test_of_two_hundred_exposures_no_bad_frame_is_accepted(faulty):
+    camera = faulty(stale=0.3, drop_frame=0.2, wrong_camera=0.2, wrong_exposure=0.2)
+    accepted = refused = 0
+    for _ in range(200):
+        before = shoot(camera)
+        try:
+            frame, _ = next_frame(camera, seq=0, not_before_s=before, want=WANT, timeout_s=1.0)
+        except (FrameRefused, FrameTimeout):
+            refused += 1
+            camera.abort()
+            camera.body.world.clock.sleep(0.1)
+            continue
+        accepted += 1
+        assert frame.serial == camera.info.serial
+        assert frame.t_start_s >= before
+        assert frame.exposure == WANT
+    assert accepted + refused == 200
+    assert refused > 50
+
+
+# addresses ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["sim://nowhere/cam", "sim://nowhere", "sim:///cam", "tcp://127.0.0.1/cam", "tcp://:1/cam",
+     "tcp://127.0.0.1:0/cam", "tcp://127.0.0.1:99999/cam", "tcp://127.0.0.1:80"],
+)  # fmt: skip
+def test_an_address_of_no_camera_is_named(url):
+    with pytest.raises(CameraUrlError, match="expected"):
+        open_camera(url)
+
+
+def test_an_unknown_view_of_a_known_world_is_named(rig):
+    world = World(rig)
+    world.register("conformance-views")
+    with pytest.raises(CameraUrlError, match="no view 'cma'"):
+        open_camera("sim://conformance-views/cma")
+    world.unregister()
+
+
+# over TCP -------------------------------------------------------------------------------------
+
+
+def test_a_served_camera_has_one_client_and_known_views(rig):
+    with serve(rig) as served:
+        url = served.addresses["cam"]
+        camera = open_camera(url)
+        with pytest.raises(CameraError, match="another program"):
+            open_camera(url)
+        with pytest.raises(CameraError, match="expected one of cam"):
+            open_camera(url.replace("/cam", "/cma"))
+        camera.close()
+        camera.close()
+
+
+def test_nobody_listening_is_a_lost_link():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with pytest.raises(LinkLost, match="is it being served"):
+        open_camera(f"tcp://127.0.0.1:{port}/cam")
+
+
+def test_a_server_that_goes_away_is_a_lost_link(rig):
+    with serve(rig) as served:
+        camera = open_camera(served.addresses["cam"])
+    with pytest.raises(LinkLost):
+        camera.clock_s()
+    with pytest.raises(LinkLost, match="closed"):
+        camera.clock_s()
+    camera.close()
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"\n",
+        b"x" * 70_000,
+        b"[]*0A50\n",
+        b'{"id":1,"do":"clock"}*0000\n',
+    ],
+)
+def test_garbage_ends_one_connection_and_leaves_the_service(rig, garbage):
+    with serve(rig) as served:
+        host, _, port = served.addresses["cam"][6:].partition("/")[0].rpartition(":")
+        with socket.create_connection((host, int(port)), timeout=5.0) as connection:
+            connection.sendall(garbage)
+            try:
+                assert connection.recv(10) == b""
+            except ConnectionResetError:
+                pass
+        open_camera(served.addresses["cam"]).close()
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [{"do": "frame"}, {"do": "dance"}, {}, {"do": "arm", "count": "x", "trigger": "edge"},
+     {"do": "arm", "count": 1, "trigger": "sneeze"},
+     {"do": "configure", "exposure_s": -1, "iso": 1}],
+)  # fmt: skip
+def test_a_request_that_makes_no_sense_is_answered_with_an_error(rig, request_):
+    with serve(rig) as served:
+        camera = open_camera(served.addresses["cam"])
+        with pytest.raises(CameraError):
+            camera._ask(request_.pop("do", "?"), **request_)
+        assert camera.clock_s() >= 0.0
+        camera.close()
+
+
+FRAME = {
+    "serial": "S", "seq": 0, "t_start_s": 1.0, "t_end_s": 1.1, "exposure_s": 0.1, "iso": 100,
+    "light": {}, "shape": [2, 4],
+}  # fmt: skip
+
+
+class Impostor:
+    """A server that opens like a camera and then plays one answer."""
+
+    def __init__(self, answer):
+        info = {
+            "serial": "S", "model": "M", "width_px": 4, "height_px": 2, "pattern": "MONO",
+            "black": [0], "white": 255, "triggers": ["edge"],
+        }  # fmt: skip
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.replies = [camera_wire.encode_message({"id": 1, "ok": True, "info": info}), answer]
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+
+    def run(self):
+        client, _ = self.server.accept()
+        with client:
+            for reply in self.replies:
+                client.recv(4096)
+                client.sendall(reply)
+
+    def camera(self):
+        return RemoteCamera(*self.server.getsockname(), "cam")
+
+    def close(self):
+        self.thread.join(5.0)
+        self.server.close()
+
+
+@pytest.fixture
+def impostor():
+    made = []
+
+    def impostor(answer):
+        made.append(Impostor(answer))
+        return made[-1].camera()
+
+    yield impostor
+    for one in made:
+        one.close()
+
+
+def frame_answer(**changes):
+    pixels = np.arange(8, dtype="<u2").tobytes()
+    message = camera_wire.encode_message(
+        {"id": 2, "ok": True, "frame": {**FRAME, **changes}}, pixels
+    )
+    return message, pixels
+
+
+def test_a_frame_arrives_as_it_was_sent(impostor):
+    message, _ = frame_answer(light={"lamp": "left"})
+    busy = camera_wire.encode_message({"id": 2, "developing": True})
+    camera = impostor(busy + message)
+    frame = camera.frame(1.0)
+    np.testing.assert_array_equal(frame.image, np.arange(8).reshape(2, 4))
+    assert (frame.light, frame.serial) == ({"lamp": "left"}, "S")
+    camera.close()
+
+
+def test_a_flipped_pixel_is_a_refused_frame(impostor):
+    message, pixels = frame_answer()
+    camera = impostor(message.removesuffix(pixels) + b"\x01" + pixels[1:])
+    with pytest.raises(FrameRefused, match="damaged"):
+        camera.frame(1.0)
+    camera.close()
+
+
+@pytest.mark.parametrize(
+    "changes", [{"shape": [3, 4]}, {"seq": "x"}, {"exposure_s": 0.0}, {"shape": [-2, -4]}]
+)
+def test_a_frame_that_contradicts_itself_is_refused(impostor, changes):
+    camera = impostor(frame_answer(**changes)[0])
+    with pytest.raises(FrameRefused):
+        camera.frame(1.0)
+    camera.close()
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [b"hello\n", b"x" * 70_000, b"", b'{"id":2,"ok":true}*0000\n',
+     camera_wire.encode_message({"id": 2, "ok": True, "blob_bytes": -1})],
+)  # fmt: skip
+def test_an_answer_that_is_no_message_is_a_lost_link(impostor, answer):
+    camera = impostor(answer)
+    with pytest.raises(LinkLost):
+        camera.clock_s()
+    camera.close()
+
+
+def test_an_answer_without_its_value_is_an_error(impostor):
+    camera = impostor(camera_wire.encode_message({"id": 2, "ok": True}))
+    with pytest.raises(CameraError, match="made no sense"):
+        camera.clock_s()
+
+
+def test_every_flipped_bit_of_a_header_is_noticed():
+    line = camera_wire.encode_message({"id": 3, "do": "arm", "count": 1})[:-1]
+    for bit in range(8 * len(line)):
+        flipped = bytearray(line)
+        flipped[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(camera_wire.BadMessage):
+            camera_wire.decode_header(bytes(flipped))
+
+
+def test_a_full_frame_of_the_real_camera_fits_a_message():
+    view = load_rig("flash").view("cam")
+    assert 2 * view.width_px * view.height_px < camera_wire.MAX_BLOB_BYTES

@@ -1,0 +1,93 @@
+"""Programs that know nothing of us talk to what is served: bash, and PyVISA."""
+
+import shutil
+import subprocess
+
+import pytest
+
+from rigsim.serve import ServeError, serve
+from rigsim.world import World
+
+IDN = "skinrig,FLASH2,FL-0001,1.0"
+SCRIPT = """
+printf '*IDN?\\n' >&3; read -r -t 5 -u 3 line; echo "$line"
+printf 'FLAS:FIRE a\\n' >&3
+printf 'SYST:ERR?\\n' >&3; read -r -t 5 -u 3 line; echo "$line"
+printf 'FLAS:COUN?\\n' >&3; read -r -t 5 -u 3 line; echo "$line"
+"""
+ANSWERS = [IDN, '203,"Unframed command"', "0"]
+
+
+@pytest.fixture(params=["pty", "tcp"])
+def served(request, rig):
+    with serve(rig, pty=request.param == "pty") as served:
+        yield served
+
+
+def test_bash_asks_and_is_refused_a_bare_command(served):
+    bash = shutil.which("bash")
+    if bash is None:
+        pytest.skip("no bash")
+    url = served.addresses["flash"]
+    path = url.replace("socket://", "/dev/tcp/").replace(":", "/")
+    run = subprocess.run(
+        [bash, "-c", f"exec 3<>{path}\n{SCRIPT}"], capture_output=True, text=True, timeout=20
+    )
+    assert run.stdout.splitlines() == ANSWERS, run.stderr
+    assert served.world.pops == []
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+def test_pyvisa_asks_and_is_refused_a_bare_command(served):
+    pyvisa = pytest.importorskip("pyvisa")
+    pytest.importorskip("pyvisa_py")
+    url = served.addresses["flash"]
+    if url.startswith("socket://"):
+        host, _, port = url.removeprefix("socket://").rpartition(":")
+        name = f"TCPIP::{host}::{port}::SOCKET"
+    else:
+        name = f"ASRL{url}::INSTR"
+    manager = pyvisa.ResourceManager("@py")
+    box = manager.open_resource(name, read_termination="\n", write_termination="\r\n", timeout=5000)
+    assert box.query("*IDN?") == IDN
+    box.write("FLAS:FIRE a")
+    assert [box.query("SYST:ERR?"), box.query("FLAS:COUN?")] == ANSWERS[1:]
+    assert box.query("SYST:CAP?").startswith('{"kind":"flash"')
+    box.close()
+    manager.close()
+
+
+def test_served_addresses_name_boxes_first(rig):
+    with serve(rig) as served:
+        assert list(served.addresses) == ["flash", "cam"]
+        assert served.addresses["flash"].startswith("socket://127.0.0.1:")
+        assert served.addresses["cam"].startswith("tcp://127.0.0.1:")
+
+
+@pytest.mark.parametrize("tcp", ["0.0.0.0:0", "192.0.2.1:5000", "example.org:1"])
+def test_an_address_that_others_reach_must_be_permitted(rig, tcp):
+    with pytest.raises(ServeError, match="fire the lights"):
+        serve(rig, tcp=tcp)
+
+
+def test_a_permitted_address_is_warned_about(rig, caplog):
+    with serve(rig, tcp="0.0.0.0:0", allow_remote=True):
+        assert "other machines" in caplog.text
+
+
+@pytest.mark.parametrize("tcp", ["127.0.0.1", ":5", "127.0.0.1:x", "127.0.0.1:99999"])
+def test_what_is_no_address_is_named(rig, tcp):
+    with pytest.raises(ServeError, match="expected HOST:PORT"):
+        serve(rig, tcp=tcp)
+
+
+def test_a_taken_port_is_named(rig):
+    with serve(rig) as served:
+        taken = served.addresses["flash"].removeprefix("socket://")
+        with pytest.raises(ServeError, match="cannot listen"):
+            serve(rig, tcp=taken)
+
+
+def test_a_world_on_a_virtual_clock_is_not_served(rig):
+    with pytest.raises(ServeError, match="clock"):
+        serve(rig, world=World(rig))
