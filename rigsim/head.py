@@ -258,7 +258,10 @@ def _pack(
     A part's row holds blend, carve, first and last solid, centre and radius of a ball around it; a
     groove's row holds depth, width, first and last segment, and the box outside which it is flat.
     """
-    solids, part_rows, segments, groove_rows = [], [], [], []
+    solids: list[tuple[float, ...]] = []
+    segments: list[tuple[float, ...]] = []
+    part_rows: list[tuple[float, ...]] = []
+    groove_rows: list[tuple[float, ...]] = []
     for part in parts:
         first = len(solids)
         solids += [(*one.a, *one.b, *one.radii, *one.ends) for one in part.solids]

@@ -90,8 +90,12 @@ def hair_map(points_mm: Float32Array, *, seed: int) -> Float32Array:
     thick = (1.0 - 0.65 * along) * float(rng.uniform(3.0, 4.2))
     brow = np.exp(-(((y - arch) / thick) ** 4))
     brow *= _rise((x - 10.5) / 2.5) * _rise((49.0 - x) / 2.5)
-    strands = points_mm * np.array([0.45, 1.0, 0.5], np.float32)
-    brow *= np.clip(0.72 + 0.3 * smooth_noise(strands, (2.2, 1.1), seed=seed + 91), 0.2, 1.0)
+    # Strands run outwards and slightly up.
+    strands = np.stack(
+        [0.16 * x, y - 0.35 * x, 0.3 * points_mm[..., 2] + 40.0 * np.sign(points_mm[..., 0])],
+        axis=-1,
+    )
+    brow *= np.clip(0.68 + 0.3 * smooth_noise(strands, (0.9, 0.45), seed=seed + 91), 0.25, 1.0)
     # The lashes of closed eyes lie along the line between the lids.
     line = 16.6 + 0.011 * (x - 31.0) ** 2
     lash = 0.85 * np.exp(-(((y - line) / 0.9) ** 2)) * _rise((x - 17.0) / 1.5)
