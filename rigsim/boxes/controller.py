@@ -343,8 +343,6 @@ class Controller:
             "protocol": self._protocol,
             "lease_min_ms": LEASE_MS[0],
             "lease_max_ms": LEASE_MS[1],
-            "cached_replies": CACHED_REPLIES,
-            "error_queue": ERROR_QUEUE,
             **self.device.capabilities(),
         }
         return wire.seal(json.dumps(table, separators=(",", ":"), allow_nan=False))

@@ -162,7 +162,7 @@ class FlashUnit:
             "lamp_max_ms": LAMP_MS[1],
             "recycle_s": self._recycle_s,
             "pops_per_min": self._pops_per_min,
-            "move_s_per_deg": self._s_per_deg,
+            "move_s_per_deg": round(self._s_per_deg, 6),
         }
 
     def commands(self) -> Mapping[str, Command]:
