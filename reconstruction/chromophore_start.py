@@ -1,0 +1,178 @@
+"""Where the chromophore fit starts: the color table turned round, on a grid of log colors.
+
+With the shading known there is a direction in log RGB along which the table's surface can be
+projected on a plane without folding, so that each point of the plane has one pair of
+chromophores. With the shading free the direction is that of gray, and dark skin folds back over
+lighter skin: the start then lies on the light side of the fold, and the grid remembers how light
+the other solution would be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.optimize import linprog
+from scipy.spatial import cKDTree
+
+from model.color_table import ColorTable
+
+FloatArray = NDArray[np.float64]
+
+LOWEST = 0.04
+"""Smallest fraction of an axis that is fitted: 6.4e-5 of the largest volume fraction."""
+GRID = 256
+"""Nodes along each axis of the start grid."""
+_SAMPLES = 384  # colors along each axis of the table that the grid is filled from
+_MARGIN = 0.02  # share of the plane's extent around the table's colors
+_POLISH_STEPS = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """The turned table: from a projected log color to fractions of the table's axes."""
+
+    projection: FloatArray
+    """Shape (2, 4): rows take (log R, log G, log B, 1) to grid units."""
+    axes: NDArray[np.float32]
+    """Shape (GRID, GRID, 2): fractions of the melanin and the blood axis, in [LOWEST, 1]."""
+    twin_log: NDArray[np.float32]
+    """Shape (GRID, GRID): largest mean log RGB of a second solution, -inf where there is none."""
+    normal: FloatArray
+    """Shape (3,): unit direction in log RGB that is projected away."""
+    side: float
+    """Sign of the surface's side, seen along `normal`, that `axes` lie on."""
+
+
+@lru_cache(maxsize=16)
+def start_for(table: ColorTable, free_shading: bool) -> Start:
+    """Return the turned table; kept for the tables used last."""
+    fraction = np.linspace(LOWEST, 1.0, _SAMPLES)
+    a, b = np.meshgrid(fraction, fraction, indexing="ij")
+    rgb, by_a, by_b = evaluate(table, a, b)
+    log_rgb = np.log(rgb)
+    across = np.cross(by_a / rgb, by_b / rgb)
+    normal = np.full(3, 1.0 / np.sqrt(3.0)) if free_shading else _unfolding_direction(across)
+    facing = across @ normal
+    chosen = _light_side(facing) if free_shading else np.ones(a.shape, dtype=np.bool_)
+    plane = _plane(log_rgb[chosen], normal)
+    y = log_rgb @ plane.T
+    low, high = y[chosen].min(axis=0), y[chosen].max(axis=0)
+    margin = _MARGIN * (high - low)
+    scale = (GRID - 1) / (high - low + 2.0 * margin)
+    projection = plane * scale[:, None]
+    offset = -(low - margin) * scale
+    line = np.arange(GRID, dtype=np.float64)
+    nodes = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1)
+    # Distances in log color, not in grid units: the nearest color is the natural start outside.
+    tree = cKDTree(y[chosen])
+    _, nearest = tree.query((nodes.reshape(-1, 2) - offset) / scale)
+    axes = np.stack([a[chosen][nearest], b[chosen][nearest]], axis=-1)
+    axes = _polish(table, axes, nodes.reshape(-1, 2), projection, offset)
+    twin = _twin_grid(log_rgb[~chosen], projection, offset)
+    return Start(
+        np.column_stack([projection, offset]),
+        axes.reshape(GRID, GRID, 2).astype(np.float32),
+        twin,
+        normal,
+        float(np.sign(np.median(facing[chosen]))),
+    )
+
+
+def evaluate(
+    table: ColorTable, a: FloatArray, b: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the color and its derivatives by the fractions a and b of the table's axes."""
+    last = table.size - 1
+    i, j = a * last, b * last
+    row = np.clip(i.astype(np.intp), 0, last - 1)
+    column = np.clip(j.astype(np.intp), 0, last - 1)
+    x, y = (i - row)[..., None, None], (j - column)[..., None]
+    cell = table.cells[row, column]
+    inner = ((cell[..., 3, :] * x + cell[..., 2, :]) * x + cell[..., 1, :]) * x + cell[..., 0, :]
+    inner_x = (3.0 * cell[..., 3, :] * x + 2.0 * cell[..., 2, :]) * x + cell[..., 1, :]
+
+    def along(c: FloatArray) -> FloatArray:
+        return ((c[..., 3] * y + c[..., 2]) * y + c[..., 1]) * y + c[..., 0]
+
+    by_y = (3.0 * inner[..., 3] * y + 2.0 * inner[..., 2]) * y + inner[..., 1]
+    return along(inner), last * along(inner_x), last * by_y
+
+
+def _unfolding_direction(across: FloatArray) -> FloatArray:
+    """Return the unit vector most clearly on one side of all the surface's tangent planes."""
+    facets = across[::8, ::8].reshape(-1, 3)
+    facets = facets / np.linalg.norm(facets, axis=1, keepdims=True)
+    result = linprog(
+        [0.0, 0.0, 0.0, -1.0],
+        A_ub=np.c_[-facets, np.ones(len(facets))],
+        b_ub=np.zeros(len(facets)),
+        bounds=[(-1.0, 1.0)] * 3 + [(None, None)],
+    )
+    direction = np.asarray(result.x[:3])
+    return direction / np.linalg.norm(direction)
+
+
+def _light_side(facing: FloatArray) -> NDArray[np.bool_]:
+    """Return the samples that are connected, without a fold, to light skin with some blood."""
+    corner = facing[: _SAMPLES // 8, _SAMPLES // 4 : _SAMPLES // 2]
+    same = facing * np.sign(np.median(corner)) > 0.0
+    regions, _ = ndimage.label(same)
+    seed = regions[: _SAMPLES // 8, _SAMPLES // 4 : _SAMPLES // 2]
+    return np.asarray(regions == np.bincount(seed[seed > 0]).argmax())
+
+
+def _plane(log_rgb: FloatArray, normal: FloatArray) -> FloatArray:
+    """Return two unit vectors across `normal`, along the principal axes of the colors."""
+    flat = log_rgb - np.outer(log_rgb @ normal, normal)
+    flat = flat - flat.mean(axis=0)
+    _, vectors = np.linalg.eigh(flat.T @ flat)
+    first = vectors[:, -1] - (vectors[:, -1] @ normal) * normal
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(normal, first)])
+
+
+def _polish(
+    table: ColorTable,
+    axes: FloatArray,
+    nodes: FloatArray,
+    projection: FloatArray,
+    offset: FloatArray,
+) -> FloatArray:
+    """Move the fractions towards their node's projected color by a few careful Newton steps."""
+    best = axes.copy()
+    best_miss = np.full(len(axes), np.inf)
+    for _ in range(_POLISH_STEPS + 1):
+        rgb, by_a, by_b = evaluate(table, axes[:, 0], axes[:, 1])
+        miss = nodes - np.log(rgb) @ projection.T - offset
+        size = np.hypot(miss[:, 0], miss[:, 1])
+        closer = size < best_miss
+        best[closer], best_miss[closer] = axes[closer], size[closer]
+        j_a, j_b = (by_a / rgb) @ projection.T, (by_b / rgb) @ projection.T
+        det = j_a[:, 0] * j_b[:, 1] - j_a[:, 1] * j_b[:, 0]
+        det = np.where(np.abs(det) > 1e-9, det, 1e-9)
+        step = np.stack(
+            [
+                (miss[:, 0] * j_b[:, 1] - miss[:, 1] * j_b[:, 0]) / det,
+                (j_a[:, 0] * miss[:, 1] - j_a[:, 1] * miss[:, 0]) / det,
+            ],
+            axis=-1,
+        )
+        reach = 2.0 / _SAMPLES
+        axes = np.clip(best + np.clip(step, -reach, reach), LOWEST, 1.0)
+    return best
+
+
+def _twin_grid(
+    log_rgb: FloatArray, projection: FloatArray, offset: FloatArray
+) -> NDArray[np.float32]:
+    """Return, per grid cell, the mean log RGB of the lightest second solution."""
+    grid = np.full((GRID, GRID), -np.inf)
+    place = np.rint(log_rgb @ projection.T + offset).astype(np.intp)
+    inside = np.all((place >= 0) & (place < GRID), axis=-1)
+    place = place[inside]
+    np.maximum.at(grid, (place[:, 0], place[:, 1]), log_rgb[inside].mean(axis=-1))
+    return np.asarray(ndimage.grey_dilation(grid, size=(3, 3)), dtype=np.float32)
