@@ -1,0 +1,237 @@
+"""The documentation says what the code does: examples run, commands parse, links lead."""
+
+import ast
+import doctest
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+
+from capture.devices import wire
+from rigsim.boxes.controller import Controller
+from rigsim.boxes.flash import FlashUnit
+from skinrig.cli import app
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+GUIDES = [ROOT / "README.md", *PAGES]
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+SPAN = re.compile(r"`([^`]+)`")
+PACKAGES = ("capture", "reconstruction", "rigsim", "model", "skinrig")
+
+
+def named(paths):
+    return pytest.mark.parametrize("page", paths, ids=lambda page: page.stem)
+
+
+def blocks(page, *languages):
+    return [body for kind, body in FENCE.findall(page.read_text("utf-8")) if kind in languages]
+
+
+def prose(page):
+    return FENCE.sub("", page.read_text("utf-8"))
+
+
+def rows(page, heading):
+    """Cells of the table below a heading, without its head."""
+    section = page.read_text("utf-8").split(f"## {heading}\n")[1].split("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith("|")][2:]
+    return [
+        [cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+        for line in lines
+    ]
+
+
+def flash_box():
+    unit = FlashUnit(
+        on_pop=lambda pop: None, on_trigger=lambda t_s: None, recycle_s=1.5, pops_per_min=20,
+        move_s=0.5, rng=np.random.default_rng(0),
+    )  # fmt: skip
+    return Controller(unit, serial="FL-0001", rng=np.random.default_rng(1))
+
+
+WIRE = ROOT / "docs" / "wire-protocol.md"
+
+
+# python ------------------------------------------------------------------------------------------
+
+
+@named([page for page in PAGES if ">>> " in page.read_text("utf-8")])
+def test_python_examples_give_what_the_page_says(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    source = "\n".join(blocks(page, "python"))
+    test = doctest.DocTestParser().get_doctest(source, {}, page.name, str(page), 0)
+    assert test.examples
+    report = []
+    doctest.DocTestRunner(verbose=False).run(test, out=report.append)
+    assert not report, "".join(report)
+
+
+def test_every_python_block_is_an_example_that_runs():
+    silent = [page.name for page in PAGES for body in blocks(page, "python") if ">>> " not in body]
+    assert silent == []
+
+
+# wire --------------------------------------------------------------------------------------------
+
+
+def test_the_manuals_frames_are_the_one_spelling_of_what_they_say():
+    lines = [line.encode() for body in blocks(WIRE, "wire") for line in body.splitlines()]
+    assert len(lines) >= 5
+    assert [wire.encode(wire.decode(line)) for line in lines] == [line + b"\n" for line in lines]
+
+
+def test_the_manuals_conversation_is_what_the_emulated_box_says_byte_for_byte():
+    (text,) = blocks(WIRE, "dialogue")
+    box, heard, printed = flash_box(), [], []
+    for line in text.splitlines():
+        time_s, mark, words = line.split(" ", 2)
+        if mark == ">":
+            said = box.feed(words.encode() + b"\n", float(time_s))
+        else:
+            printed.append(words)
+            said = box.advance(float(time_s))
+        heard += said.decode().splitlines()
+    assert heard == printed
+
+
+def test_the_manual_lists_every_command_with_its_arguments_and_what_it_needs():
+    listed = {}
+    for name, arguments, needs, _ in rows(WIRE, "Commands of the flash box"):
+        listed[name.strip("`")] = (arguments.strip("`"), needs)
+    expected = {}
+    for name, command in flash_box().commands.items():
+        needs = "" if name.endswith("?") else "frame"
+        needs = "armed" if command.armed else "bare" if command.bare else needs
+        expected[name] = (command.arguments, needs)
+    assert listed == expected
+
+
+def test_the_manual_lists_every_code():
+    cells = [row[column] for row in rows(WIRE, "Codes") for column in (0, 2)]
+    assert sorted(map(int, cells)) == sorted(int(code) for code in wire.Code)
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+def test_the_shell_example_fires_a_served_box():
+    from capture.rig import load_rig
+    from rigsim.serve import serve
+
+    (script,) = blocks(WIRE, "bash")
+    with serve(load_rig("flash").resized(16), seed=1) as served:
+        host, port = served.addresses["flash"].removeprefix("socket://").rsplit(":", 1)
+        run = subprocess.run(
+            ["bash", "-c", script],
+            env={"HOST": host, "PORT": port, "PATH": "/usr/bin:/bin"},
+            capture_output=True,
+            text=True,
+            timeout=30,
+            check=False,
+        )
+    identity, *answers = run.stdout.splitlines()
+    assert identity.startswith("skinrig,FLASH2,"), run.stderr
+    codes = [wire.decode(answer.encode()).code for answer in answers]
+    assert codes == [wire.Code.OK] * 4, run.stdout
+
+
+# command line ------------------------------------------------------------------------------------
+
+
+def shell_commands(page):
+    text = "".join(blocks(page, "sh")).replace("\\\n", " ")
+    return [
+        shlex.split(line.removeprefix(".venv/bin/"), comments=True)[1:]
+        for line in text.splitlines()
+        if line.removeprefix(".venv/bin/").startswith("skinrig ")
+    ]
+
+
+def inline_commands(page):
+    found = []
+    for span in SPAN.findall(prose(page)):
+        words = " ".join(span.split())
+        if words.startswith("skinrig "):
+            found.append(words.split()[1:])
+    return found
+
+
+def resolve(argv):
+    command = typer.main.get_command(app)
+    words = list(argv)
+    while hasattr(command, "commands"):
+        assert words, f"skinrig {' '.join(argv)}: names no command"
+        assert words[0] in command.commands, f"skinrig {' '.join(argv)}: no such command"
+        command = command.commands[words.pop(0)]
+    return command, words
+
+
+@named([page for page in GUIDES if shell_commands(page)])
+def test_commands_in_shell_blocks_parse_with_nothing_missing(page):
+    for argv in shell_commands(page):
+        command, words = resolve(argv)
+        command.make_context(command.name, words)
+
+
+@named([page for page in GUIDES if inline_commands(page)])
+def test_commands_in_the_text_exist_and_have_the_options_named(page):
+    for argv in inline_commands(page):
+        command, words = resolve(argv)
+        known = {name for parameter in command.params for name in parameter.opts}
+        unknown = [word for word in words if word.startswith("-") and word not in known]
+        assert not unknown, f"skinrig {' '.join(argv)}: {unknown}"
+
+
+def test_the_pages_name_every_command_of_a_user():
+    argvs = [argv for page in GUIDES for argv in (*shell_commands(page), *inline_commands(page))]
+    commands = set(typer.main.get_command(app).commands)
+    assert {argv[0] for argv in argvs} == commands
+
+
+# links, maps and messages ----------------------------------------------------------------------
+
+
+@named(GUIDES)
+def test_relative_links_lead_somewhere(page):
+    targets = re.findall(r"\]\(([^)\s]+)\)", prose(page))
+    local = [t.partition("#")[0] for t in targets if "://" not in t and not t.startswith("#")]
+    assert [target for target in local if not (page.parent / target).exists()] == []
+
+
+def test_the_maps_page_lists_every_map_of_the_pipeline():
+    from reconstruction.pipeline import MAPS
+
+    listed = [
+        name
+        for row in rows(ROOT / "docs" / "maps.md", "Maps of the flash rig")
+        for name in SPAN.findall(row[0])
+    ]
+    assert sorted(listed) == sorted(MAPS)
+
+
+def source_texts():
+    """Every text in the source, with whatever is filled in left as a gap."""
+    texts = []
+    for path in (p for package in PACKAGES for p in sorted((ROOT / package).rglob("*.py"))):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts = (v.value if isinstance(v, ast.Constant) else "\0" for v in node.values)
+                texts.append("".join(map(str, parts)))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                texts.append(node.value)
+    return texts + [path.read_text("utf-8") for path in sorted((ROOT / "tools").glob("*.sh"))]
+
+
+def test_messages_in_troubleshooting_are_messages_of_the_program():
+    page = ROOT / "docs" / "troubleshooting.md"
+    heads = [line.split("|")[1] for line in page.read_text("utf-8").splitlines() if "| `" in line]
+    quotes = [quote for head in heads for quote in SPAN.findall(head)]
+    assert len(quotes) > 30
+    texts = "\n".join(source_texts())
+    # what is filled in stands as three dots
+    pieces = [piece.strip() for quote in quotes for piece in quote.split("...")]
+    assert [piece for piece in pieces if piece not in texts] == []
