@@ -2,6 +2,17 @@
 
 The table is package data made by ``tools/make_skin_reflectance.py``; its optics are those of
 `rigsim.skin_layers`.
+
+Accuracy: the relative standard error has a median of 0.10 % where R > 0.3, 0.16 % where
+0.1 < R < 0.3, 0.35 % where R < 0.01, and is nowhere above 0.74 %. Interpolation adds at most 0.03 %
+(between the nodes, same photons), 0.002 % in the mean square. Lateral kernels are off by at most
+0.0021 of the light within any radius between the nodes, and their Gaussians by 0.017.
+
+Plausibility: against the mean of 100 forearms (Cooksey, Allen, Tsai 2017, doi:10.18434/M38597; nine
+wavelengths from 400 to 700 nm) the best fit is C_m = 0.0030, C_hd = 0.037 under a specular 0.04,
+with residuals of 0.035 root mean square and 0.051 at most: too bright below 500 nm, too dark above.
+A homogeneous epidermis of 0.25 mm needs that little melanin: C_m = 0.05 reflects 0.23 at
+700 nm where the forearms reflect 0.60, so fair skin lies below C_m = 0.01 and 0.05 is dark already.
 """
 
 from __future__ import annotations
@@ -17,7 +28,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from rigsim.lateral_kernels import LateralKernels
 from rigsim.skin_layers import MAX_C_HD, MAX_C_M
@@ -25,6 +36,7 @@ from rigsim.skin_layers import MAX_C_HD, MAX_C_M
 FloatArray = NDArray[np.float64]
 
 _FILE = "skin_reflectance_mc.npz"
+EMPTY_RING = 1e-9  # share that stands for a far ring that no photon reached
 
 
 class SkinTableError(ValueError):
@@ -71,6 +83,8 @@ class SkinTable:
     """Recipe version, seed, photons, optical constants and library versions."""
     _patches: FloatArray
     """log R with its slopes and twist per cell edge, shape (n_m, n_h, 4, n_wavelength)."""
+    _log_shares: FloatArray
+    """log of each ring's share of `lateral`, shape (k_m, k_h, rings, n_wavelength)."""
 
     @classmethod
     def load(cls) -> SkinTable:
@@ -148,8 +162,8 @@ class SkinTable:
 
         Notes
         -----
-        Ring shares are interpolated bilinearly over the cube roots of the fractions. The light of
-        a channel is weighted by how much of it comes back at each wavelength.
+        Cubic splines of the logarithm of the ring shares over the cube roots of the fractions.
+        The light of a channel is weighted by how much of it comes back at each wavelength.
 
         Examples
         --------
@@ -164,11 +178,15 @@ class SkinTable:
                 f"band_weights: expected finite numbers of shape ({n}, channels), one row for each "
                 f"wavelength, got shape {weights.shape}"
             )
-        i, t = _cell("c_m", c_m, MAX_C_M, self.lateral_c_m.size)
-        j, s = _cell("c_hd", c_hd, MAX_C_HD, self.lateral_c_hd.size)
-        corners = self.lateral[i : i + 2, j : j + 2]
-        shares = corners / corners.sum(axis=2, keepdims=True)
-        share = np.einsum("a,b,abrw->rw", [1.0 - t, t], [1.0 - s, s], shares)
+        log_share = self._log_shares
+        for name, value, limit in (("c_m", c_m, MAX_C_M), ("c_hd", c_hd, MAX_C_HD)):
+            at = float(_fractions(name, np.asarray(value), limit)[0])
+            # Smooth in the fraction itself, so flat in its cube root at zero.
+            flat = (1, np.zeros(log_share.shape[1:]))
+            nodes = np.linspace(0.0, 1.0, log_share.shape[0])
+            log_share = CubicSpline(nodes, log_share, bc_type=(flat, "not-a-knot"))(at)
+        share = np.exp(log_share)
+        share /= share.sum(axis=0)
         in_bands = (share * self.spectra(c_m, c_hd)) @ weights
         return LateralKernels.from_rings(self.ring_edges_mm, in_bands.T)
 
@@ -183,9 +201,15 @@ def _load() -> SkinTable:
         provenance = json.loads(str(stored["provenance"]))
     arrays["standard_error"] = arrays.pop("reflectance_standard_error")
     patches = _hermite_patches(arrays["reflectance"])
-    for array in (*arrays.values(), patches):
+    log_shares = _log_shares(arrays["lateral"])
+    for array in (*arrays.values(), patches, log_shares):
         array.setflags(write=False)
-    return SkinTable(provenance=provenance, _patches=patches, **arrays)
+    return SkinTable(provenance=provenance, _patches=patches, _log_shares=log_shares, **arrays)
+
+
+def _log_shares(rings: FloatArray) -> FloatArray:
+    shares = rings / rings.sum(axis=2, keepdims=True)
+    return np.log(np.maximum(shares, EMPTY_RING))
 
 
 def _hermite_patches(reflectance: FloatArray) -> FloatArray:
@@ -213,12 +237,6 @@ def _fractions(name: str, values: NDArray[Any], limit: float) -> FloatArray:
             f"({int(outside.sum())} of {flat.size} values are outside)"
         )
     return np.cbrt(np.minimum(flat, limit) / limit)
-
-
-def _cell(name: str, value: float, limit: float, nodes: int) -> tuple[int, float]:
-    position = float(_fractions(name, np.asarray(value), limit)[0]) * (nodes - 1)
-    index = min(int(position), nodes - 2)
-    return index, position - index
 
 
 def _interpolate(patches, c_m, c_hd, out):  # type: ignore[no-untyped-def]

@@ -109,7 +109,7 @@ def test_matched_half_space_matches_the_exact_h_function(albedo, published):
 
 @pytest.mark.parametrize(("albedo", "total"), [(0.5, 0.08009), (0.9, 0.27840), (0.99, 0.63139)])
 def test_half_space_of_skins_index_matches_adding_doubling(albedo, total):
-    """Rationale: the index of skin, 1.4. Expected: iadpython 0.5 (UR1, specular included)."""
+    """Rationale: the index of skin, 1.4. Expected: iadpython (UR1, specular included)."""
     run = traced(half_space(albedo, eta=1.4), 500_000)
     assert agrees(run.specular + run.reflectance, run.reflectance_stderr, total)
     darker = traced(half_space(1.0 - 1.1 * (1.0 - albedo), eta=1.4), 500_000)
@@ -117,7 +117,7 @@ def test_half_space_of_skins_index_matches_adding_doubling(albedo, total):
 
 
 def test_three_layers_match_the_sample_output_of_mcml():
-    """Rationale: several layers with unlike g. Expected: sample.mco of MCML 1.2.2, 1e6 photons
+    """Rationale: several layers with unlike g. Expected: sample.mco of MCML, 1e6 photons
     (Wang, Jacques, Zheng 1995, doi:10.1016/0169-2607(95)01640-F); its own noise is allowed for."""
     run = traced(MCML_SAMPLE, 1_000_000)
     assert run.specular == pytest.approx(0.0243729, abs=1e-7)

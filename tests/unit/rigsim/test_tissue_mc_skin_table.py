@@ -1,0 +1,303 @@
+"""The skin table against live photons, real skin and its own claims."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.optimize import least_squares
+
+from rigsim import skin_layers, skin_table
+from rigsim.lateral_kernels import GAUSSIAN_SIGMAS_MM, LateralKernels
+from rigsim.skin_table import SkinTable, SkinTableError
+from rigsim.tissue_mc import escape_paths, transport
+
+# Wavelength (nm), C_m, C_hd, photons: fair to dark, bloodless to Soret peak, on and off the nodes.
+ENTRIES = (
+    (400.0, 0.5, 0.32, 2_000_000),
+    (420.0, 0.003, 0.0, 60_000),
+    (420.0, 0.01, 0.3, 300_000),
+    (450.0, 0.06, 0.05, 300_000),
+    (540.0, 0.0, 0.02, 60_000),
+    (580.0, 0.24, 0.1, 800_000),
+    (700.0, 0.02, 0.005, 40_000),
+    (700.0, 0.45, 0.0, 400_000),
+)
+FALSE_ALARM = 1e-4
+
+
+@pytest.fixture(scope="module")
+def table():
+    return SkinTable.load()
+
+
+def z_values(table, entries, *, seed, factor=1.0):
+    """Live minus tabulated reflectance (times a factor) in standard errors of the difference."""
+    scores = []
+    for index, (nm, c_m, c_hd, photons) in enumerate(entries):
+        live = transport(
+            skin_layers.skin(nm, c_m, c_hd),
+            photons=photons,
+            rng=np.random.default_rng([seed, index]),
+            batches=40,
+            threads=2,
+        )
+        w = int(np.flatnonzero(table.wavelength_nm == nm)[0])
+        i = int(np.abs(table.c_m - c_m).argmin())
+        j = int(np.abs(table.c_hd - c_hd).argmin())
+        relative = table.standard_error[i, j, w] / table.reflectance[i, j, w]
+        tabulated = factor * table.spectra(c_m, c_hd)[w]
+        error = np.hypot(live.reflectance_stderr, relative * tabulated)
+        scores.append((live.reflectance - tabulated) / error)
+    return np.array(scores)
+
+
+def p_value(scores):
+    """Two-sided p of the largest score, Student with 39 degrees of freedom, Sidak-corrected."""
+    return 1.0 - (1.0 - 2.0 * stats.t.sf(np.abs(scores).max(), 39)) ** scores.size
+
+
+def test_table_agrees_with_photons_traced_now(table):
+    # Direct absorption at these entries: no reweighting, no interpolation. False alarms: 1e-4.
+    assert p_value(z_values(table, ENTRIES[:4], seed=1)) > FALSE_ALARM
+
+
+def test_a_table_two_percent_off_would_not_agree(table):
+    assert p_value(z_values(table, ENTRIES[:4], seed=1, factor=1.02)) < FALSE_ALARM
+
+
+@pytest.mark.long
+def test_table_agrees_with_many_photons_traced_now(table):
+    # Random entries over all ranges, uniform in the cube roots. False alarms: 1e-4.
+    rng = np.random.default_rng(2)
+    drawn = [
+        (float(rng.choice(table.wavelength_nm)), 0.5 * u**3, 0.32 * v**3, 400_000)
+        for u, v in rng.random((24, 2))
+    ]
+    scores = z_values(table, (*ENTRIES, *drawn), seed=3)
+    assert p_value(scores) > FALSE_ALARM
+    # Neither is the error overstated: sum z^2 is chi-square within 1e-4.
+    assert stats.chi2.sf(np.sum(scores**2), scores.size) > FALSE_ALARM
+    assert stats.chi2.cdf(np.sum(scores**2), scores.size) > FALSE_ALARM
+
+
+def test_standard_errors_keep_what_the_module_states(table):
+    relative = table.standard_error / table.reflectance
+    middle = (table.reflectance > 0.1) & (table.reflectance < 0.5)
+    assert np.median(relative[middle]) < 0.002
+    assert np.quantile(relative[middle], 0.95) < 0.003
+    assert relative.max() < 0.0075
+
+
+def test_table_covers_the_ranges_and_the_visible(table):
+    np.testing.assert_array_equal(table.wavelength_nm, np.arange(400.0, 701.0, 10.0))
+    assert (table.c_m[0], table.c_m[-1]) == (0.0, 0.5)
+    assert (table.c_hd[0], table.c_hd[-1]) == (0.0, 0.32)
+    np.testing.assert_allclose(np.diff(np.cbrt(table.c_m), 2), 0.0, atol=1e-12)
+    assert table.reflectance.min() > 0.0
+    assert table.reflectance.max() < 1.0
+
+
+def test_table_was_made_with_the_optics_of_today(table):
+    for name in ("melanin_per_mm", "blood_per_mm", "baseline_per_mm"):
+        now = [getattr(skin_layers, name)(nm) for nm in table.wavelength_nm]
+        np.testing.assert_allclose(table.provenance[name], now, rtol=1e-12)
+    now = [skin_layers.epidermis_scattering_per_mm(nm) for nm in table.wavelength_nm]
+    np.testing.assert_allclose(table.provenance["epidermis_scattering_per_mm"], now, rtol=1e-12)
+    assert table.provenance["g"] == skin_layers.ANISOTROPY
+    assert table.provenance["eta"] == skin_layers.ETA
+    assert table.provenance["epidermis_mm"] == skin_layers.EPIDERMIS_MM
+    assert table.provenance["epidermal_blood_share"] == skin_layers.EPIDERMAL_BLOOD_SHARE
+
+
+def test_spectra_pass_through_the_nodes(table):
+    c_m, c_hd = np.meshgrid(table.c_m, table.c_hd, indexing="ij")
+    np.testing.assert_allclose(table.spectra(c_m, c_hd), table.reflectance, rtol=1e-12)
+
+
+def test_more_of_either_chromophore_is_never_brighter(table):
+    many = np.linspace(0.0, 1.0, 1201) ** 3
+    some = np.linspace(0.0, 1.0, 37) ** 3
+    by_melanin = table.spectra(0.5 * many[:, None], 0.32 * some)
+    by_blood = table.spectra(0.5 * some[:, None], 0.32 * many)
+    assert np.all(np.diff(by_melanin, axis=0) < 0.0)
+    # In the darkest skin blood changes R by less than the table's float32 can hold.
+    assert np.all(np.diff(by_blood, axis=1) <= 1e-9 * by_blood[:, 1:])
+    assert np.all(np.diff(by_blood[:25], axis=1) < 0.0)
+
+
+@pytest.mark.parametrize("nm", [420.0, 540.0, 700.0])
+def test_interpolation_between_the_nodes_is_exact_to_three_parts_in_ten_thousand(nm):
+    # The same photons, reweighted at nodes and at cell centres: the difference holds no noise.
+    nodes = 41
+    at = (np.arange(nodes - 1) + 0.5) / (nodes - 1)
+    u = np.concatenate([np.linspace(0.0, 1.0, nodes), at])
+    base, melanin, blood = (
+        np.array([layer.sigma_a_per_mm for layer in skin_layers.skin(nm, *c).layers])
+        for c in ((0.0, 0.0), (0.5, 0.0), (0.0, 0.32))
+    )
+    paths = escape_paths(
+        skin_layers.skin(nm, 0.0, 0.0), photons=20_000, rng=np.random.default_rng(4)
+    )
+    live = np.zeros((u.size, u.size))
+    for batch in paths:
+        by_m = np.exp(-np.outer(u**3, batch.path_mm @ (melanin - base)))
+        by_h = np.exp(-np.outer(u**3, batch.path_mm @ (blood - base)))
+        live += (by_m * batch.weight) @ by_h.T
+    patches = skin_table._hermite_patches(live[:nodes, :nodes, None])
+    x, y = np.meshgrid(at, at, indexing="ij")
+    out = np.empty((x.size, 1))
+    skin_table._interpolate_f64(patches, x.ravel(), y.ravel(), out)
+    error = out.reshape(x.shape) / live[nodes:, nodes:] - 1.0
+    assert np.abs(error).max() < 3e-4
+    assert np.sqrt(np.mean(error**2)) < 3e-5
+
+
+def test_leading_axes_broadcast_and_inputs_stay_untouched(table):
+    rng = np.random.default_rng(5)
+    c_m, c_hd = 0.5 * rng.random((3, 1)), 0.32 * rng.random(4)
+    before = c_m.copy(), c_hd.copy()
+    spectra = table.spectra(c_m, c_hd)
+    assert spectra.shape == (3, 4, 31)
+    for i in range(3):
+        for j in range(4):
+            np.testing.assert_array_equal(spectra[i, j], table.spectra(c_m[i, 0], c_hd[j]))
+    np.testing.assert_array_equal(c_m, before[0])
+    np.testing.assert_array_equal(c_hd, before[1])
+
+
+def test_single_precision_stays_single_and_reaches_the_rim(table):
+    spectrum = table.spectra(np.float32(0.5), np.float32(0.32))
+    assert spectrum.dtype == np.float32
+    np.testing.assert_allclose(spectrum, table.spectra(0.5, 0.32), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("c_m", "c_hd", "field"),
+    [(-1e-6, 0.1, "c_m"), (0.51, 0.1, "c_m"), (0.1, 0.33, "c_hd"), (0.1, np.nan, "c_hd")],
+)
+def test_fractions_outside_the_table_are_refused_by_name(table, c_m, c_hd, field):
+    with pytest.raises(SkinTableError, match=f"^{field}: expected volume fractions"):
+        table.spectra([0.1, c_m], c_hd)
+
+
+def test_arrays_of_the_shared_table_are_read_only(table):
+    for field in fields(table):
+        value = getattr(table, field.name)
+        if isinstance(value, np.ndarray):
+            assert not value.flags.writeable
+
+
+def test_a_spectrum_of_the_table_fits_real_skin_as_the_module_states(table):
+    # Mean of 100 forearms, specular included: Cooksey, Allen, Tsai 2017, doi:10.18434/M38597.
+    nm = [400.0, 450.0, 500.0, 540.0, 560.0, 575.0, 600.0, 650.0, 700.0]
+    forearms = np.array([0.185, 0.252, 0.328, 0.317, 0.323, 0.327, 0.447, 0.557, 0.602])
+
+    def residual(roots):
+        spectrum = table.spectra(roots[0] ** 3, roots[1] ** 3)
+        return np.interp(nm, table.wavelength_nm, spectrum) + 0.04 - forearms
+
+    fit = least_squares(residual, [0.2, 0.3], bounds=([0.0, 0.0], [0.79, 0.68]))
+    c_m, c_hd = fit.x**3
+    assert (c_m, c_hd) == pytest.approx((0.0030, 0.0373), rel=0.02)
+    assert np.sqrt(np.mean(fit.fun**2)) < 0.036
+    assert np.abs(fit.fun).max() < 0.052
+
+
+def band_weights():
+    """Three smooth bands, red, green and blue, columns summing to 1."""
+    nm = np.arange(400.0, 701.0, 10.0)[:, None]
+    bands = np.exp(-0.5 * ((nm - [600.0, 540.0, 460.0]) / 30.0) ** 2)
+    return bands / bands.sum(axis=0)
+
+
+def test_kernels_hold_all_light_and_red_spreads_farthest(table):
+    kernels = table.lateral_kernels(0.01, 0.03, band_weights())
+    areas = np.pi * np.diff(kernels.ring_edges_mm**2)
+    np.testing.assert_allclose((kernels.density_per_mm2 * areas).sum(axis=1), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(kernels.encircled[:, -1], 1.0, rtol=1e-12)
+    assert np.all(np.diff(kernels.encircled, axis=1) >= 0.0)
+    assert kernels.rms_mm[0] > kernels.rms_mm[1] > kernels.rms_mm[2]
+
+
+def test_melanin_and_blood_narrow_the_kernels(table):
+    rms = [
+        table.lateral_kernels(c_m, c_hd, band_weights()).rms_mm
+        for c_m, c_hd in ((0.0, 0.01), (0.0, 0.1), (0.2, 0.1))
+    ]
+    assert np.all(rms[0] > rms[1])
+    assert np.all(rms[1] > rms[2])
+
+
+def test_a_channel_weighs_wavelengths_by_the_light_they_send_back(table):
+    c_m, c_hd = 0.01, 0.05
+    pair = np.zeros((31, 1))
+    pair[[14, 20], 0] = 0.5
+    mixed = table.lateral_kernels(c_m, c_hd, pair).density_per_mm2[0]
+    alone = table.lateral_kernels(c_m, c_hd).density_per_mm2
+    share = table.spectra(c_m, c_hd)[[14, 20]]
+    np.testing.assert_allclose(mixed, share / share.sum() @ alone[[14, 20]], rtol=1e-12)
+
+
+LIVE_KERNELS = (
+    (420.0, 0.003, 0.01, 100_000),
+    (540.0, 0.003, 0.03, 100_000),
+    (600.0, 0.04, 0.06, 200_000),
+    (700.0, 0.1, 0.1, 200_000),
+)
+
+
+def excess_deviation(table, nm, c_m, c_hd, photons, *, tabulated_nm):
+    """Largest deviation of the encircled fraction from a live run, less what noise explains.
+
+    Noise: Kolmogorov's bound, 2.23 / sqrt(n) with a false-alarm rate of 1e-4, for the effective
+    numbers of photons of the live run and of the table.
+    """
+    batches = escape_paths(
+        skin_layers.skin(nm, c_m, c_hd), photons=photons, rng=np.random.default_rng(6), threads=2
+    )
+    weight = np.concatenate([batch.weight for batch in batches])
+    radius = np.concatenate([batch.radius_mm for batch in batches])
+    live = np.cumsum(np.histogram(radius, table.ring_edges_mm, weights=weight)[0]) / weight.sum()
+    w = int(np.flatnonzero(table.wavelength_nm == tabulated_nm)[0])
+    i, j = np.abs(table.c_m - c_m).argmin(), np.abs(table.c_hd - c_hd).argmin()
+    table_noise = table.standard_error[i, j, w] / table.reflectance[i, j, w]
+    noise = 2.23 * np.hypot(np.sqrt((weight**2).sum()) / weight.sum(), table_noise)
+    return np.abs(table.lateral_kernels(c_m, c_hd).encircled[w] - live).max() - noise
+
+
+@pytest.mark.parametrize(("nm", "c_m", "c_hd", "photons"), LIVE_KERNELS)
+def test_kernels_between_the_nodes_agree_with_photons_traced_now(table, nm, c_m, c_hd, photons):
+    # Interpolation between nodes is off by 0.0021 of the light at most (420 nm, no noise).
+    assert excess_deviation(table, nm, c_m, c_hd, photons, tabulated_nm=nm) < 0.0025
+
+
+@pytest.mark.parametrize(("nm", "c_m", "c_hd", "photons"), LIVE_KERNELS)
+def test_kernels_of_another_wavelength_do_not_agree(table, nm, c_m, c_hd, photons):
+    other = {420.0: 450.0, 540.0: 500.0, 600.0: 640.0, 700.0: 600.0}[nm]
+    assert excess_deviation(table, nm, c_m, c_hd, photons, tabulated_nm=other) > 0.0025
+
+
+def test_gaussians_stand_for_the_kernels_within_two_percent_of_the_light(table):
+    for c_m, c_hd in ((0.0, 0.0), (0.01, 0.03), (0.05, 0.1), (0.5, 0.32)):
+        kernels = table.lateral_kernels(c_m, c_hd, band_weights())
+        fit = kernels.gaussians()
+        assert fit.weights.shape == (3, len(GAUSSIAN_SIGMAS_MM))
+        assert np.all(fit.weights >= 0.0)
+        np.testing.assert_allclose(fit.weights.sum(axis=1), 1.0, rtol=1e-12)
+        assert fit.worst_encircled.max() < 0.02
+        rms = np.sqrt(2.0 * fit.weights @ fit.sigmas_mm**2)
+        np.testing.assert_allclose(rms, kernels.rms_mm, rtol=0.1)
+
+
+def test_malformed_requests_for_kernels_are_refused(table):
+    with pytest.raises(SkinTableError, match=r"band_weights: expected .*shape \(31, channels\)"):
+        table.lateral_kernels(0.1, 0.1, np.ones((30, 3)))
+    with pytest.raises(SkinTableError, match="c_m"):
+        table.lateral_kernels(0.6, 0.1)
+    with pytest.raises(ValueError, match="rings: expected shape"):
+        LateralKernels.from_rings([0.0, 1.0], [[1.0, 2.0]])
+    with pytest.raises(ValueError, match="some in every channel"):
+        LateralKernels.from_rings([0.0, 1.0], [[0.0]])
+    with pytest.raises(ValueError, match="sigmas_mm"):
+        table.lateral_kernels(0.1, 0.1).gaussians([0.0, 1.0])
