@@ -59,7 +59,7 @@ def main() -> None:
         print(f"seed {seed} {preset} {state}: {by_preset[preset][-1]:.4f}", file=sys.stderr)
     covariance = total / count
     document = {
-        "log_covariance": covariance.round(9).tolist(),
+        "log_covariance": covariance.round(15).tolist(),
         "seeds": [SEEDS[0], SEEDS[-1]],
         "pixels": count,
         "rms_by_preset": {name: round(float(np.mean(v)), 5) for name, v in by_preset.items()},
