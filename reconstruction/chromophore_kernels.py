@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import boolean, float32, float64, int64, njit, prange, void
+from numba import boolean, float32, float64, int64, njit, prange, types, void
 
 from reconstruction.chromophore_start import LOWEST
 
@@ -159,19 +159,24 @@ def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyp
     return np.float32(step_a), np.float32(step_b)
 
 
+def _given(dtype: types.Type, axes: int) -> types.Array:
+    """Return the type of a contiguous argument that is only read, and may be read-only."""
+    return types.Array(dtype, axes, "C", readonly=True)
+
+
 @njit(
     void(
-        float32[:, ::1],  # rgb (n, 3)
-        float32[:, ::1],  # variance (n, 3) or (1, 3)
-        float32[::1],  # shading (n,) or (1,)
-        boolean[::1],  # usable (n,) or (1,)
+        _given(float32, 2),  # rgb (n, 3)
+        _given(float32, 2),  # variance (n, 3) or (1, 3)
+        _given(float32, 1),  # shading (n,) or (1,)
+        _given(boolean, 1),  # usable (n,) or (1,)
         boolean,  # shading is free
-        float32[:, ::1],  # covariance of the model's relative error (3, 3)
-        float32[:, :, :, :, ::1],  # cells of the color table
-        float32[::1],  # ends of the axes as volume fractions (2,)
-        float32[:, ::1],  # projection of log rgb and offset (2, 4)
-        float32[:, :, ::1],  # start grid (g, g, 2)
-        float32[:, ::1],  # mean log color of second solutions (g, g)
+        _given(float32, 2),  # covariance of the model's relative error (3, 3)
+        _given(float32, 5),  # cells of the color table
+        _given(float32, 1),  # ends of the axes as volume fractions (2,)
+        _given(float32, 2),  # projection of log rgb and offset (2, 4)
+        _given(float32, 3),  # start grid (g, g, 2)
+        _given(float32, 2),  # mean log color of second solutions (g, g)
         float32,  # largest plausible log shading
         float32,  # sign of the surface's side on which light skin lies
         float32,  # largest relative standard error of an identifiable chromophore

@@ -94,7 +94,7 @@ def invert(
         None: a free factor per pixel. "known": the factor is 1. Array of shape (...) or number:
         the known factor.
     variance
-        Noise variance of `rgb`, shape (..., 3) or (3,). None: 1 percent of each channel.
+        Noise variance of `rgb`, broadcast to its shape. None: 1 percent of each channel.
     model_error
         Relative error of the table's colors, added to the noise: a standard error, one a channel,
         or a (3, 3) covariance. A covariance with s^2 in all its cells says that the shading is
@@ -320,9 +320,12 @@ def _second_solution(
     log_color = np.log(color)
     place = np.rint(log_color @ start.projection[:, :3].T + start.projection[:, 3])
     i, j = np.clip(place, 0, start.twin_log.shape[0] - 1).astype(np.intp).transpose(2, 0, 1)
-    reach = np.inf if shading_max is None else np.log(shading_max)
+    lightest = start.twin_log[i, j].astype(np.float64)
+    darker = np.isfinite(lightest)
+    if shading_max is not None:
+        darker &= log_color.mean(axis=-1) <= lightest + np.log(shading_max)
     facing = np.cross(gradient[..., 0], gradient[..., 1]).sum(axis=-1) * start.side
-    return np.asarray((facing <= 0.0) | (log_color.mean(axis=-1) <= start.twin_log[i, j] + reach))
+    return np.asarray((facing <= 0.0) | darker)
 
 
 def _shading(shading: Shading, shape: tuple[int, ...]) -> tuple[bool, Map]:
@@ -342,10 +345,14 @@ def _variance(variance: ArrayLike | None, shape: tuple[int, ...]) -> Map:
     if variance is None:
         return np.zeros((1, 3), dtype=np.float32)
     values = np.asarray(variance, dtype=np.float32)
-    if values.shape not in ((3,), (*shape, 3)):
+    if values.shape == (3,):
+        return np.ascontiguousarray(values).reshape(1, 3)
+    try:
+        values = np.broadcast_to(values, (*shape, 3))
+    except ValueError as error:
         raise ChromophoreError(
-            f"variance: expected shape {(*shape, 3)} or (3,), got {values.shape}"
-        )
+            f"variance: expected a shape that broadcasts to {(*shape, 3)}, got {values.shape}"
+        ) from error
     return np.ascontiguousarray(values).reshape(-1, 3)
 
 
