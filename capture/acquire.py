@@ -238,12 +238,16 @@ def _take(
         except (FrameRefused, FrameTimeout, CommandRefused) as error:
             if isinstance(error, CommandRefused) and error.code != Code.HARDWARE:
                 raise
-            # a misfire has pulsed the camera line: its frame is dark and must go too
             log.warning("step %s, attempt %d: %s", step.id, attempt, error)
             refusals.append(str(error))
             counts["retakes"] += 1
-            for camera in (cameras[name] for name in step.cameras):
-                camera.abort()
+            for name in step.cameras:
+                if isinstance(error, CommandRefused):
+                    # a misfire has pulsed the camera line: a dark frame is being read out, and
+                    # until it has come the camera would miss the next pulse
+                    with contextlib.suppress(CameraError):
+                        cameras[name].frame(_frame_timeout_s(step, rig.view(name)))
+                cameras[name].abort()
             continue
         counts["stale"] += stale
         light = _light(report)
@@ -320,12 +324,16 @@ def _expose(
     frames: dict[str, Frame] = {}
     stale = 0
     for name, camera in chosen.items():
-        timeout_s = want.exposure_s + rig.view(name).readout_s + FRAME_MARGIN_S
+        timeout_s = _frame_timeout_s(step, rig.view(name))
         frames[name], dropped = next_frame(
             camera, seq=0, not_before_s=not_before[name], want=asked[name], timeout_s=timeout_s
         )
         stale += dropped
     return report, frames, stale
+
+
+def _frame_timeout_s(step: Step, view: View) -> float:
+    return float(step.settings["exposure_s"]) + view.readout_s + FRAME_MARGIN_S
 
 
 def _light(report: Any | None) -> dict[str, str | float]:

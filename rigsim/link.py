@@ -61,6 +61,7 @@ class Link:
         self._to_host: deque[tuple[float, bytes]] = deque()
         self._received = bytearray()
         self._first_open = math.inf
+        self._opened_at = math.inf
         self._byte_s = 10.0 / faults.baud if faults.baud else 0.0
         self._reset_at = faults.reset_after
         # when the last byte under way each way arrives: the line is first in, first out
@@ -72,6 +73,7 @@ class Link:
     def attach(self, now: float) -> None:
         """Open the port; raise `Unplugged` when nothing is there."""
         self._first_open = min(self._first_open, now)
+        self._opened_at = now
         self.check(now)
         self.attached = True
         if self._faults.reset_on_open:
@@ -84,9 +86,9 @@ class Link:
         self._received.clear()
 
     def check(self, now: float) -> None:
-        """Raise `Unplugged` while the cable is out."""
+        """Raise `Unplugged` while the cable is out; a port opened before stays dead after."""
         out = self._first_open + self._faults.unplug_after
-        if out <= now < out + self._faults.replug_after:
+        if now >= out and (now < out + self._faults.replug_after or self._opened_at < out):
             raise Unplugged
 
     def send(self, data: bytes, now: float) -> None:
