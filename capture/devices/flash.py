@@ -421,4 +421,4 @@ def find_box(urls: Iterable[str], serial: str, *, clock: Clock | None = None) ->
 def _decimal(field: str, value: float) -> str:
     if not math.isfinite(value):
         raise ValueError(f"{field}: got {value}, expected a finite number")
-    return f"{value:.6f}".rstrip("0").rstrip(".")
+    return f"{value:.9f}".rstrip("0").rstrip(".")

@@ -278,7 +278,7 @@ class FlashUnit:
         return ""
 
     def _get_power(self, _: str, now: float) -> str:
-        return f"{self.power:.6f}"
+        return f"{self.power:.8f}"
 
     def charge(self, now: float) -> float:
         """Return the energy in the capacitor at `now`, 0 to 1 of a full pop."""

@@ -38,9 +38,9 @@ MANUAL = {
     "FLAS:POL:ANG": ("FLAS:POL:ANG 22.5", False, ""),
     "FLAS:POL:ANG?": ("FLAS:POL:ANG?", False, "0.000"),
     "FLAS:POW": ("FLAS:POW 0.25", False, ""),
-    "FLAS:POW?": ("FLAS:POW?", False, "1.000000"),
+    "FLAS:POW?": ("FLAS:POW?", False, "1.00000000"),
     "FLAS:CHAR?": ("FLAS:CHAR?", False, "1.0000,1,0"),
-    "FLAS:FIRE": ("FLAS:FIRE a1", True, "a1,1000000,1.000000,PAR,0.000,1"),
+    "FLAS:FIRE": ("FLAS:FIRE a1", True, "a1,1000000,1.00000000,PAR,0.000,1"),
     "FLAS:LAST?": ("FLAS:LAST?", False, "NONE"),
     "FLAS:COUN?": ("FLAS:COUN?", False, "0"),
     "FLAS:LAMP": ("FLAS:LAMP ON,200", True, ""),
@@ -181,9 +181,9 @@ def test_an_unknown_header_is_undefined_framed_or_bare(bench):
 def test_settings_are_read_back(bench):
     for text, query, payload in [
         ("FLAS:POL CROS", "FLAS:POL?", "CROS"), ("FLAS:POL CROS", "FLAS:POL:ANG?", "90.000"),
-        ("FLAS:POL:ANG 30", "FLAS:POL:ANG?", "30.000"), ("FLAS:POW 0.5", "FLAS:POW?", "0.500000"),
+        ("FLAS:POL:ANG 30", "FLAS:POL:ANG?", "30.000"), ("FLAS:POW 0.5", "FLAS:POW?", "0.50000000"),
         ("SYST:WDOG 500", "SYST:WDOG?", "500"), ("SYST:ARM", "SYST:ARM?", "1"),
-        ("SYST:ARM", "STAT?", "49"), ("*RST", "FLAS:POW?", "1.000000"),
+        ("SYST:ARM", "STAT?", "49"), ("*RST", "FLAS:POW?", "1.00000000"),
     ]:  # fmt: skip
         bench.ask(text)
         assert bench.ask(query) == payload, text
@@ -400,7 +400,7 @@ def test_a_pop_tells_the_world_what_the_box_reports(bench):
     bench.ask("FLAS:POW 0.25")
     bench.now = 1.5
     report = bench.ask("FLAS:FIRE n.7")
-    assert report == "n.7,1500000,0.250000,PAR,30.000,1"
+    assert report == "n.7,1500000,0.25000000,PAR,30.000,1"
     assert bench.ask("FLAS:LAST?") == report
     (pop,) = bench.world.pops
     assert (pop.token, pop.t_s, pop.power, pop.analyser_deg) == ("n.7", 1.5, 0.25, 30.0)
@@ -488,7 +488,7 @@ def test_a_reset_draws_another_epoch_forgets_settings_and_keeps_the_count(bench)
     bench.now += 0.8
     assert bench.box.boot not in (before, 0)
     assert [bench.ask(q) for q in ("FLAS:POW?", "SYST:ARM?", "FLAS:COUN?", "FLAS:LAST?")] == [
-        "1.000000", "0", "1", "NONE",
+        "1.00000000", "0", "1", "NONE",
     ]  # fmt: skip
     assert bench.ask("SYST:PING?") == "800000"
 
