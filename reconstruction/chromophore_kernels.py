@@ -24,6 +24,8 @@ DONE_GAIN = 1e-3
 """The same as the square of the step in standard errors."""
 DONE_MISFIT = 1e-2
 """What a misfit adds to it, per square of the residual: noise makes more digits worthless."""
+DONE_NOISY = 3e-2
+"""Step, relative to the place, that is the last one if noise leaves more than it gains."""
 CONVERGED = 2e-2
 """Step, relative to the place, up to which the last one counts as converged."""
 OUTSIDE_SIGMAS = 4.0
@@ -375,10 +377,12 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 a += step_a
                 b += step_b
                 gain = abs(step_a * ra + step_b * rb)
-                if gain < DONE_GAIN + DONE_MISFIT * (cost - gain) or (
-                    abs(step_a) < DONE * a
-                    and abs(step_b) < DONE * b
-                    and max(abs(step_a), abs(step_b)) < DONE_AXIS
+                longest = max(abs(step_a) / a, abs(step_b) / b)
+                misfit = cost - gain
+                if (
+                    gain < DONE_GAIN + DONE_MISFIT * misfit
+                    or (longest < DONE and max(abs(step_a), abs(step_b)) < DONE_AXIS)
+                    or (longest < DONE_NOISY and gain < misfit)
                 ):
                     done = True
                     break
@@ -412,7 +416,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 g1 = min(max(int(y1 + _HALF), 0), grid - 1)
                 twin = (l0 + l1 + l2) / _THREE <= twin_log[g0, g1] + log_shading_max
             outside = residual > OUTSIDE_SIGMAS and distance > OUTSIDE_DISTANCE
-            close = abs(step_a) < CONVERGED * a and abs(step_b) < CONVERGED * b
+            close = max(abs(step_a) / a, abs(step_b) / b) < CONVERGED
             masks[0, n] = (done or close) and not outside
             masks[1, n] = outside
             masks[2, n] = relative_a <= limit and a < _ONE and not twin

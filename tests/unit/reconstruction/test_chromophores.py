@@ -75,7 +75,7 @@ def test_the_kernel_finds_the_minimum_that_plain_numpy_finds(shading, table, rng
     ):
         assert np.quantile((np.abs(estimate - other) / stderr)[compared], 0.99) < 0.15
     assert np.quantile(np.abs(maps.shading / factor - 1.0)[compared], 0.99) < 0.02
-    assert np.quantile((maps.residual**2 - cost)[compared], 0.99) < 0.02
+    assert np.quantile((maps.residual**2 - cost)[compared], 0.99) < 0.06
 
 
 @pytest.mark.parametrize("shading", MODES)
