@@ -19,7 +19,7 @@ ANISOTROPY = (
 )
 EUMELANIN_SHARE = 0.61  # beta_m, Donner et al. 2008; the rest is pheomelanin
 EPIDERMAL_BLOOD_SHARE = 0.25  # C_he / C_hd, Jimenez et al. 2010, doi:10.1145/1882261.1866167
-OXYGENATION = 0.75  # S, Jimenez et al. 2010
+OXYGENATION = 0.75  # S, Donner and Jensen 2006, doi:10.2312/EGWR/EGSR06/409-417
 BLOOD_G_PER_L, HEMOGLOBIN_G_PER_MOL = 150.0, 64_500.0  # Prahl 1998 (OMLC)
 
 MAX_C_M, MAX_C_HD = 0.5, 0.32  # Jimenez et al. 2010, table 1

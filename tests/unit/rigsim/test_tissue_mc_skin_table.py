@@ -1,6 +1,8 @@
 """The skin table against live photons, real skin and its own claims."""
 
+import importlib.util
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -79,6 +81,50 @@ def test_table_agrees_with_many_photons_traced_now(table):
     # Neither is the error overstated: sum z^2 is chi-square within 1e-4.
     assert stats.chi2.sf(np.sum(scores**2), scores.size) > FALSE_ALARM
     assert stats.chi2.cdf(np.sum(scores**2), scores.size) > FALSE_ALARM
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    path = Path(__file__).parents[3] / "tools" / "make_skin_reflectance.py"
+    spec = importlib.util.spec_from_file_location("make_skin_reflectance", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_recipe_makes_the_stored_numbers_from_other_photons(table, recipe):
+    made = recipe.simulate(600.0, seed=1, scale=0.02, threads=2)
+    some = np.s_[::13, ::13]
+    error = np.hypot(made["reflectance_standard_error"][some], table.standard_error[..., 20][some])
+    scores = (made["reflectance"][some] - table.reflectance[..., 20][some]) / error
+    # Sixteen nodes that share photons; false alarms: below 16 x 3e-4.
+    assert np.abs(scores).max() < 4.0
+    # Rings up to 15 mm hold all but 3e-4 of the light.
+    missing = 1.0 - made["lateral"].sum(axis=-1) / made["reflectance"][::5, ::5]
+    assert np.all((missing > -1e-9) & (missing < 1e-3))
+
+
+def test_runs_of_the_recipe_share_each_estimate_without_gaps(table, recipe):
+    shares = recipe.shares(table.c_m)
+    np.testing.assert_allclose(shares.sum(axis=0), 1.0, rtol=1e-12)
+    for (c_ref, _), share in zip(recipe.RUNS, shares, strict=True):
+        # A run must not be reweighted to less melanin than it had.
+        assert np.all(share[table.c_m < c_ref] == 0.0)
+
+
+@pytest.mark.long
+def test_interrupted_recipe_goes_on_and_ends_with_the_same_numbers(recipe, tmp_path):
+    arguments = ["--photons-scale", "1e-4", "--work", str(tmp_path), "--out"]
+    assert recipe.main([*arguments, str(tmp_path / "whole.npz")]) == 0
+    parts = sorted(tmp_path.glob("*/*nm.npz"))
+    assert len(parts) == 31
+    kept = {part: part.stat().st_mtime_ns for part in parts[1:]}
+    parts[0].unlink()
+    assert recipe.main([*arguments, str(tmp_path / "resumed.npz")]) == 0
+    assert {part: part.stat().st_mtime_ns for part in kept} == kept
+    with np.load(tmp_path / "whole.npz") as whole, np.load(tmp_path / "resumed.npz") as resumed:
+        for name in set(whole.files) - {"provenance"}:
+            np.testing.assert_array_equal(whole[name], resumed[name])
 
 
 def test_standard_errors_keep_what_the_module_states(table):
