@@ -1,5 +1,6 @@
 """Worlds, and the same box and camera behind every transport."""
 
+import dataclasses
 import itertools
 from types import SimpleNamespace
 
@@ -31,11 +32,17 @@ class Photometer:
 
 def quick_rig():
     """The flash rig, small, with a camera that reads out in 50 ms."""
-    import dataclasses
-
     rig = load_rig("flash").resized(16)
     view = dataclasses.replace(rig.views[0], readout_s=0.05)
     return dataclasses.replace(rig, views=(view,), polarizer_move_s=0.1)
+
+
+@pytest.fixture(autouse=True)
+def quick_close(monkeypatch):
+    """Skip the 0.3 s that pyserial sleeps after closing a socket."""
+    monkeypatch.setattr(
+        "serial.urlhandler.protocol_socket.time", SimpleNamespace(sleep=lambda seconds: None)
+    )
 
 
 @pytest.fixture

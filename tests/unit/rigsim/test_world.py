@@ -1,5 +1,6 @@
 """The simulated world: its time, its names, and ports and cameras on it."""
 
+import dataclasses
 import errno
 import math
 import termios
@@ -134,6 +135,9 @@ def test_a_rig_with_an_unknown_box_or_clock_is_refused():
 def test_without_a_scene_frames_hold_black_level_and_read_noise():
     rig = load_rig("flash").resized(256)
     view = rig.view("cam")
+    # two DN, so that rounding is noise like any other
+    view = dataclasses.replace(view, read_noise_e=2.0 * view.gain_e_per_dn)
+    rig = dataclasses.replace(rig, views=(view,))
     frame = World(rig).expose("cam", Exposure(0.01, 100), 0.0, seed=1)
     assert frame.shape == (view.height_px, view.width_px)
     noise_dn = view.read_noise_e / view.gain_e_per_dn
