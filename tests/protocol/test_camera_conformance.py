@@ -1,6 +1,7 @@
 """What every camera must do, over sim:// and over TCP."""
 
 import socket
+import sys
 import threading
 
 import numpy as np
@@ -432,3 +433,10 @@ def test_every_flipped_bit_of_a_header_is_noticed():
 def test_a_full_frame_of_the_real_camera_fits_a_message():
     view = load_rig("flash").view("cam")
     assert 2 * view.width_px * view.height_px < camera_wire.MAX_BLOB_BYTES
+
+
+def test_a_camera_whose_library_is_missing_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gphoto2", None)  # as if it were not installed
+    with pytest.raises(ImportError, match=r"skinrig\[gphoto\]") as caught:
+        open_camera("gphoto2:1234")
+    assert isinstance(caught.value, CameraError)
