@@ -252,9 +252,10 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             i0, i1, i2 = _ONE / d0, _ONE / d1, _ONE / d2
             a00, a11, a22 = v0 * i0 * i0 + m00, v1 * i1 * i1 + m11, v2 * i2 * i2 + m22
             if plain:
-                w = (_ONE / a00, _ZERO, _ZERO, _ONE / a11, _ZERO, _ONE / a22)
+                x0, x3, x5 = 1.0 / float64(a00), 1.0 / float64(a11), 1.0 / float64(a22)
+                x1 = x2 = x4 = 0.0
             else:
-                x = _weights(
+                x0, x1, x2, x3, x4, x5 = _weights(
                     float64(a00),
                     float64(a11),
                     float64(a22),
@@ -262,30 +263,25 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                     float64(m02),
                     float64(m12),
                 )
-                w = (
-                    np.float32(x[0]),
-                    np.float32(x[1]),
-                    np.float32(x[2]),
-                    np.float32(x[3]),
-                    np.float32(x[4]),
-                    np.float32(x[5]),
-                )
-            s0, s1, s2 = w[0] + w[1] + w[2], w[1] + w[3] + w[4], w[2] + w[4] + w[5]
-            whole = _ONE / (s0 + s1 + s2)
-            s0, s1, s2 = s0 * whole, s1 * whole, s2 * whole
+            t0, t1, t2 = x0 + x1 + x2, x1 + x3 + x4, x2 + x4 + x5
+            total = t0 + t1 + t2
+            whole = 1.0 / total
+            t0, t1, t2 = t0 * whole, t1 * whole, t2 * whole
+            s0, s1, s2 = np.float32(t0), np.float32(t1), np.float32(t2)
             if free:
-                total = _ONE / whole
-                w = (
-                    w[0] - s0 * s0 * total,
-                    w[1] - s0 * s1 * total,
-                    w[2] - s0 * s2 * total,
-                    w[3] - s1 * s1 * total,
-                    w[4] - s1 * s2 * total,
-                    w[5] - s2 * s2 * total,
-                )
+                x0, x1, x2 = x0 - t0 * t0 * total, x1 - t0 * t1 * total, x2 - t0 * t2 * total
+                x3, x4, x5 = x3 - t1 * t1 * total, x4 - t1 * t2 * total, x5 - t2 * t2 * total
             else:
                 unshaded = _ONE / known
                 d0, d1, d2 = d0 * unshaded, d1 * unshaded, d2 * unshaded
+            w = (
+                np.float32(x0),
+                np.float32(x1),
+                np.float32(x2),
+                np.float32(x3),
+                np.float32(x4),
+                np.float32(x5),
+            )
             l0, l1, l2 = math.log(d0), math.log(d1), math.log(d2)
             y0 = projection[0, 0] * l0 + projection[0, 1] * l1 + projection[0, 2] * l2
             y1 = projection[1, 0] * l0 + projection[1, 1] * l1 + projection[1, 2] * l2

@@ -154,7 +154,7 @@ def invert(
         known,
         _usable(valid, shape),
         free,
-        model_covariance(model_error, variance is None).astype(np.float32),
+        _conditioned(model_covariance(model_error, variance is None), free).astype(np.float32),
         _cells(table),
         np.array([table.c_m_max, table.c_hd_max], dtype=np.float32),
         np.ascontiguousarray(start.projection, dtype=np.float32),
@@ -251,7 +251,7 @@ def identifiability(
     noise = np.zeros(3) if noise is None else np.asarray(noise, dtype=np.float64)
     weights = _weights(
         np.broadcast_to(noise, seen.shape) / seen**2,
-        model_covariance(model_error, variance is None),
+        _conditioned(model_covariance(model_error, variance is None), shading is None),
         free=shading is None,
     )
     gradient = np.stack([by_a / color, by_b / color], axis=-1)
@@ -299,6 +299,14 @@ def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Floa
     # Single precision of the colors themselves keeps the weights finite.
     floor = RELATIVE_NOISE**2 if default_noise else 1e-12
     return np.asarray(covariance + floor * np.eye(3))
+
+
+def _conditioned(covariance: Floats, free: bool) -> Floats:
+    """Add an error common to the channels where a free shading takes it up anyway.
+
+    A covariance of colors without brightness has none, and its inverse would lose all digits.
+    """
+    return covariance + (np.trace(covariance) / 3.0 + 1e-6 if free else 0.0)
 
 
 def _weights(relative_variance: Floats, covariance: Floats, *, free: bool) -> Floats:

@@ -173,6 +173,21 @@ def test_a_model_error_widens_the_errors_like_noise(table):
     assert invert(color, table, variance=[0.0] * 3).stderr_melanin < 1e-3 * model.stderr_melanin
 
 
+def test_a_model_error_of_the_color_alone_gives_the_errors_it_implies(table):
+    # One direction of log color, without brightness: singular in the two others.
+    direction = np.array([0.8, -0.25, -0.55])
+    covariance = 1e-5 * np.outer(direction, direction) + 1e-9 * (3.0 * np.eye(3) - 1.0)
+    color = table.lookup([0.02], [0.05])
+    jacobian = table.jacobian([0.02], [0.05])[0] / color[0][:, None]
+    by_all = np.linalg.inv(np.column_stack([jacobian, np.ones(3)]))
+    implied = np.sqrt(np.diag(by_all @ covariance @ by_all.T))
+    maps = invert(color, table, variance=[0.0] * 3, model_error=covariance)
+    np.testing.assert_allclose(maps.stderr_melanin, implied[0], rtol=0.02)
+    np.testing.assert_allclose(maps.stderr_hemoglobin, implied[1], rtol=0.02)
+    bounds = identifiability(table, variance=[0.0] * 3, model_error=covariance)
+    assert np.isfinite(bounds.stderr_melanin).all()
+
+
 @pytest.mark.parametrize("shading", MODES)
 def test_unusable_pixels_are_masked_and_their_neighbours_are_not(shading, table):
     good = table.lookup(0.03, 0.05)
