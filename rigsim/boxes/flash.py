@@ -241,7 +241,7 @@ class FlashUnit:
         return now < self._settled_at
 
     def status_bits(self, now: float) -> int:
-        """Return 16 turning, 32 no pop possible yet, 64 lamp on, 128 too hot, 256 emergency stop open."""
+        """Return 16 turning, 32 no pop possible yet, 64 lamp on, 128 too hot, 256 stop open."""
         bits = MOVING * self.busy(now) + NOT_READY * (self._wait_for_fire(now)[0] > 0.0)
         bits += LAMP_ON * self._lamp.lit + HOT * self._lamp.hot + INTERLOCK * self.interlock
         return bits
