@@ -193,7 +193,11 @@ class View:
         return self.full_well_e / (self.white_level - self.black_level)
 
     def resized(self, width_px: int) -> View:
-        """Return this view with ``width_px`` columns and the same field of view; rows stay even."""
+        """Return this view with ``width_px`` columns and the same field of view; rows stay even.
+
+        Pixels grow as if the sensor's own were binned: a pixel of k times the side holds k^2
+        times the electrons, and its read noise is k times as large.
+        """
         step = 1 if self.cfa == "MONO" else 2
         if not 2 <= width_px <= MAX_SIDE_PX or width_px % step:
             raise RigError(
@@ -205,7 +209,12 @@ class View:
         factor = self.width_px / width_px
         height_px = max(step * round(self.height_px / factor / step), 2)
         return dataclasses.replace(
-            self, width_px=width_px, height_px=height_px, pixel_um=self.pixel_um * factor
+            self,
+            width_px=width_px,
+            height_px=height_px,
+            pixel_um=self.pixel_um * factor,
+            full_well_e=self.full_well_e * factor**2,
+            read_noise_e=self.read_noise_e * factor,
         )
 
 

@@ -23,6 +23,7 @@ from model import color_table, store
 from model.skin import UNITS, SkinAppearance, SkinMap
 from model.tissue_optics import ANISOTROPY_SKIN
 from reconstruction import chromophores, model_error, polarization, stages, tsumura
+from reconstruction.detectability import detectable
 
 REVISION = 1
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
@@ -235,7 +236,12 @@ def _graph(inputs: Inputs) -> list[stages.Stage]:
 def _frames(inputs: Inputs) -> Mapping[str, Any]:
     """Average the repeats of each polarizer state and subtract the darks."""
     session = inputs.session
-    darks = [raw.linear_rgb(session.read(record)) for record in session.frames("dark")]
+    # the cells of an imported picture are its pixels; a sensor's sites stand beside each other
+    imported = "photographs" in session.manifest.extra
+    demosaic: raw.Demosaic = "superpixel" if imported else "centered"
+    darks = [
+        raw.linear_rgb(session.read(record), demosaic=demosaic) for record in session.frames("dark")
+    ]
     dark: NDArray[np.float64] | float = (
         np.mean([d.rgb for d in darks], axis=0, dtype=np.float64) if darks else 0.0
     )
@@ -247,7 +253,7 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
     images: dict[str, Image | None] = {}
     for polarizer in ("parallel", "crossed"):
         shots = session.frames("subject", state=inputs.state, polarizer=polarizer)
-        linear = [raw.linear_rgb(session.read(record)) for record in shots]
+        linear = [raw.linear_rgb(session.read(record), demosaic=demosaic) for record in shots]
         if not linear:
             images[polarizer] = None
             continue
@@ -255,10 +261,12 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
             raise PipelineError(f"{polarizer} frames: differ in size, expected one camera setting")
         power = [float(record.settings.get("power", 1.0)) for record in shots]
         total = sum(power)
-        rgb: NDArray[Any] = np.sum([image.rgb for image in linear], axis=0, dtype=np.float64)
+        rgb: NDArray[Any] = np.asarray(
+            np.sum([image.rgb for image in linear], axis=0, dtype=np.float64)
+        )
         rgb -= len(linear) * dark
-        variance: NDArray[Any] = np.sum(
-            [image.variance for image in linear], axis=0, dtype=np.float64
+        variance: NDArray[Any] = np.asarray(
+            np.sum([image.variance for image in linear], axis=0, dtype=np.float64)
         )
         variance += len(linear) ** 2 * dark_variance
         images[polarizer] = Image(
@@ -353,29 +361,57 @@ def _stderr(skin_map: SkinMap) -> Float32:
 
 def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     table = color_table.build(inputs.camera, inputs.illuminant, anisotropy=ANISOTROPY_SKIN)
+    center, spread = SHADING_PRIOR if inputs.white is not None else SHADING_PRIOR_UNCALIBRATED
+    rgb = np.where(_valid(diffuse)[..., None], diffuse.values, np.nan)
     found = chromophores.invert(
-        np.where(_valid(diffuse)[..., None], diffuse.values, np.nan),
+        rgb,
         table,
+        shading=np.full(rgb.shape[:2], center),
         variance=np.square(_stderr(diffuse)),
-        model_error=model_error.load(),
+        # a relative error common to the channels: the shading is known about so well and no better
+        model_error=model_error.load() + spread**2,
     )
-    good = np.asarray(found.valid)
+    usable = found.valid | (~found.outside & np.isfinite(found.melanin))
 
-    def chromophore(name: str, values: NDArray[Any], stderr: NDArray[Any]) -> SkinMap:
+    def chromophore(
+        name: str, values: NDArray[Any], stderr: NDArray[Any], fine: NDArray[np.bool_]
+    ) -> SkinMap:
+        good = detectable(values, stderr, usable & fine)
         return SkinMap(
-            np.where(good, values, 0.0), UNITS.get(name, "1"), np.where(good, stderr, 0.0), good
-        )
+            np.where(good, values, 0.0), UNITS[name], np.where(good, stderr, 0.0), good,
+            "invalid where noise and model error leave it unknown",
+        )  # fmt: skip
 
+    whole = np.isfinite(found.stderr_melanin) & np.isfinite(found.stderr_hemoglobin)
+    melanin = chromophore("melanin", found.melanin, found.stderr_melanin, whole)
+    predicted = table.lookup(
+        np.where(usable, found.melanin, 0.0), np.where(usable, found.hemoglobin, 0.0)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shading = np.exp(np.mean(np.log(rgb / predicted), axis=-1))
+    lit = usable & np.isfinite(shading)
     return {
-        "melanin": chromophore("melanin", found.melanin, found.stderr_melanin),
-        "hemoglobin": chromophore("hemoglobin", found.hemoglobin, found.stderr_hemoglobin),
-        "shading": SkinMap(np.where(good, found.shading, 0.0), "1", valid=good),
-        "residual": SkinMap(np.where(good, found.residual, 0.0), "1", valid=good),
+        "melanin": melanin,
+        "hemoglobin": chromophore(
+            "hemoglobin", found.hemoglobin, found.stderr_hemoglobin, whole
+        ),
+        "shading": SkinMap(np.where(lit, shading, 0.0), "1", valid=lit),
+        "residual": SkinMap(np.where(usable, found.residual, 0.0), "1", valid=usable),
         "gamut_distance": SkinMap(
             np.nan_to_num(found.gamut_distance), "1",
             description="how far the color lies outside the model's, relative",
         ),
     }  # fmt: skip
+
+
+SHADING_PRIOR = (0.7, 0.6)
+"""Light on a face over that on a white tile in its place: center and relative standard error.
+
+Weak on purpose: it decides between light skin in little light and dark skin in much, which have
+the same color, and tells where pixels in between leave off.
+"""
+SHADING_PRIOR_UNCALIBRATED = (0.7, 1.0)
+"""The same when no white tile was captured and the exposure is not known."""
 
 
 def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:

@@ -46,7 +46,7 @@ def choose_plan(rig: Rig, file: Path | None, target: str | None) -> Plan:
     if target is None:
         return flash_plan(rig)
     if target == "white":
-        return flash_plan(rig, states=("white",), repeats=2)
+        return flash_plan(rig, states=("white",), repeats=4)
     if target not in CALIBRATION_TARGETS:
         expected = ", ".join(("white", *CALIBRATION_TARGETS))
         raise CaptureError(f"target: got {target!r}, expected one of {expected}")

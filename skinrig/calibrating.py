@@ -106,7 +106,7 @@ class _Frames:
 
     def dark_level(self) -> NDArray[np.float32] | float:
         """Return what a frame without light shows above its black level, (h, w, 3)."""
-        darks = [raw.linear_rgb(frame).rgb for _, frame in self.of("dark")]
+        darks = [raw.linear_rgb(frame, demosaic="centered").rgb for _, frame in self.of("dark")]
         return np.mean(darks, axis=0, dtype=np.float32) if darks else 0.0
 
 
@@ -141,7 +141,7 @@ def _sensor(frames: _Frames, created: date) -> store.Calibration:
 def _white(frames: _Frames, created: date) -> store.Calibration:
     dark = frames.dark_level()
     shots = frames.need("subject", polarizer="crossed")
-    linear = [raw.linear_rgb(frame) for _, frame in shots]
+    linear = [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
     # the tile depolarizes: crossed filters pass half of its light, the diffuse total is twice that
     reference = white.white_reference(
         [2.0 * (image.rgb - dark) for image in linear],
@@ -149,6 +149,8 @@ def _white(frames: _Frames, created: date) -> store.Calibration:
         valid=[image.valid for image in linear],
         lights=[float(record.settings["power"]) for record, _ in shots],
         reflectance=WHITE_TILE_REFLECTANCE,
+        # every pixel by itself: what the pixels' own gains differ by must cancel in the ratio
+        degree=None,
     )
     return reference.to_calibration(
         serial=frames.serial,
@@ -166,7 +168,7 @@ WHITE_TILE_REFLECTANCE = 0.99
 def _color(frames: _Frames, created: date) -> store.Calibration:
     dark = frames.dark_level()
     shots = frames.need("chart", polarizer="crossed")
-    linear = [raw.linear_rgb(frame) for _, frame in shots]
+    linear = [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
     image = np.mean([picture.rgb - dark for picture in linear], axis=0)
     valid = np.logical_and.reduce([picture.valid for picture in linear])
     centers = chart.find_chart(image)
@@ -195,7 +197,7 @@ def _polarization(frames: _Frames, created: date) -> store.Calibration:
     dark = frames.dark_level()
     shots = frames.need("malus")
     angles = np.deg2rad([float(record.settings["analyser_deg"]) for record, _ in shots])
-    linear = [raw.linear_rgb(frame) for _, frame in shots]
+    linear = [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
     images = [picture.rgb - dark for picture in linear]
     valid = np.logical_and.reduce([picture.valid for picture in linear])
     chosen = polarization.modulated_pixels(angles, images, valid=valid)

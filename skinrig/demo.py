@@ -20,7 +20,7 @@ from skinrig.console import Console, plain
 from skinrig.simulation import Simulated, simulate_session, truth_folder
 
 RIGS = ("flash",)
-SUBJECTS = ("II", "V")
+SUBJECTS = ("II", "IV")
 """Skin types of the demo: one light, one dark, so that errors by melanin band show."""
 WANT = (
     "melanin", "hemoglobin", "shading", "residual", "diffuse", "picture", "specular_picture",

@@ -169,7 +169,7 @@ def _plan(rig: Rig, target: str | None, states: tuple[str, ...], repeats: int) -
     if target is None:
         return flash_plan(rig, states=states, repeats=repeats)
     if target == "white":
-        return flash_plan(rig, states=("white",), repeats=max(2, repeats))
+        return flash_plan(rig, states=("white",), repeats=max(4, repeats))
     return flash_calibration_plan(rig, target)  # type: ignore[arg-type]
 
 
@@ -241,8 +241,8 @@ def to_superpixels(values: NDArray[Any], mask: NDArray[np.bool_] | None = None) 
 
     Examples
     --------
-    >>> to_superpixels(np.arange(4.0).reshape(2, 2))
-    array([[1.5]])
+    >>> to_superpixels(np.arange(4.0).reshape(2, 2)).tolist()
+    [[1.5]]
     """
     height, width = values.shape[0] // 2, values.shape[1] // 2
 

@@ -2,10 +2,11 @@
 
 from capture.raw.dng import encode_dng, write_dng
 from capture.raw.frame import RawError, RawFrame, noise_profile
-from capture.raw.linear import LinearImage, linear_rgb
+from capture.raw.linear import Demosaic, LinearImage, linear_rgb
 from capture.raw.reading import decode, read
 
 __all__ = [
+    "Demosaic",
     "LinearImage",
     "RawError",
     "RawFrame",

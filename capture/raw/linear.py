@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from capture.documents import Checks, Fault
 from capture.raw.frame import RawError, RawFrame, noise_profile
 
-Demosaic = Literal["superpixel", "bilinear"]
+Demosaic = Literal["superpixel", "centered", "bilinear"]
 UNIT = "fraction of full scale"
 
 _COLORS = "RGB"
@@ -45,10 +45,14 @@ def linear_rgb(
     ----------
     frame : RawFrame
         Of a sensor with a 2 x 2 color filter array.
-    demosaic : {"superpixel", "bilinear"}
+    demosaic : {"superpixel", "centered", "bilinear"}
         "superpixel": one output pixel per 2 x 2 cell, (H/2, W/2), the two greens averaged, no
-        correlation between pixels. "bilinear": (H, W), missing colors from their neighbours, at
-        the border from those that exist; the noise of neighbouring pixels is correlated.
+        correlation between pixels, but the colors of a pixel stand up to a sensor pixel apart: a
+        gradient of brightness shows as a tint. "centered": the same size, every color
+        interpolated linearly to the middle of the cell, so that a gradient has no tint; the noise
+        of neighbouring pixels is slightly correlated. "bilinear": (H, W), missing colors from
+        their neighbours, at the border from those that exist; the noise of neighbouring pixels is
+        correlated.
     gain : float, optional
         Calibrated conversion gain, electrons per DN; with ``read_noise`` instead of the file's
         own noise profile.
@@ -71,12 +75,15 @@ def linear_rgb(
     >>> cfa = np.full((4, 4), 612, np.uint16)
     >>> frame = RawFrame(cfa=cfa, pattern="RGGB", black=(512.0,) * 4, white=1512)
     >>> image = linear_rgb(frame, gain=2.0, read_noise=4.0)
-    >>> print(image.rgb[0, 0], (image.variance[0, 0] * 1e6).round(1))
-    [0.1 0.1 0.1] [54. 27. 54.]
+    >>> image.rgb[0, 0].round(6).tolist(), (image.variance[0, 0] * 1e6).round(1).tolist()
+    ([0.10000000149011612, 0.10000000149011612, 0.10000000149011612], [54.0, 27.0, 54.0])
     """
     checks = Checks("linear_rgb", RawError)
     checks.that(
-        "demosaic", demosaic, demosaic in ("superpixel", "bilinear"), "superpixel, bilinear"
+        "demosaic",
+        demosaic,
+        demosaic in ("superpixel", "centered", "bilinear"),
+        "superpixel, centered, bilinear",
     )
     pair = (gain is None) == (read_noise is None)
     checks.that("gain, read_noise", (gain, read_noise), pair, "both or neither")
@@ -88,6 +95,8 @@ def linear_rgb(
     good = frame.cfa < frame.white
     if demosaic == "superpixel":
         return _superpixel(frame.pattern, x, variance, good)
+    if demosaic == "centered":
+        return _centered(frame.pattern, x, variance, good)
     return _bilinear(frame.pattern, x, variance, good)
 
 
@@ -131,6 +140,44 @@ def _superpixel(
         noise[..., band] += weight**2 * variance[part]
         valid &= good[part]
     return LinearImage(rgb, noise, valid)
+
+
+def _centered(
+    pattern: str, x: NDArray[np.float32], variance: NDArray[np.float32], good: NDArray[np.bool_]
+) -> LinearImage:
+    """Interpolate every color to the middle of its 2 x 2 cell, linearly from its own sites."""
+    height, width = x.shape[0] // 2, x.shape[1] // 2
+    rgb = np.zeros((height, width, 3), np.float32)
+    noise = np.zeros_like(rgb)
+    bad = np.zeros((height, width), bool)
+    for cell, letter in enumerate(pattern):
+        part = (slice(cell // 2, None, 2), slice(cell % 2, None, 2))
+        ahead = (cell // 2 == 0, cell % 2 == 0)
+        band = _COLORS.index(letter)
+        weight = np.float32(1.0 / pattern.count(letter))
+        rgb[..., band] += weight * _to_middle(x[part], ahead, power=1)
+        noise[..., band] += weight**2 * _to_middle(variance[part], ahead, power=2)
+        bad |= _to_middle((~good[part]).astype(np.float32), ahead, power=1) > 0
+    return LinearImage(rgb, noise, ~bad)
+
+
+def _to_middle(
+    plane: NDArray[np.float32], ahead: tuple[bool, bool], *, power: int
+) -> NDArray[np.float32]:
+    """Shift a plane by a quarter of its pitch along both axes, with weights to ``power``.
+
+    At the border, where the neighbor is missing, the plane's own value stands alone.
+    """
+    near, far = np.float32(0.75**power), np.float32(0.25**power)
+    for axis, forward in enumerate(ahead):
+        lines = np.moveaxis(plane, axis, 0)
+        shifted = lines.copy()
+        if forward:
+            shifted[:-1] = near * lines[:-1] + far * lines[1:]
+        else:
+            shifted[1:] = near * lines[1:] + far * lines[:-1]
+        plane = np.moveaxis(shifted, 0, axis)
+    return plane
 
 
 def _bilinear(

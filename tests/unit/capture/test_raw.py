@@ -395,7 +395,7 @@ def noisy(mean_fraction, pattern, rng):
 
 
 @pytest.mark.parametrize("pattern", BAYER)
-@pytest.mark.parametrize("demosaic", ["superpixel", "bilinear"])
+@pytest.mark.parametrize("demosaic", ["superpixel", "centered", "bilinear"])
 def test_colors_come_from_their_own_pixels(pattern, demosaic):
     values = np.empty((8, 12), np.uint16)
     for cell, letter in enumerate(pattern):
@@ -403,10 +403,10 @@ def test_colors_come_from_their_own_pixels(pattern, demosaic):
     frame = RawFrame(cfa=values, pattern=pattern, black=(512.0,) * 4, white=10_512)
     image = raw.linear_rgb(frame, demosaic=demosaic, gain=1.0, read_noise=0.0)
     np.testing.assert_allclose(image.rgb, np.broadcast_to((0.2, 0.4, 0.8), image.rgb.shape), 1e-6)
-    assert image.rgb.shape[:2] == ((4, 6) if demosaic == "superpixel" else (8, 12))
+    assert image.rgb.shape[:2] == ((8, 12) if demosaic == "bilinear" else (4, 6))
 
 
-@pytest.mark.parametrize("demosaic", ["superpixel", "bilinear"])
+@pytest.mark.parametrize("demosaic", ["superpixel", "centered", "bilinear"])
 def test_the_mean_is_unbiased_and_the_propagated_variance_true(rng, demosaic):
     """False-alarm rate 1e-3 over all pixels and channels, Sidak-corrected.
 
@@ -507,3 +507,27 @@ def test_linear_values_leave_the_frame_alone(cfa):
     frame = RawFrame(cfa=cfa, pattern="RGGB", black=(0.0,) * 4, white=65535)
     raw.linear_rgb(frame, gain=1.0, read_noise=1.0, demosaic="bilinear")
     np.testing.assert_array_equal(cfa, before)
+
+
+@pytest.mark.parametrize("pattern", BAYER)
+def test_a_gradient_of_brightness_has_no_tint_when_colors_are_centered(pattern):
+    """Superpixels show the tint: their colors stand a sensor pixel apart."""
+    y, x = np.mgrid[0:16, 0:20]
+    values = (1000 + 40 * x + 60 * y).astype(np.uint16)
+    frame = RawFrame(cfa=values, pattern=pattern, black=(512.0,) * 4, white=10_512)
+
+    def tint(demosaic):
+        rgb = raw.linear_rgb(frame, demosaic=demosaic, gain=1.0, read_noise=0.0).rgb[2:-2, 2:-2]
+        return float(np.ptp(rgb, axis=-1).max())
+
+    assert tint("centered") < 1e-6
+    assert tint("superpixel") > 1e-3
+
+
+def test_a_saturated_site_spoils_every_cell_it_reaches():
+    values = np.full((8, 8), 1000, np.uint16)
+    values[2, 2] = 10_512  # red of RGGB: reaches its own cell and the ones before it
+    frame = RawFrame(cfa=values, pattern="RGGB", black=(512.0,) * 4, white=10_512)
+    valid = raw.linear_rgb(frame, demosaic="centered", gain=1.0, read_noise=0.0).valid
+    spoilt = {(int(i), int(j)) for i, j in np.argwhere(~valid)}
+    assert spoilt == {(0, 0), (0, 1), (1, 0), (1, 1)}

@@ -1,0 +1,57 @@
+"""Where an estimate stands out of its own standard error, judged by its neighborhood.
+
+Asking each pixel alone whether its estimate exceeds its error keeps the pixels that noise made
+large and drops the others: what is kept is then far too high, with errors that look small.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+NEIGHBORHOOD_PX = 15
+LIMIT = 0.5
+
+
+def detectable(
+    estimate: NDArray[np.floating],
+    stderr: NDArray[np.floating],
+    valid: NDArray[np.bool_],
+    *,
+    size_px: int = NEIGHBORHOOD_PX,
+    limit: float = LIMIT,
+) -> NDArray[np.bool_]:
+    """Return where the mean standard error around is small against the mean estimate around.
+
+    Parameters
+    ----------
+    estimate, stderr
+        (H, W).
+    valid
+        (H, W); other pixels do not count and are not detectable.
+    size_px
+        Side of the square neighborhood, odd.
+    limit
+        Largest mean standard error over mean estimate.
+
+    Returns
+    -------
+    ndarray of bool
+        (H, W).
+
+    Examples
+    --------
+    >>> one = np.ones((3, 3))
+    >>> bool(detectable(one, 0.2 * one, one > 0).all())
+    True
+    """
+    if size_px < 1 or size_px % 2 == 0:
+        raise ValueError(f"size_px: got {size_px}, expected an odd number of 1 or more")
+    good = valid & np.isfinite(estimate) & np.isfinite(stderr)
+
+    def total(values: NDArray[np.floating]) -> NDArray[np.float64]:
+        kept = np.where(good, values, 0.0).astype(np.float64)
+        return np.asarray(ndimage.uniform_filter(kept, size_px, mode="constant"))
+
+    return np.asarray(good & (total(stderr) <= limit * total(estimate)))
