@@ -6,7 +6,7 @@ import contextlib
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.rig import Rig, load_rig
@@ -134,7 +134,7 @@ def _run(
                 out, plan=plan, rig=rig,
                 devices={"flash": box_urls["flash"],
                          **{name: camera.info.serial for name, camera in opened.items()}},
-                subject=subject, source="measured",
+                subject=subject, source=_source(box.identify()),
             )  # fmt: skip
         stack.callback(session.release)
         with _stop_on_signal() as stopped:
@@ -150,6 +150,11 @@ def _run(
         "session": out, "captured": done.frames, "retakes": done.retakes,
         "stale_frames": done.stale, "steps": len(plan.steps),
     }  # fmt: skip
+
+
+def _source(identity: str) -> Literal["measured", "simulated"]:
+    """Say where frames come from, by how the box names its maker."""
+    return "simulated" if identity.upper().startswith("RIGSIM") else "measured"
 
 
 @contextlib.contextmanager

@@ -77,9 +77,9 @@ def _renderer() -> Finding:
 
 
 def _serial_ports() -> list[Finding]:
-    from serial.tools import list_ports
+    from capture.devices.port import serial_ports
 
-    ports = sorted(port.device for port in list_ports.comports())
+    ports = serial_ports()
     return [
         Finding(
             "serial ports", ", ".join(ports) or "none", True,

@@ -60,4 +60,5 @@ def serve_rig(
         try:
             served.wait(seconds)
         except KeyboardInterrupt:
-            print("served; lights dark", file=sys.stderr)
+            print("no longer served; the lights are dark", file=sys.stderr)
+            raise

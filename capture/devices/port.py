@@ -44,6 +44,7 @@ __all__ = [
     "PortTimeout",
     "PortUrlError",
     "WrongDevice",
+    "serial_ports",
 ]
 
 log = logging.getLogger(__name__)
@@ -429,6 +430,13 @@ class Port:
             if frame.name != "NAK":
                 self.events.append(frame)
         return frame
+
+
+def serial_ports() -> list[str]:
+    """Return the names of this machine's serial ports, sorted."""
+    from serial.tools import list_ports
+
+    return sorted(str(port.device) for port in list_ports.comports())
 
 
 def _hello_fields(url: str, payload: str) -> tuple[int, str, str, str]:
