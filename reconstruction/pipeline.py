@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -116,9 +117,18 @@ def reconstruct(
     """
     if not want:
         raise PipelineError(f"want: got nothing, expected names out of {', '.join(MAPS)}")
+    unknown = [name for name in want if name not in MAPS]
+    if unknown:
+        raise PipelineError(f"want: got {unknown[0]!r}, expected names out of {', '.join(MAPS)}")
+    if calibration is not None and not Path(calibration).is_dir():
+        raise PipelineError(
+            f"calibration: {calibration} is no folder; `skinrig calibrate` makes one"
+        )
     opened = Session.open(session)
     inputs = _inputs(opened, calibration, state, on_date)
     graph = _graph(inputs)
+    # a stage's other maps cost nothing more, and only whole stages can be reused
+    want = [name for stage in graph if set(stage.makes) & set(want) for name in stage.makes]
     previous = _previous(Path(out))
     outcome = stages.run(graph, list(want), cache=_Kept(graph, previous), progress=progress)
     outcome = replace(outcome, assumed=tuple(inputs.assumed))
@@ -146,7 +156,7 @@ def reconstruct(
             "color_table": {"camera": inputs.camera, "illuminant": inputs.illuminant},
         },
         inputs=inputs.hashes,
-        versions=dict(opened.manifest.versions),
+        versions={name: metadata.version(name) for name in ("skinrig", "numpy", "scipy", "numba")},
         left_out=outcome.left_out,
         seed=opened.seed,
     )
@@ -316,7 +326,8 @@ def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping
         level = np.full_like(diffuse.rgb, _assumed_white(inputs))
         reflectance, variance = diffuse.rgb / level, diffuse.variance / level**2
         valid = np.ones(diffuse.valid.shape, bool)
-    valid = valid & diffuse.valid
+    dim = (reflectance < DARKEST_SIGMAS * np.sqrt(variance)).any(axis=-1)
+    valid = valid & diffuse.valid & ~dim
     return {
         "diffuse": _map3(reflectance, np.sqrt(variance), valid, "white tile in its place = 1"),
         "specular": _map3(
@@ -326,6 +337,8 @@ def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping
     }  # fmt: skip
 
 
+DARKEST_SIGMAS = 5.0
+"""Signal over noise below which a pixel is background, not skin."""
 ASSUMED_WHITE = 0.8
 """Share of the range that a white tile is taken to fill when no white reference is at hand."""
 

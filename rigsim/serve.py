@@ -104,7 +104,8 @@ def _host_port(text: str, allow_remote: bool) -> tuple[str, int]:
     if not local and not allow_remote:
         raise ServeError(
             f"tcp: got {host!r}, expected an address of this machine only, such as 127.0.0.1: "
-            "whoever reaches the port can fire the lights; permit it explicitly if that is wanted"
+            "whoever reaches the port can fire the lights; permit it with allow_remote "
+            "(--allow-remote) if that is wanted"
         )
     if not local:
         log.warning("%s: other machines can reach the boxes and fire the lights", text)

@@ -35,7 +35,7 @@ class Outcome:
 
 
 def calibrate(
-    kind: str, sessions: Sequence[str | Path], out: str | Path, *, created: date
+    kind: str, sessions: Sequence[str | Path], out: str | Path, *, created: date | None = None
 ) -> Outcome:
     """Make one kind of calibration from target sessions and save it.
 
@@ -48,7 +48,7 @@ def calibrate(
     out
         The CALIBRATION/ folder; an older calibration of the kind is compared, then replaced.
     created
-        Date of the calibration.
+        Date of the calibration; None: that of the latest session.
 
     Raises
     ------
@@ -58,7 +58,8 @@ def calibrate(
     if kind not in _MAKERS:
         raise CalibratingError(f"kind: got {kind!r}, expected one of {', '.join(KINDS)}")
     frames = _Frames([Session.open(path) for path in sessions])
-    calibration = _MAKERS[kind](frames, created)
+    made_on = created or max(s.manifest.created_at.date() for s in frames.sessions)
+    calibration = _MAKERS[kind](frames, made_on)
     drift: tuple[store.Drift, ...] = ()
     try:
         drift = store.drift(store.load(out, kind), calibration)

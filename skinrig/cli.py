@@ -97,8 +97,16 @@ def simulate(
     console.say(
         f"{done.session}: {done.frames} frames" + (f", truth in {done.truth}" if done.truth else "")
     )
-    console.say(f"next: skinrig reconstruct {out} --want melanin,hemoglobin --out appearance")
+    console.say(f"next: {_next_step(out, target)}")
     console.document("skinrig.simulate/1", done.document())
+
+
+def _next_step(session: Path, target: str | None) -> str:
+    kinds = {"white": "white", "flat": "sensor", "dark": "sensor", "chart": "color",
+             "malus": "polarization"}  # fmt: skip
+    if target is None:
+        return f"skinrig reconstruct {session} --want melanin,hemoglobin --out appearance"
+    return f"skinrig calibrate {kinds[target]} {session} --out calibration"
 
 
 @app.command()
@@ -163,15 +171,14 @@ def calibrate(
 
     Example: skinrig calibrate sensor session-flat --out calibration
     """
-    from datetime import date
-
     from skinrig.calibrating import calibrate as make
 
     console = Console(json)
-    done = make(kind, sessions, out, created=date.today())
+    done = make(kind, sessions, out)
     console.rows(("quantity", "value"), done.summary)
     for change in done.drift:
-        console.say(f"drift: {change}")
+        if change.sigmas is None or abs(change.sigmas) > 2:
+            console.say(f"drift: {change}")
     console.say(f"{done.path}: valid until {done.calibration.valid_until}")
     console.document(
         "skinrig.calibrate/1",
@@ -199,10 +206,22 @@ def import_photos(
     done = bring_in(directory, out=out)
     for text in done.assumed:
         console.say(f"assumed: {text}")
-    console.say(f"{done.path}: {done.frames} photographs")
-    console.say(f"next: skinrig reconstruct {out} --want melanin,hemoglobin --out appearance")
+    for name in done.ignored:
+        console.say(f"ignored: {name}")
+    console.say(f"{done.path}: {done.frames} photographs, states {', '.join(done.states)}")
+    state = "" if "neutral" in done.states else f" --state {done.states[0]}"
+    console.say(
+        f"next: skinrig reconstruct {out} --want melanin,hemoglobin --out appearance{state}"
+    )
     console.document(
-        "skinrig.import/1", {"path": done.path, "frames": done.frames, "assumed": done.assumed}
+        "skinrig.import/1",
+        {
+            "path": done.path,
+            "frames": done.frames,
+            "assumed": done.assumed,
+            "states": done.states,
+            "ignored": done.ignored,
+        },
     )
 
 
@@ -345,6 +364,7 @@ def main(argv: list[str] | None = None) -> int:
         code = getattr(stop, "exit_code", None)
         return int(code if code is not None else getattr(stop, "code", 0) or 0)
     except typer.Abort:
+        print(f"skinrig: {errors.sentence(KeyboardInterrupt())}", file=sys.stderr)
         return errors.INTERRUPTED
     except KeyboardInterrupt as stop:
         print(f"skinrig: {errors.sentence(stop)}", file=sys.stderr)

@@ -6,7 +6,6 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +79,7 @@ def run_demo(
         for kind, target in (
             ("sensor", "flat"), ("white", "white"), ("color", "chart"), ("polarization", "malus"),
         ):  # fmt: skip
-            calibrate(kind, [out / f"session-flash-{target}"], calibration, created=date.today())
+            calibrate(kind, [out / f"session-flash-{target}"], calibration)
     captures: list[Simulated] = []
     with share("flash: capture two faces"):
         for subject in SUBJECTS:

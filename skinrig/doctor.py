@@ -6,6 +6,7 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
+import sys
 from dataclasses import dataclass
 
 
@@ -42,7 +43,7 @@ def examine(*, probe_renderer: bool = True) -> list[Finding]:
     findings = [
         Finding(
             "Python", version, tuple(map(int, version.split(".")[:2])) >= (3, 11),
-            "install Python 3.11 or newer",
+            "" if sys.version_info >= (3, 11) else "install Python 3.11 or newer",
         )
     ]  # fmt: skip
     for module, name in _REQUIRED.items():

@@ -29,6 +29,8 @@ def exit_code(error: BaseException) -> int:
     """
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED
+    if isinstance(error, ImportError) and (error.name or "").split(".")[0] in _OWN:
+        return BUG
     if isinstance(error, ImportError):
         return EXTRA_MISSING
     own = [kind for kind in type(error).__mro__ if kind.__module__.split(".")[0] in _OWN]
@@ -48,7 +50,7 @@ _OWN = ("capture", "reconstruction", "model", "rigsim", "skinrig")
 def sentence(error: BaseException) -> str:
     """Return what to print for ``error``, without a traceback."""
     if isinstance(error, KeyboardInterrupt):
-        return "interrupted; the same command with --resume goes on where it stopped"
+        return "interrupted; a capture or simulation goes on with --resume"
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
     text = str(error).strip() or type(error).__name__

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model import store
-from model.skin import SkinAppearance
+from model.skin import SkinAppearance, SkinMap
 from skinrig import evaluation, figures, page
 
 COVERAGE_LOW, COVERAGE_HIGH = 0.60, 0.76
@@ -144,7 +145,7 @@ def _appearance_section(
             estimate=skin_map.values,
             standard_error=skin_map.stderr,
             truth=None if true_map is None else true_map.values,
-            valid=skin_map.valid,
+            valid=_shown(skin_map, true_map),
         )
     if truth is not None and "melanin" in truth.maps:
         body += _errors(name, appearance, truth, checks)
@@ -164,6 +165,11 @@ def _appearance_section(
         | dict(sorted(appearance.versions.items()))
     )
     return body
+
+
+def _shown(estimate: SkinMap, truth: SkinMap | None) -> NDArray[np.bool_] | None:
+    masks = [m.valid for m in (estimate, truth) if m is not None and m.valid is not None]
+    return np.logical_and.reduce(masks) if masks else None
 
 
 def _errors(

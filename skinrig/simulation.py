@@ -123,6 +123,12 @@ def simulate_session(
         raise SimulationError(f"target: got {target!r}, expected one of {', '.join(TARGETS)}")
     if seed < 0:
         raise SimulationError(f"seed: got {seed}, expected 0 or more")
+    if target is None:
+        from rigsim.perfusion import STATES
+
+        unknown = [state for state in states if state not in STATES]
+        if unknown:
+            raise SimulationError(f"state: got {unknown[0]!r}, expected one of {', '.join(STATES)}")
     path = Path(out)
     width = width_px or WIDTHS_PX[size]
     rig = load_rig(rig_name)
@@ -267,7 +273,9 @@ _TRUTH_NAMES = {"diffuse": "diffuse_radiance", "specular": "specular_radiance", 
 def _truth(maps: Mapping[str, NDArray[Any]], seed: int, session: str, state: str) -> SkinAppearance:
     mask = np.asarray(maps["mask"], bool)
     # a superpixel on the outline mixes skin and background: no truth is claimed for it
-    whole = to_superpixels(mask.astype(float)) == 1.0
+    # and where hair covers the skin there is none
+    bare = mask & (np.asarray(maps["melanin"]) > 0)
+    whole = to_superpixels(bare.astype(float)) == 1.0
     kept = {}
     for name, values in maps.items():
         if name == "mask" or (np.ndim(values) == 3 and np.shape(values)[2] != 3):

@@ -316,7 +316,7 @@ class Controller:
         return f"{self._protocol},{self.device.kind},{self.serial},{self._firmware}"
 
     def _identify(self, _: str, now: float) -> str:
-        return f"skinrig,{self.device.model},{self.serial},{self._firmware}"
+        return f"RIGSIM,{self.device.model},{self.serial},{self._firmware}"
 
     def _greet(self, _: str, now: float) -> str:
         return self._hello()

@@ -45,7 +45,16 @@ def test_a_comparison_without_an_assertion_would_be_found():
 
 def none_defaults_without_none(source):
     found = []
-    for node in ast.walk(ast.parse(source)):
+    tree = ast.parse(source)
+    aliases = [
+        target.id
+        for node in tree.body
+        if isinstance(node, ast.Assign) and "None" in ast.unparse(node.value)
+        for target in node.targets
+        if isinstance(target, ast.Name)
+    ]
+    allowed = re.compile("|".join([r"None", r"Any", r"object", *(rf"\b{a}\b" for a in aliases)]))
+    for node in ast.walk(tree):
         if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             continue
         args = node.args
@@ -59,7 +68,7 @@ def none_defaults_without_none(source):
             if isinstance(default, ast.Constant)
             and default.value is None
             and arg.annotation is not None
-            and not re.search(r"None|Any|object", ast.unparse(arg.annotation))
+            and not allowed.search(ast.unparse(arg.annotation))
         ]
     return found
 

@@ -18,7 +18,7 @@ RIG = load_rig("flash").resized(16)
 # header -> (text, needs arming, expected payload or a test of it)
 ANY = object()
 MANUAL = {
-    "*IDN?": ("*IDN?", False, "skinrig,FLASH2,FL-0001,1.0"),
+    "*IDN?": ("*IDN?", False, "RIGSIM,FLASH2,FL-0001,1.0"),
     "*RST": ("*RST", False, ""),
     "*CLS": ("*CLS", False, ""),
     "*OPC?": ("*OPC?", False, "1"),

@@ -20,7 +20,7 @@ from rigsim.world import World
 
 def test_the_box_says_who_it_is_and_what_it_allows(bench):
     box = bench.box()
-    assert box.identify() == "skinrig,FLASH2,FL-0001,1.0"
+    assert box.identify() == "RIGSIM,FLASH2,FL-0001,1.0"
     assert (box.identity.kind, box.identity.serial) == ("flash", "FL-0001")
     assert box.limits["recycle_s"] == 1.5
     assert box.limits["power_max"] == 1.0

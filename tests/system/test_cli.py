@@ -46,6 +46,7 @@ def test_the_promised_commands_are_there():
         (["simulate", "flash", "--out", "x", "--subject", "green"], 3, "green"),
         (["reconstruct", "nothing", "--want", "melanin", "--out", "x"], 3, "nothing"),
         (["calibrate", "sensor", "nothing"], 3, "nothing"),
+        (["simulate", "flash", "--out", "x", "--state", "happy"], 3, "happiness"),
         (["bench", "--stage", "coffee"], 3, "coffee"),
         (["capture", "flash", "--out", "x"], 3, "--port flash=URL"),
         (["capture", "flash", "--out", "x", "--port", "flash"], 3, "NAME=URL"),

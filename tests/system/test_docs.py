@@ -134,7 +134,7 @@ def test_the_shell_example_fires_a_served_box():
             check=False,
         )
     identity, *answers = run.stdout.splitlines()
-    assert identity.startswith("skinrig,FLASH2,"), run.stderr
+    assert identity.startswith("RIGSIM,FLASH2,"), run.stderr
     codes = [wire.decode(answer.encode()).code for answer in answers]
     assert codes == [wire.Code.OK] * 4, run.stdout
 
