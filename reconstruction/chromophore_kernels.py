@@ -42,6 +42,10 @@ MAPS = (
     "gamut_distance",
 )
 MASKS = ("valid", "outside", "melanin_identifiable", "hemoglobin_identifiable", "ambiguous")
+VAGUE = 0.1
+"""Relative standard error of a shading from which on color is a better start than brightness."""
+SAME_SIDE = 0.1
+"""Distance, along the melanin axis, within which a solution is the lighter of two."""
 HUGE = 1e30
 """Colors and variances from here on count as infinite."""
 
@@ -51,6 +55,7 @@ _LOW = np.float32(LOWEST)
 _ONE = np.float32(1.0)
 _TWO = np.float32(2.0)
 _THREE = np.float32(3.0)
+_FOUR = np.float32(4.0)
 _HALF = np.float32(0.5)
 _ZERO = np.float32(0.0)
 
@@ -123,6 +128,15 @@ def _weights(a00, a11, a22, a01, a02, a12):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=_FAST)
+def _project(rows, l0, l1, l2):  # type: ignore[no-untyped-def]
+    """Take log RGB to the coordinates of a start grid."""
+    return (
+        rows[0, 0] * l0 + rows[0, 1] * l1 + rows[0, 2] * l2 + rows[0, 3],
+        rows[1, 0] * l0 + rows[1, 1] * l1 + rows[1, 2] * l2 + rows[1, 3],
+    )
+
+
+@njit(inline="always", fastmath=_FAST)
 def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
     """Interpolate the start grid bilinearly, clamped to it."""
     last = axes.shape[0] - 1
@@ -176,8 +190,10 @@ def _given(dtype: types.Type, axes: int) -> types.Array:
         _given(float32, 2),  # covariance of the model's relative error (3, 3)
         _given(float32, 5),  # cells of the color table
         _given(float32, 1),  # ends of the axes as volume fractions (2,)
-        _given(float32, 2),  # projection of log rgb and offset (2, 4)
-        _given(float32, 3),  # start grid (g, g, 2)
+        _given(float32, 2),  # projection of log rgb with its brightness, and offset (2, 4)
+        _given(float32, 3),  # start grid on it (g, g, 2)
+        _given(float32, 2),  # projection of log rgb without brightness, and offset (2, 4)
+        _given(float32, 3),  # start grid on it (g, g, 2)
         _given(float32, 2),  # mean log color of second solutions (g, g)
         float32,  # largest plausible log shading
         float32,  # sign of the surface's side on which light skin lies
@@ -202,8 +218,10 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     model,
     cells,
     ends,
-    projection,
-    axes,
+    surface,
+    surface_axes,
+    chroma,
+    chroma_axes,
     twin_log,
     log_shading_max,
     light_side,
@@ -216,10 +234,12 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     pixels = rgb.shape[0]
     last = cells.shape[0]
     length = np.float32(last)
-    grid = axes.shape[0]
+    grid = twin_log.shape[0]
     m00, m01, m02 = model[0, 0], model[0, 1], model[0, 2]
     m11, m12, m22 = model[1, 1], model[1, 2], model[2, 2]
     plain = m01 == 0.0 and m02 == 0.0 and m12 == 0.0
+    common_variance = max(min(m01, m02, m12), _ZERO)
+    vague = not free and common_variance > VAGUE * VAGUE
     each_variance = variance.shape[0] > 1
     each_shading = shading.shape[0] > 1
     each_usable = usable.shape[0] > 1
@@ -283,11 +303,18 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 np.float32(x5),
             )
             l0, l1, l2 = math.log(d0), math.log(d1), math.log(d2)
-            y0 = projection[0, 0] * l0 + projection[0, 1] * l1 + projection[0, 2] * l2
-            y1 = projection[1, 0] * l0 + projection[1, 1] * l1 + projection[1, 2] * l2
-            y0 += projection[0, 3]
-            y1 += projection[1, 3]
-            a, b = _guess(axes, y0, y1)
+            a = b = a_light = b_light = _ONE
+            twin_brightness = -np.float32(np.inf)
+            if free or vague:
+                y0, y1 = _project(chroma, l0, l1, l2)
+                a, b = _guess(chroma_axes, y0, y1)
+                a_light, b_light = a, b
+                g0 = min(max(int(y0 + _HALF), 0), grid - 1)
+                g1 = min(max(int(y1 + _HALF), 0), grid - 1)
+                twin_brightness = twin_log[g0, g1]
+            if not free and (not vague or twin_brightness > -HUGE):
+                y0, y1 = _project(surface, l0, l1, l2)
+                a, b = _guess(surface_axes, y0, y1)
             a_before, b_before, cost_before = a, b, np.float32(np.inf)
             step_a = step_b = _ZERO
             s = _ONE
@@ -311,7 +338,11 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                     t = _ONE / s
                     e0, e1, e2 = q0 * t - _ONE, q1 * t - _ONE, q2 * t - _ONE
                 else:
-                    e0, e1, e2 = q0 - _ONE, q1 - _ONE, q2 - _ONE
+                    # log(q) to second order: a shading known to 50 percent leaves large factors.
+                    mean = (q0 + q1 + q2) / _THREE
+                    t = _ONE / mean
+                    common = math.log(mean) - _ONE
+                    e0, e1, e2 = q0 * t + common, q1 * t + common, q2 * t + common
                 cost = _form(w, e0, e1, e2, e0, e1, e2)
                 r0, r1, r2 = r0 * length, r1 * length, r2 * length
                 ga0, ga1, ga2 = x0 * r0, x1 * r1, x2 * r2
@@ -386,10 +417,16 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             e0 -= ga0 * step_a + gb0 * step_b
             e1 -= ga1 * step_a + gb1 * step_b
             e2 -= ga2 * step_a + gb2 * step_b
+            residual = math.sqrt(max(_form(w, e0, e1, e2, e0, e1, e2), _ZERO))
+            # The shading's share of what is left: all of the mean when free, else the most
+            # probable part of it given how well it is known.
+            shift = s0 * e0 + s1 * e1 + s2 * e2
             if free:
-                shift = s0 * e0 + s1 * e1 + s2 * e2
-                e0, e1, e2 = e0 - shift, e1 - shift, e2 - shift
                 s *= _ONE + shift
+            else:
+                shift *= common_variance * np.float32(total)
+                s = np.float32(math.exp(shift))
+            e0, e1, e2 = e0 - shift, e1 - shift, e2 - shift
             a = min(max(a, _LOW), _ONE)
             b = min(max(b, _LOW), _ONE)
             wide = float64(aa) * bb
@@ -397,7 +434,6 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             inverse = np.float32(1.0 / det)
             relative_a = _THREE * math.sqrt(bb * inverse) / a
             relative_b = _THREE * math.sqrt(aa * inverse) / b
-            residual = math.sqrt(max(_form(w, e0, e1, e2, e0, e1, e2), _ZERO))
             distance = math.sqrt((e0 * e0 + e1 * e1 + e2 * e2) / _THREE)
             maps[0, n] = ends[0] * a * a * a
             maps[1, n] = ends[1] * b * b * b
@@ -406,11 +442,23 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             maps[4, n] = relative_b * maps[1, n]
             maps[5, n] = residual
             maps[6, n] = distance
+            brightness = (l0 + l1 + l2) / _THREE
             twin = False
             if free:
-                g0 = min(max(int(y0 + _HALF), 0), grid - 1)
-                g1 = min(max(int(y1 + _HALF), 0), grid - 1)
-                twin = (l0 + l1 + l2) / _THREE <= twin_log[g0, g1] + log_shading_max
+                twin = brightness <= twin_brightness + log_shading_max
+            elif vague and twin_brightness > -HUGE:
+                # The prior of the shading must favor this side of the fold by two sigma.
+                if abs(a - a_light) < SAME_SIDE:
+                    other = max(brightness - twin_brightness, _ZERO)
+                else:
+                    i, j = a_light * length, b_light * length
+                    row, column = min(int(i), last - 1), min(int(j), last - 1)
+                    x, y = i - np.float32(row), j - np.float32(column)
+                    f0, _, _ = _cell(cells[row, column, 0], x, y)
+                    f1, _, _ = _cell(cells[row, column, 1], x, y)
+                    f2, _, _ = _cell(cells[row, column, 2], x, y)
+                    other = brightness - math.log(f0 * f1 * f2) / _THREE
+                twin = other * other - shift * shift < _FOUR * common_variance
             outside = residual > OUTSIDE_SIGMAS and distance > OUTSIDE_DISTANCE
             close = max(abs(step_a) / a, abs(step_b) / b) < CONVERGED
             masks[0, n] = (done or close) and not outside

@@ -36,14 +36,14 @@ def fit(
     Returns
     -------
     tuple of ndarray
-        C_m, C_hd, shading and the weighted square sum of the residuals, each of shape (n,).
+        C_m, C_hd, shading and the weighted square sum of log differences, each of shape (n,).
     """
     start = start_for(table, free_shading)
     place = np.log(rgb) @ start.projection[:, :3].T + start.projection[:, 3]
     i, j = np.clip(np.rint(place), 0, start.axes.shape[0] - 1).astype(np.intp).T
     x = np.clip(start.axes[i, j].astype(np.float64), LOWEST, 1.0)
     damping = np.full(len(x), 1e-3)
-    shading, residual, gradient = _linearise(rgb, table, x, weights, free_shading)
+    shading, residual, gradient = _linearise(rgb, table, x, free_shading)
     cost = _square(residual, weights)
     for _ in range(_STEPS):
         normal = np.swapaxes(gradient, -1, -2) @ weights @ gradient
@@ -57,9 +57,7 @@ def fit(
         normal[:, [0, 1], [0, 1]] = np.where(held, 1.0, np.maximum(diagonal, 1e-300))
         step = np.linalg.solve(normal, right[..., None])[..., 0]
         tried = np.clip(x + np.clip(step, -0.1, 0.1), LOWEST, 1.0)
-        new_shading, new_residual, new_gradient = _linearise(
-            rgb, table, tried, weights, free_shading
-        )
+        new_shading, new_residual, new_gradient = _linearise(rgb, table, tried, free_shading)
         new_cost = _square(new_residual, weights)
         better = new_cost <= cost
         x = np.where(better[:, None], tried, x)
@@ -72,16 +70,16 @@ def fit(
 
 
 def _linearise(
-    rgb: Floats, table: ColorTable, x: Floats, weights: Floats, free_shading: bool
+    rgb: Floats, table: ColorTable, x: Floats, free_shading: bool
 ) -> tuple[Floats, Floats, Floats]:
     """Return shading, relative residuals and the color's relative derivatives at x."""
     color, by_a, by_b = evaluate(table, x[:, 0], x[:, 1])
-    ratio = rgb / color
+    residual = np.log(rgb / color)
     shading = np.ones(len(x))
     if free_shading:
-        # The projected weights know no common factor; any positive mean of the ratios serves.
-        shading = np.exp(np.log(ratio).mean(axis=-1))
-    residual = ratio / shading[:, None] - 1.0
+        # The projected weights know no common factor; any mean of the ratios serves.
+        shading = np.exp(residual.mean(axis=-1))
+        residual = residual - np.log(shading)[:, None]
     return shading, residual, np.stack([by_a / color, by_b / color], axis=-1)
 
 

@@ -117,10 +117,13 @@ def _unfolding_direction(across: FloatArray) -> FloatArray:
 
 
 def _light_side(facing: FloatArray) -> NDArray[np.bool_]:
-    """Return the samples that are connected, without a fold, to light skin with some blood."""
+    """Return the samples that melanin reaches without a fold, around light skin with some blood.
+
+    Behind the first fold may lie a second one, where skin is dark and faces as light skin does.
+    """
     corner = facing[: _SAMPLES // 8, _SAMPLES // 4 : _SAMPLES // 2]
     same = facing * np.sign(np.median(corner)) > 0.0
-    regions, _ = ndimage.label(same)
+    regions, _ = ndimage.label(np.logical_and.accumulate(same, axis=0))
     seed = regions[: _SAMPLES // 8, _SAMPLES // 4 : _SAMPLES // 2]
     return np.asarray(regions == np.bincount(seed[seed > 0]).argmax())
 

@@ -42,7 +42,8 @@ class ChromophoreMaps:
     hemoglobin: Map
     """Volume fraction of blood in the dermis, 2e-5 to 0.32; NaN where the input is unusable."""
     shading: Map
-    """Factor between the table's color and the pixel: fitted when free, else as given."""
+    """Factor between the table's color and the pixel: fitted when free, else as given; when the
+    model error says that it is known roughly, the most probable factor."""
     stderr_melanin: Map
     """Standard error of `melanin`: Fisher information of noise and model error together."""
     stderr_hemoglobin: Map
@@ -61,7 +62,8 @@ class ChromophoreMaps:
     hemoglobin_identifiable: Mask
     """The same for hemoglobin."""
     ambiguous: Mask
-    """With the shading free: darker skin under more light has the same color."""
+    """Darker skin under more light has the same color: with the shading free, or known so roughly
+    that it does not favor one of them by two standard errors."""
 
     @property
     def identifiable(self) -> Mask:
@@ -145,7 +147,11 @@ def invert(
     pixels = int(np.prod(shape, dtype=np.int64))
     maps = np.empty((len(kernels.MAPS), pixels), dtype=np.float32)
     masks = np.empty((len(kernels.MASKS), pixels), dtype=np.bool_)
-    start = start_for(table, free)
+    covariance = _conditioned(model_covariance(model_error, variance is None), free)
+    vague = covariance.min() > kernels.VAGUE**2
+    chroma = start_for(table, True) if free or vague else None
+    surface = start_for(table, False) if chroma is None or not free else chroma
+    chroma = surface if chroma is None else chroma
     if shading_max is not None and not shading_max > 0.0:
         raise ChromophoreError(f"shading_max: expected a positive factor, got {shading_max}")
     kernels.fit_pixels(
@@ -154,14 +160,16 @@ def invert(
         known,
         _usable(valid, shape),
         free,
-        _conditioned(model_covariance(model_error, variance is None), free).astype(np.float32),
+        covariance.astype(np.float32),
         _cells(table),
         np.array([table.c_m_max, table.c_hd_max], dtype=np.float32),
-        np.ascontiguousarray(start.projection, dtype=np.float32),
-        start.axes,
-        start.twin_log,
+        np.ascontiguousarray(surface.projection, dtype=np.float32),
+        surface.axes,
+        np.ascontiguousarray(chroma.projection, dtype=np.float32),
+        chroma.axes,
+        chroma.twin_log,
         np.float32(np.inf if shading_max is None else np.log(shading_max)),
-        np.float32(start.side),
+        np.float32(chroma.side),
         np.float32(limit),
         maps,
         masks,
