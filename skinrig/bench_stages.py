@@ -8,11 +8,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from skinrig import bench_flash, bench_tissue
+from skinrig import bench_chromophores, bench_flash, bench_tissue
 from skinrig.benchmark import StageBenchmark, to_document
 from skinrig.console import Console, plain
 
 STAGES: dict[str, Callable[..., StageBenchmark]] = {
+    "chromophores": bench_chromophores.inversion,
     "render-flash": bench_flash.render,
     "layered-reflectance": bench_tissue.layered_reflectance,
     "color-table": bench_tissue.table,
