@@ -44,7 +44,7 @@ def inversion(*, toy: bool) -> StageBenchmark:
             def invert(
                 coarse: color_table.ColorTable = coarse, given: str | None = given
             ) -> chromophores.ChromophoreMaps:
-                return chromophores.invert(picture, coarse, shading=given, variance=variance)  # type: ignore[arg-type]
+                return chromophores.invert(picture, coarse, shading=given, variance=variance)
 
             timing = measure(invert, repeats=1 if toy else 3)
             found = invert()

@@ -40,9 +40,16 @@ fi
 
 # Mitsuba compiles with LLVM where it finds version 17 or newer; 14 is refused and
 # 15 and 16 abort the process, so a present but old LLVM does not count.
-if ! ls /usr/lib/*/libLLVM.so.1[789]* /usr/lib/*/libLLVM.so.2* /usr/lib/*/libLLVM-1[789].so* \
-        /usr/lib/*/libLLVM-2*.so* /usr/lib64/libLLVM.so.1[789]* /usr/lib64/libLLVM.so.2* \
-        >/dev/null 2>&1; then
+has_good_llvm() {
+  local library
+  for library in /usr/lib/*/libLLVM.so.1[789]* /usr/lib/*/libLLVM.so.2* \
+                 /usr/lib/*/libLLVM-1[789].so* /usr/lib/*/libLLVM-2*.so* \
+                 /usr/lib64/libLLVM.so.1[789]* /usr/lib64/libLLVM.so.2*; do
+    [ -e "$library" ] && return 0
+  done
+  return 1
+}
+if ! has_good_llvm; then
   if is_root_with_apt && [ "${SKINRIG_NO_APT:-}" = "" ]; then
     say "no LLVM 17 or newer: installing Debian's libllvm19 through apt (Mitsuba renders faster with it)"
     apt_install libllvm19 ||
