@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from capture.rig import Light
 from model import spectra
 from rigsim import lateral, shading
+from rigsim.atlas import Atlas
 from rigsim.films import Films, absorbing_axis
 from rigsim.lateral_kernels import GaussianSum
 from rigsim.mesh import Float32Array
@@ -25,6 +26,10 @@ SIGMAS_MM: Final = (0.02, 0.06, 0.15, 0.35, 0.8, 1.8, 4.0)
 
 HAIR_REFLECTANCE: Final = (0.016, 0.011, 0.008)
 """White-balanced reflectance of dark brown hair, seen as a matt cover."""
+
+PIGMENT_BLUR_MM: Final = 0.12
+"""Width of the blur of melanin's absorbance; fitted to photons that walk through patterned skin,
+see `spread_pattern`."""
 
 SHADOW_SAMPLES: Final = 8
 """Points on each flash that cast shadows."""
@@ -173,17 +178,57 @@ def spread_through_pigment(
     ndarray of float32
         Shape (N, N, 3).
 
-    Notes
-    -----
-    Melanin lies above the scattering dermis, so light passes it where it enters and again where it
-    leaves: its pattern acts once before and once after the spreading, as m = sqrt(R(C_m, C_hd) /
-    R(0, C_hd)) each time. Blood acts inside, before the spreading.
+    See Also
+    --------
+    spread_pattern : what is done, and how well it holds.
     """
     table = skin_color(camera, light)
     without = table.rgb(np.zeros_like(subject.melanin), subject.hemoglobin(state))
-    pigment = np.sqrt(reflectance / without)
-    inside = pigment * without * entered[..., None]
-    return pigment * lateral.spread_light(inside, subject.atlas, kernels.sigmas_mm, kernels.weights)
+    return spread_pattern(reflectance, without, entered, subject.atlas, kernels)
+
+
+def spread_pattern(
+    reflectance: Float32Array,
+    without_melanin: Float32Array,
+    entered: Float32Array,
+    atlas: Atlas,
+    kernels: GaussianSum,
+) -> Float32Array:
+    """Return the light that leaves patterned skin.
+
+    Parameters
+    ----------
+    reflectance
+        Sharp reflectance of the skin, shape (N, N, C).
+    without_melanin
+        The same of skin with its blood but no melanin, shape (N, N, C).
+    entered
+        Light that enters, shape (N, N).
+    atlas
+        The surface.
+    kernels
+        Lateral profile, C channels.
+
+    Returns
+    -------
+    ndarray of float32
+        Shape (N, N, C).
+
+    Notes
+    -----
+    Melanin lies above the scattering dermis, so light passes it where it enters and again where it
+    leaves: its pattern acts once before and once after the spreading, as m = sqrt(R / R without
+    melanin) each time, with log m blurred by `PIGMENT_BLUR_MM` since light crosses the epidermis
+    aslant. Blood acts inside, before the spreading. Against photons that walk through patterned
+    skins at two wavelengths (`rigsim.patterned_tissue`) this errs by 1.4 % rms over six edges and
+    spots, to which the width was fitted, and by 3 to 4 % on stripes of 0.75 mm, to which it was
+    not; leaving transport out errs by 6.3 % on the six, blurring the reflectance by 3.7 %.
+    """
+    channels = reflectance.shape[-1]
+    log_m = np.log(reflectance / without_melanin) * np.float32(0.5)
+    pigment = np.exp(lateral.spread_light(log_m, atlas, [PIGMENT_BLUR_MM], np.ones((channels, 1))))
+    inside = pigment * without_melanin * entered[..., None]
+    return pigment * lateral.spread_light(inside, atlas, kernels.sigmas_mm, kernels.weights)
 
 
 def typical_kernels(subject: Subject, state: str, camera: str, light: str) -> GaussianSum:

@@ -143,6 +143,16 @@ def test_both_ray_tracers_agree(view):
     assert np.abs(one.position_mm - other.position_mm)[both].max() < 5e-3
 
 
+def test_no_single_ray_slips_between_the_triangles_of_a_closed_surface(choice, view):
+    fine = render.g_buffer(
+        render.Caster(sphere(60.0, columns=720, rows=360), choice=choice), view, subpixels=4
+    )
+    hit = np.pad(fine.mask, 1).astype(int)
+    rows, columns = fine.mask.shape
+    around = sum(hit[y : y + rows, x : x + columns] for y in range(3) for x in range(3))
+    assert not ((around == 8) & ~fine.mask).any()
+
+
 def test_a_white_plate_under_constant_light_renders_to_its_albedo():
     """Mitsuba itself, by a described scene: radiance = albedo times the sky's radiance."""
     image = render.radiance(
