@@ -46,6 +46,8 @@ VAGUE = 0.1
 """Relative standard error of a shading from which on color is a better start than brightness."""
 SAME_SIDE = 0.1
 """Distance, along the melanin axis, within which a solution is the lighter of two."""
+OTHER_SIDE = 0.2
+"""Distance, along the melanin axis, from which on color and brightness mean two solutions."""
 HUGE = 1e30
 """Colors and variances from here on count as infinite."""
 
@@ -312,9 +314,12 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 g0 = min(max(int(y0 + _HALF), 0), grid - 1)
                 g1 = min(max(int(y1 + _HALF), 0), grid - 1)
                 twin_brightness = twin_log[g0, g1]
-            if not free and (not vague or twin_brightness > -HUGE):
+            if not free:
                 y0, y1 = _project(surface, l0, l1, l2)
-                a, b = _guess(surface_axes, y0, y1)
+                a_seen, b_seen = _guess(surface_axes, y0, y1)
+                # Color is the better start unless brightness says that it is the other solution.
+                if not vague or abs(a_seen - a_light) > OTHER_SIDE or twin_brightness > -HUGE:
+                    a, b = a_seen, b_seen
             a_before, b_before, cost_before = a, b, np.float32(np.inf)
             step_a = step_b = _ZERO
             s = _ONE
