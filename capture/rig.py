@@ -20,6 +20,7 @@ Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG", "MONO"]
 PATTERNS: tuple[str, ...] = ("RGGB", "BGGR", "GRBG", "GBRG", "MONO")
 ID_RULE = "1 to 64 of A-Z a-z 0-9 _ - . , not starting with a dot"
 MAX_SIDE_PX = 65_535
+MAX_BINNING = 3.0
 
 
 class RigError(InputError):
@@ -196,7 +197,8 @@ class View:
         """Return this view with ``width_px`` columns and the same field of view; rows stay even.
 
         Pixels grow as if the sensor's own were binned: a pixel of k times the side holds k^2
-        times the electrons, and its read noise is k times as large.
+        times the electrons, and its read noise is k times as large; no further than 3 x 3, where
+        the levels of the converter would begin to hide the noise.
         """
         step = 1 if self.cfa == "MONO" else 2
         if not 2 <= width_px <= MAX_SIDE_PX or width_px % step:
@@ -208,13 +210,14 @@ class View:
             )
         factor = self.width_px / width_px
         height_px = max(step * round(self.height_px / factor / step), 2)
+        binned = min(max(factor, 1.0), MAX_BINNING)
         return dataclasses.replace(
             self,
             width_px=width_px,
             height_px=height_px,
             pixel_um=self.pixel_um * factor,
-            full_well_e=self.full_well_e * factor**2,
-            read_noise_e=self.read_noise_e * factor,
+            full_well_e=self.full_well_e * binned**2,
+            read_noise_e=self.read_noise_e * binned,
         )
 
 

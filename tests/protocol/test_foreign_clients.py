@@ -8,7 +8,7 @@ import pytest
 from rigsim.serve import ServeError, serve
 from rigsim.world import World
 
-IDN = "skinrig,FLASH2,FL-0001,1.0"
+IDN = "RIGSIM,FLASH2,FL-0001,1.0"
 SCRIPT = """
 printf '*IDN?\\n' >&3; read -r -t 5 -u 3 line; echo "$line"
 printf 'FLAS:FIRE a\\n' >&3

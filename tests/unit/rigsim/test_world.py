@@ -173,16 +173,16 @@ def test_pyserial_finds_the_port_by_its_url(world):
     Port("sim://flash?world=unit-world").close()  # makes the handler known
     with serial.serial_for_url("sim://flash?world=unit-world", timeout=0.1) as port:
         port.write(b"*IDN?\n")
-        assert port.read_until() == b"skinrig,FLASH2,FL-0001,1.0\n"
+        assert port.read_until() == b"RIGSIM,FLASH2,FL-0001,1.0\n"
 
 
 def test_bytes_take_their_time_on_the_line(world, port):
     port.write(b"*IDN?\n")
     assert port.in_waiting == 0
     answer = port.read(100)
-    # 6 bytes there and 27 back at 86.8 us each, then silence up to the timeout
-    assert len(answer) == 27
-    assert world.transcript[-1].split()[0] == f"{33 * 10 / 115_200:.6f}"
+    # 6 bytes there and 26 back at 86.8 us each, then silence up to the timeout
+    assert len(answer) == 26
+    assert world.transcript[-1].split()[0] == f"{32 * 10 / 115_200:.6f}"
 
 
 def test_a_read_ends_at_its_timeout(world, port):
@@ -200,7 +200,7 @@ def test_a_read_without_a_timeout_that_nothing_can_end_is_refused(port):
 def test_a_flush_drops_what_has_arrived(world, port):
     port.write(b"*IDN?\n")
     world.clock.sleep(0.01)
-    assert port.in_waiting == 27
+    assert port.in_waiting == 26
     port.reset_input_buffer()
     assert port.in_waiting == 0
 
