@@ -47,21 +47,18 @@ def main(first: int, last: int) -> None:
             for key, rows in pooled.items():
                 estimate = maps.maps[key]
                 valid = estimate.valid if estimate.valid is not None else np.ones_like(skin)
-                rows.append(
-                    np.stack(
-                        [
-                            truth.maps["melanin"].values[skin],
-                            truth.maps[f"{key}_blurred"].values[skin],
-                            estimate.values[skin],
-                            (estimate.stderr if estimate.stderr is not None else skin)[skin],
-                            valid[skin],
-                        ]
-                    )  # fmt: skip
+                stderr = estimate.stderr if estimate.stderr is not None else np.ones_like(skin)
+                columns = (
+                    truth.maps["melanin"].values,
+                    truth.maps[f"{key}_blurred"].values,
+                    estimate.values,
+                    stderr,
+                    valid,
                 )
+                rows.append(np.stack([column[skin] for column in columns]))
             print(f"seed {seed} {preset} {state}", file=sys.stderr)
-    print(
-        "map         band          pixels masked%   all: error% cover% stderr%   bound<10%: share% error% cover%"
-    )
+    print("map         band          pixels masked%   all: error% cover% stderr%", end="")
+    print("   bound<10%: share% error% cover% stderr%")
     for key, rows in pooled.items():
         melanin, true, value, stderr, valid = np.concatenate(rows, axis=1).astype(np.float64)
         for low, high in BANDS:
