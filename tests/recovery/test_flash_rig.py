@@ -3,11 +3,13 @@
 Subjects of seeds from 100 on; the model-error term was fitted on seeds 0 to 19.
 """
 
+import dataclasses
 from datetime import date
 
 import numpy as np
 import pytest
 
+from capture.calibration import store as calibration_store
 from model import store
 from reconstruction import pipeline
 from skinrig.calibrating import calibrate
@@ -16,7 +18,7 @@ from skinrig.simulation import simulate_session
 
 pytestmark = pytest.mark.render
 
-WIDTH_PX = 320
+WIDTH_PX = 768  # the demo's
 TODAY = date.today()
 
 
@@ -41,35 +43,46 @@ def reconstructed(folder, calibration, *, subject, seed, **more):
     return store.read(folder / "maps"), store.read(done.truth)
 
 
+def limit_for(row):
+    """15 % where the bound is below 10 %, else 1.3 times the bound."""
+    return 0.15 if row.median_stderr < 0.10 else 1.3 * row.median_stderr
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("subject", "seed"), [("I", 100), ("III", 102), ("IV", 103), ("VI", 105)])
-def test_chromophores_are_recovered_within_15_percent(tmp_path, calibration, subject, seed, rng):
+def test_chromophores_are_recovered_within_their_bounds(tmp_path, calibration, subject, seed, rng):
     """Median relative error over the skin, against the truth with lateral transport in it."""
     maps, truth = reconstructed(tmp_path, calibration, subject=subject, seed=seed)
     rows = [r for r in compare(maps, truth, rng=rng) if r.against == "blurred" and r.band is None]
     assert {row.name for row in rows} == {"melanin", "hemoglobin"}
     for row in rows:
-        assert row.median_relative <= 0.15, row
-        assert row.masked <= 0.25, row
+        if row.name == "hemoglobin" and subject == "VI":
+            # blood under so much melanin cannot be seen: masked, not guessed
+            assert row.masked > 0.95
+            continue
+        assert row.median_relative <= limit_for(row), row
+    melanin = next(row for row in rows if row.name == "melanin")
+    assert melanin.masked <= 0.15
 
 
 @pytest.mark.long
-def test_without_the_white_reference_the_error_grows(tmp_path, calibration, rng):
-    """Shows that the test above can fail: the wrong white balance is taken for pigment."""
-    simulate_session(
+def test_a_white_balance_5_percent_off_breaks_the_bounds(tmp_path, calibration, rng):
+    """Shows that the test above can fail."""
+    white = calibration_store.load(calibration, "white")
+    tinted = dataclasses.replace(
+        white, maps=dict(white.maps) | {"signal": white.maps["signal"] * np.float32([1.05, 1, 1])}
+    )
+    calibration_store.save(tinted, tmp_path / "tinted")
+    done = simulate_session(
         "flash", tmp_path / "session-flash", subject="III", seed=102, width_px=WIDTH_PX
     )
-    truth = store.read(tmp_path / "truth-flash")
-    errors = []
-    for used in (calibration, None):
-        out = tmp_path / f"maps-{used is None}"
-        pipeline.reconstruct(
-            tmp_path / "session-flash", want=["melanin", "hemoglobin"], out=out, calibration=used
-        )
-        rows = compare(store.read(out), truth, rng=rng)
-        errors.append(max(r.median_relative for r in rows if r.band is None))
-    assert errors[1] > 2 * errors[0]
-    assert errors[1] > 0.15
+    pipeline.reconstruct(
+        done.session, want=["melanin", "hemoglobin"], out=tmp_path / "maps",
+        calibration=tmp_path / "tinted",
+    )  # fmt: skip
+    rows = compare(store.read(tmp_path / "maps"), store.read(done.truth), rng=rng)
+    broken = [r for r in rows if r.band is None and not r.median_relative <= limit_for(r)]
+    assert broken
 
 
 def test_a_subject_is_reconstructed_only_as_far_as_wanted(tmp_path):
