@@ -57,6 +57,22 @@ class MapError:
         return "all" if self.band is None else f"C_m {self.band[0]:g}–{self.band[1]:g}"
 
 
+MEDIAN_LIMIT = 0.15
+BOUND_LIMIT = 0.10
+BOUND_FACTOR = 1.3
+
+
+def limit(row: MapError) -> float:
+    """Return the largest median relative error that counts as kept.
+
+    15 % where the estimate's own standard error, which is the Cramer-Rao bound of noise and model
+    error, is below 10 %; elsewhere 1.3 times that bound.
+    """
+    if row.median_stderr < BOUND_LIMIT:
+        return MEDIAN_LIMIT
+    return max(MEDIAN_LIMIT, BOUND_FACTOR * row.median_stderr)
+
+
 def compare(
     appearance: SkinAppearance,
     truth: SkinAppearance,

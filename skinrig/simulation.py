@@ -36,6 +36,8 @@ class Simulated:
     """Time that passed on the rig's own clock."""
     left_out: tuple[tuple[str, str], ...]
     """What the scene did not build, and why."""
+    blur_mm: tuple[float, ...] = ()
+    """Width from 10 to 90 % of an edge that light spreading in the skin blurs, R, G, B, mm."""
 
     def document(self) -> Mapping[str, Any]:
         """Return this as JSON values."""
@@ -45,6 +47,7 @@ class Simulated:
             "frames": self.frames,
             "rig_seconds": self.rig_seconds,
             "left_out": self.left_out,
+            "blur_mm": self.blur_mm,
         }
 
 
@@ -167,8 +170,10 @@ def simulate_session(
         for state, scene in scenes.items():
             folder = truth if state == states[0] else truth.with_name(f"{truth.name}-{state}")
             store.write(folder, _truth(scene.truth(), seed, session.content_hash, state))
-    left_out = tuple(next(iter(scenes.values())).left_out)
-    return Simulated(path, truth, len(session.frames()), rig_seconds, left_out)
+    first = next(iter(scenes.values()))
+    blur = () if target else tuple(float(width) for width in first.resolution_mm())
+    left_out = tuple(first.left_out)
+    return Simulated(path, truth, len(session.frames()), rig_seconds, left_out, blur)
 
 
 def _plan(rig: Rig, target: str | None, states: tuple[str, ...], repeats: int) -> Plan:

@@ -13,7 +13,7 @@ from capture.calibration import store as calibration_store
 from model import store
 from reconstruction import pipeline
 from skinrig.calibrating import calibrate
-from skinrig.evaluation import compare
+from skinrig.evaluation import compare, limit
 from skinrig.simulation import simulate_session
 
 pytestmark = pytest.mark.render
@@ -43,11 +43,6 @@ def reconstructed(folder, calibration, *, subject, seed, **more):
     return store.read(folder / "maps"), store.read(done.truth)
 
 
-def limit_for(row):
-    """15 % where the bound is below 10 %, else 1.3 times the bound."""
-    return 0.15 if row.median_stderr < 0.10 else 1.3 * row.median_stderr
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("subject", "seed"), [("I", 100), ("III", 102), ("IV", 103), ("VI", 105)])
 def test_chromophores_are_recovered_within_their_bounds(tmp_path, calibration, subject, seed, rng):
@@ -60,7 +55,7 @@ def test_chromophores_are_recovered_within_their_bounds(tmp_path, calibration, s
             # blood under so much melanin cannot be seen: masked, not guessed
             assert row.masked > 0.95
             continue
-        assert row.median_relative <= limit_for(row), row
+        assert row.median_relative <= limit(row), row
     melanin = next(row for row in rows if row.name == "melanin")
     assert melanin.masked <= 0.15
 
@@ -81,7 +76,7 @@ def test_a_white_balance_5_percent_off_breaks_the_bounds(tmp_path, calibration, 
         calibration=tmp_path / "tinted",
     )  # fmt: skip
     rows = compare(store.read(tmp_path / "maps"), store.read(done.truth), rng=rng)
-    broken = [r for r in rows if r.band is None and not r.median_relative <= limit_for(r)]
+    broken = [r for r in rows if r.band is None and not r.median_relative <= limit(r)]
     assert broken
 
 
