@@ -294,11 +294,16 @@ def _expose(
         box.wait_charged(CHARGE_TIMEOUT_S)
     chosen = {name: cameras[name] for name in step.cameras}
     lit_by_box = power > 0
+    for name, camera in chosen.items():
+        if lit_by_box and Trigger.EDGE not in camera.info.triggers:
+            # exposing on request would miss the flash: every lit frame would be dark
+            raise CameraError(
+                f"view {name!r}: the camera {camera.info.serial} cannot be released by the flash "
+                "box's trigger line; release it from the box and let a tethering program write "
+                "its files into a hot folder"
+            )
     triggers = {
-        name: Trigger.EDGE
-        if lit_by_box and Trigger.EDGE in camera.info.triggers
-        else Trigger.SOFTWARE
-        for name, camera in chosen.items()
+        name: Trigger.EDGE if lit_by_box else Trigger.SOFTWARE for name, camera in chosen.items()
     }
     asked: dict[str, Exposure] = {}
     not_before: dict[str, float] = {}

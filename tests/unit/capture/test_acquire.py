@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 
 from capture.acquire import AcquisitionError, Interrupted, run_plan
-from capture.devices.camera import CameraInfo, Frame, FrameTimeout, Trigger, WrongCamera
+from capture.devices.camera import (
+    CameraError,
+    CameraInfo,
+    Frame,
+    FrameTimeout,
+    Trigger,
+    WrongCamera,
+)
 from capture.devices.port import LinkLost
 from capture.plan import flash_plan
 from capture.rig import load_rig
@@ -193,3 +200,11 @@ def test_a_camera_that_is_not_the_rigs_is_refused_before_anything_flashes(plan, 
 def test_a_missing_box_is_named_with_what_to_type(plan, session):
     with pytest.raises(AcquisitionError, match="--port flash=URL"):
         run_plan(plan, RIG, boxes={}, cameras={"cam": Camera()}, session=session)
+
+
+def test_a_camera_that_the_box_cannot_release_is_refused_before_a_flash_is_lost(plan, session):
+    camera, log = Camera(), []
+    camera.info = dataclasses.replace(camera.info, triggers=(Trigger.SOFTWARE,))
+    with pytest.raises(CameraError, match="hot folder"):
+        run(plan, session, Box(log), camera)
+    assert not [entry for entry in log if entry.startswith("fire")]
