@@ -70,7 +70,7 @@ def limit(row: MapError) -> float:
     """
     if row.median_stderr < BOUND_LIMIT:
         return MEDIAN_LIMIT
-    return max(MEDIAN_LIMIT, BOUND_FACTOR * row.median_stderr)
+    return BOUND_FACTOR * row.median_stderr
 
 
 def compare(
