@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -21,6 +21,7 @@ PATTERNS: tuple[str, ...] = ("RGGB", "BGGR", "GRBG", "GBRG", "MONO")
 ID_RULE = "1 to 64 of A-Z a-z 0-9 _ - . , not starting with a dot"
 MAX_SIDE_PX = 65_535
 MAX_BINNING = 3.0
+_AXIS = "0 <= degrees < 180"
 
 
 class RigError(InputError):
@@ -41,10 +42,10 @@ def is_id(text: str) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Light:
-    """One light of the rig.
+    """One light of the rig: a flash, which gives its energy in one pop, or an LED.
 
     Angles of axes are measured in the plane across the light's beam from the horizontal (+x of a
-    camera at +z) towards +y, in degrees.
+    camera at +z) towards +y, in degrees. A light points at the rig's origin.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
@@ -54,10 +55,15 @@ class Light:
     """Centre of the emitting disc, mm, rig frame."""
     illuminant: str = "D55"
     """Name of the spectrum, see ``model.spectra.illuminant``."""
-    polarizer_axis_deg: float
-    """Axis of the polarizer in front of the light, degrees, 0 <= axis < 180."""
-    energy_ws: float
-    """Energy of one pop at power 1, Ws (J), > 0."""
+    polarizer_axis_deg: float | None = None
+    """Axis of the polarizer in front of the light, degrees, 0 <= axis < 180; None: no polarizer."""
+    energy_ws: float | None = None
+    """Of a flash: energy of one pop at power 1, Ws (J), > 0; None: the light is no flash."""
+    power_w: float | None = None
+    """Of an LED: optical power at level 1, W, > 0; None: the light is no LED."""
+    half_intensity_deg: float | None = None
+    """Angle off the light's axis where its intensity has halved, falling as a power of the cosine,
+    0 < degrees < 90; None: the same in all directions."""
     radius_mm: float
     """Radius of the emitting disc, mm, > 0."""
 
@@ -67,14 +73,29 @@ class Light:
         checks.finite(position_mm=self.position_mm)
         checks.that("position_mm", self.position_mm, _norm(self.position_mm) > 0, "not the origin")
         checks.that("illuminant", self.illuminant, bool(self.illuminant), "a name")
-        checks.that(
-            "polarizer_axis_deg",
-            self.polarizer_axis_deg,
-            0 <= self.polarizer_axis_deg < 180,
-            "0 <= degrees < 180",
-        )
-        checks.positive(energy_ws=self.energy_ws, radius_mm=self.radius_mm)
+        axis, half = self.polarizer_axis_deg, self.half_intensity_deg
+        checks.that("polarizer_axis_deg", axis, axis is None or 0 <= axis < 180, _AXIS)
+        checks.that("half_intensity_deg", half, half is None or 0 < half < 90, "0 < degrees < 90")
+        strengths = {"energy_ws": self.energy_ws, "power_w": self.power_w}
+        given = {name: value for name, value in strengths.items() if value is not None}
+        checks.that("energy_ws, power_w", tuple(given), len(given) == 1, "one of the two")
+        checks.positive(radius_mm=self.radius_mm, **given)
         checks.close()
+
+    def intensity(self, off_axis_rad: float) -> float:
+        """Return the intensity ``off_axis_rad`` off the light's axis over that on it, 0 to 1.
+
+        Examples
+        --------
+        >>> half = {"power_w": 1, "half_intensity_deg": 60}
+        >>> led = Light(name="a", position_mm=(0, 0, 700), radius_mm=3, **half)
+        >>> round(led.intensity(math.radians(60)), 6)
+        0.5
+        """
+        if self.half_intensity_deg is None:
+            return 1.0
+        exponent = math.log(0.5) / math.log(math.cos(math.radians(self.half_intensity_deg)))
+        return max(math.cos(off_axis_rad), 0.0) ** exponent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,8 +132,9 @@ class View:
     """DN of saturation, at most 2**bit_depth - 1."""
     spectral_sensitivity: str = "Nikon 5100 (NPL)"
     """Name of the curves, see ``model.spectra.camera_sensitivity``."""
-    analyser_axis_deg: float
-    """Axis of the analyser at rotator reading 0 (the parallel state), degrees, 0 <= axis < 180."""
+    analyser_axis_deg: float | None = None
+    """Axis of the analyser at rotator reading 0 (the parallel state), degrees, 0 <= axis < 180;
+    None: no analyser."""
     full_well_e: float
     """Electrons at ``white_level``, > 0."""
     read_noise_e: float
@@ -150,12 +172,8 @@ class View:
             self.black_level < self.white_level <= top,
             f"black_level {self.black_level} < white_level <= {top}",
         )
-        checks.that(
-            "analyser_axis_deg",
-            self.analyser_axis_deg,
-            0 <= self.analyser_axis_deg < 180,
-            "0 <= degrees < 180",
-        )
+        analyser = self.analyser_axis_deg
+        checks.that("analyser_axis_deg", analyser, analyser is None or 0 <= analyser < 180, _AXIS)
         checks.that("read_noise_e", self.read_noise_e, 0 <= self.read_noise_e < math.inf, ">= 0")
         checks.close()
 
@@ -236,7 +254,7 @@ class Rig:
     boxes: tuple[str, ...]
     """Names of the controllers that drive the lights."""
     recycle_s: float
-    """Least time between two pops at power 1, s, >= 0."""
+    """Least time between two pops of a flash at power 1, s, >= 0; 0 where no light is a flash."""
     max_pops_per_min: float = 20.0
     """Most pops in any minute, > 0."""
     polarizer_move_s: float = 0.5
@@ -277,6 +295,29 @@ class Rig:
         (504, 336, 45.0)
         """
         return dataclasses.replace(self, views=tuple(v.resized(width_px) for v in self.views))
+
+    def subset(
+        self, *, lights: Sequence[str] | None = None, views: Sequence[str] | None = None
+    ) -> Rig:
+        """Return this rig with some of its lights and views only, in the rig's own order.
+
+        Parameters
+        ----------
+        lights, views : sequence of str
+            Names to keep; None keeps all.
+
+        Raises
+        ------
+        RigError
+            Where a name is not of this rig.
+        """
+        kept_lights = [self.light(name) for name in lights] if lights is not None else self.lights
+        kept_views = [self.view(name) for name in views] if views is not None else self.views
+        return dataclasses.replace(
+            self,
+            lights=tuple(light for light in self.lights if light in kept_lights),
+            views=tuple(view for view in self.views if view in kept_views),
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return the rig as JSON values; ``rig_from_json`` is the inverse."""

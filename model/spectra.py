@@ -192,7 +192,7 @@ def camera_names() -> tuple[str, ...]:
 
 def illuminant_names() -> tuple[str, ...]:
     """Return the names that `illuminant` knows."""
-    return (*_DAYLIGHT_NOMINAL_K, "A", "E", "xenon flash")
+    return (*_DAYLIGHT_NOMINAL_K, "A", "E", "LED-B3", "xenon flash")
 
 
 def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
@@ -201,9 +201,10 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArra
     Parameters
     ----------
     name
-        "D50", "D55", "D65" (CIE daylight), "A", "E" (equal energy) or "xenon flash".
+        "D50", "D55", "D65" (CIE daylight), "A", "E" (equal energy), "LED-B3" (white LED) or
+        "xenon flash".
     wavelength_nm
-        Wavelengths in nm, shape (n,), 380 to 780 for daylight.
+        Wavelengths in nm, shape (n,), 380 to 780 for daylight; the LED gives nothing outside that.
 
     Returns
     -------
@@ -238,6 +239,9 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArra
         return _black_body(wavelength, 1.435e7, 2848.0)
     if name == "E":
         return np.full(wavelength.shape, 100.0)
+    if name == "LED-B3":
+        power = _sampled("cie_led_b3.csv", wavelength, outside=0.0)[..., 0]
+        return np.asarray(100.0 * power / _sampled("cie_led_b3.csv", 560.0, outside=0.0)[..., 0])
     if name == "xenon flash":
 
         def envelope(nm: FloatArray) -> FloatArray:

@@ -60,6 +60,8 @@ class Films:
         reading = READING_DEG[polarizer] if analyser_deg is None else analyser_deg
         if not math.isfinite(reading):
             raise FilmError(f"analyser_deg: got {reading}, expected a finite angle")
+        if view.analyser_axis_deg is None:
+            raise FilmError(f"view {view.name!r}: has no analyser; give it an analyser_axis_deg")
         return view.analyser_axis_deg + reading + self.analyser_zero_deg
 
 
@@ -90,4 +92,6 @@ def films_of(rig: Rig) -> Films:
 
 def absorbing_axis(light: Light) -> NDArray[np.float64]:
     """Return the absorbing axis of a light's film, which faces the rig's origin; shape (3,)."""
+    if light.polarizer_axis_deg is None:
+        raise FilmError(f"light {light.name!r}: has no polarizer; give it a polarizer_axis_deg")
     return axis_in_plane(light.polarizer_axis_deg + 90.0, light.position_mm, (0.0, 1.0, 0.0))

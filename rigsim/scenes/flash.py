@@ -347,6 +347,8 @@ def _light_weights(rig: Rig) -> NDArray[np.float64]:
     energy, share = [], []
     view_axis = np.asarray(rig.views[0].axes[2])
     for light in rig.lights:
+        if light.energy_ws is None:
+            raise SceneError(f"light {light.name!r}: is no flash, it has no energy_ws")
         place = np.asarray(light.position_mm)
         squared = float(place @ place)
         energy.append(light.energy_ws)

@@ -207,7 +207,9 @@ def describe(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
             "intensity": {"type": "uniform", "value": INTENSITY},
         }
         before = where * (1.0 - 2.0 / float(np.linalg.norm(where)))
-        scene[f"film {light.name}"] = _film(before, (0.0, 0.0, 0.0), 2.0, light.polarizer_axis_deg)
+        axis_deg = light.polarizer_axis_deg
+        if axis_deg is not None:
+            scene[f"film {light.name}"] = _film(before, (0.0, 0.0, 0.0), 2.0, axis_deg)
     return scene
 
 

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from capture.rig import RigError, is_id, load_rig, rig_from_json
+from capture.rig import Light, RigError, is_id, load_rig, rig_from_json
 
 
 @pytest.fixture
@@ -156,3 +156,37 @@ def test_two_lights_of_one_name_are_refused(flash_json):
 @pytest.mark.parametrize("text", ["", ".", "..", "a/b", "a\\b", "a b", "ä", "x" * 65, "a+b", "a@b"])
 def test_an_id_can_never_leave_its_folder(text):
     assert not is_id(text)
+
+
+def test_the_dome_holds_150_leds_and_16_cameras_none_behind_an_led():
+    dome = load_rig("dome")
+    leds = np.array([light.position_mm for light in dome.lights])
+    cameras = np.array([view.position_mm for view in dome.views])
+    assert len(leds) == 150
+    assert len(cameras) == 16
+    apart = np.arccos(
+        (cameras / np.linalg.norm(cameras, axis=1)[:, None])
+        @ (leds / np.linalg.norm(leds, axis=1)[:, None]).T
+    )
+    assert np.degrees(apart.min()) > 4.0
+
+
+def test_a_light_is_a_flash_or_an_led_and_not_both():
+    with pytest.raises(RigError, match="one of the two"):
+        Light(name="a", position_mm=(0, 0, 1), energy_ws=1.0, power_w=1.0, radius_mm=1.0)
+    with pytest.raises(RigError, match="one of the two"):
+        Light(name="a", position_mm=(0, 0, 1), radius_mm=1.0)
+
+
+def test_an_led_without_lobe_shines_the_same_everywhere():
+    led = Light(name="a", position_mm=(0, 0, 1), power_w=1.0, radius_mm=1.0)
+    assert led.intensity(3.0) == 1.0
+
+
+def test_a_subset_keeps_the_rigs_order_and_refuses_a_foreign_name():
+    dome = load_rig("dome")
+    few = dome.subset(lights=["L007", "L003"], views=["C01"])
+    assert [light.name for light in few.lights] == ["L003", "L007"]
+    assert [view.name for view in few.views] == ["C01"]
+    with pytest.raises(RigError, match="L7"):
+        dome.subset(lights=["L7"])

@@ -1,0 +1,95 @@
+"""Print capture/rigs/dome.toml: 150 LEDs on a geodesic sphere and 16 cameras around the face.
+
+The vertices of an icosahedron whose edges are cut in four lie on a sphere in 162 places; the
+twelve lowest, where the subject's shoulders are, hold no LED. Weyrich et al. 2005, section 5, give
+150 LEDs on a geodesic dome and 16 cameras but no coordinates; these are this project's choice, with
+every camera at least four degrees away from the nearest LED.
+
+    python tools/make_dome_rig.py > capture/rigs/dome.toml
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+LIGHTS_MM = 700.0
+CAMERAS_MM = 760.0  # behind the struts, looking between the LEDs
+ROWS_DEG = {
+    -22.0: (-58, -29, 0, 29, 58),
+    5.0: (-80, -51, -20, 20, 51, 80),
+    40.0: (-60, -30, 0, 30, 60),
+}
+
+
+def led_positions() -> np.ndarray:
+    sphere = trimesh.creation.icosphere(subdivisions=2)  # each halving doubles: 4 parts an edge
+    places = sphere.vertices / np.linalg.norm(sphere.vertices, axis=1)[:, None]
+    places = places[np.argsort(-places[:, 1], kind="stable")][:150]
+    azimuth = np.degrees(np.arctan2(places[:, 0], places[:, 2])).round(3)
+    height = (places[:, 1] * LIGHTS_MM).round(1)
+    order = np.lexsort((azimuth, -height))
+    return (places[order] * LIGHTS_MM).round(1) + 0.0
+
+
+def camera_positions() -> list[np.ndarray]:
+    out = []
+    for elevation, azimuths in ROWS_DEG.items():
+        for azimuth in azimuths:
+            e, a = np.radians([elevation, azimuth])
+            place = CAMERAS_MM * np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
+            out.append(place.round(1) + 0.0)
+    return out
+
+
+HEAD = """\
+# 150 LEDs and 16 cameras around the face, after Weyrich et al. 2005, section 5.
+# Made by tools/make_dome_rig.py. Frame: mm, origin at the subject's centre, +x right, +y up,
+# +z where the subject looks.
+name = "dome"
+boxes = ["dome"]
+recycle_s = 0.0              # no light is a flash
+"""
+LIGHT = """
+[[lights]]
+name = "L{number:03d}"
+position_mm = {place}
+illuminant = "LED-B3"
+power_w = 1.0
+half_intensity_deg = 40.0
+radius_mm = 10.0
+"""
+CAMERA = """
+[[views]]
+name = "C{number:02d}"
+camera_model = "skinrig dome camera"
+serial = "SD-{number:04d}"
+position_mm = {place}
+target_mm = [0.0, 0.0, 0.0]
+up = [0.0, 1.0, 0.0]
+focal_mm = 20.0              # field at the subject: 331 x 262 mm
+pixel_um = 6.7
+width_px = 1300
+height_px = 1030
+f_number = 8.0
+readout_s = 0.02
+bit_depth = 12
+cfa = "RGGB"
+black_level = 64
+white_level = 4095
+spectral_sensitivity = "Nikon 5100 (NPL)"
+full_well_e = 22000.0
+read_noise_e = 9.0
+"""
+
+
+def main() -> None:
+    print(HEAD, end="")
+    for number, place in enumerate(led_positions()):
+        print(LIGHT.format(number=number, place=place.tolist()), end="")
+    for number, place in enumerate(camera_positions()):
+        print(CAMERA.format(number=number, place=place.tolist()), end="")
+
+
+if __name__ == "__main__":
+    main()
