@@ -203,7 +203,7 @@ def test_relative_links_lead_somewhere(page):
 
 
 def test_the_maps_page_lists_every_map_of_the_pipeline():
-    from reconstruction.pipeline import MAPS
+    from reconstruction.flash_stages import MAPS
 
     listed = [
         name

@@ -1,0 +1,110 @@
+"""What a reconstruction stands on: a session, its calibrations, what is assumed without them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from capture.calibration import store as calibration_store
+from capture.session import Session
+
+
+class EvidenceError(ValueError):
+    """A session that cannot be reconstructed as asked."""
+
+
+@dataclass(slots=True)
+class Evidence:
+    """A session and a folder of calibrations; keeps account of what was read and what assumed.
+
+    Attributes
+    ----------
+    session
+        Open for reading.
+    calibration
+        CALIBRATION/ folder; None: everything is assumed.
+    state
+        Which state of the subject.
+    on_date
+        The date that calibrations must be valid on.
+    assumed
+        What was taken for granted for want of a calibration, one line each.
+    hashes
+        SHA-256 of everything that was read, by what it is.
+    noted
+        JSON values that belong into the record of the maps.
+    """
+
+    session: Session
+    calibration: Path | None
+    state: str
+    on_date: date
+    assumed: list[str] = field(default_factory=list)
+    hashes: dict[str, str] = field(default_factory=dict)
+    noted: dict[str, Any] = field(default_factory=dict)
+
+    @staticmethod
+    def of(
+        session: Session, calibration: str | Path | None, *, state: str, on_date: date | None
+    ) -> Evidence:
+        """Begin with what the session itself says that it assumed.
+
+        Raises
+        ------
+        EvidenceError
+            When ``calibration`` is no folder.
+        """
+        if calibration is not None and not Path(calibration).is_dir():
+            raise EvidenceError(
+                f"calibration: {calibration} is no folder; `skinrig calibrate` makes one"
+            )
+        return Evidence(
+            session=session,
+            calibration=None if calibration is None else Path(calibration),
+            state=state,
+            on_date=on_date or session.manifest.created_at.date(),
+            assumed=[str(text) for text in session.manifest.extra.get("assumed", [])],
+            hashes={"session": session.content_hash},
+        )
+
+    def load(
+        self, kind: str, serials: Sequence[str], otherwise: str
+    ) -> calibration_store.Calibration | None:
+        """Return the calibration of a kind, or None and note what is assumed instead.
+
+        Parameters
+        ----------
+        kind
+            "white", "color", "geometry", ...
+        serials
+            Devices that it must be of.
+        otherwise
+            What is assumed where the folder holds none of that kind.
+
+        Raises
+        ------
+        CalibrationError
+            When it is damaged, of another rig or device, or out of date.
+        """
+        if self.calibration is not None:
+            try:
+                found = calibration_store.load(self.calibration, kind)
+            except calibration_store.CalibrationMissing:
+                pass
+            else:
+                calibration_store.require(
+                    found,
+                    rig=self.session.rig.name,
+                    serials=list(serials),
+                    on_date=self.on_date,
+                    kind=kind,
+                )
+                content = (self.calibration / f"{kind}.json").read_bytes()
+                self.hashes[f"calibration {kind}"] = hashlib.sha256(content).hexdigest()
+                return found
+        self.assumed.append(otherwise)
+        return None
