@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
+
+_FILE = re.compile(r"[a-z][a-z0-9_]{0,63}\.[a-z0-9]{1,8}")
 
 UNITS: Mapping[str, str] = MappingProxyType(
     {
@@ -17,6 +20,8 @@ UNITS: Mapping[str, str] = MappingProxyType(
         "diffuse": "1",
         "specular": "1",
         "normals": "1",
+        "normals_refined": "1",
+        "r_d": "1",
         "position": "mm",
         "roughness": "1",
         "residual": "1",
@@ -88,6 +93,8 @@ class SkinAppearance:
         JSON values: settings, hashes of what was read, versions of what computed it.
     left_out
         What was not computed, and why.
+    files
+        What is no map, by file name, e.g. the mesh that the maps belong to as ``mesh.ply``.
     seed
         Of the simulation; None when nothing was drawn.
 
@@ -104,12 +111,18 @@ class SkinAppearance:
     inputs: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     left_out: tuple[tuple[str, str], ...] = ()
+    files: Mapping[str, bytes] = field(default_factory=dict)
     seed: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse an unknown source and a unit that contradicts the map's name."""
         if self.source not in ("measured", "simulated"):
             raise ValueError(f"source: got {self.source!r}, expected 'measured' or 'simulated'")
+        for name in self.files:
+            if _FILE.fullmatch(name) is None or name.endswith((".exr", "appearance.json")):
+                raise ValueError(
+                    f"files: got name {name!r}, expected a-z 0-9 _ and an extension, not .exr"
+                )
         for name, skin_map in self.maps.items():
             expected = UNITS.get(name)
             if expected is not None and skin_map.unit != expected:

@@ -1,4 +1,4 @@
-"""The APPEARANCE/ format: one EXR file a map and one sealed JSON document.
+"""The APPEARANCE/ format: one EXR file a map, other files as they are, one sealed JSON document.
 
 ``appearance.json`` names each file with its SHA-256, and seals itself; a folder appears whole
 or not at all. TRUTH/ folders have the same format.
@@ -54,6 +54,7 @@ class _Document(_Strict):
     source: Literal["measured", "simulated"]
     seed: int | None
     maps: dict[str, _MapEntry]
+    files: dict[str, str] = Field(default_factory=dict)
     parameters: dict[str, JsonValue]
     inputs: dict[str, str]
     versions: dict[str, str]
@@ -98,6 +99,7 @@ def write(path: str | Path, appearance: SkinAppearance) -> Path:
             "source": appearance.source,
             "seed": appearance.seed,
             "maps": {n: _write_map(fresh, n, m) for n, m in sorted(appearance.maps.items())},
+            "files": {n: _write_file(fresh / n, d) for n, d in sorted(appearance.files.items())},
             "parameters": dict(appearance.parameters),
             "inputs": dict(appearance.inputs),
             "versions": dict(appearance.versions),
@@ -147,6 +149,9 @@ def read(path: str | Path, *, only: tuple[str, ...] | None = None) -> SkinAppear
         inputs=document.inputs,
         versions=document.versions,
         left_out=tuple(document.left_out),
+        files={
+            name: _read_file(_inside(folder, name), sha) for name, sha in document.files.items()
+        },
         seed=document.seed,
     )
 
@@ -233,11 +238,7 @@ def _read_map(folder: Path, entry: _MapEntry) -> SkinMap:
     def one(file: _FileEntry | None, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
         if file is None:
             return None
-        if Path(file.file).name != file.file or file.file.startswith("."):
-            raise StoreError(f"{folder}: got file name {file.file!r}, expected a plain name")
-        path = folder / file.file
-        if path.is_symlink() or not path.is_file():
-            raise StoreError(f"{path}: is missing; the folder is damaged")
+        path = _inside(folder, file.file)
         if _digest(path) != file.sha256:
             raise StoreError(f"{path}: was changed after it was written (its hash does not fit)")
         image = read_exr(path)
@@ -255,6 +256,28 @@ def _read_map(folder: Path, entry: _MapEntry) -> SkinMap:
         valid=None if valid is None else valid > 0.5,
         description=entry.description,
     )
+
+
+def _write_file(path: Path, data: bytes) -> str:
+    _write_synced(path, data)
+    return hashlib.sha256(data).hexdigest()
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """Return the path of a file that a document names, which may be plain and inside only."""
+    if Path(name).name != name or name.startswith("."):
+        raise StoreError(f"{folder}: got file name {name!r}, expected a plain name")
+    path = folder / name
+    if path.is_symlink() or not path.is_file():
+        raise StoreError(f"{path}: is missing; the folder is damaged")
+    return path
+
+
+def _read_file(path: Path, sha256: str) -> bytes:
+    data = path.read_bytes()
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise StoreError(f"{path}: was changed after it was written (its hash does not fit)")
+    return data
 
 
 def _digest(path: Path) -> str:

@@ -21,6 +21,7 @@ def appearance(rng):
         parameters={"iterations": 4},
         inputs={"session": "ab12"},
         left_out=(("normals", "not wanted"),),
+        files={"mesh.ply": b"ply not really"},
         seed=7,
     )
 
@@ -35,6 +36,7 @@ def test_what_is_written_reads_back_equal(tmp_path, appearance):
     assert back.maps["diffuse"].stderr is None
     assert (back.source, back.seed, back.left_out) == ("simulated", 7, appearance.left_out)
     assert back.parameters == {"iterations": 4}
+    assert back.files == appearance.files
 
 
 def test_a_folder_is_replaced_whole_and_nothing_stays_behind(tmp_path, appearance):
@@ -92,6 +94,23 @@ def test_a_path_trick_in_the_document_is_refused(tmp_path, appearance):
     (folder / store.DOCUMENT).write_text(json.dumps(document))
     with pytest.raises(store.StoreError, match="plain name"):
         store.read(folder)
+
+
+def test_a_path_trick_in_the_name_of_a_file_is_refused(tmp_path, appearance):
+    folder = store.write(tmp_path / "a", appearance)
+    document = json.loads((folder / store.DOCUMENT).read_text())
+    document["files"] = {"../secret.ply": document["files"].pop("mesh.ply")}
+    del document["seal"]
+    document["seal"] = store._seal(document)
+    (folder / store.DOCUMENT).write_text(json.dumps(document))
+    with pytest.raises(store.StoreError, match="plain name"):
+        store.read(folder)
+
+
+@pytest.mark.parametrize("name", ["../mesh.ply", "Mesh.ply", "melanin.exr", "mesh", ".mesh.ply"])
+def test_a_file_name_that_could_hide_or_clash_is_refused(name):
+    with pytest.raises(ValueError, match="files: got name"):
+        SkinAppearance({}, "simulated", files={name: b""})
 
 
 def test_a_missing_map_is_named_with_those_there_are(tmp_path, appearance):
