@@ -9,13 +9,15 @@ from capture.session.errors import (
     SessionLocked,
 )
 from capture.session.frames import FrameRecord
-from capture.session.journal import FrameLine
+from capture.session.journal import AttachmentLine, FrameLine
 from capture.session.manifest import SCHEMA, CalibrationRef, Manifest, Subject
+from capture.session.reopening import reopen_copy
 from capture.session.store import Session
 from capture.session.verification import VerifyReport, verify
 
 __all__ = [
     "SCHEMA",
+    "AttachmentLine",
     "CalibrationRef",
     "ConsentError",
     "Disk",
@@ -29,5 +31,6 @@ __all__ = [
     "SessionLocked",
     "Subject",
     "VerifyReport",
+    "reopen_copy",
     "verify",
 ]

@@ -11,10 +11,11 @@ from capture.documents import Fault
 from capture.plan import PlanError
 from capture.session.disk import read_file
 from capture.session.errors import SessionDamage, SessionError
-from capture.session.journal import CloseLine, FrameLine, Walk, walk
+from capture.session.journal import AttachmentLine, CloseLine, FrameLine, Walk, walk
 from capture.session.manifest import Manifest, decode
 
 MANIFEST, JOURNAL, FRAMES, ORPHANS = "session.json", "journal.jsonl", "frames", "orphans"
+ATTACHMENTS = "attachments"
 MAX_MANIFEST_BYTES = 2**26
 MAX_JOURNAL_BYTES = 2**30
 
@@ -30,6 +31,16 @@ class Contents:
     def frame_lines(self) -> tuple[FrameLine, ...]:
         """All committed frames, in the order of commitment."""
         return tuple(line for _, line in self.walk.lines if isinstance(line, FrameLine))
+
+    @property
+    def attachment_lines(self) -> tuple[AttachmentLine, ...]:
+        """All committed attachments, in the order of commitment."""
+        return tuple(line for _, line in self.walk.lines if isinstance(line, AttachmentLine))
+
+    @property
+    def file_lines(self) -> tuple[FrameLine | AttachmentLine, ...]:
+        """All committed files: frames, then attachments."""
+        return (*self.frame_lines, *self.attachment_lines)
 
     @property
     def close_line(self) -> CloseLine | None:
@@ -61,6 +72,8 @@ def read_contents(path: Path) -> Contents:
     where = path / JOURNAL
     journal = read_file(where, limit=MAX_JOURNAL_BYTES, what="journal")
     _require_folder(path / FRAMES)
+    if os.path.lexists(path / ATTACHMENTS):  # made with the first attachment
+        _require_folder(path / ATTACHMENTS)
     walked = walk(journal, seal=seal, where=str(where))
     if walked.damage is None:
         walked = _against_plan(walked, manifest, str(where))
@@ -70,12 +83,17 @@ def read_contents(path: Path) -> Contents:
 def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
     """Note the first line that the plan does not allow: an unknown step, a frame twice."""
     seen: set[str] = set()
+    frames = 0
     for byte, line in walked.lines:
         if isinstance(line, CloseLine):
-            got, good, expected = f"{line.frames} frames", line.frames == len(seen), str(len(seen))
+            got, good, expected = f"{line.frames} frames", line.frames == frames, str(frames)
+        elif isinstance(line, AttachmentLine):
+            got, good, expected = line.file, line.file not in seen, "each attachment once"
+            seen.add(line.file)
         else:
             got, good, expected = line.file, line.file not in seen, "each frame once"
             seen.add(line.file)
+            frames += 1
             try:
                 step = manifest.plan.step(line.step)
                 if line.camera not in step.cameras:
@@ -94,9 +112,10 @@ def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
     return walked
 
 
-def list_frames(path: Path) -> list[str]:
-    """Return the names in the frames folder, sorted."""
-    return sorted(os.listdir(path / FRAMES))
+def list_files(path: Path) -> list[str]:
+    """Return the paths in the folders of frames and attachments, sorted, inside the session."""
+    folders = [folder for folder in (FRAMES, ATTACHMENTS) if (path / folder).is_dir()]
+    return sorted(f"{folder}/{name}" for folder in folders for name in os.listdir(path / folder))
 
 
 def _require_folder(folder: Path) -> None:

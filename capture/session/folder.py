@@ -8,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 
 from capture.documents import Fault
-from capture.session.contents import FRAMES, JOURNAL, MANIFEST, ORPHANS, Contents, list_frames
+from capture.session.contents import FRAMES, JOURNAL, MANIFEST, ORPHANS, Contents, list_files
 from capture.session.disk import Disk
 from capture.session.errors import SessionDamage, SessionDiskError, SessionError
 
@@ -71,28 +71,29 @@ def require_free(path: Path) -> None:
 
 
 def set_orphans_aside(disk: Disk, path: Path, contents: Contents) -> None:
-    """Move files without a line to ``orphans/``; a committed frame that is gone is an error."""
-    lines = {Path(line.file).name: line for line in contents.frame_lines}
-    present = list_frames(path)
-    for name, line in lines.items():
-        size = (path / line.file).lstat().st_size if name in present else None
+    """Move files without a line to ``orphans/``; a committed file that is gone is an error."""
+    lines = {line.file: line for line in contents.file_lines}
+    present = list_files(path)
+    for line in lines.values():
+        size = (path / line.file).lstat().st_size if line.file in present else None
         if size != line.bytes:
             got = "nothing" if size is None else f"{size} bytes"
             faults = [Fault(line.file, got, f"{line.bytes} bytes, as committed")]
-            advice = "Restore the frame from a copy; skinrig verify lists all that is damaged."
+            advice = "Restore the file from a copy; skinrig verify lists all that is damaged."
             raise SessionDamage(
-                "a committed frame is gone", where=str(path), faults=faults, advice=advice
+                "a committed file is gone", where=str(path), faults=faults, advice=advice
             )
-    orphans = [name for name in present if name not in lines]
+    orphans = [file for file in present if file not in lines]
     if not orphans:
         return
     taken = set(os.listdir(path / ORPHANS))
-    for name in orphans:
-        number = 1
+    for file in orphans:
+        name, number = Path(file).name, 1
         while f"{name}.{number}" in taken:
             number += 1
         taken.add(f"{name}.{number}")
-        _log.warning("%s: no line in the journal, set aside", path / FRAMES / name)
-        disk.rename(path / FRAMES / name, path / ORPHANS / f"{name}.{number}")
+        _log.warning("%s: no line in the journal, set aside", path / file)
+        disk.rename(path / file, path / ORPHANS / f"{name}.{number}")
     disk.fsync_dir(path / ORPHANS)
-    disk.fsync_dir(path / FRAMES)
+    for folder in sorted({Path(file).parent for file in orphans}):
+        disk.fsync_dir(path / folder)

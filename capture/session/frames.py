@@ -1,4 +1,4 @@
-"""Committed frames as they are asked for and checked."""
+"""Committed frames and attachments as they are asked for and checked."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from capture.documents import Fault
 from capture.plan import Step, Value
 from capture.session.disk import read_file
 from capture.session.errors import SessionDamage
-from capture.session.journal import FrameLine
+from capture.session.journal import AttachmentLine, FrameLine
 
 MAX_FRAME_BYTES = 2**30
+"""Of one frame, and of one attachment."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,13 +66,14 @@ class FrameRecord:
         return self.line.actual
 
 
-def check_frame(path: Path, line: FrameLine) -> bytes:
-    """Return the bytes of a frame's file, after size and hash have been checked."""
-    blob = read_file(path, limit=MAX_FRAME_BYTES, what="frame")
+def check_file(path: Path, line: FrameLine | AttachmentLine) -> bytes:
+    """Return the bytes of a committed file, after size and hash have been checked."""
+    what = "frame" if isinstance(line, FrameLine) else "attachment"
+    blob = read_file(path, limit=MAX_FRAME_BYTES, what=what)
     found = xxhash.xxh3_128_hexdigest(blob)
     if len(blob) != line.bytes or found != line.xxh128:
         got = f"{len(blob)} bytes, xxh128 {found}"
         faults = [Fault("content", got, f"{line.bytes} bytes, xxh128 {line.xxh128}")]
-        advice = "Restore the frame from a copy, or take it again in a new session."
+        advice = f"Restore the {what} from a copy, or take it again in a new session."
         raise SessionDamage("is damaged", where=str(path), faults=faults, advice=advice)
     return blob

@@ -1,4 +1,4 @@
-"""journal.jsonl: one sealed line per completed frame, each chained to all before it.
+"""journal.jsonl: one sealed line per frame or attachment, each chained to all before it.
 
 A line is ``{"h":HASH,"r":RECORD}`` in canonical JSON, with HASH the SHA-256 of the hash before and
 of RECORD; the first is chained to the seal of session.json. So a line of another session, a line
@@ -21,6 +21,7 @@ from capture.rig import ID_RULE, is_id
 from capture.session.errors import SessionDamage
 
 MAX_LINE_BYTES = 65_536
+ATTACHMENT_RULE = f"{ID_RULE}, not ending in .part"
 _XXH128 = re.compile(r"[0-9a-f]{32}")
 
 
@@ -75,6 +76,42 @@ class FrameLine:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AttachmentLine:
+    """One file that belongs to the capture and is no frame, as the journal holds it."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    name: str
+    file: str
+    """Path inside the session; must be the one that the name gives."""
+    bytes: int
+    xxh128: str
+    about: Mapping[str, Value]
+    """Where it is from, for people: texts and numbers."""
+
+    def __post_init__(self) -> None:
+        checks = Checks("Attachment line", SessionDamage)
+        checks.that("name", self.name, is_attachment_name(self.name), ATTACHMENT_RULE)
+        expected = attachment_file(self.name)
+        checks.that("file", self.file, self.file == expected, expected)
+        checks.that("bytes", self.bytes, self.bytes > 0, "> 0")
+        good = _XXH128.fullmatch(self.xxh128) is not None
+        checks.that("xxh128", self.xxh128, good, "32 hexadecimal digits")
+        checks.close()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the line's record."""
+        return {
+            "type": "attachment",
+            "name": self.name,
+            "file": self.file,
+            "bytes": self.bytes,
+            "xxh128": self.xxh128,
+            "about": dict(self.about),
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CloseLine:
     """The end of a session: nothing may follow."""
 
@@ -96,7 +133,7 @@ class CloseLine:
         }
 
 
-Line = FrameLine | CloseLine
+Line = FrameLine | AttachmentLine | CloseLine
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +167,28 @@ def frame_file(step: str, camera: str, attempt: int) -> str:
     """
     suffix = "" if attempt == 1 else f"+{attempt}"
     return f"frames/{step}+{camera}{suffix}.dng"
+
+
+def is_attachment_name(name: str) -> bool:
+    """Return whether ``name`` can be an attachment's, a plain file name.
+
+    Examples
+    --------
+    >>> is_attachment_name("scan.ply"), is_attachment_name("../scan.ply")
+    (True, False)
+    """
+    return is_id(name) and not name.endswith(".part")
+
+
+def attachment_file(name: str) -> str:
+    """Return the path of an attachment inside its session.
+
+    Examples
+    --------
+    >>> attachment_file("scan.ply")
+    'attachments/scan.ply'
+    """
+    return f"attachments/{name}"
 
 
 def seal_line(previous: str, line: Line) -> tuple[bytes, str]:
@@ -184,9 +243,11 @@ def _unseal(text: bytes, head: str, where: str) -> tuple[Line | None, str]:
         raise _damage(where, None, "hash", got, f"{digest}: the line is not what was written")
     if kind == "frame":
         return parse(FrameLine, record, where=where, error=SessionDamage), digest
+    if kind == "attachment":
+        return parse(AttachmentLine, record, where=where, error=SessionDamage), digest
     if kind == "close":
         return parse(CloseLine, record, where=where, error=SessionDamage), digest
-    raise _damage(where, None, "type", shown(kind), '"frame" or "close"')
+    raise _damage(where, None, "type", shown(kind), '"frame", "attachment" or "close"')
 
 
 def _is_torn(text: bytes, unended: bool, *, last: bool, head: str) -> bool:

@@ -13,10 +13,11 @@ from typing import Any, Literal
 import xxhash
 
 from capture import raw
-from capture.documents import Fault, shown
+from capture.documents import Checks, Fault, shown
 from capture.plan import Plan, Value
 from capture.rig import Rig
 from capture.session.contents import (
+    ATTACHMENTS,
     FRAMES,
     JOURNAL,
     MANIFEST,
@@ -29,11 +30,15 @@ from capture.session.errors import SessionDiskError, SessionError, SessionLocked
 from capture.session.folder import DiskErrors, require_free, set_orphans_aside, write_new
 from capture.session.frames import MAX_FRAME_BYTES
 from capture.session.journal import (
+    ATTACHMENT_RULE,
     MAX_LINE_BYTES,
+    AttachmentLine,
     CloseLine,
     FrameLine,
     Line,
+    attachment_file,
     frame_file,
+    is_attachment_name,
     seal_line,
 )
 from capture.session.manifest import (
@@ -268,11 +273,62 @@ class Session(SessionView):
             t_box_s=None if t_box_s is None else float(t_box_s),
             t_host_s=float(t_host_s),
         )
+        self._write(descriptor, line, blob)
+        self._lines.setdefault((step_id, camera), []).append(line)
+
+    def attach(self, name: str, data: bytes, *, about: Mapping[str, Value] | None = None) -> None:
+        """Put a file that is no frame on the medium; when this returns, it survives a power cut.
+
+        Parameters
+        ----------
+        name : str
+            1 to 64 of A-Z a-z 0-9 _ - . , not starting with a dot, e.g. ``"scan.ply"``; not the
+            name of an attachment that is there, for what is attached is never replaced.
+        data : bytes
+            Its content, at least one byte.
+        about : mapping, optional
+            Where it is from: texts, finite numbers, true or false.
+
+        Raises
+        ------
+        SessionError
+            Where the session is closed, or name or content do not fit; nothing is written.
+        SessionDiskError
+            Where the disk refuses; nothing committed before is touched, and the session can be
+            resumed.
+        """
+        descriptor = self._writable()
+        if name in self._attached:
+            faults = [Fault("name", shown(name), "a name that is free")]
+            advice = "What is attached stays; choose another name."
+            what = "an attachment of this name is there already"
+            raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
+        checks = Checks("Attachment", SessionError)
+        checks.that("name", name, is_attachment_name(name), ATTACHMENT_RULE)
+        fits = 0 < len(data) <= MAX_FRAME_BYTES
+        checks.that("data", f"{len(data)} bytes", fits, f"1 to {MAX_FRAME_BYTES} bytes")
+        checks.close()
+        line = AttachmentLine(
+            name=name,
+            file=attachment_file(name),
+            bytes=len(data),
+            xxh128=xxhash.xxh3_128_hexdigest(data),
+            about=dict(about or {}),
+        )
+        self._write(descriptor, line, bytes(data))
+        self._attached[name] = line
+
+    def _write(self, descriptor: int, line: FrameLine | AttachmentLine, blob: bytes) -> None:
+        """Bring a file and then its line of the journal to the medium."""
         text, head = self._seal(line)
         target = self.path / line.file
         part = target.with_name(target.name + ".part")
         try:
             with DiskErrors(self.path):
+                if isinstance(line, AttachmentLine) and not self._attached:
+                    if not target.parent.is_dir():
+                        self._disk.make_dir(self.path / ATTACHMENTS)
+                    self._disk.fsync_dir(self.path)
                 write_new(self._disk, part, blob)
                 self._disk.rename(part, target)
                 self._disk.fsync_dir(target.parent)
@@ -282,7 +338,6 @@ class Session(SessionView):
             self.release()
             raise
         self._head = head
-        self._lines.setdefault((step_id, camera), []).append(line)
 
     def close(self, *, missing_because: str = "") -> None:
         """End the session for good: nothing can be added afterwards.
@@ -369,11 +424,12 @@ class Session(SessionView):
         try:
             text, head = seal_line(self._head, line)
         except (TypeError, ValueError, RecursionError) as exc:
-            faults = [Fault("settings, actual", str(exc), "texts, finite numbers, true or false")]
+            values = "about" if isinstance(line, AttachmentLine) else "settings, actual"
+            faults = [Fault(values, str(exc), "texts, finite numbers, true or false")]
             raise SessionError("the journal line cannot be written", faults=faults) from exc
         if len(text) > MAX_LINE_BYTES:
             faults = [Fault("line", f"{len(text)} bytes", f"at most {MAX_LINE_BYTES}")]
-            raise SessionError("settings and actual are too long", faults=faults)
+            raise SessionError("what is said of it is too long", faults=faults)
         return text, head
 
     def _append(self, descriptor: int, text: bytes) -> None:

@@ -8,18 +8,20 @@ from datetime import UTC, date, datetime
 from pathlib import Path
 
 from capture.session.contents import (
+    ATTACHMENTS,
     FRAMES,
     JOURNAL,
     MANIFEST,
     ORPHANS,
     Contents,
-    list_frames,
+    list_files,
     read_contents,
 )
 from capture.session.errors import SessionError
-from capture.session.frames import check_frame
+from capture.session.frames import check_file
+from capture.session.journal import FrameLine
 
-_KNOWN = {MANIFEST, JOURNAL, FRAMES, ORPHANS, "index.sqlite", "ascmhl"}
+_KNOWN = {MANIFEST, JOURNAL, FRAMES, ATTACHMENTS, ORPHANS, "index.sqlite", "ascmhl"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +37,11 @@ class VerifyReport:
     frames: int
     """Committed frames whose files are good."""
     bytes: int
-    """Bytes of those frames."""
+    """Bytes of those frames and of the attachments that are good."""
 
 
 def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
-    """Check manifest, journal and every frame of a session.
+    """Check manifest, journal, every frame and every attachment of a session.
 
     Parameters
     ----------
@@ -55,7 +57,8 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
     Notes
     -----
     A flipped bit anywhere in a committed file is found: session.json carries a seal over all its
-    bytes, the journal a SHA-256 chain from that seal, and the journal a XXH3-128 of every frame.
+    bytes, the journal a SHA-256 chain from that seal, and the journal a XXH3-128 of every frame and
+    attachment.
     This guards against accidents; against a forger only a copy of the last hash kept elsewhere
     helps (``Session.content_hash``).
     """
@@ -69,28 +72,27 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
     if contents.walk.damage is not None:
         problems.append(str(contents.walk.damage))
     frames = size = 0
-    for line in contents.frame_lines:
+    for line in contents.file_lines:
         try:
-            size += len(check_frame(place / line.file, line))
-            frames += 1
+            size += len(check_file(place / line.file, line))
+            frames += isinstance(line, FrameLine)
         except SessionError as exc:
             problems.append(str(exc))
     strays = problems if contents.walk.closed else warnings
     damaged_journal = contents.walk.damage is not None
-    strays.extend(_stray_frames(place, contents) if not damaged_journal else [])
+    strays.extend(_stray_files(place, contents) if not damaged_journal else [])
     warnings.extend(_state(place, contents))
     warnings.extend(_consent(contents, today or datetime.now(UTC).date()))
     return VerifyReport(not problems, tuple(problems), tuple(warnings), frames, size)
 
 
-def _stray_frames(place: Path, contents: Contents) -> list[str]:
-    present = list_frames(place)
-    known = {Path(line.file).name for line in contents.frame_lines}
+def _stray_files(place: Path, contents: Contents) -> list[str]:
+    known = {line.file for line in contents.file_lines}
     advice = "it was never acknowledged; resuming sets it aside"
     return [
-        f"{place / FRAMES / name}: no line in the journal; {advice}"
-        for name in present
-        if name not in known
+        f"{place / file}: no line in the journal; {advice}"
+        for file in list_files(place)
+        if file not in known
     ]
 
 

@@ -11,9 +11,9 @@ from capture.documents import Fault, shown
 from capture.plan import Plan, Step
 from capture.rig import Rig
 from capture.session.contents import Contents
-from capture.session.errors import ConsentError, SessionDamage
-from capture.session.frames import FrameRecord, check_frame
-from capture.session.journal import FrameLine
+from capture.session.errors import ConsentError, SessionDamage, SessionError
+from capture.session.frames import FrameRecord, check_file
+from capture.session.journal import AttachmentLine, FrameLine
 from capture.session.manifest import ANY_USE, Manifest, Subject
 
 
@@ -28,6 +28,9 @@ class SessionView:
         self._lines: dict[tuple[str, str], list[FrameLine]] = {}
         for line in contents.frame_lines:
             self._lines.setdefault((line.step, line.camera), []).append(line)
+        self._attached: dict[str, AttachmentLine] = {
+            line.name: line for line in contents.attachment_lines
+        }
 
     def todo(self) -> list[tuple[Step, str]]:
         """Return the steps and cameras without a committed frame, in the order of the plan."""
@@ -67,12 +70,43 @@ class SessionView:
             Where the file is missing or one bit of it differs from what was committed.
         """
         where = self.path / record.file
-        blob = check_frame(where, record.line)
+        blob = check_file(where, record.line)
         frame = raw.decode(memoryview(blob), where=str(where))
         if frame.step_id != record.step_id:
             faults = [Fault("step", frame.step_id, record.step_id)]
             raise SessionDamage("is another frame", where=str(where), faults=faults)
         return frame
+
+    def attachments(self) -> tuple[str, ...]:
+        """Return the names of the files attached, in the order they were attached."""
+        return tuple(self._attached)
+
+    def attachment_line(self, name: str) -> AttachmentLine:
+        """Return what the journal says of an attachment: size, hash, and where it is from.
+
+        Raises
+        ------
+        SessionError
+            Where there is none of that name.
+        """
+        if name not in self._attached:
+            known = ", ".join(self._attached) or "none"
+            faults = [Fault("attachment", shown(name), f"one of: {known}")]
+            raise SessionError("holds no such attachment", where=str(self.path), faults=faults)
+        return self._attached[name]
+
+    def attachment(self, name: str) -> bytes:
+        """Return the bytes of an attachment, after its hash has been checked.
+
+        Raises
+        ------
+        SessionError
+            Where there is none of that name.
+        SessionDamage
+            Where the file is missing or one bit of it differs from what was attached.
+        """
+        line = self.attachment_line(name)
+        return check_file(self.path / line.file, line)
 
     def export_allowed(self, scope: str, *, today: date | None = None) -> bool:
         """Return whether the subject's consent covers ``scope`` on the day; "any" covers all."""

@@ -32,6 +32,8 @@ def write_session(path, *, closed=True, session_id="one", frames=4):
             blob = raw.encode_dng(values, **levels, step_id=step.id, session_id=session.id)
             note = {"note": "token @ 7 J*"}  # letters that one bit turns into a newline or a zero
             session.commit(step.id, "cam", blob, settings={}, actual=note, t_host_s=0.0)
+            if step.id == "S001":
+                session.attach("scan.ply", b"ply\nscan of a head\n" * 9, about={"unit": "mm"})
         if closed:
             session.close()
     return path
@@ -193,6 +195,14 @@ def record_with(key, value):
     return lambda path: reseal(path, journal=lambda records: records[1].update({key: value}))
 
 
+def attachment_with(key, value):
+    return lambda path: reseal(path, journal=lambda records: records[2].update({key: value}))
+
+
+def attachment(path):
+    return path / "attachments" / "scan.ply"
+
+
 def frame(path):
     return path / frame_file("S001", "cam", 1)
 
@@ -203,9 +213,9 @@ def link_the_frame(path):
     frame(path).symlink_to(secret)
 
 
-def link_the_folder(path):
-    (path / "frames").rename(path.parent / "elsewhere")
-    (path / "frames").symlink_to(path.parent / "elsewhere")
+def link_the_folder(path, name="frames"):
+    (path / name).rename(path.parent / "elsewhere")
+    (path / name).symlink_to(path.parent / "elsewhere")
 
 
 def take_another_journal(path):
@@ -292,6 +302,25 @@ BROKEN = {
     ),
     "journal with an absurd size": (record_with("bytes", -1), "bytes: got -1, expected > 0"),
     "journal with an unknown record": (record_with("type", "delete"), "got 'delete'"),
+    "attachment missing": (lambda p: attachment(p).unlink(), "scan.ply"),
+    "attachment truncated": (
+        lambda p: attachment(p).write_bytes(attachment(p).read_bytes()[:-7]),
+        "scan.ply",
+    ),
+    "attachment that climbs out": (
+        attachment_with("file", "../passwd"),
+        "expected attachments/scan.ply",
+    ),
+    "attachment of a bad name": (attachment_with("name", "../scan.ply"), "name"),
+    "attachment of an absurd size": (attachment_with("bytes", 0), "bytes: got 0, expected > 0"),
+    "attachment twice": (
+        lambda p: reseal(p, journal=lambda r: r.insert(3, r[2])),
+        "each attachment once",
+    ),
+    "attachments folder that is a link": (
+        lambda p: link_the_folder(p, "attachments"),
+        "a folder, not a link",
+    ),
     "frame missing": (lambda p: frame(p).unlink(), "S001+cam.dng"),
     "frame empty": (lambda p: frame(p).write_bytes(b""), "got 0 bytes"),
     "frame truncated": (lambda p: frame(p).write_bytes(frame(p).read_bytes()[:-7]), "S001+cam.dng"),
@@ -322,7 +351,8 @@ def test_a_broken_session_gives_one_clear_error(closed, name):
 
 def read_all(path):
     session = Session.open(path)
-    return [session.read(record) for record in session.frames()]
+    frames = [session.read(record) for record in session.frames()]
+    return frames, [session.attachment(name) for name in session.attachments()]
 
 
 def test_the_list_of_broken_inputs_is_long_enough():
@@ -335,9 +365,10 @@ def test_a_forged_session_with_nothing_wrong_in_it_is_accepted(closed):
     assert verify(closed).ok
 
 
-def test_a_stray_file_in_a_closed_session_is_a_problem(closed):
-    (closed / "frames" / "S009+cam.dng").write_bytes(b"x")
-    assert "S009+cam.dng" in verify(closed).problems[0]
+@pytest.mark.parametrize("file", ["frames/S009+cam.dng", "attachments/notes.txt"])
+def test_a_stray_file_in_a_closed_session_is_a_problem(closed, file):
+    (closed / file).write_bytes(b"x")
+    assert file in verify(closed).problems[0]
 
 
 def test_an_unknown_file_beside_the_frames_is_a_warning(closed):

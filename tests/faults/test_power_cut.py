@@ -41,6 +41,9 @@ def plan_of(frames):
     )
 
 
+SCAN = b"ply: a scan " * 7
+
+
 def commit(session, step_id):
     values = np.full((10, 16), 600 + int(step_id[1:]), np.uint16)
     words = {"pattern": "RGGB", "black": 512, "white": 16383}
@@ -95,7 +98,8 @@ class LoggedDisk(Disk):
 
     def sync(self, descriptor):
         name, inode = self.open[descriptor]
-        kind = "frame" if name.endswith(".dng.part") else Path(name).name
+        kinds = {".dng.part": "frame", ".ply.part": "attachment"}
+        kind = next((k for end, k in kinds.items() if name.endswith(end)), Path(name).name)
         if kind != self.left_out:
             self.note("sync", inode)
 
@@ -124,6 +128,14 @@ class NoFrameSync(LoggedDisk):
 
 class NoFolderSync(LoggedDisk):
     left_out = "s/frames"
+
+
+class NoAttachmentSync(LoggedDisk):
+    left_out = "attachment"
+
+
+class NoAttachmentFolderSync(LoggedDisk):
+    left_out = "s/attachments"
 
 
 class NoJournalSync(LoggedDisk):
@@ -240,7 +252,7 @@ def lay_out(image, root):
 
 def judge(path, acknowledged, plan):
     """Return what became of a session after a crash: ok, lost, corrupt or refused."""
-    frames = acknowledged - {"created", "closed"}
+    frames = acknowledged - {"created", "closed"}  # and the scan
     try:
         if "created" not in acknowledged and not (path / "session.json").exists():
             create(path, plan, LoggedFrom(path.parent)).release()  # over whatever debris there is
@@ -257,6 +269,8 @@ def judge(path, acknowledged, plan):
             found = outcome(session, frames, plan)
             for step, _ in session.todo():
                 commit(session, step.id)
+            if not session.attachments():
+                session.attach("scan.ply", SCAN)
             session.close()
     except SessionError:
         return "refused"
@@ -265,8 +279,14 @@ def judge(path, acknowledged, plan):
 
 def outcome(session, frames, plan):
     records = {record.step_id: record for record in session.frames()}
-    if not frames <= set(records):
+    if not frames <= set(records) | set(session.attachments()):
         return "lost"
+    for name in session.attachments():
+        try:
+            if session.attachment(name) != SCAN:
+                return "corrupt"
+        except SessionError:
+            return "corrupt"
     for step_id, record in records.items():
         try:
             right = set(np.unique(session.read(record).cfa)) == {600 + int(step_id[1:])}
@@ -296,9 +316,12 @@ def record(root, disk, plan):
     """Capture a whole session on ``disk``, noting what was acknowledged and when."""
     session = create(root / "s", plan, disk)
     disk.note("acknowledged", "created")
-    for step, _ in session.todo():
+    for number, (step, _) in enumerate(session.todo()):
         commit(session, step.id)
         disk.note("acknowledged", step.id)
+        if number == 0:
+            session.attach("scan.ply", SCAN)
+            disk.note("acknowledged", "scan.ply")
     session.close()
     disk.note("acknowledged", "closed")
     return disk.log
@@ -331,6 +354,8 @@ def test_a_power_cut_at_any_instant_loses_nothing_acknowledged(tmp_path, frames)
     [
         (NoFrameSync, {"refused", "corrupt"}),
         (NoFolderSync, {"refused", "lost"}),
+        (NoAttachmentSync, {"refused", "corrupt"}),
+        (NoAttachmentFolderSync, {"refused", "lost"}),
         (NoJournalSync, {"refused", "lost"}),
     ],
 )

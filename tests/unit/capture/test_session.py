@@ -21,6 +21,7 @@ from capture.session import (
     SessionError,
     SessionLocked,
     Subject,
+    reopen_copy,
     verify,
 )
 
@@ -415,3 +416,116 @@ def test_a_frame_that_vanished_is_named_and_not_silently_retaken(session):
     (session.path / "frames/D000+cam.dng").unlink()
     with pytest.raises(SessionDamage, match=r"frames/D000\+cam.dng: got nothing"):
         Session.resume(session.path)
+
+
+# --- attachments ----------------------------------------------------------------------------------
+
+
+def test_an_attachment_is_read_back_bit_for_bit_after_the_session_is_closed(session):
+    data = bytes(range(256)) * 9
+    session.attach("scan.ply", data, about={"unit": "mm", "triangles": 12})
+    assert session.attachment("scan.ply") == data
+    commit_all(session)
+    session.close()
+    opened = Session.open(session.path)
+    assert (opened.attachments(), opened.attachment("scan.ply")) == (("scan.ply",), data)
+    assert opened.attachment_line("scan.ply").about == {"unit": "mm", "triangles": 12}
+    assert verify(session.path, today=NOON.date()).warnings == ()
+    assert verify(session.path).bytes == sum(
+        file.stat().st_size
+        for folder in ("frames", "attachments")
+        for file in (session.path / folder).iterdir()
+    )
+
+
+def test_the_content_hash_vouches_for_an_attachment(session):
+    before = session.content_hash
+    session.attach("scan.ply", b"one")
+    assert session.content_hash != before
+    assert Session.open(session.path).content_hash == session.content_hash
+
+
+def test_an_attachment_survives_an_interruption_and_strays_go_to_the_orphans(session):
+    session.attach("scan.ply", b"scan")
+    session.release()
+    (session.path / "attachments/other.ply.part").write_bytes(b"half")
+    with Session.resume(session.path) as again:
+        assert again.attachment("scan.ply") == b"scan"
+        again.attach("other.ply", b"whole")
+    assert [file.read_bytes() for file in (session.path / "orphans").iterdir()] == [b"half"]
+    assert Session.open(session.path).attachments() == ("scan.ply", "other.ply")
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "about", "reason"),
+    [
+        ("../scan.ply", b"x", {}, "name"),
+        ("a/b", b"x", {}, "name"),
+        ("scan.part", b"x", {}, "name"),
+        ("", b"x", {}, "name"),
+        ("scan.ply", b"", {}, "0 bytes"),
+        ("scan.ply", b"x", {"scale": float("nan")}, "cannot be written"),
+        ("there.ply", b"y", {}, "there already"),
+    ],
+)
+def test_an_attachment_that_cannot_be_leaves_no_trace(session, name, data, about, reason):
+    session.attach("there.ply", b"x")
+    before = files(session.path)
+    with pytest.raises(SessionError, match=reason):
+        session.attach(name, data, about=about)
+    assert files(session.path) == before
+    with pytest.raises(SessionError, match=r"one of: there\.ply"):
+        session.attachment("their.ply")
+
+
+def test_nothing_is_attached_to_a_closed_session(closed):
+    before = files(closed)
+    with pytest.raises(SessionError, match="never modified"):
+        Session.open(closed).attach("scan.ply", b"x")
+    assert files(closed) == before
+
+
+@pytest.mark.parametrize(
+    "operation", ["make_dir", "create", "write", "fsync", "rename", "fsync_dir", "fdatasync"]
+)
+def test_a_refusing_disk_costs_one_attachment_and_nothing_acknowledged(session, operation):
+    commit(session, "D000")
+    session.release()
+    writer = Session.resume(session.path, disk=FullDisk(operation, after=0))
+    with pytest.raises(SessionDiskError, match="No space left"):
+        writer.attach("scan.ply", b"scan")
+    with Session.resume(session.path) as again:
+        assert [record.step_id for record in again.frames()] == ["D000"]
+        if not again.attachments():  # a refused sync leaves open whether the line arrived
+            again.attach("scan.ply", b"scan")
+        assert again.attachment("scan.ply") == b"scan"
+    assert verify(session.path).ok
+
+
+def test_a_copy_of_a_closed_session_takes_an_attachment_and_the_original_stays(tmp_path, session):
+    commit(session, "D000")
+    session.attach("notes.txt", b"as captured")
+    session.close(missing_because="the subject left")
+    before = files(session.path)
+    copy, reason = reopen_copy(session.path, tmp_path / "copy")
+    copy.attach("scan.ply", b"scan")
+    copy.close(missing_because=reason)
+    assert files(session.path) == before
+    both = Session.open(session.path), Session.open(tmp_path / "copy")
+    assert both[0].id == both[1].id
+    assert both[0].content_hash != both[1].content_hash
+    assert both[1].attachments() == ("notes.txt", "scan.ply")
+    assert verify(tmp_path / "copy").ok
+    records = [opened.read(opened.frames()[0]).cfa for opened in both]
+    np.testing.assert_array_equal(*records)
+
+
+def test_only_a_closed_and_sound_session_is_copied(tmp_path, session):
+    commit(session, "D000")
+    with pytest.raises(SessionError, match="is not closed"):
+        reopen_copy(session.path, tmp_path / "copy")
+    session.close(missing_because="the subject left")
+    file = session.path / "frames/D000+cam.dng"
+    file.write_bytes(file.read_bytes()[:-1] + b"\xff")
+    with pytest.raises(SessionDamage, match="D000"):
+        reopen_copy(session.path, tmp_path / "copy")

@@ -1,0 +1,92 @@
+"""A closed session is never modified; what must be added goes into a copy that is open again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from capture.documents import Fault
+from capture.session.contents import (
+    ATTACHMENTS,
+    FRAMES,
+    JOURNAL,
+    MANIFEST,
+    MAX_JOURNAL_BYTES,
+    MAX_MANIFEST_BYTES,
+    ORPHANS,
+    undamaged_contents,
+)
+from capture.session.disk import Disk, read_file
+from capture.session.errors import SessionError
+from capture.session.folder import DiskErrors, require_free, write_new
+from capture.session.frames import check_file
+from capture.session.journal import CloseLine
+from capture.session.store import Session
+
+
+def reopen_copy(
+    path: str | Path, copy: str | Path, *, disk: Disk | None = None
+) -> tuple[Session, str]:
+    """Copy a closed session without its closing line, and open the copy for writing.
+
+    Every byte is checked while it is copied. The copy has the same id, manifest and chain of
+    hashes up to the closing line, so that its frames are the same frames; its `content_hash`
+    differs as soon as something is added.
+
+    Parameters
+    ----------
+    path : str or Path
+        The closed session; it is only read.
+    copy : str or Path
+        A new (or empty) folder whose parent exists.
+    disk : Disk, optional
+        File operations; the real ones by default.
+
+    Returns
+    -------
+    Session
+        The copy, open for writing.
+    str
+        Why frames are missing, as the closing line said; empty where none is. Close the copy
+        with it.
+
+    Raises
+    ------
+    SessionError
+        Where the session is not closed, or `copy` is not free.
+    SessionDamage
+        Where one bit of the session is not what was written.
+    """
+    disk = disk or Disk()
+    place, target = Path(path), Path(copy)
+    contents = undamaged_contents(place)
+    if contents.close_line is None:
+        advice = "An open session needs no copy: Session.resume opens it."
+        faults = [Fault("session", "open", "closed")]
+        raise SessionError("is not closed", where=str(place), faults=faults, advice=advice)
+    (start, reason) = next(
+        (byte, line.reason) for byte, line in contents.walk.lines if isinstance(line, CloseLine)
+    )
+    journal = read_file(place / JOURNAL, limit=MAX_JOURNAL_BYTES, what="journal")[:start]
+    manifest = read_file(place / MANIFEST, limit=MAX_MANIFEST_BYTES, what="manifest")
+    require_free(target)
+    with DiskErrors(target):
+        folders = [FRAMES, ORPHANS, *([ATTACHMENTS] if contents.attachment_lines else [])]
+        for folder in (target, *(target / name for name in folders)):
+            if not folder.is_dir():
+                disk.make_dir(folder)
+        for line in contents.file_lines:
+            write_new(disk, target / line.file, check_file(place / line.file, line))
+        for name in folders:
+            disk.fsync_dir(target / name)
+        if (target / JOURNAL).exists():  # debris of an interrupted creation, empty
+            disk.remove(target / JOURNAL)
+        write_new(disk, target / JOURNAL, journal)
+        part = target / f"{MANIFEST}.part"
+        if part.exists():
+            disk.remove(part)
+        write_new(disk, part, manifest)
+        disk.fsync_dir(target)
+        disk.rename(part, target / MANIFEST)
+        disk.fsync_dir(target)
+        disk.fsync_dir(target.resolve().parent)
+    return Session.resume(target, disk=disk), reason
