@@ -1,0 +1,253 @@
+"""Maps on a mesh against the truth on another: nearest points, then errors with intervals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import metrics
+from model.skin import SkinAppearance, SkinMap
+
+NEAR_MM = 3.0
+"""Farther than this from the true surface a point has no truth."""
+CHANNELS = ("red", "green", "blue")
+NORMAL_MAPS = ("half_vector_normals", "normals", "normals_refined")
+
+NORMAL_LIMIT_DEG = 1.0
+ALBEDO_LIMIT = 0.03
+
+# of an error with the same deviation in two directions, the length that 68.27 % stay below
+RAYLEIGH_68 = math.sqrt(-2.0 * math.log(1.0 - 0.6827))
+
+
+class SurfaceTruthError(ValueError):
+    """An appearance and a truth that cannot be compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """Which texel of the truth lies nearest to each texel of an estimate.
+
+    Attributes
+    ----------
+    rows, columns
+        Texels of the estimate, shape (N,).
+    truth
+        Flat index into the truth's texels, shape (N,).
+    distance_mm
+        Between the two, shape (N,).
+    """
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    truth: NDArray[np.intp]
+    distance_mm: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceError:
+    """How one map of a surface, or one channel of it, compares with the truth.
+
+    Attributes
+    ----------
+    name
+        Of the map, with its channel.
+    unit
+        "deg", or "%" of the truth.
+    points, masked
+        Texels with a truth, and the share of them without a valid estimate.
+    mean, median, interval, high
+        Of the absolute error: mean, median with its 68 % bootstrap interval, 95th percentile.
+    bias
+        Median of the signed error; NaN for angles.
+    coverage
+        Share of truths inside the 68 % region of the estimate.
+    median_stderr
+        Median of the standard error, in ``unit``.
+    """
+
+    name: str
+    unit: str
+    points: int
+    masked: float
+    mean: float
+    median: float
+    interval: tuple[float, float]
+    high: float
+    bias: float
+    coverage: metrics.Coverage
+    median_stderr: float
+
+    @property
+    def judged(self) -> tuple[str, float, float]:
+        """What is held to a limit: its name, the value and the limit, in ``unit``."""
+        if self.unit == "deg":
+            return "mean error", self.mean, NORMAL_LIMIT_DEG
+        return "median error", self.median, 100.0 * ALBEDO_LIMIT
+
+
+def match(appearance: SkinAppearance, truth: SkinAppearance, *, near_mm: float = NEAR_MM) -> Match:
+    """Find the true texel nearest to each texel of an estimate.
+
+    Parameters
+    ----------
+    appearance, truth
+        Both with a map "position", mm, in the rig's frame.
+    near_mm
+        Texels farther from every true one are left out: no truth is known of them.
+
+    Raises
+    ------
+    SurfaceTruthError
+        Where a position map is missing or no texel has a true one near by.
+    """
+    from scipy.spatial import cKDTree
+
+    for name, side in (("appearance", appearance), ("truth", truth)):
+        if "position" not in side.maps:
+            raise SurfaceTruthError(f"{name}: has no map 'position', which texels are matched by")
+    rows, columns = np.nonzero(_valid(appearance.maps["position"]))
+    place = appearance.maps["position"].values[rows, columns]
+    true_place = truth.maps["position"]
+    usable = _valid(true_place)
+    if "mask" in truth.maps:
+        usable = usable & (truth.maps["mask"].values > 0.5)
+    known = np.flatnonzero(usable)
+    if not len(known):
+        raise SurfaceTruthError("truth: no texel of it is valid")
+    tree = cKDTree(true_place.values.reshape(-1, 3)[known])
+    distance, index = tree.query(place, workers=1)
+    near = distance <= near_mm
+    if not near.any():
+        raise SurfaceTruthError(
+            f"position: no texel lies within {near_mm:g} mm of the true surface; nearest "
+            f"{distance.min() if len(distance) else math.nan:.1f} mm: is the scan registered?"
+        )
+    return Match(rows[near], columns[near], known[index[near]], distance[near])
+
+
+def compare(
+    appearance: SkinAppearance, truth: SkinAppearance, *, rng: np.random.Generator
+) -> list[SurfaceError]:
+    """Compare normals and albedo with their truths.
+
+    Parameters
+    ----------
+    appearance
+        Maps of :data:`NORMAL_MAPS` and "r_d", those that are there; a normal's standard error is
+        the angle in each of two directions across it, rad, the same in all three channels.
+    truth
+        With "position", "normals", "r_d" and, where part of it does not count, "mask".
+    rng
+        For the bootstrap intervals.
+    """
+    pairs = match(appearance, truth)
+    rows = []
+    for name in NORMAL_MAPS:
+        if name in appearance.maps and "normals" in truth.maps:
+            rows.append(_angles(name, appearance.maps[name], truth, pairs, rng))
+    if "r_d" in appearance.maps and "r_d" in truth.maps:
+        rows += _channels("r_d", appearance.maps["r_d"], truth, pairs, rng)
+    return rows
+
+
+def errors_at(
+    name: str, appearance: SkinAppearance, truth: SkinAppearance, pairs: Match
+) -> NDArray[np.float64]:
+    """Return a map's error at each matched texel, NaN where it is not valid.
+
+    Angles in degrees for normals; else relative to the truth, in %, mean of the channels.
+    """
+    estimate = appearance.maps[name]
+    values = estimate.values[pairs.rows, pairs.columns].astype(np.float64)
+    good = _valid(estimate)[pairs.rows, pairs.columns]
+    true_name = "normals" if name in NORMAL_MAPS else name
+    true_values = _flat(truth.maps[true_name])[pairs.truth]
+    if name in NORMAL_MAPS:
+        error = np.degrees(metrics.angular_error_rad(values, true_values))
+    else:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = (values - true_values) / true_values
+        error = 100.0 * (relative.mean(axis=-1) if relative.ndim == 2 else relative)
+    return np.where(good, error, np.nan)
+
+
+def _angles(
+    name: str, estimate: SkinMap, truth: SkinAppearance, pairs: Match, rng: np.random.Generator
+) -> SurfaceError:
+    good = _valid(estimate)[pairs.rows, pairs.columns]
+    normals = estimate.values[pairs.rows, pairs.columns][good].astype(np.float64)
+    angle = metrics.angular_error_rad(normals, _flat(truth.maps["normals"])[pairs.truth][good])
+    stderr = None
+    if estimate.stderr is not None:
+        stderr = estimate.stderr[pairs.rows, pairs.columns][good][:, 0].astype(np.float64)
+    held = (
+        metrics.coverage([], [], [])
+        if stderr is None
+        else metrics.coverage(angle, RAYLEIGH_68 * stderr, np.zeros(len(angle)))
+    )
+    spread = math.nan if stderr is None or not len(stderr) else math.degrees(np.median(stderr))
+    return _row(name, "deg", np.degrees(angle), good, held, spread, math.nan, rng)
+
+
+def _channels(
+    name: str, estimate: SkinMap, truth: SkinAppearance, pairs: Match, rng: np.random.Generator
+) -> list[SurfaceError]:
+    good = _valid(estimate)[pairs.rows, pairs.columns]
+    values = estimate.values[pairs.rows, pairs.columns][good].astype(np.float64)
+    true_values = _flat(truth.maps[name])[pairs.truth][good]
+    rows = []
+    for channel, color in enumerate(CHANNELS):
+        value, true_value = values[:, channel], true_values[:, channel]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = (value - true_value) / true_value
+        held, spread = metrics.coverage([], [], []), math.nan
+        if estimate.stderr is not None:
+            stderr = estimate.stderr[pairs.rows, pairs.columns][good][:, channel]
+            held = metrics.coverage(value, stderr.astype(np.float64), true_value)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                spread = float(100.0 * np.median(stderr / np.abs(value))) if len(value) else spread
+        bias = float(100.0 * np.median(relative)) if len(relative) else math.nan
+        rows.append(
+            _row(f"{name} {color}", "%", 100.0 * np.abs(relative), good, held, spread, bias, rng)
+        )
+    return rows
+
+
+def _row(
+    name: str,
+    unit: str,
+    error: NDArray[np.float64],
+    good: NDArray[np.bool_],
+    held: metrics.Coverage,
+    spread: float,
+    bias: float,
+    rng: np.random.Generator,
+) -> SurfaceError:
+    median, interval = metrics.median_with_interval(error, rng=rng)
+    return SurfaceError(
+        name=name,
+        unit=unit,
+        points=len(good),
+        masked=1.0 - float(good.mean()) if len(good) else math.nan,
+        mean=float(error.mean()) if len(error) else math.nan,
+        median=median,
+        interval=interval,
+        high=float(np.percentile(error, 95)) if len(error) else math.nan,
+        bias=bias,
+        coverage=held,
+        median_stderr=spread,
+    )
+
+
+def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+    shape = skin_map.values.shape[:2]
+    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
+
+
+def _flat(skin_map: SkinMap) -> NDArray[np.float64]:
+    values = skin_map.values
+    return values.reshape(-1, *values.shape[2:]).astype(np.float64)

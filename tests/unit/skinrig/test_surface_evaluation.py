@@ -1,0 +1,86 @@
+"""Errors on a mesh: matched by place, judged against a truth on another atlas."""
+
+import math
+
+import numpy as np
+import pytest
+
+from model.skin import SkinAppearance, SkinMap
+from skinrig import surface_evaluation as evaluation
+
+
+def plane(side, rng, *, shift_mm=0.0):
+    """A flat square of 20 mm, seen on an atlas of `side` texels, with its normals and albedo."""
+    x, y = np.meshgrid(np.linspace(0, 20, side), np.linspace(0, 20, side))
+    position = np.stack([x, y, np.full_like(x, shift_mm)], axis=-1)
+    normals = np.zeros((side, side, 3))
+    normals[..., 2] = 1.0
+    albedo = np.broadcast_to([0.5, 0.4, 0.3], (side, side, 3))
+    return {"position": position, "normals": normals, "r_d": albedo}
+
+
+def appearance(maps, **stderr):
+    units = {"position": "mm"}
+    return SkinAppearance(
+        {
+            name: SkinMap(values, units.get(name, "1"), stderr.get(name))
+            for name, values in maps.items()
+        },
+        "simulated",
+    )
+
+
+def tilted(normals, sigma_rad, rng):
+    out = normals + np.concatenate(
+        [
+            sigma_rad * rng.standard_normal((*normals.shape[:2], 2)),
+            np.zeros((*normals.shape[:2], 1)),
+        ],
+        axis=-1,
+    )
+    return out / np.linalg.norm(out, axis=-1, keepdims=True)
+
+
+def test_a_known_tilt_is_measured_and_covered_as_its_standard_error_says(rng):
+    truth, maps = plane(60, rng), plane(80, rng)
+    sigma = math.radians(0.8)
+    maps["normals"] = tilted(maps["normals"], sigma, rng)
+    found = appearance(maps, normals=np.full((80, 80, 3), sigma))
+    row = evaluation.compare(found, appearance(truth), rng=rng)[0]
+    assert row.name == "normals"
+    # mean of a Rayleigh distribution; 6400 draws know it to 0.7 %, 4 sigma are asked for
+    assert row.mean == pytest.approx(0.8 * math.sqrt(math.pi / 2), rel=0.03)
+    # a share of 0.6827 of 6400 has a deviation of 0.0058: 4 sigma
+    assert row.coverage.share == pytest.approx(0.6827, abs=0.024)
+
+
+def test_a_standard_error_half_as_large_is_caught_by_its_coverage(rng):
+    truth, maps = plane(60, rng), plane(80, rng)
+    maps["normals"] = tilted(maps["normals"], 0.02, rng)
+    found = appearance(maps, normals=np.full((80, 80, 3), 0.01))
+    assert evaluation.compare(found, appearance(truth), rng=rng)[0].coverage.share < 0.4
+
+
+def test_albedo_is_judged_by_channel_and_relative_to_the_truth(rng):
+    truth, maps = plane(40, rng), plane(40, rng)
+    maps["r_d"] = maps["r_d"] * [1.02, 1.0, 0.9]
+    rows = evaluation.compare(appearance(maps), appearance(truth), rng=rng)
+    red, green, blue = (row for row in rows if row.name.startswith("r_d"))
+    assert red.bias == pytest.approx(2.0, abs=1e-4)
+    assert green.median == pytest.approx(0.0, abs=1e-4)
+    assert blue.median == pytest.approx(10.0, abs=1e-4)
+    assert blue.judged[1] > blue.judged[2] > red.judged[1]
+
+
+def test_texels_without_a_true_point_near_by_are_left_out(rng):
+    truth, maps = plane(40, rng), plane(40, rng)
+    maps["position"] = maps["position"] + [10.0, 0.0, 0.0]
+    pairs = evaluation.match(appearance(maps), appearance(truth))
+    assert 0 < len(pairs.rows) < 40 * 40
+    assert pairs.distance_mm.max() <= evaluation.NEAR_MM
+
+
+def test_a_scan_that_is_not_registered_is_named(rng):
+    truth, maps = plane(10, rng), plane(10, rng, shift_mm=80.0)
+    with pytest.raises(evaluation.SurfaceTruthError, match="is the scan registered"):
+        evaluation.match(appearance(maps), appearance(truth))
