@@ -99,6 +99,54 @@ class Light:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LedLimits:
+    """What LEDs may do near eyes and skin, and what their driver can; a box may allow less.
+
+    The numbers are this project's nominal ones, not a certificate: an assembled dome is measured.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    max_on_s: float = 0.5
+    """Longest time an LED stays on for one command or row, s, > 0."""
+    max_duty: float = 0.25
+    """Most mean level of an LED over ``duty_window_s``, 0 < duty <= 1."""
+    duty_window_s: float = 1.0
+    """Time over which duty is taken, s, > 0."""
+    thermal_tau_s: float = 4.0
+    """Time constant of an LED's temperature, s, > 0."""
+    thermal_trip: float = 0.6
+    """Temperature at which its driver trips, 0 < trip < 1; 1 is where it would settle when on."""
+    dose_ws: float = 50.0
+    """Most light an LED may send out to one subject, Ws, > 0."""
+    max_at_once: int = 24
+    """Most LEDs that may be on together, >= 2."""
+    max_flashes_per_s: float = 3.0
+    """Flashes seen by open eyes in any second must stay below this, > 0."""
+    max_flicker_rms: float = 0.25
+    """Most light of 3 to 65 Hz at open eyes, rms over mean, > 0."""
+    overlap_s: float = 1e-4
+    """How long before one LED goes off the next one is on, s, >= 0."""
+    settle_s: float = 1e-3
+    """Time from an LED's turn to the cameras' release, s, >= ``overlap_s``."""
+    max_rows: int = 1024
+    """Longest table the box holds, >= 1."""
+
+    def __post_init__(self) -> None:
+        checks = Checks("LED limits", RigError)
+        counts = ("max_at_once", "max_rows", "overlap_s", "settle_s")
+        fields = [field.name for field in dataclasses.fields(self)]
+        checks.positive(**{name: getattr(self, name) for name in fields if name not in counts})
+        checks.that("max_duty", self.max_duty, self.max_duty <= 1, "0 < duty <= 1")
+        checks.that("thermal_trip", self.thermal_trip, self.thermal_trip < 1, "0 < trip < 1")
+        checks.that("max_at_once", self.max_at_once, self.max_at_once >= 2, ">= 2")
+        checks.that("max_rows", self.max_rows, self.max_rows >= 1, ">= 1")
+        good = 0 <= self.overlap_s <= self.settle_s < math.inf
+        checks.that("settle_s", self.settle_s, good, f"0 <= overlap_s {self.overlap_s} <= settle_s")
+        checks.close()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class View:
     """One camera of the rig: pinhole, sensor and analyser, all nominal."""
 
@@ -259,6 +307,8 @@ class Rig:
     """Most pops in any minute, > 0."""
     polarizer_move_s: float = 0.5
     """Time to turn the analyser, s, >= 0."""
+    leds: LedLimits | None = None
+    """Limits of the rig's LEDs; None: it has none."""
 
     def __post_init__(self) -> None:
         checks = Checks(f"Rig {self.name!r}", RigError)
@@ -275,6 +325,9 @@ class Rig:
         checks.positive(max_pops_per_min=self.max_pops_per_min)
         move = self.polarizer_move_s
         checks.that("polarizer_move_s", move, 0 <= move < math.inf, "seconds >= 0")
+        has_leds = any(light.power_w is not None for light in self.lights)
+        known = self.leds is not None or not has_leds
+        checks.that("leds", self.leds, known, "the limits of the LEDs among the lights")
         checks.close()
 
     def view(self, name: str) -> View:

@@ -49,6 +49,20 @@ HEAD = """\
 name = "dome"
 boxes = ["dome"]
 recycle_s = 0.0              # no light is a flash
+
+[leds]                       # nominal, see capture.rig.LedLimits; measure an assembled dome
+max_on_s = 0.5
+max_duty = 0.25              # mean level over duty_window_s
+duty_window_s = 1.0
+thermal_tau_s = 4.0
+thermal_trip = 0.6
+dose_ws = 50.0               # of one LED to one subject: a twentieth of the blue-light bound
+max_at_once = 24
+max_flashes_per_s = 3.0
+max_flicker_rms = 0.25
+overlap_s = 0.0001
+settle_s = 0.001
+max_rows = 1024
 """
 LIGHT = """
 [[lights]]

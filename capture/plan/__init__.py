@@ -1,0 +1,26 @@
+"""What shall be captured: steps and plans, and each rig's generators of them."""
+
+from capture.plan.flash import (
+    FLAT_POWERS,
+    MALUS_ANGLES_DEG,
+    Target,
+    flash_calibration_plan,
+    flash_plan,
+)
+from capture.plan.steps import KINDS, POLARIZERS, Kind, Plan, PlanError, Polarizer, Step, Value
+
+__all__ = [
+    "FLAT_POWERS",
+    "KINDS",
+    "MALUS_ANGLES_DEG",
+    "POLARIZERS",
+    "Kind",
+    "Plan",
+    "PlanError",
+    "Polarizer",
+    "Step",
+    "Target",
+    "Value",
+    "flash_calibration_plan",
+    "flash_plan",
+]

@@ -1,0 +1,163 @@
+"""Plans of the flash rig: a subject in several states, and the calibration targets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal, get_args
+
+from capture.plan.steps import POLARIZERS, Kind, Plan, Polarizer, Step, Value, require
+from capture.rig import Rig
+
+Target = Literal["dark", "flat", "chart", "malus"]
+
+# powers of the photon transfer series: dense in the shadows, up to full scale
+FLAT_POWERS = (0.03125, 0.0625, 0.125, 0.1875, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0)
+MALUS_ANGLES_DEG = tuple(15.0 * k for k in range(13))
+
+
+def flash_plan(
+    rig: Rig,
+    *,
+    states: Sequence[str] = ("neutral",),
+    repeats: int = 1,
+    darks: int = 4,
+    power: float = 1.0,
+    exposure_s: float = 0.008,
+    iso: int = 100,
+) -> Plan:
+    """Plan parallel and crossed flash images of a subject in each of several states.
+
+    Parameters
+    ----------
+    rig : Rig
+    states : sequence of str
+        Expressions or physiological states, captured one after the other.
+    repeats : int
+        Image pairs per state, >= 1.
+    darks : int
+        Frames with no light at the beginning, >= 0.
+    power : float
+        Flash power, 0 < power <= 1.
+    exposure_s : float
+        Exposure time, s; it covers the pop.
+    iso : int
+
+    Returns
+    -------
+    Plan
+        Darks, then per state and repeat a parallel and a crossed image; the order of the two
+        alternates, so that the analyser turns once per pair.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> rig = load_rig("flash")
+    >>> plan = flash_plan(rig, states=("neutral", "anger"), darks=1)
+    >>> [(s.id, s.settings["polarizer"]) for s in plan.steps]  # doctest: +NORMALIZE_WHITESPACE
+    [('D000', 'parallel'), ('S000', 'parallel'), ('S001', 'crossed'), ('S002', 'crossed'),
+     ('S003', 'parallel')]
+    >>> round(plan.estimated_s(rig), 2)
+    29.04
+    """
+    require(repeats >= 1, "repeats", repeats, ">= 1")
+    require(darks >= 0, "darks", darks, ">= 0")
+    require(0 < power <= 1, "power", power, "0 < power <= 1")
+    series = _Series(rig, exposure_s=exposure_s, iso=iso)
+    series.darks(darks)
+    pair: list[Polarizer] = ["parallel", "crossed"]
+    for state in states:
+        for repeat in range(repeats):
+            for polarizer in pair:
+                index: dict[str, str | int | float] = {"state": state, "polarizer": polarizer}
+                index["repeat"] = repeat
+                series.add("S", "subject", index, polarizer=polarizer, power=power)
+            pair.reverse()
+    return series.plan()
+
+
+def flash_calibration_plan(
+    rig: Rig,
+    target: Target,
+    *,
+    repeats: int = 2,
+    darks: int = 2,
+    exposure_s: float = 0.008,
+    iso: int = 100,
+) -> Plan:
+    """Plan the frames of one calibration of the flash rig.
+
+    Parameters
+    ----------
+    rig : Rig
+    target : {"dark", "flat", "chart", "malus"}
+        "dark": ``8 * repeats`` frames with the cap on; "flat": 10 flash powers on an even white
+        field, ``repeats`` frames each (photon transfer pairs); "chart": ``repeats`` parallel and
+        crossed images of a color chart; "malus": 13 analyser angles from 0 to 180 degrees,
+        ``repeats`` frames each.
+    repeats : int
+        Frames per condition, >= 1 (>= 2 for "flat": pairs).
+    darks : int
+        Frames with no light before all but "dark", >= 0.
+    exposure_s, iso
+        Exposure time, s, and sensitivity.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> plan = flash_calibration_plan(load_rig("flash"), "malus", repeats=1, darks=0)
+    >>> plan.steps[-1].index["analyser_deg"], plan.steps[-1].kind
+    (180.0, 'malus')
+    """
+    targets = get_args(Target)
+    require(target in targets, "target", target, f"one of {', '.join(targets)}")
+    least = 2 if target == "flat" else 1
+    require(repeats >= least, "repeats", repeats, f">= {least}")
+    require(darks >= 0, "darks", darks, ">= 0")
+    series = _Series(rig, exposure_s=exposure_s, iso=iso)
+    series.darks(8 * repeats if target == "dark" else darks)
+    conditions: Iterable[tuple[dict[str, str | float], dict[str, Value]]]
+    if target == "dark":
+        conditions = ()
+    elif target == "flat":
+        conditions = [({"power": p}, {"polarizer": "parallel", "power": p}) for p in FLAT_POWERS]
+    elif target == "chart":
+        conditions = [({"polarizer": p}, {"polarizer": p, "power": 1.0}) for p in POLARIZERS]
+    else:
+        conditions = [
+            ({"analyser_deg": a}, {"polarizer": "parallel", "analyser_deg": a, "power": 1.0})
+            for a in MALUS_ANGLES_DEG
+        ]
+    for index, settings in conditions:
+        for repeat in range(repeats):
+            series.add(target[0].upper(), target, {**index, "repeat": repeat}, **settings)
+    return series.plan()
+
+
+class _Series:
+    """Steps being numbered, for all views of one rig at one exposure."""
+
+    def __init__(self, rig: Rig, *, exposure_s: float, iso: int) -> None:
+        self._rig = rig
+        self._exposure: dict[str, Value] = {"exposure_s": exposure_s, "iso": iso}
+        self._steps: list[Step] = []
+        self._counts: dict[str, int] = {}
+
+    def add(
+        self, letter: str, kind: Kind, index: Mapping[str, str | int | float], **settings: Value
+    ) -> None:
+        number = self._counts.get(letter, 0)
+        self._counts[letter] = number + 1
+        cameras = tuple(view.name for view in self._rig.views)
+        identity = f"{letter}{number:03d}"
+        self._steps.append(Step(identity, kind, index, {**settings, **self._exposure}, cameras))
+
+    def darks(self, count: int) -> None:
+        for repeat in range(count):
+            self.add("D", "dark", {"repeat": repeat}, polarizer="parallel", power=0.0)
+
+    def plan(self) -> Plan:
+        limits = {
+            "max_pops_per_min": self._rig.max_pops_per_min,
+            "recycle_s": self._rig.recycle_s,
+        }
+        return Plan(self._rig.name, tuple(self._steps), limits)
