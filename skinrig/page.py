@@ -118,10 +118,30 @@ def _picture(
 def color_picture(title: str, linear: NDArray[np.floating], *, width: int = 320) -> str:
     """Return a figure of a linear sRGB image, (H, W, 3)."""
     small = shrink(np.asarray(linear), width)
+    return plain_picture(title, png.srgb8(small.astype(float)))
+
+
+def plain_picture(title: str, image: NDArray[np.uint8]) -> str:
+    """Return a figure of an 8-bit image, (H, W) or (H, W, 3), shown as it is."""
     return (
-        f'<figure><img alt="{escape(title)}" src="{png.data_uri(png.srgb8(small.astype(float)))}">'
+        f'<figure><img alt="{escape(title)}" src="{png.data_uri(image)}">'
         f"<figcaption>{escape(title)}</figcaption></figure>"
     )
+
+
+def scalar_picture(
+    title: str,
+    values: NDArray[np.floating],
+    *,
+    low: float,
+    high: float,
+    scale: str = "viridis",
+    valid: NDArray[np.bool_] | None = None,
+    unit: str = "",
+    width: int = 280,
+) -> str:
+    """Return a figure of a map, (H, W), with its color scale; pixels not valid are gray."""
+    return _picture(title, values, low, high, scale, valid, unit, width)
 
 
 def map_panel(

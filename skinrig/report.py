@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from skinrig import evaluation, figures, page
+from skinrig import evaluation, figures, page, surface_section
 
 
 class ReportError(ValueError):
@@ -132,8 +132,11 @@ def _appearance_section(
     ]
     if pictures:
         body += f"<div class=maps>{''.join(pictures)}</div>"
+    on_mesh = "position" in appearance.maps
+    if on_mesh:
+        body += surface_section.section(name, appearance, truth, checks)
     for key, skin_map in sorted(appearance.maps.items()):
-        if skin_map.values.ndim != 2 or key.startswith("_"):
+        if skin_map.values.ndim != 2 or key.startswith("_") or on_mesh:
             continue
         true_map = truth.maps.get(key) if truth is not None else None
         body += page.map_panel(
@@ -144,7 +147,7 @@ def _appearance_section(
             truth=None if true_map is None else true_map.values,
             valid=_shown(skin_map, true_map),
         )
-    if truth is not None and "melanin" in truth.maps:
+    if truth is not None and "melanin" in truth.maps and not on_mesh:
         body += _errors(name, appearance, truth, checks)
     elif truth is None:
         body += (
