@@ -225,6 +225,37 @@ def import_photos(
     )
 
 
+@import_app.command("mesh")
+def import_mesh(
+    file: Annotated[Path, typer.Argument(help="Scanned mesh: .obj or .ply.")],
+    session: Annotated[Path, typer.Option(help="Session that gets the mesh.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Copy to write, of a session that is closed.")
+    ] = None,
+    unit: Annotated[str, typer.Option(help="Unit of the file: mm, cm, m or inch.")] = "mm",
+    json: Json = False,
+) -> None:
+    """Attach a scanned mesh to a session.
+
+    Example: skinrig import mesh scan.obj --unit m --session session
+    """
+    from capture.importers.meshes import import_mesh as bring_in
+
+    console = Console(json)
+    done = bring_in(file, session=session, out=out, unit=unit)
+    size = " x ".join(f"{side:.0f}" for side in done.extent_mm)
+    console.say(
+        f"{done.path}: {done.vertices} vertices, {done.faces} triangles, {size} mm, "
+        f"{'with' if done.has_uv else 'without'} texture coordinates"
+    )
+    console.say(f"next: skinrig verify {done.path}")
+    console.document(
+        "skinrig.import/1",
+        {"path": done.path, "vertices": done.vertices, "faces": done.faces,
+         "has_uv": done.has_uv, "extent_mm": done.extent_mm, "reopened": done.reopened},
+    )  # fmt: skip
+
+
 @app.command()
 def reconstruct(
     session: Annotated[Path, typer.Argument(help="SESSION/ folder.")],

@@ -1,4 +1,4 @@
-"""Foreign pictures into SESSION/: photographs of any camera, stripped of what identifies people."""
+"""Foreign data into SESSION/: photographs stripped of what identifies people, scanned meshes."""
 
 from capture.importers.photos import Imported, import_photos
 from capture.importers.pictures import Photo, PhotoError, read_photo

@@ -1,0 +1,248 @@
+"""Scanned meshes of any maker into SESSION/: OBJ and PLY, checked, in millimetres."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.documents import Fault, InputError
+from capture.session import Session, SessionError, reopen_copy
+
+MM_PER_UNIT: Final[Mapping[str, float]] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
+EXTENT_RANGE_MM: Final = (20.0, 3000.0)
+"""Longest side of a scan of a face, a head or a person."""
+MAX_FILE_BYTES: Final = 2**31
+SCAN: Final = "scan.ply"
+"""Name of the attachment that holds a session's scanned mesh."""
+
+_PLY_COUNT: Final = re.compile(rb"element[ \t]+(vertex|face)[ \t]+(\d+)")
+
+
+class MeshImportError(InputError):
+    """A mesh file that cannot be used."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScannedMesh:
+    """Triangles as they stand in a file, in millimetres; nothing is cleaned or joined."""
+
+    vertices_mm: NDArray[np.float32]
+    """Positions, shape (V, 3), mm, the scanner's frame."""
+    faces: NDArray[np.int32]
+    """Vertex indices, shape (F, 3); polygons of more corners are cut into triangles."""
+    uv: NDArray[np.float32] | None
+    """Texture coordinates, shape (V, 2), (0, 0) bottom left; None where the file has none."""
+    about: Mapping[str, str | int | float | bool]
+    """Where it is from: hash and kind of the file, unit, counts."""
+
+    def to_ply(self) -> bytes:
+        """Return the mesh as a binary PLY with float32 positions (and ``s``, ``t``)."""
+        fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+        columns = [self.vertices_mm]
+        if self.uv is not None:
+            fields += [("s", "<f4"), ("t", "<f4")]
+            columns.append(self.uv)
+        names = "".join(f"property float {name}\n" for name, _ in fields)
+        header = (
+            "ply\nformat binary_little_endian 1.0\ncomment unit mm\n"
+            f"element vertex {len(self.vertices_mm)}\n{names}"
+            f"element face {len(self.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        )
+        corners = np.empty(len(self.faces), [("count", "u1"), ("index", "<i4", 3)])
+        corners["count"], corners["index"] = 3, self.faces
+        vertices = np.ascontiguousarray(np.concatenate(columns, axis=1), "<f4")
+        return header.encode("ascii") + vertices.tobytes() + corners.tobytes()
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedMesh:
+    """What an import did."""
+
+    path: str
+    """The session that holds the mesh now."""
+    vertices: int
+    faces: int
+    has_uv: bool
+    extent_mm: tuple[float, float, float]
+    """Width, height and depth, mm."""
+    reopened: bool
+    """Whether the session is a copy of a closed one."""
+
+
+def read_mesh(path: str | Path, *, unit: str = "mm") -> ScannedMesh:
+    """Read an OBJ or PLY file, ascii or binary, of triangles or polygons, in any groups.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file that ends in .obj or .ply.
+    unit : {"mm", "cm", "m", "inch"}
+        What one unit of the file is.
+
+    Returns
+    -------
+    ScannedMesh
+
+    Raises
+    ------
+    MeshImportError
+        Where the file is missing, empty, cut short or no mesh, where a position is not finite, or
+        where the mesh is no size of a face in this unit.
+    """
+    place = Path(path)
+    if unit not in MM_PER_UNIT:
+        raise _error(place, "unit", repr(unit), f"one of {', '.join(MM_PER_UNIT)}")
+    kind = place.suffix.lower().removeprefix(".")
+    if kind not in ("obj", "ply"):
+        raise _error(place, "file", f"suffix {place.suffix!r}", ".obj or .ply")
+    try:
+        data = place.read_bytes() if place.stat().st_size <= MAX_FILE_BYTES else None
+    except OSError as exc:
+        raise _error(place, "file", str(exc.strerror), "a file that can be read") from exc
+    if data is None:
+        raise _error(place, "file", "a larger one", f"at most {MAX_FILE_BYTES} bytes")
+    if not data.strip():
+        raise _error(place, "file", "an empty one", "vertices and faces")
+    vertices, faces, uv = _decode(data, kind, place)
+    _check(vertices, faces, data if kind == "ply" else b"", place)
+    if uv is not None and not np.isfinite(uv).all():
+        uv = None
+    scale = MM_PER_UNIT[unit]
+    _check_extent(np.ptp(vertices[np.unique(faces)], axis=0) * scale, scale, place)
+    about: dict[str, str | int | float | bool] = {
+        "origin": "imported",
+        "sha256": f"sha256:{hashlib.sha256(data).hexdigest()}",
+        "format": kind,
+        "unit": unit,
+        "vertices": len(vertices),
+        "faces": len(faces),
+        "uv": uv is not None,
+    }
+    return ScannedMesh(
+        (vertices * scale).astype(np.float32),
+        faces.astype(np.int32),
+        None if uv is None else uv.astype(np.float32),
+        about,
+    )
+
+
+def import_mesh(
+    path: str | Path, *, session: str | Path, out: str | Path | None = None, unit: str = "mm"
+) -> ImportedMesh:
+    """Attach a scanned mesh to a session that holds none yet, as ``scan.ply`` in mm.
+
+    Parameters
+    ----------
+    path : str or Path
+        See `read_mesh`.
+    session : str or Path
+        An open session, which stays open; or, with `out`, a closed one, which stays as it is.
+    out : str or Path, optional
+        New folder for a copy of a closed session that holds the mesh, and is closed again.
+    unit : {"mm", "cm", "m", "inch"}
+        What one unit of the file is.
+
+    Raises
+    ------
+    MeshImportError
+        Where the mesh cannot be used.
+    SessionError
+        Where the session holds a scan already, or is closed and no `out` is given.
+    """
+    mesh = read_mesh(path, unit=unit)
+    found = Session.open(session)
+    if SCAN in found.attachments():
+        advice = "What is attached stays: make a new session for another scan."
+        faults = [Fault("attachment", f"{SCAN}, attached before", "none of that name")]
+        raise SessionError("holds a scan already", where=str(session), faults=faults, advice=advice)
+    if found.closed and out is None:
+        advice = "Name a folder for a copy that holds the mesh: --out COPY."
+        raise SessionError("the session is closed", where=str(session), advice=advice)
+    if out is not None:
+        opened, reason = reopen_copy(session, out)
+        with opened:
+            opened.attach(SCAN, mesh.to_ply(), about=mesh.about)
+            opened.close(missing_because=reason)
+    else:
+        with Session.resume(session) as opened:
+            opened.attach(SCAN, mesh.to_ply(), about=mesh.about)
+    width, height, depth = (float(x) for x in np.ptp(mesh.vertices_mm, axis=0))
+    return ImportedMesh(
+        str(out if out is not None else session),
+        len(mesh.vertices_mm),
+        len(mesh.faces),
+        mesh.uv is not None,
+        (width, height, depth),
+        out is not None,
+    )
+
+
+_Arrays = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]
+
+
+def _decode(data: bytes, kind: str, place: Path) -> _Arrays:
+    """Return vertices, faces and texture coordinates of all parts of a file."""
+    import trimesh
+
+    try:
+        # a stream and not a path: no file named inside (materials, textures) is opened
+        loaded: Any = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
+        parts = [part for part in loaded.dump() if hasattr(part, "faces")]
+    except Exception as exc:  # the readers raise whatever their parsers meet
+        reason = str(exc).splitlines()[0] if str(exc) else type(exc).__name__
+        raise _error(place, "content", reason, f"a whole {kind.upper()} file") from exc
+    if not parts or not sum(len(part.faces) for part in parts):
+        got = "points only" if parts or loaded.geometry else "nothing"
+        raise _error(place, "faces", got, "at least one triangle")
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([np.asarray(part.vertices, np.float64) for part in parts])
+    faces = np.concatenate(
+        [np.asarray(part.faces, np.int64) + at for part, at in zip(parts, first, strict=False)]
+    )
+    uvs = [getattr(part.visual, "uv", None) for part in parts]
+    whole = all(
+        uv is not None and len(uv) == len(part.vertices)
+        for uv, part in zip(uvs, parts, strict=True)
+    )
+    uv = np.concatenate([np.asarray(uv, np.float64)[:, :2] for uv in uvs]) if whole else None
+    return vertices, faces, uv
+
+
+def _check(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], ply: bytes, where: Path
+) -> None:
+    counts = {name: int(count) for name, count in _PLY_COUNT.findall(ply.split(b"end_header")[0])}
+    for name, got in ((b"vertex", len(vertices)), (b"face", len(faces))):
+        if got < counts.get(name, 0):
+            text = f"{counts[name]}, as its header says"
+            raise _error(where, f"{name.decode()} elements", f"{got}: the file is cut short", text)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        text = f"0 to {len(vertices) - 1}"
+        raise _error(where, "faces", f"vertices {faces.min()} to {faces.max()}", text)
+    bad = int(np.count_nonzero(~np.isfinite(vertices).all(axis=1)))
+    if bad:
+        raise _error(where, "vertices", f"{bad} that are not finite", "numbers only")
+
+
+def _check_extent(extent_mm: NDArray[np.float64], scale: float, where: Path) -> None:
+    low, high = EXTENT_RANGE_MM
+    longest = float(extent_mm.max())
+    if low <= longest <= high:
+        return
+    fitting = [u for u, s in MM_PER_UNIT.items() if low <= longest / scale * s <= high]
+    hint = f"it would be in {' or '.join(fitting)}: --unit {fitting[0]}" if fitting else ""
+    fault = Fault("size", f"{longest:.4g} mm", f"{low:g} to {high:g} mm", hint)
+    raise MeshImportError("is no size of a face", where=str(where), faults=[fault])
+
+
+def _error(place: Path, field: str, got: str, expected: str) -> MeshImportError:
+    faults = [Fault(field, got, expected)]
+    return MeshImportError("is not a mesh that can be used", where=str(place), faults=faults)
