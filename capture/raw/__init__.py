@@ -2,7 +2,7 @@
 
 from capture.raw.dng import encode_dng, write_dng
 from capture.raw.frame import RawError, RawFrame, noise_profile
-from capture.raw.linear import Demosaic, LinearImage, linear_rgb
+from capture.raw.linear import Demosaic, LinearImage, interpolate, linear_rgb
 from capture.raw.reading import decode, read
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "RawFrame",
     "decode",
     "encode_dng",
+    "interpolate",
     "linear_rgb",
     "noise_profile",
     "read",

@@ -92,12 +92,40 @@ def linear_rgb(
         fault = Fault("pattern", "MONO", "RGGB, BGGR, GRBG or GBRG")
         raise RawError("a monochrome frame has no color", where=frame.path, faults=[fault])
     x, variance = _pixels(frame, gain, read_noise)
-    good = frame.cfa < frame.white
+    return interpolate(x, variance, frame.cfa < frame.white, frame.pattern, demosaic=demosaic)
+
+
+def interpolate(
+    values: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    good: NDArray[np.bool_],
+    pattern: str,
+    *,
+    demosaic: Demosaic = "superpixel",
+) -> LinearImage:
+    """Interpolate the colors of a mosaic of linear values.
+
+    Parameters
+    ----------
+    values, variance : ndarray of float32, shape (H, W)
+        Linear values behind a 2 x 2 color filter array, and their variance; H and W are even.
+    good : ndarray of bool, shape (H, W)
+        False for values that must not be used; no pixel that they contribute to is valid.
+    pattern : str
+        "RGGB", "BGGR", "GRBG" or "GBRG".
+    demosaic : {"superpixel", "centered", "bilinear"}
+        As in `linear_rgb`.
+
+    Returns
+    -------
+    LinearImage
+        In the unit of `values`.
+    """
     if demosaic == "superpixel":
-        return _superpixel(frame.pattern, x, variance, good)
+        return _superpixel(pattern, values, variance, good)
     if demosaic == "centered":
-        return _centered(frame.pattern, x, variance, good)
-    return _bilinear(frame.pattern, x, variance, good)
+        return _centered(pattern, values, variance, good)
+    return _bilinear(pattern, values, variance, good)
 
 
 def _pixels(
