@@ -3,6 +3,7 @@
 from capture.session.disk import Disk
 from capture.session.errors import (
     ConsentError,
+    NotASession,
     SessionDamage,
     SessionDiskError,
     SessionError,
@@ -24,6 +25,7 @@ __all__ = [
     "FrameLine",
     "FrameRecord",
     "Manifest",
+    "NotASession",
     "Session",
     "SessionDamage",
     "SessionDiskError",

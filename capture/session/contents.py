@@ -10,7 +10,7 @@ from pathlib import Path
 from capture.documents import Fault
 from capture.plan import PlanError
 from capture.session.disk import read_file
-from capture.session.errors import SessionDamage, SessionError
+from capture.session.errors import NotASession, SessionDamage, SessionError
 from capture.session.journal import AttachmentLine, CloseLine, FrameLine, Walk, walk
 from capture.session.manifest import Manifest, decode
 
@@ -64,7 +64,11 @@ def read_contents(path: Path) -> Contents:
         advice = "Name the folder of a session; skinrig simulate and skinrig capture make one."
         found = "no such folder" if not path.is_dir() else f"no {MANIFEST} in it"
         faults = [Fault("folder", found, f"a folder with {MANIFEST}")]
-        return SessionError("is not a session", where=str(path), faults=faults, advice=advice)
+        if (path / JOURNAL).is_file() and (path / JOURNAL).stat().st_size > 0:
+            advice = f"Restore {MANIFEST} from a copy: frames were committed here."
+            what = "has lost its manifest"
+            return SessionDamage(what, where=str(path), faults=faults, advice=advice)
+        return NotASession("is not a session", where=str(path), faults=faults, advice=advice)
 
     where = path / MANIFEST
     data = read_file(where, limit=MAX_MANIFEST_BYTES, what="manifest", missing=no_session)

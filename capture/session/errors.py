@@ -9,6 +9,10 @@ class SessionError(InputError):
     """A session that cannot be used in the way asked."""
 
 
+class NotASession(SessionError):
+    """A folder that holds no session."""
+
+
 class SessionDamage(SessionError):
     """A session whose files are not what was written."""
 

@@ -17,7 +17,7 @@ from capture.session.contents import (
     list_files,
     read_contents,
 )
-from capture.session.errors import SessionError
+from capture.session.errors import NotASession, SessionError
 from capture.session.frames import check_file
 from capture.session.journal import FrameLine
 
@@ -54,6 +54,11 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
     -------
     VerifyReport
 
+    Raises
+    ------
+    NotASession
+        Where there is none; nothing can be said of what is not there.
+
     Notes
     -----
     A flipped bit anywhere in a committed file is found: session.json carries a seal over all its
@@ -67,6 +72,8 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
     warnings: list[str] = []
     try:
         contents = read_contents(place)
+    except NotASession:
+        raise
     except SessionError as exc:
         return VerifyReport(False, (str(exc),), (), 0, 0)
     if contents.walk.damage is not None:
