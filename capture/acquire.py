@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import secrets
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -37,6 +38,8 @@ log = logging.getLogger(__name__)
 
 MAX_ATTEMPTS = 3
 CHARGE_TIMEOUT_S = 60.0
+MAX_TOKEN = 48
+"""Characters of the longest token that a box takes."""
 FRAME_MARGIN_S = 5.0
 """How much longer than exposure and read-out a frame may take to come."""
 
@@ -121,6 +124,7 @@ def run_plan(
     prompt: Callable[[str], None] | None = None,
     interrupted: Callable[[], bool] | None = None,
     clock: Callable[[], float] = time.time,
+    run_id: str = "",
 ) -> Acquired:
     """Capture what the session still lacks of a plan.
 
@@ -143,6 +147,9 @@ def run_plan(
         Asked before each step; True stops in good order.
     clock
         The host's time, s since 1970, for the journal.
+    run_id
+        Begins the token of every flash of this run; drawn at random by default, so that no two
+        flashes bear one token, also after a resume.
 
     Returns
     -------
@@ -158,6 +165,7 @@ def run_plan(
     Interrupted
         When ``interrupted`` said so.
     """
+    run_id = run_id or secrets.token_hex(4)
     plan.check(rig)
     if "flash" not in boxes:
         raise AcquisitionError("box 'flash': no port was given; add --port flash=URL")
@@ -180,7 +188,7 @@ def run_plan(
                     prompt(state)
             if progress is not None:
                 progress(f"{number}/{len(steps)} {step.id} {step.kind} {_index_text(step)}")
-            _take(step, rig, box, cameras, session, taken, clock, counts)
+            _take(step, rig, box, cameras, session, taken, clock, counts, run_id)
     finally:
         _tear_down(box, cameras)
     return Acquired(**counts)
@@ -229,12 +237,13 @@ def _take(
     taken: Mapping[tuple[str, str], int],
     clock: Callable[[], float],
     counts: dict[str, int],
+    run_id: str,
 ) -> None:
     """Take one step with all its cameras, or none: a step with one bad frame is shot again."""
     refusals: list[str] = []
     for attempt in range(1, MAX_ATTEMPTS + 1):
         try:
-            report, frames, stale = _expose(step, rig, box, cameras, attempt)
+            report, frames, stale = _expose(step, rig, box, cameras, _token(run_id, step, attempt))
         except (FrameRefused, FrameTimeout, CommandRefused) as error:
             if isinstance(error, CommandRefused) and error.code != Code.HARDWARE:
                 raise
@@ -273,14 +282,15 @@ def _take(
             counts["frames"] += 1
         counts["steps"] += 1
         return
+    safe = "what was captured is safe: mend the cause and run the same command with --resume"
     raise AcquisitionError(
-        f"step {step.id}: failed {MAX_ATTEMPTS} times ({refusals[-1]}); what was captured is safe: "
-        "mend the cause and run the same command with --resume"
+        f"step {step.id}: failed {MAX_ATTEMPTS} times ({refusals[-1]}); "
+        + (safe if session.frames() else "nothing was captured: mend the cause and start again")
     )
 
 
 def _expose(
-    step: Step, rig: Rig, box: Flash, cameras: Mapping[str, Camera], attempt: int
+    step: Step, rig: Rig, box: Flash, cameras: Mapping[str, Camera], token: str
 ) -> tuple[Any | None, dict[str, Frame], int]:
     """Set the light and the cameras, make the exposure, and collect one frame a camera."""
     want = Exposure(float(step.settings["exposure_s"]), int(step.settings["iso"]))
@@ -324,7 +334,7 @@ def _expose(
     if lit_by_box:
         # armed for this pop only: a read-out may outlast any lease
         box.arm()
-        report = box.fire(f"{step.id}.{attempt}")
+        report = box.fire(token)
         box.dark()
     frames: dict[str, Frame] = {}
     stale = 0
@@ -335,6 +345,11 @@ def _expose(
         )
         stale += dropped
     return report, frames, stale
+
+
+def _token(run_id: str, step: Step, attempt: int) -> str:
+    """Name one flash: the run, the step and the try, in the 48 characters that a box takes."""
+    return f"{run_id}.{step.id[: MAX_TOKEN - len(run_id) - 4]}.{attempt}"
 
 
 def _frame_timeout_s(step: Step, view: View) -> float:

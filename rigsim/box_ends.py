@@ -169,6 +169,7 @@ class TcpEnd:
             client, peer = self._listener.accept()
         except OSError:
             return  # gone again
+        self._readable()  # a client that was killed may not have been noticed yet
         if self._client is not None:
             log.warning("%s: refused %s, another host has the box", self.address, peer)
             self._see_out(client)

@@ -117,6 +117,11 @@ class CameraBody:
         else:
             self.missed_edges += 1
 
+    @property
+    def reading_out(self) -> bool:
+        """Whether an exposure or its read-out is under way."""
+        return self.world.now < self._busy_until
+
     def fire(self) -> None:
         """Start an exposure now."""
         with self.world.lock:

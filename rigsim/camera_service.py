@@ -7,6 +7,7 @@ import logging
 import socket
 import socketserver
 import threading
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,7 +15,7 @@ from capture.devices import camera_wire
 from capture.devices.camera import CameraError, Exposure, FrameTimeout, Trigger
 from capture.devices.camera_wire import BadMessage
 
-from .camera import SimCamera
+from .camera import CameraBody, SimCamera
 from .world import World
 
 __all__ = ["CameraService"]
@@ -22,6 +23,8 @@ __all__ = ["CameraService"]
 log = logging.getLogger(__name__)
 
 LONGEST_WAIT_S = 600.0
+LOOK_S = 0.2
+"""How often the wait for a frame looks whether its client is still there, s."""
 
 
 class CameraService:
@@ -43,7 +46,8 @@ class CameraService:
     def __init__(self, world: World, host: str, port: int) -> None:
         service = self
         self.world = world
-        self._taken: set[str] = set()
+        self._holders: dict[str, socket.socket] = {}
+        self._waits: dict[str, threading.Lock] = {v.name: threading.Lock() for v in world.rig.views}
         self._lock = threading.Lock()
         self._connections: set[socket.socket] = set()
 
@@ -93,31 +97,40 @@ class CameraService:
         finally:
             with self._lock:
                 self._connections.discard(connection)
-                if view is not None:
-                    self._taken.discard(view)
-            if view is not None:
-                self.world.camera(view).disarm()
+                held = view is not None and self._holders.get(view) is connection
+                if view is not None and held:
+                    # still locked: nobody may have armed it meanwhile
+                    self.world.camera(view).disarm()
+                    del self._holders[view]
 
     def _open(
         self, connection: socket.socket, request: Mapping[str, Any], current: str | None
     ) -> str | None:
-        name = request.get("view")
-        fault = ""
+        name = str(request.get("view"))
+        fault, error = "", "CameraError"
         with self._lock:
+            holder = self._holders.get(name)
             if request.get("version") != camera_wire.VERSION:
                 fault = f"version: got {request.get('version')!r}, expected {camera_wire.VERSION}"
             elif name not in self.addresses:
                 fault = f"view: got {name!r}, expected one of {', '.join(self.addresses)}"
-            elif name in self._taken or current is not None:
-                fault = f"view {name!r}: another program has this camera"
+            elif current is not None or (holder is not None and not _hung_up(holder)):
+                fault, error = f"view {name!r}: another program has this camera", "CameraBusy"
+            elif self.world.camera(name).reading_out:
+                # armed now, it would miss its trigger
+                fault, error = f"view {name!r}: is reading out a frame of before", "CameraBusy"
             else:
-                self._taken.add(str(name))
+                # a client that died while its frame was awaited or made loses the camera at once
+                self._holders[name] = connection
         if fault:
-            _send(connection, request, ok=False, error="CameraError", text=fault)
+            _send(connection, request, ok=False, error=error, text=fault)
             return current
-        info = SimCamera(self.world.camera(str(name))).info
-        _send(connection, request, ok=True, info=camera_wire.info_to_json(info))
-        return str(name)
+        with self._waits[name]:  # a wait of that client's has ended: it takes no frame of ours
+            camera = SimCamera(self.world.camera(name))
+            if holder is not None:
+                camera.abort()
+        _send(connection, request, ok=True, info=camera_wire.info_to_json(camera.info))
+        return name
 
     def _answer(
         self, connection: socket.socket, request: Mapping[str, Any], view: str | None
@@ -125,6 +138,9 @@ class CameraService:
         try:
             if view is None:
                 raise CameraError("no camera was opened on this connection")
+            with self._lock:
+                if self._holders.get(view) is not connection:
+                    raise ConnectionResetError("the camera has gone to another client")
             fields, blob = self._do(connection, SimCamera(self.world.camera(view)), request)
         except (CameraError, KeyError, TypeError, ValueError) as exc:
             kind = "FrameTimeout" if isinstance(exc, FrameTimeout) else "CameraError"
@@ -150,7 +166,7 @@ class CameraService:
                 return {}, None
             case "frame":
                 timeout_s = min(max(float(request["timeout_s"]), 0.0), LONGEST_WAIT_S)
-                shot = camera.body.next_shot(timeout_s)
+                shot = self._next_shot(connection, camera.body, timeout_s)
                 _send(connection, request, developing=True)
                 table, blob = camera_wire.frame_to_message(camera.body.develop(shot))
                 return {"frame": table}, blob
@@ -159,6 +175,29 @@ class CameraService:
                 return {}, None
             case other:
                 raise CameraError(f"do: got {other!r}, which no camera understands")
+
+    def _next_shot(self, connection: socket.socket, body: CameraBody, timeout_s: float) -> Any:
+        """Wait for a frame, but not for a client that is gone."""
+        until = time.monotonic() + timeout_s
+        while True:
+            left_s = max(0.0, until - time.monotonic())
+            with self._waits[body.view.name]:
+                if self._holders.get(body.view.name) is not connection or _hung_up(connection):
+                    raise ConnectionResetError("the client is gone")
+                with contextlib.suppress(FrameTimeout):
+                    return body.next_shot(min(left_s, LOOK_S))
+            if left_s <= LOOK_S:
+                raise FrameTimeout(f"camera {body.view.serial}: no frame in {timeout_s:g} s")
+
+
+def _hung_up(connection: socket.socket) -> bool:
+    """Tell whether the other end has closed a connection."""
+    try:
+        return not connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
 
 
 def _request(stream: Any) -> dict[str, Any] | None:

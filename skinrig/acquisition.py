@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.rig import Rig, load_rig
 from capture.session import Session, Subject
 from skinrig.console import Console
+from skinrig.errors import UsageError
 
 CALIBRATION_TARGETS = ("dark", "flat", "chart", "malus")
+RETRY_S = 10.0
+"""How long a device that is held, or reads out a frame of before, is asked for again."""
+RETRY_PAUSE_S = 0.5
+
+_T = TypeVar("_T")
 
 
 class CaptureError(ValueError):
@@ -32,11 +41,27 @@ def addresses(given: Sequence[str], option: str) -> dict[str, str]:
     for text in given:
         name, equals, url = text.partition("=")
         if not (equals and name and url):
-            raise CaptureError(f"{option}: got {text!r}, expected NAME=URL")
+            raise UsageError(f"{option}: got {text!r}, expected NAME=URL")
         if name in found:
-            raise CaptureError(f"{option}: {name!r} is given twice")
+            raise UsageError(f"{option}: {name!r} is given twice")
         found[name] = url
     return found
+
+
+def require_addresses(rig: Rig, boxes: Mapping[str, str], cameras: Mapping[str, str]) -> None:
+    """Raise, naming all that is missing, unless each box and each camera has an address.
+
+    Raises
+    ------
+    UsageError
+    """
+    missing = [f"--port {name}=URL" for name in rig.boxes if name not in boxes]
+    missing += [f"--camera {v.name}=URL" for v in rig.views if v.name not in cameras]
+    if missing:
+        raise UsageError(
+            f"the rig {rig.name!r} needs {' '.join(missing)}; --dry-run needs none, and "
+            "skinrig serve prints those of a simulation"
+        )
 
 
 def choose_plan(rig: Rig, file: Path | None, target: str | None) -> Plan:
@@ -53,17 +78,33 @@ def choose_plan(rig: Rig, file: Path | None, target: str | None) -> Plan:
     return flash_calibration_plan(rig, target)  # type: ignore[arg-type]
 
 
+def write_plan(plan: Plan, file: Path) -> None:
+    """Write a plan as ``--plan`` takes it; a file that exists may hold somebody's changes.
+
+    Raises
+    ------
+    CaptureError
+        Where `file` exists.
+    """
+    text = json.dumps(plan.to_json(), indent=1) + "\n"
+    try:
+        with file.open("x", encoding="utf-8") as stream:
+            stream.write(text)
+    except FileExistsError as exc:
+        raise CaptureError(f"{file}: exists; choose a new name for the plan") from exc
+
+
 def capture_session(
     rig_name: str,
-    out: Path,
+    out: Path | None,
     *,
     ports: Sequence[str],
     cameras: Sequence[str],
     plan: Path | None,
     target: str | None,
-    pseudonym: str,
-    consent: tuple[str, ...],
+    subject: Subject,
     dry_run: bool,
+    plan_out: Path | None,
     resume: bool,
     console: Console,
 ) -> Mapping[str, Any]:
@@ -71,8 +112,10 @@ def capture_session(
 
     Raises
     ------
-    CaptureError
+    UsageError
         For an address that is none, or a missing one.
+    CaptureError
+        For an unknown target, or a plan file that exists.
     DeviceError
         When a box or camera fails; what was captured stays and can be resumed.
     """
@@ -80,23 +123,22 @@ def capture_session(
     rig = load_rig(rig_name)
     chosen = choose_plan(rig, plan, target)
     seconds = chosen.estimated_s(rig)
+    if not dry_run:
+        require_addresses(rig, box_urls, camera_urls)
+    if out is None and not dry_run:
+        raise UsageError("a capture needs --out SESSION")
     console.say(f"{len(chosen.steps)} steps, about {seconds:.0f} s")
-    if dry_run:
+    if plan_out is not None:
+        write_plan(chosen, plan_out)
+        console.say(f"{plan_out}: the plan; change it and hand it over with --plan {plan_out}")
+    if out is None or dry_run:
         console.rows(
             ("step", "kind", "settings"),
             [(s.id, s.kind, " ".join(f"{k}={v}" for k, v in s.settings.items()))
              for s in chosen.steps],
         )  # fmt: skip
         return {"steps": len(chosen.steps), "estimated_s": seconds, "captured": 0}
-    for name in rig.boxes:
-        if name not in box_urls:
-            raise CaptureError(f"box {name!r}: no address was given; add --port {name}=URL")
-    for view in rig.views:
-        if view.name not in camera_urls:
-            raise CaptureError(f"view {view.name!r}: add --camera {view.name}=URL")
-    return _run(
-        rig, chosen, out, box_urls, camera_urls, Subject(pseudonym, consent), resume, console
-    )
+    return _run(rig, chosen, out, box_urls, camera_urls, subject, resume, console)
 
 
 def _run(
@@ -115,11 +157,12 @@ def _run(
     from capture.devices.port import Port
 
     with contextlib.ExitStack() as stack:
-        box = FlashBox(Port(box_urls["flash"]))
+        box = patiently(lambda: FlashBox(Port(box_urls["flash"])), console.progress)
         stack.callback(box.close)
         opened = {}
         for view in rig.views:
-            opened[view.name] = open_camera(camera_urls[view.name])
+            url = camera_urls[view.name]
+            opened[view.name] = patiently(partial(open_camera, url), console.progress)
             stack.callback(opened[view.name].close)
         sizes = {(c.info.width_px, c.info.height_px) for c in opened.values()}
         width, _ = next(iter(sizes))
@@ -130,12 +173,14 @@ def _run(
             session = Session.resume(out)
             plan = session.plan
         else:
+            fresh = not out.exists()
             session = Session.create(
                 out, plan=plan, rig=rig,
                 devices={"flash": box_urls["flash"],
                          **{name: camera.info.serial for name, camera in opened.items()}},
                 subject=subject, source=_source(box.identify()),
             )  # fmt: skip
+            stack.enter_context(_unless_used(session, fresh, console))
         stack.callback(session.release)
         with _stop_on_signal() as stopped:
             done = run_plan(
@@ -150,6 +195,64 @@ def _run(
         "session": out, "captured": done.frames, "retakes": done.retakes,
         "stale_frames": done.stale, "steps": len(plan.steps),
     }  # fmt: skip
+
+
+def patiently(
+    open_device: Callable[[], _T],
+    progress: Callable[[str], None],
+    *,
+    retry_s: float = RETRY_S,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> _T:
+    """Open a device, asking again for a few seconds while another program holds it.
+
+    What was killed a moment ago may still hold its ports.
+    """
+    from capture.devices.camera import CameraBusy
+    from capture.devices.port import PortBusy
+
+    until_s = clock() + retry_s
+    told = False
+    while True:
+        try:
+            return open_device()
+        except (CameraBusy, PortBusy) as error:
+            if clock() >= until_s:
+                raise
+            if not told:
+                progress(f"{error}; trying again for {retry_s:g} s")
+            told = True
+        sleep(RETRY_PAUSE_S)
+
+
+@contextlib.contextmanager
+def _unless_used(session: Session, fresh: bool, console: Console) -> Iterator[None]:
+    """Take a new session away again when a device failed before its first frame."""
+    try:
+        yield
+    except Exception:
+        if not session.frames():
+            session.release()
+            remove_unused(session.path, with_folder=fresh)
+            console.progress(f"nothing was captured: {session.path} was taken away again")
+        raise
+
+
+def remove_unused(path: Path, *, with_folder: bool) -> None:
+    """Remove what a session without frames consists of; without ``with_folder`` only its content.
+
+    The manifest goes first: without it there is no session, whatever else is interrupted.
+    """
+    for name in ("session.json", "journal.jsonl"):
+        (path / name).unlink()
+    with contextlib.suppress(OSError):  # what is not the session's own stays, and its folder
+        for part in (path / "frames").glob("*.part"):
+            part.unlink()
+        (path / "frames").rmdir()
+        (path / "orphans").rmdir()
+        if with_folder:
+            path.rmdir()
 
 
 def _source(identity: str) -> Literal["measured", "simulated"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,6 +27,14 @@ app = typer.Typer(
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything that is drawn.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder to write.")]
+Consent = Annotated[
+    list[str] | None,
+    typer.Option("--consent", help="Use that the subject agreed to; repeatable, or by commas."),
+]
+ConsentExpires = Annotated[
+    datetime | None,
+    typer.Option("--consent-expires", formats=["%Y-%m-%d"], help="Last day of the consent."),
+]
 
 
 def _version(shown: bool) -> None:
@@ -80,6 +89,8 @@ def simulate(
         typer.Option(help="A target instead of a face: white, chart, flat, dark, malus."),
     ] = None,
     state: Annotated[list[str] | None, typer.Option(help="State of the face; repeatable.")] = None,
+    consent: Consent = None,
+    consent_expires: ConsentExpires = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
     json: Json = False,
 ) -> None:
@@ -87,12 +98,14 @@ def simulate(
 
     Example: skinrig simulate flash --out session-flash --subject IV
     """
-    from skinrig.simulation import simulate_session
+    from skinrig.consent import subject_of
+    from skinrig.simulation import USES, simulate_session
 
     console = Console(json)
     done = simulate_session(
         rig, out, size=size, seed=seed, subject=subject, mesh=mesh, target=target,
         states=tuple(state or ("neutral",)), resume=resume, progress=console.progress,
+        person=subject_of(f"simulated-{subject}-{seed}", consent or USES, consent_expires),
     )  # fmt: skip
     console.say(
         f"{done.session}: {done.frames} frames" + (f", truth in {done.truth}" if done.truth else "")
@@ -112,14 +125,16 @@ def _next_step(session: Path, target: str | None) -> str:
 @app.command()
 def capture(
     rig: Annotated[str, typer.Argument(help="Name of a rig, or its TOML file.")],
-    out: Out,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the session.")] = None,
     port: Annotated[list[str] | None, typer.Option(help="Box: NAME=URL; repeatable.")] = None,
     camera: Annotated[list[str] | None, typer.Option(help="Camera: VIEW=URL; repeatable.")] = None,
     plan: Annotated[Path | None, typer.Option(help="Plan, JSON; default: the rig's own.")] = None,
     target: Annotated[str | None, typer.Option(help="Plan of a calibration target.")] = None,
     subject: Annotated[str, typer.Option(help="Pseudonym of the subject.")] = "anonymous",
-    consent: Annotated[str, typer.Option(help="Scopes the subject agreed to, by commas.")] = "",
+    consent: Consent = None,
+    consent_expires: ConsentExpires = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print the plan.")] = False,
+    plan_out: Annotated[Path | None, typer.Option(help="New file for the plan, JSON.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
     json: Json = False,
 ) -> None:
@@ -129,12 +144,13 @@ def capture(
     --out session
     """
     from skinrig.acquisition import capture_session
+    from skinrig.consent import subject_of
 
     console = Console(json)
     done = capture_session(
         rig, out, ports=port or [], cameras=camera or [], plan=plan, target=target,
-        pseudonym=subject, consent=tuple(filter(None, consent.split(","))), dry_run=dry_run,
-        resume=resume, console=console,
+        subject=subject_of(subject, consent, consent_expires), dry_run=dry_run,
+        plan_out=plan_out, resume=resume, console=console,
     )  # fmt: skip
     console.document("skinrig.capture/1", done)
 
@@ -194,6 +210,12 @@ app.add_typer(import_app, name="import")
 def import_photos(
     directory: Annotated[Path, typer.Argument(help="Folder of photographs, or one file.")],
     out: Out,
+    rig: Annotated[
+        str | None, typer.Option(help="Rig whose camera took them, so that its calibrations hold.")
+    ] = None,
+    subject: Annotated[str, typer.Option(help="Pseudonym of the subject.")] = "unnamed",
+    consent: Consent = None,
+    consent_expires: ConsentExpires = None,
     json: Json = False,
 ) -> None:
     """Turn RAW, TIFF, EXR, PNG or JPEG photographs into a session.
@@ -201,9 +223,12 @@ def import_photos(
     Example: skinrig import photos portraits --out session-portraits
     """
     from capture.importers import import_photos as bring_in
+    from capture.rig import load_rig
+    from skinrig.consent import subject_of
 
     console = Console(json)
-    done = bring_in(directory, out=out)
+    person = subject_of(subject, consent, consent_expires)
+    done = bring_in(directory, out=out, rig=None if rig is None else load_rig(rig), subject=person)
     for text in done.assumed:
         console.say(f"assumed: {text}")
     for name in done.ignored:

@@ -21,6 +21,10 @@ class MissingExtra(ImportError):
         )
 
 
+class UsageError(ValueError):
+    """A command that lacks an argument, or has one of the wrong form."""
+
+
 def exit_code(error: BaseException) -> int:
     """Return the exit code that stands for ``error``.
 
@@ -33,6 +37,8 @@ def exit_code(error: BaseException) -> int:
         return BUG
     if isinstance(error, ImportError):
         return EXTRA_MISSING
+    if isinstance(error, UsageError):
+        return USAGE
     own = [kind for kind in type(error).__mro__ if kind.__module__.split(".")[0] in _OWN]
     names = {kind.__name__ for kind in own}
     if any(kind.__module__.startswith("capture.devices") for kind in own) or (

@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 
 from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.rig import Rig, load_rig
+from capture.session import Session, Subject
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
 
 WIDTHS_PX = {"small": 768, "full": 3024}
 TARGETS = ("white", "chart", "flat", "dark", "malus")
 RIGS = ("flash",)
+USES = ("research", "publication")
+"""What may be done with a face that is nobody's, unless said otherwise."""
 
 
 class SimulationError(ValueError):
@@ -78,6 +81,7 @@ def simulate_session(
     resume: bool = False,
     width_px: int | None = None,
     created: datetime | None = None,
+    person: Subject | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Simulated:
     """Simulate a capture into SESSION/, and write its truth beside it.
@@ -108,6 +112,8 @@ def simulate_session(
         Pixels across, instead of ``size``.
     created
         Date of the session; None: now.
+    person
+        Pseudonym and consent to record; None: one who agreed to :data:`USES`.
     progress
         Called with one line a frame.
 
@@ -116,8 +122,6 @@ def simulate_session(
     SimulationError
         For an unknown rig, size or target.
     """
-    from capture.session import Session, Subject
-
     if rig_name not in RIGS:
         raise SimulationError(f"rig: got {rig_name!r}, expected one of {', '.join(RIGS)}")
     if size not in WIDTHS_PX:
@@ -157,7 +161,7 @@ def simulate_session(
             plan=_plan(rig, target, states, repeats),
             rig=rig,
             devices={"flash": "rigsim flash box", "cam": rig.views[0].serial},
-            subject=Subject(f"simulated-{subject}-{seed}", ("research", "publication")),
+            subject=person or Subject(f"simulated-{subject}-{seed}", USES),
             source="simulated",
             seed=seed,
             extra={"simulation": asked},

@@ -31,6 +31,10 @@ class CameraUrlError(CameraError, ValueError):
     """An address that no camera answers to."""
 
 
+class CameraBusy(CameraError):
+    """Another program has the camera."""
+
+
 class FrameTimeout(CameraError, TimeoutError):
     """No frame came in time."""
 

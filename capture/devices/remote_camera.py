@@ -12,6 +12,7 @@ from typing import Any
 from . import camera_wire
 from .camera import (
     Camera,
+    CameraBusy,
     CameraError,
     CameraInfo,
     CameraUrlError,
@@ -30,6 +31,7 @@ ANSWER_TIMEOUT_S = 5.0
 """How long an answer may take beyond what was asked for, s."""
 DEVELOP_TIMEOUT_S = 300.0
 """How long a frame may take from its arrival until its pixels are sent, s."""
+_KINDS = {"FrameTimeout": FrameTimeout, "CameraBusy": CameraBusy}
 
 
 def open_camera(rest: str) -> Camera:
@@ -56,7 +58,7 @@ class RemoteCamera:
     LinkLost
         When nothing answers there.
     CameraError
-        When no such camera is served there, or another program has it.
+        When no such camera is served there (`CameraBusy`: another program has it).
     """
 
     def __init__(self, host: str, port: int, view: str) -> None:
@@ -153,7 +155,7 @@ class RemoteCamera:
             self._drop()
             raise LinkLost(f"{self._url}: the link was lost in {what!r} ({exc})") from exc
         if answer.get("ok") is not True:
-            kind = {"FrameTimeout": FrameTimeout}.get(str(answer.get("error")), CameraError)
+            kind = _KINDS.get(str(answer.get("error")), CameraError)
             raise kind(f"{self._url}: {answer.get('text', 'refused without a reason')}")
         return answer
 

@@ -1,13 +1,18 @@
-"""A host that is killed or freezes with a lamp on: the box is dark within its lease."""
+"""A host that is killed or freezes: the box is dark within its lease, and free for the next one."""
 
+import dataclasses
+import json
 import signal
 import subprocess
 import sys
 
 import pytest
 
+from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
+from capture.session import Session
 from rigsim.serve import serve
+from skinrig.cli import main
 
 LEASE_S = 0.3
 # the operating system's scheduling on a busy machine; the box itself is exact to a millisecond
@@ -66,3 +71,43 @@ def test_a_host_that_dies_leaves_the_box_dark_within_the_lease(lamp_keeper, tran
         print(f"dark {1e3 * (dark_s - struck_s):.0f} ms after the host fell silent")
         assert dark_s - struck_s <= LEASE_S + MARGIN_S
         assert box.tripped
+
+
+@pytest.mark.parametrize("transport", ["pty", "tcp"])
+def test_a_capture_killed_while_its_frame_is_awaited_is_resumed_at_once(
+    tmp_path, transport, capsys
+):
+    """The kill falls into a read-out of 1 s; served devices notice that their client is gone."""
+    rig = load_rig("flash").resized(16)
+    slow = dataclasses.replace(
+        rig, views=(dataclasses.replace(rig.views[0], readout_s=1.0),), polarizer_move_s=0.05
+    )
+    steps = flash_plan(rig, darks=1).steps[:2]
+    plan = tmp_path / "plan.json"
+    plan.write_text(json.dumps(Plan("flash", steps).to_json()))
+    out = tmp_path / "s"
+    with serve(slow, pty=transport == "pty") as served:
+        argv = ["capture", "flash", "--plan", str(plan), "--out", str(out)]
+        argv += ["--port", f"flash={served.addresses['flash']}"]
+        argv += ["--camera", f"cam={served.addresses['cam']}"]
+        with subprocess.Popen(
+            [sys.executable, "-m", "skinrig.cli", *argv], stderr=subprocess.PIPE, text=True
+        ) as host:
+            while "2/2 S000" not in host.stderr.readline():
+                assert host.poll() is None
+            struck_s = served.world.now
+            while not served.world.pops and served.world.now < struck_s + 5.0:
+                served.wait(0.01)
+            host.kill()
+        killed_s = served.world.now
+        assert main([*argv, "--resume"]) == 0, capsys.readouterr().err
+        # two read-outs and a recycle time; the dead client would have waited for 10.5 s
+        took_s = served.world.now - killed_s
+        pops = list(served.world.pops)
+    print(f"resumed and done {took_s:.1f} s after the kill")
+    assert took_s < 8.0
+    session = Session.open(out)
+    assert session.closed
+    assert len(session.frames()) == 2
+    # the killed run's pop and ours: no token twice
+    assert len({pop.token for pop in pops}) == len(pops) == 2

@@ -9,6 +9,7 @@ import pytest
 
 from capture.devices import camera_wire
 from capture.devices.camera import (
+    CameraBusy,
     CameraError,
     CameraUrlError,
     Exposure,
@@ -258,7 +259,7 @@ def test_a_served_camera_has_one_client_and_known_views(rig):
     with serve(rig) as served:
         url = served.addresses["cam"]
         camera = open_camera(url)
-        with pytest.raises(CameraError, match="another program"):
+        with pytest.raises(CameraBusy, match="another program"):
             open_camera(url)
         with pytest.raises(CameraError, match="expected one of cam"):
             open_camera(url.replace("/cam", "/cma"))

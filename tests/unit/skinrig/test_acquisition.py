@@ -1,0 +1,169 @@
+"""Captures as they begin and end on the command line, on worlds without pixels."""
+
+import dataclasses
+
+import pytest
+
+from capture.devices.camera import CameraBusy, CameraError
+from capture.devices.port import PortBusy
+from capture.plan import Plan, flash_plan
+from capture.rig import load_rig
+from capture.session import Session
+from rigsim.faults import Faults
+from rigsim.world import World
+from skinrig import acquisition
+from skinrig.cli import main
+from skinrig.errors import UsageError
+
+RIG = load_rig("flash").resized(16)
+
+
+@pytest.fixture
+def sim():
+    """Return a function that makes a world and the arguments that capture on it."""
+    made = []
+
+    def sim(name, rig=RIG, **faults):
+        made.append(World(rig, faults=Faults(**faults)))
+        made[-1].register(name)
+        return ["--port", f"flash=sim://flash?world={name}", "--camera", f"cam=sim://{name}/cam"]
+
+    yield sim
+    for world in made:
+        world.unregister()
+
+
+def test_a_plan_file_of_a_dry_run_captures_as_it_stands(tmp_path, sim, capsys):
+    file = tmp_path / "plan.json"
+    argv = ["capture", "flash", "--dry-run", "--plan-out", str(file)]
+    assert main(argv) == 0
+    assert Plan.from_json(file.read_text()) == flash_plan(load_rig("flash"))
+    assert main(argv) == 3  # somebody may have changed it
+    assert "exists" in capsys.readouterr().err
+    out = tmp_path / "s"
+    assert main(["capture", "flash", "--plan", str(file), "--out", str(out), *sim("w1")]) == 0
+    assert Session.open(out).plan.steps == flash_plan(load_rig("flash")).steps
+
+
+def test_what_the_subject_agreed_to_and_until_when_is_in_the_session(tmp_path, sim):
+    out = tmp_path / "s"
+    consent = ["--consent", "research,teaching", "--consent", "publication"]
+    argv = ["capture", "flash", "--subject", "P042", *consent, "--consent-expires", "2031-01-01"]
+    assert main([*argv, "--out", str(out), *sim("w2")]) == 0
+    subject = Session.open(out).subject
+    assert (subject.pseudonym, str(subject.consent_expires)) == ("P042", "2031-01-01")
+    assert subject.consent_scope == ("research", "teaching", "publication")
+
+
+def test_a_date_that_is_none_is_a_usage_error(capsys):
+    argv = ["capture", "flash", "--dry-run", "--consent-expires", "next year"]
+    assert main(argv) == 2
+    assert "next year" in capsys.readouterr().err
+
+
+def test_all_missing_addresses_are_one_line_and_a_usage_error(tmp_path, capsys):
+    assert main(["capture", "flash", "--out", str(tmp_path / "s")]) == 2
+    err = capsys.readouterr().err
+    assert "--port flash=URL --camera cam=URL" in err
+    assert len(err.splitlines()) == 1
+    assert not (tmp_path / "s").exists()
+
+
+@pytest.mark.parametrize("there_before", [True, False])
+def test_a_capture_that_fails_before_its_first_frame_leaves_no_session(
+    tmp_path, sim, capsys, there_before
+):
+    out = tmp_path / "s"
+    if there_before:
+        out.mkdir()
+    other = dataclasses.replace(RIG, views=(dataclasses.replace(RIG.views[0], serial="ZZ-1"),))
+    assert main(["capture", "flash", "--out", str(out), *sim("w3", other)]) == 4
+    assert "ZZ-1" in capsys.readouterr().err
+    assert out.exists() == there_before
+    assert not there_before or not list(out.iterdir())
+
+
+def test_a_capture_that_fails_later_keeps_what_it_has(tmp_path, sim, capsys):
+    out = tmp_path / "s"
+    argv = ["capture", "flash", "--out", str(out)]
+    assert main([*argv, *sim("w4", misfire=1.0)]) == 4
+    assert "--resume" in capsys.readouterr().err
+    assert len(Session.open(out).frames("dark")) == 4
+    assert main([*argv, *sim("w5"), "--resume"]) == 0
+    assert Session.open(out).closed
+
+
+def test_a_first_step_that_fails_does_not_speak_of_resuming(tmp_path, sim, capsys):
+    out = tmp_path / "s"
+    assert main(["capture", "flash", "--out", str(out), *sim("w6", drop_frame=1.0)]) == 4
+    err = capsys.readouterr().err
+    assert "nothing was captured" in err
+    assert "--resume" not in err
+    assert not out.exists()
+
+
+def test_what_is_not_the_sessions_own_is_never_removed(tmp_path):
+    path = tmp_path / "s"
+    session = Session.create(
+        path, plan=flash_plan(RIG), rig=RIG, devices={},
+        subject=acquisition.Subject("p"), source="measured",
+    )  # fmt: skip
+    session.release()
+    (path / "frames" / "diary.txt").write_text("mine")
+    acquisition.remove_unused(path, with_folder=True)
+    assert [str(p.relative_to(path)) for p in path.rglob("*.txt")] == ["frames/diary.txt"]
+    assert not (path / "session.json").exists()
+
+
+@pytest.mark.parametrize("error", [CameraBusy("busy"), PortBusy("busy")])
+def test_a_device_that_is_held_is_asked_for_again_and_said_so_once(error):
+    now, said, failures = [0.0], [], [error] * 3
+
+    def open_device():
+        if failures:
+            raise failures.pop()
+        return "camera"
+
+    def sleep(seconds):
+        now[0] += seconds
+
+    found = acquisition.patiently(open_device, said.append, clock=lambda: now[0], sleep=sleep)
+    assert (found, len(said)) == ("camera", 1)
+    failures[:] = [error] * 99
+    with pytest.raises(type(error)):
+        acquisition.patiently(open_device, said.append, clock=lambda: now[0], sleep=sleep)
+    assert now[0] == pytest.approx(3 * 0.5 + 10.0)
+
+
+def test_a_device_that_is_broken_is_not_asked_for_again():
+    def open_device():
+        raise CameraError("broken")
+
+    with pytest.raises(CameraError, match="broken"):
+        acquisition.patiently(open_device, print, sleep=lambda seconds: pytest.fail("waited"))
+
+
+def test_addresses_of_the_wrong_form_are_usage_errors():
+    for given in (["flash"], ["=x"], ["flash="], ["flash=a", "flash=b"]):
+        with pytest.raises(UsageError, match="--port"):
+            acquisition.addresses(given, "--port")
+
+
+def test_an_import_knows_whose_photographs_they_are_and_by_which_rig(tmp_path, sim, capsys):
+    shot = tmp_path / "shot"
+    argv = ["capture", "flash", "--out", str(shot), *sim("w7")]
+    assert main(argv) == 0
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    crossed = Session.open(shot).frames("subject", polarizer="crossed")[0]
+    (photos / "anna crossed.dng").write_bytes((shot / crossed.file).read_bytes())
+    out = tmp_path / "s"
+    argv = ["import", "photos", str(photos), "--out", str(out), "--subject", "P7"]
+    consent = ["--consent", "research", "--consent-expires", "2030-05-06"]
+    assert main([*argv, *consent]) == 0
+    subject = Session.open(out).subject
+    assert (subject.pseudonym, subject.consent_scope) == ("P7", ("research",))
+    assert str(subject.consent_expires) == "2030-05-06"
+    # the rig that ships has a larger camera: these are no photographs of it
+    assert main([*argv[:-4], "--out", str(tmp_path / "t"), "--rig", "flash"]) == 3
+    assert "was not taken by this rig's camera" in capsys.readouterr().err
