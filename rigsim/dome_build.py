@@ -1,0 +1,190 @@
+"""A dome as it was built: near the drawing, never on it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.rig import Rig, View
+
+FloatArray = NDArray[np.float64]
+
+UNDISTORT_STEPS: Final = 12
+"""Newton steps from image to ray; each doubles the right digits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerances:
+    """Standard deviations of what a workshop leaves; 0 builds to the drawing."""
+
+    camera_mm: float = 1.5
+    """Camera's centre of projection, mm, per axis."""
+    camera_deg: float = 0.3
+    """Turn of a camera about each of its axes, degrees."""
+    focal: float = 0.003
+    """Relative, of the focal length."""
+    distortion: float = 0.0
+    """Of the lens: k1 of this size below zero, k2 as large, p1 and p2 a hundredth."""
+    gain: float = 0.01
+    """Relative, of a camera's response."""
+    light_mm: float = 2.5
+    """Place of a light, mm, per axis."""
+    light_deg: float = 1.0
+    """Turn of a light's axis, degrees, per axis."""
+    power: float = 0.05
+    """Relative, of a light's power."""
+    lobe_deg: float = 1.0
+    """Of the angle where a light's intensity has halved, degrees."""
+
+    def __post_init__(self) -> None:
+        """Check signs."""
+        for name, value in dataclasses.asdict(self).items():
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"Tolerances.{name}: got {value}, expected >= 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BuiltDome:
+    """The truth about a rig; what its file says is ``nominal``."""
+
+    nominal: Rig
+    """As drawn."""
+    rig: Rig
+    """As it stands: places, focal lengths, powers and lobes; the names are the nominal ones."""
+    axis: FloatArray
+    """Unit vectors in which the lights shine, shape (L, 3)."""
+    distortion: Mapping[str, FloatArray] = field(default_factory=dict)
+    """k1, k2, p1, p2, k3 by view, on coordinates over depth, x right and y down."""
+    gain: Mapping[str, float] = field(default_factory=dict)
+    """Response by view; 1 where not named."""
+    dead: frozenset[str] = frozenset()
+    """Lights that give none."""
+    wiring: tuple[int, ...] = ()
+    """Light that answers to each channel of the box; empty: each to its own."""
+
+    def answering(self, channel: int) -> int:
+        """Return the light that a channel of the box drives."""
+        return self.wiring[channel] if self.wiring else channel
+
+
+def build(rig: Rig, *, seed: int, tolerances: Tolerances | None = None) -> BuiltDome:
+    """Draw a dome as built; the same seed builds each named part the same in any subset.
+
+    Parameters
+    ----------
+    rig
+        As drawn.
+    seed
+        Seed of what the workshop left.
+    tolerances
+        Standard deviations; None takes the usual ones.
+    """
+    size = tolerances or Tolerances()
+    views, distortion, gain = [], {}, {}
+    for view in rig.views:
+        rng = np.random.default_rng([seed, *view.serial.encode()])
+        views.append(_shifted(view, size, rng))
+        k = np.array([-1.0 + 0.2 * rng.standard_normal(), *rng.standard_normal(3), 0.0])
+        distortion[view.name] = size.distortion * k * [1.0, 1.0, 0.01, 0.01, 0.0]
+        gain[view.name] = float(np.exp(size.gain * rng.standard_normal()))
+    lights, axes = [], []
+    for light in rig.lights:
+        rng = np.random.default_rng([seed, *light.name.encode()])
+        place = np.array(light.position_mm) + size.light_mm * rng.standard_normal(3)
+        half = light.half_intensity_deg
+        power = light.power_w
+        lights.append(
+            dataclasses.replace(
+                light,
+                position_mm=tuple(place.tolist()),
+                power_w=None if power is None else power * math.exp(size.power * rng.normal()),
+                half_intensity_deg=None if half is None else half + size.lobe_deg * rng.normal(),
+            )
+        )
+        turn = math.radians(size.light_deg) * rng.standard_normal(3)
+        axis = -place / np.linalg.norm(place)
+        axis = axis + np.cross(turn, axis)
+        axes.append(axis / np.linalg.norm(axis))
+    built = dataclasses.replace(rig, views=tuple(views), lights=tuple(lights))
+    return BuiltDome(rig, built, np.array(axes), distortion, gain)
+
+
+def _shifted(view: View, size: Tolerances, rng: np.random.Generator) -> View:
+    place = np.array(view.position_mm) + size.camera_mm * rng.standard_normal(3)
+    right, up, back = (np.array(axis) for axis in view.axes)
+    turn = math.radians(size.camera_deg) * rng.standard_normal(3)
+    turn_mm = turn[0] * right + turn[1] * up + turn[2] * back
+    forward = -back + np.cross(turn_mm, -back)
+    target = place + forward / np.linalg.norm(forward) * view.distance_mm
+    upward = up + np.cross(turn_mm, up)
+    return dataclasses.replace(
+        view,
+        position_mm=tuple(place.tolist()),
+        target_mm=tuple(target.tolist()),
+        up=tuple(upward.tolist()),
+        focal_mm=view.focal_mm * (1.0 + size.focal * float(rng.standard_normal())),
+    )
+
+
+def bend(xy: ArrayLike, distortion: ArrayLike) -> FloatArray:
+    """Return where a lens puts rays: slopes across the axis to slopes on the sensor, (..., 2)."""
+    slopes = np.asarray(xy, np.float64)
+    k1, k2, p1, p2, k3 = np.asarray(distortion, np.float64)
+    square = np.sum(slopes * slopes, axis=-1, keepdims=True)
+    product = slopes[..., :1] * slopes[..., 1:]
+    tangential = np.concatenate(
+        [
+            2 * p1 * product + p2 * (square + 2 * slopes[..., :1] ** 2),
+            2 * p2 * product + p1 * (square + 2 * slopes[..., 1:] ** 2),
+        ],
+        axis=-1,
+    )
+    return slopes * (1 + k1 * square + k2 * square**2 + k3 * square**3) + tangential
+
+
+def unbend(xy: ArrayLike, distortion: ArrayLike) -> FloatArray:
+    """Return the ray that a lens puts at ``xy``: the inverse of `bend`, by Newton's method."""
+    wanted = np.asarray(xy, np.float64)
+    found = wanted.copy()
+    if not np.any(distortion):
+        return found
+    step = 1e-6
+    right, down = np.array([step, 0.0]), np.array([0.0, step])
+    for _ in range(UNDISTORT_STEPS):
+        miss = bend(found, distortion) - wanted
+        gx = (bend(found + right, distortion) - bend(found - right, distortion)) / (2 * step)
+        gy = (bend(found + down, distortion) - bend(found - down, distortion)) / (2 * step)
+        det = gx[..., 0] * gy[..., 1] - gx[..., 1] * gy[..., 0]
+        found[..., 0] -= (gy[..., 1] * miss[..., 0] - gy[..., 0] * miss[..., 1]) / det
+        found[..., 1] -= (gx[..., 0] * miss[..., 1] - gx[..., 1] * miss[..., 0]) / det
+    return found
+
+
+def pixel_corner_rays(view: View, distortion: ArrayLike) -> FloatArray:
+    """Return the directions through the corners of all pixels, shape (H + 1, W + 1, 3).
+
+    Rig frame; lengths are such that the component along the optical axis is 1.
+    """
+    columns = np.arange(view.width_px + 1) - view.width_px / 2  # corners lie half a pixel off
+    rows = np.arange(view.height_px + 1) - view.height_px / 2
+    x, y = np.meshgrid(columns / view.focal_px, rows / view.focal_px)
+    slopes = unbend(np.stack([x, y], axis=-1), distortion)
+    right, up, back = (np.array(axis) for axis in view.axes)
+    return np.asarray(slopes[..., :1] * right - slopes[..., 1:] * up - back)
+
+
+def image_of(view: View, distortion: ArrayLike, points_mm: ArrayLike) -> FloatArray:
+    """Return column and row where points appear, shape (..., 2); NaN behind the camera."""
+    offset = np.asarray(points_mm, np.float64) - view.position_mm
+    right, up, back = (np.array(axis) for axis in view.axes)
+    depth = -(offset @ back)
+    depth = np.where(depth > 0.0, depth, np.nan)
+    slopes = np.stack([offset @ right / depth, -(offset @ up) / depth], axis=-1)
+    middle = np.array([(view.width_px - 1) / 2, (view.height_px - 1) / 2])
+    return bend(slopes, distortion) * view.focal_px + middle

@@ -1,0 +1,261 @@
+"""A polished ball before the dome's cloth: its outline, and every lit LED in it.
+
+The cloth is a sphere around the rig; it is lit by the LEDs themselves, once, and both the ball and
+the gap beside it show it. An LED is a flat disc of even radiance.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+REFLECTANCE: Final = 0.62
+"""Of polished chromium in the visible, at all angles (Fresnel's rise near the rim is left out)."""
+
+CLOTH_MM: Final = 1200.0
+"""Radius of the cloth around the rig's origin."""
+CLOTH_REFLECTANCE: Final = 0.06
+CLOTH_ROWS: Final = 48
+"""Rows of the map of light on the cloth; it has twice as many columns."""
+
+
+def light_on_cloth(
+    lamp_mm: FloatArray, lamp_axis: FloatArray, lamp_exponent: FloatArray, strength: FloatArray
+) -> FloatArray:
+    """Return the light that the cloth sends back, shape (`CLOTH_ROWS`, 2 `CLOTH_ROWS`).
+
+    In the unit of a white's signal; rows by elevation from +y down, columns by azimuth
+    atan2(x, z) from -pi.
+    """
+    elevation = np.pi / 2 - (np.arange(CLOTH_ROWS) + 0.5) * np.pi / CLOTH_ROWS
+    azimuth = (np.arange(2 * CLOTH_ROWS) + 0.5) * np.pi / CLOTH_ROWS - np.pi
+    e, a = np.meshgrid(elevation, azimuth, indexing="ij")
+    outward = np.stack([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)], axis=-1)
+    places = CLOTH_MM * outward
+    total = np.zeros(e.shape)
+    for place, axis, exponent, power in zip(
+        lamp_mm, lamp_axis, lamp_exponent, strength, strict=True
+    ):
+        offset = places - place
+        d2 = np.sum(offset**2, axis=-1)
+        off = np.clip(offset @ axis / np.sqrt(d2), 0.0, None)
+        cosine = np.clip(np.sum(offset * outward, axis=-1) / np.sqrt(d2), 0.0, None)
+        total += power * np.where(off > 0, off, 1.0) ** exponent * (off > 0) * cosine / d2
+    return CLOTH_REFLECTANCE * total
+
+
+def reflection_point(
+    eye_mm: FloatArray, lamp_mm: FloatArray, ball_mm: FloatArray, radius_mm: float
+) -> FloatArray:
+    """Return where a ball shows a lamp to an eye, by halving the angle (Alhazen's problem)."""
+    to_eye, to_lamp = eye_mm - ball_mm, lamp_mm - ball_mm
+    e = to_eye / np.linalg.norm(to_eye)
+    across = to_lamp - (to_lamp @ e) * e
+    length = float(np.linalg.norm(across))
+    if length < 1e-9:
+        return np.asarray(ball_mm + radius_mm * e)
+    across /= length
+
+    def miss(angle: float) -> float:
+        normal = math.cos(angle) * e + math.sin(angle) * across
+        point = radius_mm * normal
+        out, back = to_lamp - point, to_eye - point
+        tangent = -math.sin(angle) * e + math.cos(angle) * across
+        return float(out @ tangent / np.linalg.norm(out) + back @ tangent / np.linalg.norm(back))
+
+    low, high = 0.0, math.pi
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if miss(middle) > 0 else (low, middle)
+    normal = math.cos(low) * e + math.sin(low) * across
+    return np.asarray(ball_mm + radius_mm * normal)
+
+
+@njit(cache=True, nogil=True)
+def _cloth_at(place: FloatArray, direction: FloatArray, cloth: FloatArray) -> float:
+    """Return the cloth's light where a ray from inside it ends; bilinear."""
+    length = np.sqrt(np.sum(direction * direction))
+    along = np.sum(place * direction) / length
+    t = -along + np.sqrt(max(along * along - np.sum(place * place) + CLOTH_MM * CLOTH_MM, 0.0))
+    x = place[0] + t * direction[0] / length
+    y = place[1] + t * direction[1] / length
+    z = place[2] + t * direction[2] / length
+    rows, columns = cloth.shape
+    row = (0.5 - np.arcsin(min(max(y / CLOTH_MM, -1.0), 1.0)) / np.pi) * rows - 0.5
+    column = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * columns - 0.5
+    i, j = int(np.floor(row)), int(np.floor(column))
+    a, b = row - i, column - j
+    top, bottom = min(max(i, 0), rows - 1), min(max(i + 1, 0), rows - 1)
+    left, right = j % columns, (j + 1) % columns
+    return (1 - a) * ((1 - b) * cloth[top, left] + b * cloth[top, right]) + a * (
+        (1 - b) * cloth[bottom, left] + b * cloth[bottom, right]
+    )
+
+
+@njit(cache=True, nogil=True)
+def _ball_distance(eye: FloatArray, ray: FloatArray, ball: FloatArray, radius: float) -> float:
+    """Return the distance in lengths of ``ray`` to the ball; negative: the ray passes it."""
+    ox, oy, oz = eye[0] - ball[0], eye[1] - ball[1], eye[2] - ball[2]
+    a = ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2]
+    b = ox * ray[0] + oy * ray[1] + oz * ray[2]
+    c = ox * ox + oy * oy + oz * oz - radius * radius
+    square = b * b - a * c
+    if square <= 0.0:
+        return -1.0
+    return (-b - np.sqrt(square)) / a
+
+
+@njit(cache=True, nogil=True)
+def _bounce(
+    eye: FloatArray, ray: FloatArray, t: float, ball: FloatArray, place: FloatArray, out: FloatArray
+) -> None:
+    """Write where a ray meets the ball and where it goes from there."""
+    n0, n1, n2 = 0.0, 0.0, 0.0
+    for k in range(3):
+        place[k] = eye[k] + t * ray[k]
+    n0, n1, n2 = place[0] - ball[0], place[1] - ball[1], place[2] - ball[2]
+    square = n0 * n0 + n1 * n1 + n2 * n2
+    twice = 2.0 * (ray[0] * n0 + ray[1] * n1 + ray[2] * n2) / square
+    out[0] = ray[0] - twice * n0
+    out[1] = ray[1] - twice * n1
+    out[2] = ray[2] - twice * n2
+
+
+@njit(cache=True, nogil=True)
+def surroundings(
+    rays: FloatArray,
+    eye_mm: FloatArray,
+    ball_mm: FloatArray,
+    radius_mm: float,
+    reflectance: float,
+    cloth: FloatArray,
+    subpixels: int,
+) -> NDArray[np.float32]:
+    """Return the cloth as each pixel sees it, past the ball and in it; without the LEDs.
+
+    Parameters
+    ----------
+    rays
+        Directions through the corners of pixels, shape (H + 1, W + 1, 3).
+    eye_mm, ball_mm
+        Centres of projection and of the ball, shape (3,).
+    radius_mm
+        Of the ball; 0 shows the cloth alone.
+    reflectance
+        Of the ball.
+    cloth
+        From `light_on_cloth`.
+    subpixels
+        Rays along each side of pixels on the ball's outline.
+    """
+    height, width = rays.shape[0] - 1, rays.shape[1] - 1
+    out = np.zeros((height, width), np.float32)
+    place, away, ray = np.empty(3), np.empty(3), np.empty(3)
+    inside = np.zeros((height + 1, width + 1), np.bool_)
+    for i in range(height + 1):
+        for j in range(width + 1):
+            inside[i, j] = _ball_distance(eye_mm, rays[i, j], ball_mm, radius_mm) > 0.0
+    for i in range(height):
+        for j in range(width):
+            count = int(inside[i, j]) + int(inside[i, j + 1])
+            count += int(inside[i + 1, j]) + int(inside[i + 1, j + 1])
+            fine = 1 if count == 0 or count == 4 else subpixels
+            total = 0.0
+            for a in range(fine):
+                for b in range(fine):
+                    y, x = (a + 0.5) / fine, (b + 0.5) / fine
+                    for k in range(3):
+                        ray[k] = (1 - y) * ((1 - x) * rays[i, j, k] + x * rays[i, j + 1, k]) + y * (
+                            (1 - x) * rays[i + 1, j, k] + x * rays[i + 1, j + 1, k]
+                        )
+                    t = _ball_distance(eye_mm, ray, ball_mm, radius_mm)
+                    if t > 0.0:
+                        _bounce(eye_mm, ray, t, ball_mm, place, away)
+                        total += reflectance * _cloth_at(place, away, cloth)
+                    else:
+                        total += _cloth_at(eye_mm, ray, cloth)
+            out[i, j] = total / (fine * fine)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def add_lamp(
+    image: NDArray[np.float32],
+    rays: FloatArray,
+    box: NDArray[np.int64],
+    eye_mm: FloatArray,
+    ball_mm: FloatArray,
+    radius_mm: float,
+    reflectance: float,
+    lamp_mm: FloatArray,
+    lamp_axis: FloatArray,
+    lamp_exponent: float,
+    lamp_radius_mm: float,
+    strength: float,
+    reflected: bool,
+    subpixels: int,
+) -> None:
+    """Add one LED to an image, in place: its reflection in the ball, or the LED itself.
+
+    Parameters
+    ----------
+    image
+        Shape (H, W).
+    rays
+        As of `surroundings`.
+    box
+        First and past-the-last row and column that the LED can cover, shape (4,).
+    eye_mm, ball_mm, radius_mm, reflectance
+        As of `surroundings`.
+    lamp_mm, lamp_axis, lamp_exponent, lamp_radius_mm
+        The LED.
+    strength
+        Intensity on its axis in the unit of a white's signal x mm^2.
+    reflected
+        True for the reflection, False for the LED past the ball.
+    subpixels
+        Rays along each side of a pixel.
+    """
+    place, away, ray = np.empty(3), np.empty(3), np.empty(3)
+    area = lamp_radius_mm * lamp_radius_mm  # of the disc over pi: a white's signal is E, not E/pi
+    for i in range(box[0], box[1]):
+        for j in range(box[2], box[3]):
+            total = 0.0
+            for a in range(subpixels):
+                for b in range(subpixels):
+                    y, x = (a + 0.5) / subpixels, (b + 0.5) / subpixels
+                    for k in range(3):
+                        ray[k] = (1 - y) * ((1 - x) * rays[i, j, k] + x * rays[i, j + 1, k]) + y * (
+                            (1 - x) * rays[i + 1, j, k] + x * rays[i + 1, j + 1, k]
+                        )
+                    t = _ball_distance(eye_mm, ray, ball_mm, radius_mm)
+                    if (t > 0.0) != reflected:
+                        continue
+                    if reflected:
+                        _bounce(eye_mm, ray, t, ball_mm, place, away)
+                    else:
+                        place[:] = eye_mm
+                        away[:] = ray
+                    facing, gap, length = 0.0, 0.0, 0.0
+                    for k in range(3):
+                        facing -= away[k] * lamp_axis[k]
+                        gap -= (lamp_mm[k] - place[k]) * lamp_axis[k]
+                        length += away[k] * away[k]
+                    if facing <= 0.0 or gap <= 0.0:
+                        continue
+                    square = 0.0
+                    for k in range(3):
+                        beside = place[k] + gap / facing * away[k] - lamp_mm[k]
+                        square += beside * beside
+                    if square < lamp_radius_mm * lamp_radius_mm:
+                        # radiance of a flat disc: intensity over its area seen from there
+                        total += (facing / np.sqrt(length)) ** (lamp_exponent - 1.0)
+            if total > 0.0:
+                share = reflectance if reflected else 1.0
+                image[i, j] += share * strength / area * total / (subpixels * subpixels)
