@@ -1,0 +1,454 @@
+"""Photometric stereo's inner loop: one robust linear fit a point, vectorised over its lights.
+
+`reconstruction.photometric_stereo` is the door. A kernel is serial and releases the lock: tiles
+of points are mapped over threads. All reals have the type of the data (float32 or float64).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+BLOCK = 32
+"""Points gathered at once: rows of a stack are read in whole cache lines."""
+LANES = 32
+"""Lights are filled up to a multiple with samples of no strength: vector loops have no rest."""
+SHARED, PER_POINT, NEAR = 0, 1, 2
+"""How light vectors are given: one a light, one a light and point, or positions."""
+
+# Row of the table of settings, which carries them in the type of the data.
+SHADOW, GRAZING, TUKEY, TOLERANCE, FLOOR, L1_SOFT, MIN_SPREAD, BRIGHT_PART = range(8)
+# Rows of the table of results.
+NX, NY, NZ, ALBEDO, RESIDUAL, STDERR, STDERR_ALBEDO, USED, SCALE = range(9)
+ROWS = 9
+
+# Reordered sums, but NaN and infinity keep their meaning.
+_FAST = {"reassoc", "contract", "nsz", "arcp"}
+_FASTER = _FAST | {"nnan", "ninf"}  # where nothing but finite numbers can come
+TUKEY_EFFICIENCY = 0.95  # of the biweight with c = 4.685 at the normal distribution
+_MAD = 0.6744897501960817  # median of |x| of the unit normal distribution
+_BISECTIONS = 10
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy", inline="always")
+def _solve(a, g):  # type: ignore[no-untyped-def]
+    """Solve the symmetric system a = (xx, xy, xz, yy, yz, zz), g, in float64; singular gives 0."""
+    xx, xy, xz, yy, yz, zz = a
+    cxx = yy * zz - yz * yz
+    cxy = xz * yz - xy * zz
+    cxz = xy * yz - xz * yy
+    det = xx * cxx + xy * cxy + xz * cxz
+    trace = xx + yy + zz
+    if not det > 1e-18 * trace * trace * trace:
+        return 0.0, 0.0, 0.0
+    cyy = xx * zz - xz * xz
+    cyz = xy * xz - xx * yz
+    czz = xx * yy - xy * xy
+    one = 1.0 / det
+    return (
+        one * (cxx * g[0] + cxy * g[1] + cxz * g[2]),
+        one * (cxy * g[0] + cyy * g[1] + cyz * g[2]),
+        one * (cxz * g[0] + cyz * g[1] + czz * g[2]),
+    )
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+def _step_l1(x, y, z, v, m, b0, b1, b2, soft):  # type: ignore[no-untyped-def]
+    """Return the Newton step of sum m |r| with |r| rounded off below ``soft``."""
+    zero = x.dtype.type(0.0)
+    xx, xy, xz, yy, yz, zz, gx, gy, gz = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for k in range(x.size):
+        xk, yk, zk = x[k], y[k], z[k]
+        r = v[k] - (xk * b0 + yk * b1 + zk * b2)
+        w = m[k] / max(abs(r), soft)
+        wx, wy, wz = w * xk, w * yk, w * zk
+        xx += wx * xk
+        xy += wx * yk
+        xz += wx * zk
+        yy += wy * yk
+        yz += wy * zk
+        zz += wz * zk
+        gx += wx * r
+        gy += wy * r
+        gz += wz * r
+    a = (float(xx), float(xy), float(xz), float(yy), float(yz), float(zz))
+    return _solve(a, (float(gx), float(gy), float(gz)))
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+def _step_squares(x, y, z, v, m, b0, b1, b2):  # type: ignore[no-untyped-def]
+    """Return the step to the least squares of the samples chosen by m."""
+    zero = x.dtype.type(0.0)
+    xx, xy, xz, yy, yz, zz, gx, gy, gz = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for k in range(x.size):
+        xk, yk, zk = x[k], y[k], z[k]
+        r = v[k] - (xk * b0 + yk * b1 + zk * b2)
+        wx, wy, wz = m[k] * xk, m[k] * yk, m[k] * zk
+        xx += wx * xk
+        xy += wx * yk
+        xz += wx * zk
+        yy += wy * yk
+        yz += wy * zk
+        zz += wz * zk
+        gx += wx * r
+        gy += wy * r
+        gz += wz * r
+    a = (float(xx), float(xy), float(xz), float(yy), float(yz), float(zz))
+    return _solve(a, (float(gx), float(gy), float(gz)))
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+def _step_biweight(x, y, z, v, s, b0, b1, b2, per_reach2, least):  # type: ignore[no-untyped-def]
+    """Return the step of Tukey's biweight over the samples that the fit itself sees lit."""
+    zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
+    xx, xy, xz, yy, yz, zz, gx, gy, gz = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for k in range(x.size):
+        xk, yk, zk = x[k], y[k], z[k]
+        fit = xk * b0 + yk * b1 + zk * b2
+        r = v[k] - fit
+        t = max(one - r * r * per_reach2, zero)
+        w = t * t if fit > least * s[k] else zero
+        wx, wy, wz = w * xk, w * yk, w * zk
+        xx += wx * xk
+        xy += wx * yk
+        xz += wx * zk
+        yy += wy * yk
+        yz += wy * zk
+        zz += wz * zk
+        gx += wx * r
+        gy += wy * r
+        gz += wz * r
+    a = (float(xx), float(xy), float(xz), float(yy), float(yz), float(zz))
+    return _solve(a, (float(gx), float(gy), float(gz)))
+
+
+@njit(cache=True, nogil=True, fastmath=_FASTER, error_model="numpy")
+def _kth_largest(q, rank):  # type: ignore[no-untyped-def]
+    """Return about the rank-th largest of the values above 0, from above."""
+    zero, one = q.dtype.type(0.0), q.dtype.type(1.0)
+    top = total = zero
+    for k in range(q.size):
+        top = max(top, q[k])
+        total += max(q[k], zero)
+    low, high = zero, min(top, total / q.dtype.type(rank))
+    half = q.dtype.type(0.5)
+    for _ in range(_BISECTIONS):
+        middle = half * (low + high)
+        count = zero
+        for k in range(q.size):
+            count += one if q[k] > middle else zero
+        if count >= rank:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+def _residuals(x, y, z, v, s, m, b0, b1, b2, least, q):  # type: ignore[no-untyped-def]
+    """Put |r| of the samples that are not dark into q, -1 for others; return their number.
+
+    Nor those that the fit does not see lit.
+    """
+    zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
+    count = zero
+    for k in range(x.size):
+        fit = x[k] * b0 + y[k] * b1 + z[k] * b2
+        lit = (fit > least * s[k]) & (m[k] > zero)
+        q[k] = abs(v[k] - fit) if lit else -one
+        count += one if lit else zero
+    return int(count)
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+def _noise(q, count):  # type: ignore[no-untyped-def]
+    """Return the scale of residuals: their median without the three that any fit makes 0."""
+    if count < 4:
+        return q.dtype.type(0.0)
+    rank = count - (3 + (count - 3 + 1) // 2) + 1  # from the largest
+    return _kth_largest(q, rank) / q.dtype.type(_MAD)
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+def _moments(x, y, z, v, s, b0, b1, b2, per_reach2, least, sums):  # type: ignore[no-untyped-def]
+    """Sum what the standard errors need over the samples with weight; return their number."""
+    zero, one, five = x.dtype.type(0.0), x.dtype.type(1.0), x.dtype.type(5.0)
+    xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero
+    dxx, dxy, dxz, dyy, dyz, dzz = zero, zero, zero, zero, zero, zero
+    used, psi2, slope, slope2, raw2 = zero, zero, zero, zero, zero
+    for k in range(x.size):
+        xk, yk, zk, sk = x[k], y[k], z[k], s[k]
+        fit = xk * b0 + yk * b1 + zk * b2
+        r = v[k] - fit
+        t = one - r * r * per_reach2
+        lit = (sk > zero) & (fit > least * sk) & (t > zero)
+        w = one if lit else zero
+        # directions without strength: of unit length
+        per = w / (sk * sk if lit else one)
+        wx, wy, wz = w * xk, w * yk, w * zk
+        xx += wx * xk
+        xy += wx * yk
+        xz += wx * zk
+        yy += wy * yk
+        yz += wy * zk
+        zz += wz * zk
+        px, py, pz = per * xk, per * yk, per * zk
+        dxx += px * xk
+        dxy += px * yk
+        dxz += px * zk
+        dyy += py * yk
+        dyz += py * zk
+        dzz += pz * zk
+        used += w
+        psi = w * r * t * t
+        bend = w * t * (five * t - (five - one))
+        psi2 += psi * psi
+        slope += bend
+        slope2 += bend * bend
+        raw2 += per * r * r
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = xx, xy, xz, yy, yz, zz
+    sums[6], sums[7], sums[8], sums[9], sums[10], sums[11] = dxx, dxy, dxz, dyy, dyz, dzz
+    sums[12], sums[13], sums[14], sums[15] = psi2, slope, slope2, raw2
+    return int(used)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _finish(x, y, z, v, s, b0, b1, b2, scale, known, robust, settings, sums, out):  # type: ignore[no-untyped-def]
+    """Write normal, albedo, residual and standard errors of one point; False where it has none."""
+    kind = x.dtype.type
+    length = math.sqrt(float(b0) * b0 + float(b1) * b1 + float(b2) * b2)
+    if not (length > 0.0 and length < math.inf):
+        return False
+    least = settings[GRAZING] * kind(length) if robust else -kind(math.inf)
+    reach = settings[TUKEY] * scale
+    per_reach2 = kind(1.0) / (reach * reach) if robust and reach > kind(0.0) else kind(0.0)
+    used = _moments(x, y, z, v, s, b0, b1, b2, per_reach2, least, sums)
+    if used < 3:
+        return False
+    xx, xy, xz, yy, yz, zz, dxx, dxy, dxz, dyy, dyz, dzz, psi2, slope, slope2, raw2 = sums
+    # the least eigenvalue of the directions used, over their trace (which is their number)
+    minors = dxx * dyy - dxy * dxy + dxx * dzz - dxz * dxz + dyy * dzz - dyz * dyz
+    det = (
+        dxx * (dyy * dzz - dyz * dyz)
+        - dxy * (dxy * dzz - dyz * dxz)
+        + dxz * (dxy * dyz - dyy * dxz)
+    )
+    if not det > float(settings[MIN_SPREAD]) * minors * used:
+        return False
+    nx, ny, nz = b0 / length, b1 / length, b2 / length
+    free = used - 3
+    # Huber (1981), section 7.6: covariance of an M-estimate of regression
+    variance = math.inf
+    if free > 0 and slope > 0.0:
+        mean = slope / used
+        spread = max(slope2 / used - mean * mean, 0.0)
+        correction = 1.0 + 3.0 / used * spread / (mean * mean)
+        variance = psi2 / free / (mean * mean) * correction * correction
+    if known:
+        least_variance = 1.0 / TUKEY_EFFICIENCY if robust else 1.0
+        # misfit beyond chance (3 sigma of a chi square) widens the errors
+        beyond = least_variance * (1.0 + 3.0 * math.sqrt(2.0 / max(free, 1)))
+        if free == 0 or not variance > beyond:
+            variance = least_variance
+    cxx, cyy, czz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
+    cxy, cxz, cyz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
+    full = xx * cxx + xy * cxy + xz * cxz
+    if not full > 0.0:
+        return False
+    along = (
+        nx * (cxx * nx + 2.0 * (cxy * ny + cxz * nz))
+        + ny * (cyy * ny + 2.0 * cyz * nz)
+        + nz * czz * nz
+    ) / full
+    across = max((cxx + cyy + czz) / full - along, 0.0)
+    angle, error = math.pi, math.inf
+    if variance < math.inf:
+        angle = math.sqrt(variance * across) / length
+        error = math.sqrt(variance * max(along, 0.0))
+        if angle > 1.0:  # the signal drowns in its noise
+            return False
+    out[NX], out[NY], out[NZ] = nx, ny, nz
+    out[ALBEDO] = length
+    out[RESIDUAL] = math.sqrt(raw2 / used)
+    out[STDERR] = angle
+    out[STDERR_ALBEDO] = error
+    out[USED] = used
+    out[SCALE] = scale
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fit_point(
+    x,
+    y,
+    z,
+    v,
+    s,
+    q,
+    m,
+    robust,
+    known,
+    l1_steps,
+    steps,
+    settings,
+    sums,
+    out,
+):  # type: ignore[no-untyped-def]
+    """Fit one point: v = x b0 + y b1 + z b2 on samples with s > 0."""
+    kind = x.dtype.type
+    zero, one = kind(0.0), kind(1.0)
+    b0 = b1 = b2 = zero
+    n = 0
+    for k in range(x.size):
+        usable = s[k] > zero
+        m[k] = one if usable else zero
+        n += 1 if usable else 0
+    if n < 3:
+        return False
+    if not robust:
+        for _ in range(2):  # the second step refines the digits of the first
+            d0, d1, d2 = _step_squares(x, y, z, v, m, b0, b1, b2)
+            b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
+        return _finish(x, y, z, v, s, b0, b1, b2, one, known, False, settings, sums, out)
+    # lit samples: those above a part of a bright one, which is not the brightest for highlights
+    total = zero
+    for k in range(x.size):
+        q[k] = v[k] / s[k] if m[k] > zero else -one
+    rank = min(n, max(4, int(n * settings[BRIGHT_PART])))
+    bright = _kth_largest(q, rank)
+    if not bright > zero:
+        return False
+    dark = settings[SHADOW] * bright
+    lit = 0
+    for k in range(x.size):
+        m[k] = one if q[k] > dark else zero
+        total += s[k] * m[k]
+        lit += 1 if q[k] > dark else 0
+    if lit < 3:
+        return False
+    soft = settings[L1_SOFT] * bright * total / kind(lit)
+    if known:
+        soft = max(soft, one)
+    d0, d1, d2 = _step_squares(x, y, z, v, m, b0, b1, b2)
+    b0, b1, b2 = kind(d0), kind(d1), kind(d2)
+    near = settings[TOLERANCE] * settings[TOLERANCE]
+    for _ in range(l1_steps):
+        d0, d1, d2 = _step_l1(x, y, z, v, m, b0, b1, b2, soft)
+        b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
+        if d0 * d0 + d1 * d1 + d2 * d2 < near * (b0 * b0 + b1 * b1 + b2 * b2):
+            break
+    floor = settings[FLOOR] * bright * total / kind(lit)
+    if known:
+        floor = max(floor, one)
+    scale = one
+    for step in range(steps):
+        length = kind(math.sqrt(b0 * b0 + b1 * b1 + b2 * b2))
+        least = settings[GRAZING] * length
+        if step % 2 == 0 and step < 4:
+            count = _residuals(x, y, z, v, s, m, b0, b1, b2, least, q)
+            scale = max(_noise(q, count), floor)
+        per_reach = one / (settings[TUKEY] * scale)
+        d0, d1, d2 = _step_biweight(x, y, z, v, s, b0, b1, b2, per_reach * per_reach, least)
+        b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
+        if step > 2 and d0 * d0 + d1 * d1 + d2 * d2 < near * (b0 * b0 + b1 * b1 + b2 * b2):
+            break
+    return _finish(x, y, z, v, s, b0, b1, b2, scale, known, True, settings, sums, out)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fit_points(  # type: ignore[no-untyped-def]
+    intensity, variance, usable, strength, directions, per_point, positions, points, way,
+    robust, known, l1_steps, steps, settings, out, valid,
+):  # fmt: skip
+    """Fit every point of a tile.
+
+    Parameters
+    ----------
+    intensity, variance, usable, strength
+        (N, P); any layout, broadcast views too.
+    directions
+        (N, 3) unit vectors; read when ``way`` is `SHARED`.
+    per_point
+        (N, P, 3) unit vectors; read when ``way`` is `PER_POINT`.
+    positions, points
+        (N, 3) and (P, 3) mm; read when ``way`` is `NEAR`, where strength falls as 1 / d^2.
+    settings
+        By row, see the names above, in the data's type.
+    out, valid
+        (P, ROWS) and (P,), written.
+    """
+    kind = out.dtype.type
+    lights, count = intensity.shape
+    zero, one = kind(0.0), kind(1.0)
+    lanes = (lights + LANES - 1) // LANES * LANES
+    v = np.zeros((BLOCK, lanes), out.dtype)
+    s = np.zeros((BLOCK, lanes), out.dtype)
+    x, y, z = np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype)
+    q, m = np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype)
+    sums = np.empty(16, np.float64)
+    for start in range(0, count, BLOCK):
+        size = min(BLOCK, count - start)
+        for k in range(lights):
+            for p in range(size):
+                value = kind(intensity[k, start + p])
+                power = kind(strength[k, start + p])
+                good = usable[k, start + p] and value - value == zero
+                good = good and power > zero and power - power == zero
+                weight = one
+                if known:
+                    noise = kind(variance[k, start + p])
+                    good = good and noise > zero and noise - noise == zero
+                    if good:
+                        weight = one / math.sqrt(noise)
+                v[p, k] = value * weight if good else zero
+                s[p, k] = power * weight if good else zero
+        for p in range(size):
+            place = start + p
+            if way == SHARED:
+                for k in range(lights):
+                    x[k] = directions[k, 0] * s[p, k]
+                    y[k] = directions[k, 1] * s[p, k]
+                    z[k] = directions[k, 2] * s[p, k]
+            elif way == PER_POINT:
+                for k in range(lights):
+                    x[k] = kind(per_point[k, place, 0])
+                    y[k] = kind(per_point[k, place, 1])
+                    z[k] = kind(per_point[k, place, 2])
+                    length = x[k] * x[k] + y[k] * y[k] + z[k] * z[k]
+                    if length > kind(0.25) and length < kind(4.0):
+                        scale = s[p, k] / kind(math.sqrt(length))
+                        x[k], y[k], z[k] = x[k] * scale, y[k] * scale, z[k] * scale
+                    else:  # no direction: an occluded light
+                        x[k], y[k], z[k], v[p, k], s[p, k] = zero, zero, zero, zero, zero
+            else:
+                for k in range(lights):
+                    dx = positions[k, 0] - points[place, 0]
+                    dy = positions[k, 1] - points[place, 1]
+                    dz = positions[k, 2] - points[place, 2]
+                    d2 = dx * dx + dy * dy + dz * dz
+                    if d2 > zero and d2 - d2 == zero:
+                        s[p, k] = s[p, k] / d2
+                        scale = s[p, k] / kind(math.sqrt(d2))
+                        x[k], y[k], z[k] = dx * scale, dy * scale, dz * scale
+                    else:
+                        x[k], y[k], z[k], v[p, k], s[p, k] = zero, zero, zero, zero, zero
+            for row in range(ROWS):
+                out[place, row] = zero
+            valid[place] = _fit_point(
+                x,
+                y,
+                z,
+                v[p],
+                s[p],
+                q,
+                m,
+                robust,
+                known,
+                l1_steps,
+                steps,
+                settings,
+                sums,
+                out[place],
+            )
