@@ -1,0 +1,534 @@
+"""The light dome: LEDs lit one at a time around a face or a target, seen by many cameras.
+
+A camera's rays are traced once and serve all lights (see `rigsim.scenes.olat`). The unit of light
+is fixed by the rig alone: a perfect white diffuser at the rig's origin that faces an LED of
+`METER_LED` gets `METER_RATE_PER_S` of full scale per second in the strongest channel.
+
+Notes
+-----
+For a camera c and a light l, before noise and vignetting, in fractions of full scale per second of
+on-time at level 1::
+
+    signal = I_l lobe_l(off axis) cos(theta) pi f_r / d^2,    I_l = `DomeScene.intensity(l)`
+
+averaged over the LED's disc and over the pixel. Positions and powers of the lights are those of the
+rig that is given: to simulate a dome that differs from its plan, give the dome as it is built.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.rig import Light, Rig, RigError, View
+from model import spectra
+from model.skin import UNITS, SkinAppearance, SkinMap
+from rigsim import surface_brdf
+from rigsim.atlas import sample, spread, unwrap
+from rigsim.head_motion import HeadMotion
+from rigsim.mesh import Float32Array
+from rigsim.render import Caster, GBuffer
+from rigsim.scenes import olat
+from rigsim.scenes.olat import Hits, Lamp
+from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.subject import Subject
+from rigsim.surface_brdf import SkinSurface, skin_surface
+from rigsim.targets import Target
+from rigsim.variant import VariantChoice
+
+METER_RATE_PER_S: Final = 24.0
+"""Full scales per second of the white reference in its strongest channel. Pale skin that faces the
+LED then takes 60 ms for 0.8 of full scale, as long as 300 pictures in 25 s leave."""
+
+METER_LED: Final = (1.0, 40.0, 700.0)
+"""Power in W, half-intensity angle in degrees and distance in mm of the LED that defines it."""
+
+POWER_DEVIATION: Final = 0.001
+"""Relative standard deviation of an LED's energy from pulse to pulse."""
+
+HAIR_LIMIT: Final = 0.02
+"""Pixels with more hair than this part are not skin."""
+
+KEPT_FRAMES: Final = 16
+"""Latest frames that are kept, so that the second exposure of each camera costs nothing."""
+
+
+class SceneError(ValueError):
+    """A scene is asked for something that it does not hold."""
+
+
+class Pulse(Protocol):
+    """A lit LED, as the world reports it, clipped to the exposure."""
+
+    @property
+    def led(self) -> int:
+        """Index of the light in the rig."""
+
+    @property
+    def level(self) -> float:
+        """Fraction of full power, 0 to 1."""
+
+    @property
+    def t_on_s(self) -> float:
+        """World time at which it went on, s."""
+
+    @property
+    def t_off_s(self) -> float:
+        """World time at which it went off, s."""
+
+
+class DomeScene:
+    """One subject or target inside the dome.
+
+    Parameters
+    ----------
+    rig
+        The dome; its lights must share one spectrum and be LEDs.
+    subject
+        A face or a target.
+    motion
+        How the head moves; ``None`` holds it still. Targets stand still.
+    sensor
+        Sensor of every view; ``None`` takes what each view states.
+    seed
+        Seeds what differs from pulse to pulse.
+    interreflections
+        Whether light goes from skin to skin.
+    subsurface
+        Whether light spreads sideways inside the skin.
+    subpixels
+        Rays along each side of a pixel.
+    choice
+        Mitsuba variant; ``None`` chooses.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        subject: Subject | Target,
+        *,
+        motion: HeadMotion | None = None,
+        sensor: Sensor | None = None,
+        seed: int = 0,
+        interreflections: bool = False,
+        subsurface: bool = False,
+        subpixels: int = 2,
+        choice: VariantChoice | None = None,
+    ) -> None:
+        spectra_names = {light.illuminant for light in rig.lights}
+        if len(spectra_names) > 1:
+            raise SceneError(
+                f"lights: got the spectra {', '.join(sorted(spectra_names))}, expected one"
+            )
+        for light in rig.lights:
+            if light.power_w is None:
+                raise SceneError(f"light {light.name!r}: is no LED, it has no power_w")
+        if subpixels < 1:
+            raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
+        self.rig = rig
+        self.subject = subject
+        self.motion = motion
+        self.seed = seed
+        self.interreflections = interreflections
+        self.subsurface = subsurface
+        self.subpixels = subpixels
+        self._illuminant = rig.lights[0].illuminant
+        self._sensors = {
+            view.name: sensor_of(view) if sensor is None else sensor for view in rig.views
+        }
+        self._caster = Caster(subject.mesh, choice=choice)
+        self._surfaces: dict[str, SkinSurface] = {}
+        self._textures: dict[str, Float32Array] = {}
+        self._hits: OrderedDict[tuple[str, float], tuple[Hits, Caster]] = OrderedDict()
+        self._frames: OrderedDict[tuple[str, int, float], Float32Array] = OrderedDict()
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """What this scene does not build, with the reason."""
+        out = [
+            ("depth of field and lens blur", "at f/8, 60 mm off focus: 1 to 2 pixels"),
+            ("ambient light", "the room is dark"),
+            ("light from the dome's frame and from other LEDs' lenses", "they are black"),
+        ]
+        if isinstance(self.subject, Subject):
+            out += [
+                ("eyes, teeth and hair on the head", "the eyes are closed; only skin is estimated"),
+                ("dependence of the boundary on its roughness", "light enters a smooth boundary"),
+            ]
+            if not self.interreflections:
+                out.append(("light from skin to skin", "interreflections=False asks for it"))
+            if not self.subsurface:
+                out.append(("light spreading sideways in skin", "subsurface=False asks for it"))
+            if self.motion is None:
+                out.append(("movement of the head", "motion=None asks for it"))
+            else:
+                out.append(("blur by movement within an exposure", "0.06 s move 0.05 mm"))
+        return out
+
+    # light ------------------------------------------------------------------------------------
+
+    def white_rgb(self, view_name: str | None = None) -> Float32Array:
+        """Return the camera RGB of white under the LEDs, shape (3,), the strongest channel 1."""
+        view = self._view(view_name)
+        white = spectra.camera_white(view.spectral_sensitivity, self._illuminant)
+        return np.asarray(white / white.max(), np.float32)
+
+    def intensity(self, light: int, *, view_name: str | None = None) -> Float32Array:
+        """Return I_l of the module's equation, full scales per second times mm^2, shape (3,)."""
+        led = self.rig.lights[light]
+        power, half, distance_mm = METER_LED
+        unit = power * _per_steradian(_exponent(half)) / distance_mm**2
+        strength = float(led.power_w or 0.0) * _per_steradian(_exponent(led.half_intensity_deg))
+        return np.float32(METER_RATE_PER_S * strength / unit) * self.white_rgb(view_name)
+
+    def sensor(self, view_name: str | None = None) -> Sensor:
+        """Return the sensor of a view."""
+        return self._sensors[self._view(view_name).name]
+
+    def radiance(
+        self, view_name: str, lights: Sequence[int] | None = None, *, t_s: float = 0.0
+    ) -> Float32Array:
+        """Return the light on a sensor for each LED alone, without noise and vignetting.
+
+        Parameters
+        ----------
+        view_name
+            Which camera.
+        lights
+            Indices into the rig's lights; ``None`` takes all.
+        t_s
+            World time, s; it matters to moving heads only.
+
+        Returns
+        -------
+        ndarray of float32
+            Camera RGB without white balance, shape (n, H, W, 3), fraction of full scale per second
+            of on-time at level 1.
+        """
+        view = self._view(view_name)
+        chosen = range(len(self.rig.lights)) if lights is None else lights
+        out = np.empty((len(chosen), view.height_px, view.width_px, 3), np.float32)
+        for k, light in enumerate(chosen):
+            out[k] = self._frame(view, light, t_s)
+        return out
+
+    def exposure(
+        self, view_name: str, *, pops: Sequence[Pulse], exposure_s: float, seed: int
+    ) -> NDArray[np.uint16]:
+        """Expose a camera once.
+
+        Parameters
+        ----------
+        view_name
+            Which camera.
+        pops
+            The pulses of the LEDs, clipped to the exposure; none gives a dark frame.
+        exposure_s
+            Exposure time, s.
+        seed
+            Seed of this exposure's noise.
+
+        Returns
+        -------
+        ndarray of uint16
+            Raw DN, shape (H, W).
+        """
+        view = self._view(view_name)
+        rng = np.random.default_rng([self.seed, seed])
+        light = np.zeros((view.height_px, view.width_px, 3), np.float32)
+        for pulse in pops:
+            if not 0.0 <= pulse.level <= 1.0:
+                raise SceneError(f"level of LED {pulse.led}: got {pulse.level}, expected 0 to 1")
+            if not pulse.t_off_s >= pulse.t_on_s:
+                raise SceneError(
+                    f"pulse of LED {pulse.led}: got {pulse.t_on_s} to {pulse.t_off_s} s, "
+                    "expected an end after its beginning"
+                )
+            on_s = pulse.level * (pulse.t_off_s - pulse.t_on_s)
+            energy = on_s * (1.0 + POWER_DEVIATION * rng.standard_normal())
+            if energy > 0.0:
+                middle = 0.5 * (pulse.t_on_s + pulse.t_off_s)
+                light += np.float32(energy) * self._frame(view, pulse.led, middle)
+        return expose(light, sensor=self._sensors[view.name], rng=rng, exposure_s=exposure_s)
+
+    # truth ------------------------------------------------------------------------------------
+
+    def truth(self, view_name: str | None = None) -> dict[str, NDArray[np.generic]]:
+        """Return what an estimator should find, at the sensor's resolution, at time 0.
+
+        Parameters
+        ----------
+        view_name
+            Which camera; ``None`` takes the first.
+
+        Returns
+        -------
+        dict
+            Maps of shape (H, W[, 3]), float32, averaged over each pixel's covered part:
+
+            ``r_d``: factor of the diffuse term, white-balanced, see `rigsim.surface_brdf`;
+            ``normals``: unit, rig frame, with relief; ``position_mm``: rig frame;
+            ``roughness``, ``oil``, ``fuzz``: of the surface terms; ``uv``: (H, W, 2);
+            ``hair``: part covered by hair (brows, lashes);
+            ``mask``: bool, pixels wholly on skin.
+
+        Raises
+        ------
+        SceneError
+            A target stands there; only faces have these maps.
+        """
+        self._face()
+        view = self._view(view_name)
+        hits, _ = self._seen(view, 0.0)
+        surface = olat.unpack_surface(hits.surface)
+        normals = _unit(hits.scatter(hits.normals()))
+        maps = hits.scatter(surface)
+        hair = hits.scatter(1.0 - surface[:, 6:])[..., 0]
+        coverage = hits.coverage()
+        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
+        return {
+            "r_d": maps[..., :3],
+            "normals": normals,
+            "position_mm": hits.scatter(hits.position_mm),
+            "roughness": maps[..., 3],
+            "oil": maps[..., 4],
+            "fuzz": maps[..., 5],
+            "uv": hits.scatter(uv),
+            "hair": hair,
+            "mask": (coverage > 1.0 - 1e-6) & (hair < HAIR_LIMIT),
+        }
+
+    def truth_appearance(self, view_name: str | None = None) -> SkinAppearance:
+        """Return the truth on the face's own texture, at time 0.
+
+        Parameters
+        ----------
+        view_name
+            A camera, for its spectral sensitivity; ``None`` takes the first.
+
+        Returns
+        -------
+        SkinAppearance
+            ``position`` in mm and ``normals`` with relief (rig frame), ``r_d``, ``r_d_floor``
+            (`rigsim.surface_brdf.surface_floor`: by how much eq. (6)'s minimum lies above r_d even
+            without noise), ``reflectance`` (at normal incidence), ``roughness``, ``oil``, ``fuzz``;
+            valid on bare skin.
+        """
+        subject = self._face()
+        surface = self._surface(self._view(view_name))
+        valid = subject.atlas.covered & (subject.hair < HAIR_LIMIT)
+        floor = np.zeros(valid.shape, np.float32)
+        floor[valid] = surface_brdf.surface_floor(surface.packed()[valid])
+        white = "camera RGB over that of a perfect white, without hair"
+        maps = {
+            "position": (subject.atlas.position_mm, UNITS["position"], "rig frame"),
+            "normals": (surface.normal, UNITS["normals"], "rig frame, with relief"),
+            "r_d": (surface.r_d, "1", f"factor of the diffuse term, {white}"),
+            "r_d_floor": (floor, "1", "least surface term in the unit of r_d, within 70 degrees"),
+            "reflectance": (surface.reflectance, "1", f"at normal incidence, {white}"),
+            "roughness": (surface.roughness, UNITS["roughness"], "Beckmann, skin below the oil"),
+            "oil": (surface.oil, "1", "share covered by oil, GGX of half the roughness"),
+            "fuzz": (surface.fuzz, "1", "optical depth of vellus hair"),
+        }
+        return SkinAppearance(
+            {
+                name: SkinMap(values, unit, valid=valid, description=text)
+                for name, (values, unit, text) in maps.items()
+            },
+            "simulated",
+            parameters={"preset": subject.preset, "subject_seed": subject.seed},
+            left_out=tuple(self.left_out),
+            seed=self.seed,
+        )
+
+    def brdf(
+        self,
+        uv: ArrayLike,
+        to_light: ArrayLike,
+        to_camera: ArrayLike,
+        *,
+        view_name: str | None = None,
+    ) -> tuple[Float32Array, Float32Array]:
+        """Evaluate the true reflection at points of the face.
+
+        Parameters
+        ----------
+        uv
+            Texture coordinates, shape (n, 2), (0, 0) is bottom left.
+        to_light, to_camera
+            Unit vectors in the rig frame away from the surface, shape (n, 3) or (3,); the face's
+            own normals with relief are used.
+        view_name
+            A camera, for its spectral sensitivity; ``None`` takes the first.
+
+        Returns
+        -------
+        total : ndarray of float32
+            f_r in 1/sr, white-balanced camera RGB, shape (n, 3).
+        specular : ndarray of float32
+            Its surface terms, shape (n,).
+        """
+        self._face()
+        texture = self._texture(self._view(view_name))
+        points = np.atleast_2d(np.asarray(uv, np.float32))
+        values = sample(texture, points, np.ones(len(points), np.bool_))
+        return surface_brdf.evaluate(values[:, :7], _unit(values[:, 7:]), to_light, to_camera)
+
+    # inside -----------------------------------------------------------------------------------
+
+    def _face(self) -> Subject:
+        if not isinstance(self.subject, Subject):
+            raise SceneError(f"truth: got the target {self.subject.name!r}, expected a face")
+        return self.subject
+
+    def _view(self, name: str | None) -> View:
+        if name is None:
+            return self.rig.views[0]
+        try:
+            return self.rig.view(name)
+        except RigError as error:
+            raise SceneError(str(error)) from error
+
+    def _surface(self, view: View) -> SkinSurface:
+        camera = view.spectral_sensitivity
+        if camera not in self._surfaces:
+            self._surfaces[camera] = skin_surface(self._face(), camera, self._illuminant)
+        return self._surfaces[camera]
+
+    def _texture(self, view: View) -> Float32Array:
+        """Return the surface and its normals with relief, shape (N, N, 10)."""
+        camera = view.spectral_sensitivity
+        if camera not in self._textures:
+            atlas, surface = self._face().atlas, self._surface(view)
+            layers = np.concatenate([surface.packed(), surface.normal], axis=-1)
+            self._textures[camera] = spread(layers, atlas.covered)
+        return self._textures[camera]
+
+    def _frame(self, view: View, light: int, t_s: float) -> Float32Array:
+        if not 0 <= light < len(self.rig.lights):
+            raise SceneError(f"light: got {light}, expected 0 to {len(self.rig.lights) - 1}")
+        key = (view.name, light, self._instant(t_s))
+        if key not in self._frames:
+            while len(self._frames) >= KEPT_FRAMES:
+                self._frames.popitem(last=False)
+            self._frames[key] = self._render(view, light, key[2])
+        self._frames.move_to_end(key)
+        return self._frames[key]
+
+    def _instant(self, t_s: float) -> float:
+        """Return the time that decides how the scene stands, s."""
+        if self.motion is None or not isinstance(self.subject, Subject):
+            return 0.0
+        return round(t_s, 4)
+
+    def _render(self, view: View, light: int, t_s: float) -> Float32Array:
+        shape = (view.height_px, view.width_px, 3)
+        if isinstance(self.subject, Target) and self.subject.kind == "cap":
+            return np.zeros(shape, np.float32)
+        hits, caster = self._seen(view, t_s)
+        lamp = self._lamp(self.rig.lights[light], t_s)
+        image = olat.light_up(hits, lamp, olat.seen_from(hits, caster, lamp))
+        image *= self.intensity(light, view_name=view.name)
+        return image
+
+    def _pose(self, t_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        if self.motion is None or not isinstance(self.subject, Subject):
+            return np.eye(3), np.zeros(3)
+        return self.motion.pose(t_s)
+
+    def _lamp(self, light: Light, t_s: float) -> Lamp:
+        """Return a light in the frame of the mesh."""
+        rotation, shift = self._pose(t_s)
+        place = np.asarray(light.position_mm)
+        return Lamp(
+            position_mm=(place - shift) @ rotation,
+            axis=-place / float(np.linalg.norm(place)) @ rotation,
+            exponent=_exponent(light.half_intensity_deg),
+            radius_mm=light.radius_mm,
+        )
+
+    def _seen(self, view: View, t_s: float) -> tuple[Hits, Caster]:
+        key = (view.name, t_s)
+        if key not in self._hits:
+            # Still heads need every camera's rows again for every light; moving ones never do.
+            most = len(self.rig.views) if self._instant(1.0) == 0.0 else 2
+            while len(self._hits) >= most:
+                self._hits.popitem(last=False)
+            self._hits[key] = self._look(view, t_s)
+        self._hits.move_to_end(key)
+        return self._hits[key]
+
+    def _look(self, view: View, t_s: float) -> tuple[Hits, Caster]:
+        rotation, shift = self._pose(t_s)
+        moved = dataclasses.replace(
+            view,
+            position_mm=_vector((np.asarray(view.position_mm) - shift) @ rotation),
+            target_mm=_vector((np.asarray(view.target_mm) - shift) @ rotation),
+            up=_vector(np.asarray(view.up) @ rotation),
+        )
+        if isinstance(self.subject, Target):
+            return self._look_at_target(moved, self.subject), self._caster
+        caster = self._caster
+        amount = 0.0 if self.motion is None else self.motion.twitch(t_s)
+        texture = self._texture(view)
+        if amount > 0.0 and self.motion is not None:
+            mesh, atlas = self.motion.twitched(self.subject.mesh, amount), self.subject.atlas
+            caster = Caster(mesh, choice=self._caster.choice)
+            # The relief turns with the surface below it.
+            turned = spread(unwrap(mesh, atlas.size).normal - atlas.normal, atlas.covered)
+            texture = np.concatenate([texture[..., :7], texture[..., 7:] + turned], axis=-1)
+
+        def look_up(buffers: GBuffer, rows: NDArray[np.int32]) -> tuple[Float32Array, Float32Array]:
+            uv = buffers.uv.reshape(-1, 2)[rows]
+            values = sample(texture, uv, np.ones(len(rows), np.bool_))
+            return _unit(values[:, 7:]), np.maximum(values[:, :7], 0.0)
+
+        hits = olat.find_hits(caster, moved, look_up, subpixels=self.subpixels)
+        return hits, caster
+
+    def _look_at_target(self, view: View, target: Target) -> Hits:
+        if target.kind == "source":
+            raise SceneError(f"target {target.name!r}: shines itself, it has no place in the dome")
+        metal = target.kind == "metal"
+        rgb = target.rgb(view.spectral_sensitivity, self._illuminant)
+
+        def look_up(buffers: GBuffer, rows: NDArray[np.int32]) -> tuple[Float32Array, Float32Array]:
+            uv = buffers.uv.reshape(-1, 2)[rows]
+            surface = np.zeros((len(rows), 7), np.float32)
+            size = rgb.shape[0]
+            column = np.clip((uv[:, 0] * size).astype(np.int64), 0, size - 1)
+            row = np.clip(((1.0 - uv[:, 1]) * size).astype(np.int64), 0, size - 1)
+            surface[:, :3] = rgb[row, column]
+            surface[:, 3] = target.alpha
+            return buffers.normal.reshape(-1, 3)[rows], surface
+
+        kind = olat.METAL if metal else olat.MATT
+        return olat.find_hits(self._caster, view, look_up, subpixels=self.subpixels, kind=kind)
+
+
+def _exponent(half_intensity_deg: float | None) -> float:
+    """Return the exponent of the cosine that an LED's intensity follows; -1 for none."""
+    if half_intensity_deg is None:
+        return -1.0
+    return math.log(0.5) / math.log(math.cos(math.radians(half_intensity_deg)))
+
+
+def _per_steradian(exponent: float) -> float:
+    """Return the intensity on the axis of 1 W that follows a power of the cosine."""
+    return 1.0 / (4.0 * math.pi) if exponent < 0.0 else (exponent + 1.0) / (2.0 * math.pi)
+
+
+def _unit(vectors: Float32Array) -> Float32Array:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, np.float32(1e-6)), np.float32)
+
+
+def _vector(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
