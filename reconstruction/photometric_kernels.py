@@ -280,22 +280,9 @@ def _finish(x, y, z, v, s, b0, b1, b2, scale, known, robust, settings, sums, out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fit_point(
-    x,
-    y,
-    z,
-    v,
-    s,
-    q,
-    m,
-    robust,
-    known,
-    l1_steps,
-    steps,
-    settings,
-    sums,
-    out,
-):  # type: ignore[no-untyped-def]
+def _fit_point(  # type: ignore[no-untyped-def]
+    x, y, z, v, s, q, m, robust, known, l1_steps, steps, settings, sums, out,
+):  # fmt: skip
     """Fit one point: v = x b0 + y b1 + z b2 on samples with s > 0."""
     kind = x.dtype.type
     zero, one = kind(0.0), kind(1.0)
