@@ -24,7 +24,6 @@ from capture.devices.camera import (
 )
 from capture.rig import RigError, View
 
-from .boxes.flash import FlashPop
 from .world import World, get
 
 __all__ = ["CameraBody", "SimCamera", "open_camera"]
@@ -134,7 +133,7 @@ class CameraBody:
             self._open_shutter(now)
 
     def _open_shutter(self, now: float) -> None:
-        shot = _Shot(self._shots, self._seq, now, self.exposure)
+        shot = _Shot(self._shots, self._seq, now + self.view.shutter_lag_s, self.exposure)
         self._shots += 1
         self._seq += 1
         self._armed -= 1
@@ -168,15 +167,13 @@ class CameraBody:
         exposure = shot.exposure
         if rng.random() < faults.wrong_exposure:
             exposure = dataclasses.replace(exposure, exposure_s=2.0 * exposure.exposure_s)
-        pops: tuple[FlashPop, ...] = self.world.pops_between(
-            shot.start_s, shot.start_s + exposure.exposure_s
-        )
+        light = self.world.light_between(shot.start_s, shot.start_s + exposure.exposure_s)
         image = self.world.expose(
             self.view.name,
             exposure,
             shot.start_s,
             seed=int(rng.integers(0, 2**63)),
-            pops=pops,
+            pops=light,
         )
         return Frame(
             serial=FOREIGN_SERIAL if foreign else self.view.serial,

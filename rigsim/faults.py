@@ -103,7 +103,11 @@ class Faults:
     lamp_dead: bool = False
     """The modelling lamp draws no current."""
     heat: float = 0.0
-    """How hot the lamp's driver is at power-up, 0 to 1; it trips at 0.8."""
+    """How hot lamps' and LEDs' drivers are at power-up, 0 to 1; the flash's trips at 0.8."""
+    led_dead: str = ""
+    """Numbers of LEDs of the dome that draw no current, joined by +."""
+    led_weak: str = ""
+    """LEDs of the dome that give less light than they are driven for: number=share, joined by +."""
     misfire: float = 0.0
     """Probability that the tube does not ignite."""
     slow_charge: float = 1.0
@@ -138,6 +142,29 @@ class Faults:
             raise ValueError(f"slow_charge: got {self.slow_charge}, expected more than 0")
         if not abs(self.drift_ppm) < 1e5:
             raise ValueError(f"drift_ppm: got {self.drift_ppm}, expected less than 1e5")
+        if not all(0.0 <= share <= 1.0 for share in self.weak_leds.values()):
+            raise ValueError(f"led_weak: got {self.led_weak!r}, expected shares from 0 to 1")
+        _ = self.dead_leds  # complains where it is no list
+
+    @property
+    def dead_leds(self) -> frozenset[int]:
+        """Numbers of the dead LEDs."""
+        return frozenset(_led_number("led_dead", part) for part in self.led_dead.split("+") if part)
+
+    @property
+    def weak_leds(self) -> dict[int, float]:
+        """Light of the weak LEDs relative to a new one, by number.
+
+        Examples
+        --------
+        >>> Faults(led_weak="3=0.5+17=0.25").weak_leds
+        {3: 0.5, 17: 0.25}
+        """
+        found = {}
+        for part in filter(None, self.led_weak.split("+")):
+            number, _, share = part.partition("=")
+            found[_led_number("led_weak", number)] = float(_value("led_weak", share, float))
+        return found
 
     @classmethod
     def from_text(cls, switches: Mapping[str, str]) -> Faults:
@@ -156,6 +183,12 @@ class Faults:
                 raise ValueError(f"{name}: no such switch; {hint}")
             values[name] = _value(name, text, type(fields[name].default))
         return cls(**values)  # type: ignore[arg-type]
+
+
+def _led_number(name: str, text: str) -> int:
+    if not (text.isascii() and text.isdecimal()):
+        raise ValueError(f"{name}: got {text!r}, expected the number of an LED")
+    return int(text)
 
 
 def _value(name: str, text: str, kind: type) -> float | int | bool | str:
@@ -203,7 +236,12 @@ CATALOGUE: tuple[FaultKind, ...] = (
     FaultKind(12, "box takes no bytes", ("stall_after", "stall_s"), "retried or PortTimeout"),
     FaultKind(13, "host frozen or killed with a light on", (), "dark within the lease"),
     FaultKind(14, "wrong box or firmware", ("serial", "protocol"), "WrongDevice"),
-    FaultKind(15, "lamp dead or driver too hot", ("lamp_dead", "heat"), "refused -240 or 102"),
+    FaultKind(
+        15,
+        "lamp or LED dead or weak, driver too hot",
+        ("lamp_dead", "led_dead", "led_weak", "heat"),
+        "refused -240 or 102, dead LEDs named; weak ones are left to calibration",
+    ),
     FaultKind(16, "flash not charged, or misfire", ("slow_charge", "misfire"), "-213 or -240"),
     FaultKind(17, "stepper stalls, home missed, force trip", (), "no such box yet"),
     FaultKind(18, "pump leaks, shutter stuck", (), "no such box yet"),

@@ -7,22 +7,25 @@ comes next, or the real one. Boxes live as long as their world, not as long as t
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 import threading
 import time
 import zlib
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capture.devices.camera import Exposure
-from capture.rig import Rig, View, load_rig
+from capture.rig import LedLimits, Rig, View, load_rig
 
-from .boxes.controller import Controller
+from .boxes.controller import Controller, Device
+from .boxes.dome import DomeUnit, LedPulse
 from .boxes.flash import FlashPop, FlashUnit
 from .faults import NO_FAULTS, Faults
 from .link import Link
@@ -30,19 +33,26 @@ from .link import Link
 if TYPE_CHECKING:
     from .camera import CameraBody
 
-__all__ = ["FlashPop", "Scene", "World", "WorldClock", "get"]
+__all__ = ["FlashPop", "LedPulse", "Light", "Scene", "World", "WorldClock", "get"]
 
-SERIAL_NUMBER = "FL-0001"
+SERIAL_NUMBERS = {"flash": "FL-0001", "dome": "DM-0001"}
 TRANSCRIPT_LINES = 4096
+
+Light = FlashPop | LedPulse
+"""Light that came out of a box: a pop of the flash, or a stretch of one LED's light."""
 
 
 class Scene(Protocol):
     """What is in front of the cameras."""
 
     def exposure(
-        self, view_name: str, *, pops: Sequence[FlashPop], exposure_s: float, seed: int
+        self, view_name: str, *, pops: Sequence[Any], exposure_s: float, seed: int
     ) -> NDArray[np.uint16]:
-        """Return the DN, shape (H, W), of one exposure lit by `pops`."""
+        """Return the DN, shape (H, W), of one exposure lit by `pops`.
+
+        They are what the rig's box gives: `FlashPop` of the flash, or `LedPulse` of the dome,
+        clipped to the time in which the shutter was open.
+        """
 
 
 class WorldClock:
@@ -81,7 +91,9 @@ class World:
     scene : Scene or None
         May be exchanged between exposures.
     pops : list of FlashPop
-        All light so far.
+        All pops so far.
+    pulses : list of LedPulse
+        All light of LEDs that has ended, in the order in which it did.
     """
 
     def __init__(
@@ -101,6 +113,7 @@ class World:
         self.scene = scene
         self.faults = NO_FAULTS if faults is None else faults
         self.pops: list[FlashPop] = []
+        self.pulses: list[LedPulse] = []
         self.clock = WorldClock(self)
         self.transcript: deque[str] = deque(maxlen=TRANSCRIPT_LINES)
         self.lock = threading.RLock()
@@ -109,13 +122,26 @@ class World:
         self._now = 0.0
         self._name = ""
         self._cameras: dict[str, CameraBody] = {}
+        self._dome: DomeUnit | None = None
         self._links = {name: self._make_box(name) for name in self.rig.boxes}
 
     def _make_box(self, name: str) -> Link:
-        if name != "flash":
-            raise ValueError(f"boxes: got {name!r}, expected 'flash', the only box there is")
+        kinds = {"flash": self._make_flash, "dome": self._make_dome}
+        if name not in kinds:
+            raise ValueError(f"boxes: got {name!r}, expected one of {', '.join(kinds)}")
         rng = self.rng_for("box", name)
-        unit = FlashUnit(
+        box = Controller(
+            kinds[name](rng),
+            serial=self.faults.serial or SERIAL_NUMBERS[name],
+            protocol=self.faults.protocol,
+            rng=rng,
+        )
+        return Link(
+            box, faults=self.faults, rng=self.rng_for("link", name), record=self._record_bytes
+        )
+
+    def _make_flash(self, rng: np.random.Generator) -> Device:
+        return FlashUnit(
             on_pop=self.pops.append,
             on_trigger=self._trigger,
             recycle_s=self.rig.recycle_s,
@@ -128,15 +154,20 @@ class World:
             interlock=self.faults.interlock,
             rng=rng,
         )
-        box = Controller(
-            unit,
-            serial=self.faults.serial or SERIAL_NUMBER,
-            protocol=self.faults.protocol,
-            rng=rng,
+
+    def _make_dome(self, rng: np.random.Generator) -> Device:
+        self._dome = DomeUnit(
+            self.rig.lights,
+            self.rig.leds or LedLimits(),
+            cameras=len(self.rig.views),
+            on_pulse=self.pulses.append,
+            on_trigger=self._trigger,
+            dead=self.faults.dead_leds,
+            weak=self.faults.weak_leds,
+            heat=self.faults.heat,
+            interlock=self.faults.interlock,
         )
-        return Link(
-            box, faults=self.faults, rng=self.rng_for("link", name), record=self._record_bytes
-        )
+        return self._dome
 
     def rng_for(self, *names: str) -> np.random.Generator:
         """Return a generator that depends on the world's seed and on `names` only."""
@@ -209,9 +240,30 @@ class World:
                 self._cameras[view_name] = CameraBody(self, self.rig.view(view_name))
             return self._cameras[view_name]
 
-    def _trigger(self, now: float) -> None:
-        for camera in self._cameras.values():
-            camera.edge(now)
+    def _trigger(self, now: float, mask: int = -1) -> None:
+        """Pulse the camera line; a dome pulses the lines of the mask's bits, in the rig's order."""
+        for number, view in enumerate(self.rig.views):
+            if mask >> number & 1 and view.name in self._cameras:
+                self._cameras[view.name].edge(now)
+
+    def light_between(self, start: float, end: float) -> tuple[Light, ...]:
+        """Return pops from `start` to `end`, both included, and LEDs' light clipped to them."""
+        with self.lock:
+            return self.pops_between(start, end) + self._pulses_between(start, end)
+
+    def _pulses_between(self, start: float, end: float) -> tuple[Light, ...]:
+        # light is kept in the order in which it ended
+        first = bisect_right(self.pulses, start, key=lambda pulse: pulse.t_off_s)
+        found = self.pulses[first:]
+        if self._dome is not None:
+            found += self._dome.light_now(self.now)
+        return tuple(
+            dataclasses.replace(
+                pulse, t_on_s=max(pulse.t_on_s, start), t_off_s=min(pulse.t_off_s, end)
+            )
+            for pulse in found
+            if pulse.t_on_s < end and pulse.t_off_s > start
+        )
 
     def pops_between(self, start: float, end: float) -> tuple[FlashPop, ...]:
         """Return the pops from `start` to `end`, both included, in s."""
@@ -225,7 +277,7 @@ class World:
         t_start: float,
         *,
         seed: int,
-        pops: Iterable[FlashPop] | None = None,
+        pops: Iterable[Light] | None = None,
     ) -> NDArray[np.uint16]:
         """Return the DN, shape (H, W), of an exposure that began at `t_start`.
 
@@ -240,10 +292,10 @@ class World:
         seed
             Of the sensor's noise.
         pops
-            Light that was seen; by default what popped while the shutter was open.
+            Light that was seen; by default what came while the shutter was open.
         """
         end = t_start + exposure.exposure_s
-        seen = self.pops_between(t_start, end) if pops is None else tuple(pops)
+        seen = self.light_between(t_start, end) if pops is None else tuple(pops)
         scene = self.scene
         if scene is None:
             return _dark_frame(self.rig.view(view_name), np.random.default_rng(seed))

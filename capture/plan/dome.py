@@ -1,0 +1,292 @@
+"""Plans of the light dome: one light at a time at several exposures, and its targets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import numpy as np
+
+from capture.plan.eye_light import eye_light
+from capture.plan.light_order import best_order
+from capture.plan.rows import LedRow
+from capture.plan.steps import Kind, Plan, Step, Value, require
+from capture.rig import LedLimits, Rig
+
+DomeTarget = Literal["charuco", "mirror", "white", "dark"]
+
+EXPOSURES_S = (0.048, 0.012)
+"""Two stops apart; the longer one and its read-out fit into a twelfth of a second."""
+FRAMES_PER_S = 12.0
+TRACKING_EVERY = 25
+"""Lights between two tracking frames."""
+TRACKING_LIGHTS = 12
+TRACKING_FLOOR = 0.25
+"""Least light of a tracking frame at the eyes, of the brightest single light."""
+LEVEL_STEPS = 1000
+"""The box sets an LED's level in so many steps."""
+
+
+def dome_plan(
+    rig: Rig,
+    *,
+    exposures_s: Sequence[float] = EXPOSURES_S,
+    frames_per_s: float = FRAMES_PER_S,
+    tracking_every: int = TRACKING_EVERY,
+    darks: int = 2,
+    level: float = 1.0,
+    iso: int = 100,
+    order: Sequence[int] | None = None,
+) -> Plan:
+    """Plan a capture of a subject: every light by itself, at every exposure.
+
+    Parameters
+    ----------
+    rig : Rig
+        A dome.
+    exposures_s : sequence of float
+        Exposure of each pass over all lights, s.
+    frames_per_s : float
+        Lights a second, > 0.
+    tracking_every : int
+        Lights between two frames lit by several lights at once, from which motion is estimated; 0
+        for none. A pass with tracking also begins and ends with one.
+    darks : int
+        Frames without light at each exposure, >= 0.
+    level : float
+        Of each light, 0 < level <= 1.
+    iso : int
+    order : sequence of int, optional
+        Numbers of all lights; by default the order with the least flicker.
+
+    Returns
+    -------
+    Plan
+        Per exposure: darks, then all lights in one order, so that a light's frames of different
+        passes are equally far apart in time.
+
+    Raises
+    ------
+    PlanError
+        For what the rig's LEDs may not do, or an exposure that does not fit.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> dome = load_rig("dome")
+    >>> plan = dome_plan(dome)
+    >>> sum(step.kind == "olat" for step in plan.steps), round(plan.estimated_s(dome), 1)
+    (300, 26.6)
+    """
+    require(tracking_every >= 0, "tracking_every", tracking_every, ">= 0")
+    require(darks >= 0, "darks", darks, ">= 0")
+    series = _Series(rig, frames_per_s=frames_per_s, iso=iso)
+    shown = best_order(rig, dwell_s=series.dwell_s) if order is None else [int(k) for k in order]
+    require(sorted(shown) == list(range(len(rig.lights))), "order", shown, "every light once")
+    for number, exposure_s in enumerate(exposures_s):
+        series.darks(darks, exposure_s, number)
+        for place, light in enumerate(shown):
+            if tracking_every and place % tracking_every == 0:
+                series.tracking(number, place, exposure_s, shown[max(place - 1, 0)], level)
+            name = rig.lights[light].name
+            series.add(
+                f"{name}-{number}", "olat", {"light": name, "exposure": number, "pass": number},
+                exposure_s, light=name, level=level,
+            )  # fmt: skip
+        if tracking_every:
+            series.tracking(number, len(shown), exposure_s, shown[-1], level)
+    return series.plan()
+
+
+def dome_calibration_plan(
+    rig: Rig,
+    target: DomeTarget,
+    *,
+    exposures_s: Sequence[float] = EXPOSURES_S,
+    poses: int = 12,
+    spheres: int = 3,
+    darks: int = 2,
+    level: float = 1.0,
+    iso: int = 100,
+) -> Plan:
+    """Plan the frames of one calibration of the dome.
+
+    Parameters
+    ----------
+    rig : Rig
+        A dome.
+    target : {"charuco", "mirror", "white", "dark"}
+        "charuco": a board in ``poses`` poses, each lit by several lights at the first exposure;
+        "mirror": a mirror sphere at ``spheres`` places, each lit by every light at the last
+        exposure; "white": a white target lit by every light at the last exposure; "dark":
+        ``8 * darks`` frames with the caps on, at every exposure.
+    exposures_s : sequence of float
+        As for `dome_plan`.
+    poses, spheres : int
+        Poses of the board and places of the sphere, >= 1; a person moves them in between.
+    darks : int
+        Frames with no light at the exposure in use, >= 0.
+    level, iso
+        As for `dome_plan`.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> plan = dome_calibration_plan(load_rig("dome"), "mirror", spheres=2)
+    >>> plan.steps[-1].kind, dict(plan.steps[-1].index)["sphere"], len(plan.steps)
+    ('mirror', 1, 302)
+    """
+    targets = get_args(DomeTarget)
+    require(target in targets, "target", target, f"one of {', '.join(targets)}")
+    require(darks >= 0, "darks", darks, ">= 0")
+    for name, count in (("poses", poses), ("spheres", spheres)):
+        require(count >= 1, name, count, ">= 1")
+    series = _Series(rig, frames_per_s=FRAMES_PER_S, iso=iso)
+    if target == "dark":
+        for number, exposure_s in enumerate(exposures_s):
+            series.darks(8 * darks, exposure_s, number)
+        return series.plan()
+    if target == "charuco":
+        series.darks(darks, exposures_s[0], 0)
+        for pose in range(poses):
+            series.several(f"P{pose:02d}", "charuco", {"pose": pose}, exposures_s[0], level)
+        return series.plan()
+    last = len(exposures_s) - 1
+    series.darks(darks, exposures_s[last], last)
+    order = best_order(rig, dwell_s=series.dwell_s)
+    for sphere in range(spheres if target == "mirror" else 1):
+        for light in order:
+            name = rig.lights[light].name
+            mirror = target == "mirror"
+            index: dict[str, str | int | float] = {"sphere": sphere} if mirror else {}
+            series.add(
+                f"M{sphere}-{name}" if mirror else f"W-{name}", target, {**index, "light": name},
+                exposures_s[last], light=name, level=level,
+            )  # fmt: skip
+    return series.plan()
+
+
+def tracking_lights(rig: Rig) -> list[int]:
+    """Return lights spread over the half of the dome in front of the subject, at most 12.
+
+    Each next one is the farthest from those before it, beginning with the most frontal.
+    """
+    place = np.array([light.position_mm for light in rig.lights], np.float64)
+    place /= np.linalg.norm(place, axis=1)[:, None]
+    front = [k for k in range(len(place)) if place[k, 2] > 0.0] or list(range(len(place)))
+    chosen = [max(front, key=lambda k: place[k, 2])]
+    while len(chosen) < min(TRACKING_LIGHTS, len(front)):
+        nearest = (place[front] @ place[chosen].T).max(axis=1)
+        chosen.append(front[int(np.argmin(nearest))])
+    return sorted(chosen)
+
+
+class _Series:
+    """Steps being numbered, for all views of one dome."""
+
+    def __init__(self, rig: Rig, *, frames_per_s: float, iso: int) -> None:
+        require(rig.leds is not None, "rig", rig.name, "one with LEDs and their limits")
+        require(frames_per_s > 0, "frames_per_s", frames_per_s, "> 0")
+        self._rig = rig
+        self._limits = rig.leds or LedLimits()
+        # the box counts microseconds
+        self.dwell_s = round(1e6 / frames_per_s) / 1e6
+        most_s = self._limits.max_on_s
+        require(
+            self.dwell_s <= most_s, "frames_per_s", frames_per_s, f"at least {1.0 / most_s:g} 1/s"
+        )
+        self._iso = iso
+        self._steps: list[Step] = []
+        self._tracking = tracking_lights(rig)
+        self._eye = eye_light(rig)
+
+    def add(
+        self,
+        identity: str,
+        kind: Kind,
+        index: dict[str, str | int | float],
+        exposure_s: float,
+        **settings: Value,
+    ) -> None:
+        level = float(settings.get("level", 0.0))
+        require(0 <= level <= 1, "level", level, "0 to 1")
+        limits = self._limits
+        # an LED held longer than the duty allows would be refused by the box
+        on_s = limits.max_duty * limits.duty_window_s
+        require(level * self.dwell_s <= on_s, "level x dwell", level * self.dwell_s, f"<= {on_s}")
+        readout_s = max(view.readout_s for view in self._rig.views)
+        room_s = self.dwell_s - limits.settle_s - limits.overlap_s
+        require(
+            exposure_s <= room_s and exposure_s + readout_s <= self.dwell_s,
+            "exposure_s", exposure_s,
+            f"to fit with read-out {readout_s:g} s into {self.dwell_s:g} s a light",
+        )  # fmt: skip
+        cameras = tuple(view.name for view in self._rig.views)
+        every: dict[str, Value] = {
+            "exposure_s": float(exposure_s), "iso": self._iso, "dwell_s": self.dwell_s,
+        }  # fmt: skip
+        self._steps.append(Step(identity, kind, index, {**settings, **every}, cameras))
+
+    def darks(self, count: int, exposure_s: float, number: int) -> None:
+        for repeat in range(count):
+            index: dict[str, str | int | float] = {"repeat": repeat, "exposure": number}
+            identity = f"D{number}-{repeat:02d}"
+            self.add(identity, "dark", index, exposure_s, light="none", level=0.0)
+
+    def tracking(
+        self, number: int, after: int, exposure_s: float, before: int, level: float
+    ) -> None:
+        """Add a tracking frame as bright to the eyes as the light before it, where that suffices.
+
+        So it is no flash among its neighbours.
+        """
+        brightest = level * float(self._eye.max())
+        wanted = max(level * float(self._eye[before]), TRACKING_FLOOR * brightest)
+        self.several(
+            f"T{number}-{after:03d}", "tracking", {"after": after, "exposure": number}, exposure_s,
+            wanted / max(float(self._eye[self._tracking].sum()), 1e-12), number=number,
+        )  # fmt: skip
+
+    def several(
+        self,
+        identity: str,
+        kind: Kind,
+        index: dict[str, str | int | float],
+        exposure_s: float,
+        level: float,
+        number: int | None = None,
+    ) -> None:
+        """Add a step lit by the tracking lights together; ``level`` is cut to what one may give."""
+        limits = self._limits
+        most = min(1.0, limits.max_duty * limits.duty_window_s / self.dwell_s)
+        if kind == "charuco":  # together as bright as one light alone
+            level = level / len(self._tracking)
+        level = min(most, max(1.0, np.ceil(LEVEL_STEPS * level)) / LEVEL_STEPS)
+        names = "+".join(self._rig.lights[k].name for k in self._tracking)
+        index = index if number is None else {**index, "pass": number}
+        self.add(identity, kind, index, exposure_s, leds=names, level=float(level))
+
+    def plan(self) -> Plan:
+        limits = self._limits
+        return Plan(
+            self._rig.name,
+            tuple(self._steps),
+            {
+                "max_duty": limits.max_duty,
+                "max_on_s": limits.max_on_s,
+                "max_flashes_per_s": limits.max_flashes_per_s,
+                "max_flicker_rms": limits.max_flicker_rms,
+                "dose_ws": limits.dose_ws,
+            },
+        )
+
+
+def as_table(rows: Sequence[LedRow]) -> list[tuple[tuple[int, ...], int, int]]:
+    """Return rows as the box counts them: LEDs, level in thousandths, time in us.
+
+    Examples
+    --------
+    >>> as_table([LedRow((3,), 1.0, 0.083333), LedRow((), 0.0, 0.05)])
+    [((3,), 1000, 83333), ((), 0, 50000)]
+    """
+    return [(row.leds, round(LEVEL_STEPS * row.level), round(1e6 * row.dwell_s)) for row in rows]

@@ -1,0 +1,86 @@
+"""How much of each LED's light reaches the subject's eyes, by a cosine model.
+
+An eye is a small plane at its place in the nominal head, facing +z. It receives an LED's intensity
+in its direction times the cosine to +z over the distance squared; what comes from behind does not
+reach it. Lids, pupil and gaze are left out: eyes are taken as open and looking straight ahead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Light, Rig, Vector
+
+EYES_MM: tuple[Vector, Vector] = ((-31.0, 25.0, 80.0), (31.0, 25.0, 80.0))
+"""Corneas of a nominal adult head in the rig frame, mm."""
+
+
+def radiant_intensity(light: Light) -> float:
+    """Return an LED's intensity on its axis at level 1, W/sr.
+
+    Its power is spread over a hemisphere as a power of the cosine off the axis, or over the whole
+    sphere where it shines the same in all directions.
+
+    Examples
+    --------
+    >>> led = Light(name="a", position_mm=(0, 0, 700), radius_mm=3, power_w=1.0,
+    ...             half_intensity_deg=60)
+    >>> round(radiant_intensity(led) * math.pi, 9)
+    1.0
+    """
+    power_w = light.power_w or 0.0
+    if light.half_intensity_deg is None:
+        return power_w / (4.0 * math.pi)
+    exponent = math.log(0.5) / math.log(math.cos(math.radians(light.half_intensity_deg)))
+    return power_w * (exponent + 1.0) / (2.0 * math.pi)
+
+
+def eye_light(
+    rig: Rig, *, eyes_mm: Sequence[Vector] = EYES_MM, facing: Vector = (0.0, 0.0, 1.0)
+) -> NDArray[np.float64]:
+    """Return each light's irradiance at the eyes at level 1, mean of both, W/m^2.
+
+    Parameters
+    ----------
+    rig : Rig
+    eyes_mm : sequence of 3-vectors
+        Where the eyes are, mm, rig frame.
+    facing : 3-vector
+        Where they look, unit length.
+
+    Returns
+    -------
+    ndarray
+        (L,), in the order of ``rig.lights``; 0 for what is behind the eyes.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> dome = load_rig("dome")
+    >>> light = eye_light(dome)
+    >>> front = max(range(150), key=lambda k: dome.lights[k].position_mm[2])
+    >>> bool(light[front] == light.max()), int((light == 0).sum())
+    (True, 68)
+    """
+    places = np.array([light.position_mm for light in rig.lights], np.float64)
+    axes = -places / np.linalg.norm(places, axis=1)[:, None]
+    on_axis = np.array([radiant_intensity(light) for light in rig.lights])
+    total = np.zeros(len(places))
+    for eye in eyes_mm:
+        towards = np.asarray(eye, np.float64) - places
+        distance_mm = np.linalg.norm(towards, axis=1)
+        towards /= distance_mm[:, None]
+        off_axis_rad = np.arccos(np.clip((towards * axes).sum(axis=1), -1.0, 1.0))
+        lobe = np.array(
+            [
+                light.intensity(float(angle))
+                for light, angle in zip(rig.lights, off_axis_rad, strict=True)
+            ]
+        )
+        cosine = np.clip(-(towards @ np.asarray(facing, np.float64)), 0.0, None)
+        total += on_axis * lobe * cosine / (distance_mm * 1e-3) ** 2
+    return total / len(eyes_mm)

@@ -1,0 +1,193 @@
+"""How much the dome's light flickers for the subject's open eyes.
+
+Flashes at 3 Hz or more can provoke seizures in people who are sensitive to light (Harding, Wilkins,
+Erba, Barkley, Fisher 2005, doi:10.1111/j.1528-1167.2005.31305.x); the band reported is 3 to about
+65 Hz. The light at the eyes (`capture.plan.eye_light`) is averaged over 1/65 s, the shortest time
+in which flicker is seen, and two figures are taken of it: opposing pairs of changes of a tenth of
+the maximum, counted in the worst second, and the rms of its 3 to 65 Hz part over its mean.
+These are planning figures, not a medical certificate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.plan.eye_light import eye_light
+from capture.plan.rows import LedRow, led_rows, passes
+from capture.plan.steps import Plan
+from capture.rig import LedLimits, Rig
+
+BAND_HZ = (3.0, 65.0)
+FUSION_HZ = 65.0
+FLASH_SHARE = 0.1
+"""Least change of a flash, of the brightest light of the plan."""
+SAMPLE_S = 1e-3
+REST_S = 1.0
+"""Darkness before and after each piece of a plan."""
+RMS_FROM_S = 2.0
+"""Shorter pieces are judged by their flashes alone: of one flash, any rms over mean is large."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlickerReport:
+    """Figures of the flicker of a plan's worst uninterrupted piece."""
+
+    flashes_per_s: float
+    """Flashes in the worst second."""
+    rms: float
+    """Root mean square of the light of 3 to 65 Hz over its mean; 0 where all pieces are short."""
+    seconds: float
+    """Time of all pieces, s."""
+    mean_w_m2: float
+    """Mean irradiance at the eyes, W/m^2."""
+
+    def within(self, limits: LedLimits) -> bool:
+        """Tell whether open eyes may see this."""
+        return self.flashes_per_s < limits.max_flashes_per_s and self.rms <= limits.max_flicker_rms
+
+
+def eye_signal(
+    rows: Sequence[LedRow], weights: NDArray[np.float64], *, overlap_s: float = 0.0
+) -> NDArray[np.float64]:
+    """Return the light at the eyes, averaged over each `SAMPLE_S`, with rest before and after.
+
+    Parameters
+    ----------
+    rows : sequence of LedRow
+    weights : ndarray
+        (L,) irradiance of each light at level 1, W/m^2.
+    overlap_s : float
+        How long before its row each LED comes on, s.
+
+    Returns
+    -------
+    ndarray
+        (T,), W/m^2.
+    """
+    light = np.array([row.level * float(weights[list(row.leds)].sum()) for row in rows])
+    ends = np.cumsum([row.dwell_s for row in rows])
+    starts = np.concatenate([[0.0], ends[:-1] - overlap_s]) if len(rows) else ends
+    # the integral of each row's light up to t is a ramp from its start to its end
+    count = int(np.ceil((float(ends[-1]) + 2.0 * REST_S) / SAMPLE_S)) if len(rows) else 0
+    edges = np.arange(count + 1) * SAMPLE_S - REST_S
+    times = np.concatenate([starts, ends])
+    slopes = np.concatenate([light, -light])
+    order = np.argsort(times, kind="stable")
+    times, rates = times[order], np.cumsum(slopes[order])
+    held = np.concatenate([[0.0], np.cumsum(rates[:-1] * np.diff(times))])
+    return np.asarray(np.diff(np.interp(edges, times, held)) / SAMPLE_S)
+
+
+def fused(signal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a signal averaged over 1/65 s, as the eye sees it."""
+    width = round(1.0 / FUSION_HZ / SAMPLE_S)
+    return np.convolve(signal, np.full(width, 1.0 / width), mode="same")
+
+
+def count_flashes(signal: NDArray[np.float64], *, least: float) -> float:
+    """Return the most flashes in any second: half the number of turns that differ by ``least``.
+
+    Examples
+    --------
+    >>> on = np.r_[np.zeros(100), np.ones(100)]
+    >>> count_flashes(np.tile(on, 10), least=0.1)
+    5.0
+    """
+    turns: list[int] = []
+    low = high = extreme = float(signal[0]) if signal.size else 0.0
+    rising: bool | None = None
+    for number, value in enumerate(signal.tolist()):
+        if rising is None:
+            low, high = min(low, value), max(high, value)
+            if high - low < least:
+                continue
+            rising, extreme = value == high, value
+            turns.append(number)
+        elif (value - extreme if rising else extreme - value) > 0.0:
+            extreme = value
+        elif abs(value - extreme) >= least:
+            rising, extreme = not rising, value
+            turns.append(number)
+    times = np.array(turns) * SAMPLE_S
+    if times.size == 0:
+        return 0.0
+    inside = np.searchsorted(times, times + 1.0, side="left") - np.arange(times.size)
+    return float(inside.max()) / 2.0
+
+
+def band_rms(signal: NDArray[np.float64]) -> float:
+    """Return the rms of a signal's 3 to 65 Hz part over its mean; 0 for no light.
+
+    Examples
+    --------
+    >>> t = np.arange(10_000) * SAMPLE_S
+    >>> round(band_rms(1.0 + 0.1 * np.sin(2 * np.pi * 12.0 * t)), 6)
+    0.070711
+    """
+    mean = float(signal.mean()) if signal.size else 0.0
+    if mean <= 0.0:
+        return 0.0
+    power = np.abs(np.fft.rfft(signal)) ** 2
+    frequency_hz = np.fft.rfftfreq(signal.size, SAMPLE_S)
+    inside = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
+    return float(np.sqrt(2.0 * power[inside].sum()) / signal.size / mean)
+
+
+def flicker_of_rows(
+    rows: Sequence[LedRow], weights: NDArray[np.float64], *, overlap_s: float = 0.0
+) -> FlickerReport:
+    """Return the figures of rows that follow one another without a pause.
+
+    Parameters
+    ----------
+    rows, weights, overlap_s
+        As for `eye_signal`.
+    """
+    signal = eye_signal(rows, weights, overlap_s=overlap_s)
+    seconds = sum(row.dwell_s for row in rows)
+    if not signal.size or signal.max() <= 0.0:
+        return FlickerReport(0.0, 0.0, seconds, 0.0)
+    rest = round(REST_S / SAMPLE_S)
+    seen = fused(signal)
+    rms = band_rms(signal[rest:-rest]) if seconds >= RMS_FROM_S else 0.0
+    flashes = count_flashes(seen, least=FLASH_SHARE * float(seen.max()))
+    return FlickerReport(flashes, rms, seconds, float(signal[rest:-rest].mean()))
+
+
+def flicker_report(plan: Plan, rig: Rig) -> FlickerReport:
+    """Return the flicker of a plan for open eyes: the worst figures of its pieces.
+
+    Parameters
+    ----------
+    plan : Plan
+        Of the dome.
+    rig : Rig
+        With the lights that the plan names.
+
+    Examples
+    --------
+    >>> from capture.plan.dome import dome_plan
+    >>> from capture.rig import load_rig
+    >>> dome = load_rig("dome")
+    >>> report = flicker_report(dome_plan(dome), dome)
+    >>> report.flashes_per_s <= 1.0, report.within(dome.leds)
+    (True, True)
+    """
+    weights = eye_light(rig)
+    overlap_s = rig.leds.overlap_s if rig.leds is not None else 0.0
+    reports = [
+        flicker_of_rows(led_rows(piece, rig), weights, overlap_s=overlap_s)
+        for piece in passes(plan.steps)
+    ]
+    seconds = sum(report.seconds for report in reports)
+    mean = sum(report.mean_w_m2 * report.seconds for report in reports)
+    return FlickerReport(
+        max(report.flashes_per_s for report in reports),
+        max(report.rms for report in reports),
+        seconds,
+        mean / seconds if seconds else 0.0,
+    )

@@ -1,0 +1,154 @@
+"""In which order the dome's lights are shown, so that open eyes see little flicker.
+
+All orders begin and end where the eyes see least, because a piece of a plan begins and ends dark.
+Which order is best is not decided here by rule but measured, see `best_order`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.plan.eye_light import eye_light
+from capture.plan.flicker import FlickerReport, flicker_of_rows
+from capture.plan.rows import LedRow
+from capture.rig import Rig
+
+BANDS = 6
+"""Bands of eye light within which the path is kept short."""
+
+
+def by_name(rig: Rig) -> list[int]:
+    """Return the lights in the rig's own order."""
+    return list(range(len(rig.lights)))
+
+
+def spiral(rig: Rig) -> list[int]:
+    """Return the lights on a spiral around the vertical axis, from the top down."""
+    place = _directions(rig)
+    turn = np.arctan2(place[:, 0], place[:, 2])
+    ring = np.round(place[:, 1] * 6.0)
+    return [int(k) for k in np.lexsort((turn, -ring))]
+
+
+def nearest(rig: Rig) -> list[int]:
+    """Return a short path through all lights: always on to the nearest, then mended by 2-opt.
+
+    It begins at the light that the eyes see least.
+    """
+    return _path(_directions(rig), list(range(len(rig.lights))), int(np.argmin(eye_light(rig))))
+
+
+def rise_and_fall(rig: Rig) -> list[int]:
+    """Return the lights sorted by what the eyes see: every other one rising, the rest falling."""
+    rising = np.argsort(eye_light(rig), kind="stable")
+    return [int(k) for k in (*rising[::2], *rising[1::2][::-1])]
+
+
+def rise_and_fall_nearby(rig: Rig) -> list[int]:
+    """Return the lights in bands of what the eyes see, rising and falling, each a short path."""
+    place, light = _directions(rig), eye_light(rig)
+    rising = np.argsort(light, kind="stable")
+    legs = [rising[::2], rising[1::2][::-1]]
+    order: list[int] = []
+    for leg in legs:
+        for band in np.array_split(leg, BANDS):
+            rest = [int(k) for k in band]
+            if rest:
+                start = order[-1] if order else rest[0]
+                first = rest[int(np.argmax(place[rest] @ place[start]))]
+                order += _path(place, rest, first)
+    return order
+
+
+ORDERS: Mapping[str, Callable[[Rig], list[int]]] = MappingProxyType(
+    {
+        "name": by_name,
+        "spiral": spiral,
+        "nearest": nearest,
+        "rise and fall": rise_and_fall,
+        "rise and fall, nearby": rise_and_fall_nearby,
+    }
+)
+
+
+def compare_orders(rig: Rig, *, dwell_s: float) -> dict[str, FlickerReport]:
+    """Return the flicker of one pass over all lights in each of the orders.
+
+    Parameters
+    ----------
+    rig : Rig
+    dwell_s : float
+        Time of each light, s.
+    """
+    weights = eye_light(rig)
+    overlap_s = rig.leds.overlap_s if rig.leds is not None else 0.0
+    return {
+        name: flicker_of_rows(
+            [LedRow((k,), 1.0, dwell_s) for k in order(rig)], weights, overlap_s=overlap_s
+        )
+        for name, order in ORDERS.items()
+    }
+
+
+def best_order(rig: Rig, *, dwell_s: float) -> list[int]:
+    """Return the order with the fewest flashes in any second, and of those the least flicker.
+
+    Parameters
+    ----------
+    rig, dwell_s
+        As for `compare_orders`.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> order = best_order(load_rig("dome"), dwell_s=1 / 12)
+    >>> sorted(order) == list(range(150))
+    True
+    """
+    found = compare_orders(rig, dwell_s=dwell_s)
+    best = min(found, key=lambda name: (found[name].flashes_per_s, found[name].rms))
+    return ORDERS[best](rig)
+
+
+def _directions(rig: Rig) -> NDArray[np.float64]:
+    place = np.array([light.position_mm for light in rig.lights], np.float64)
+    return np.asarray(place / np.linalg.norm(place, axis=1)[:, None])
+
+
+def _path(place: NDArray[np.float64], members: list[int], first: int) -> list[int]:
+    """Return a short path through ``members`` from ``first``: greedy, then 2-opt."""
+    rest = [k for k in members if k != first]
+    path = [first] if first in members else []
+    at = first
+    while rest:
+        at = rest[int(np.argmax(place[rest] @ place[at]))]
+        path.append(at)
+        rest.remove(at)
+    return _without_crossings(place, path)
+
+
+def _without_crossings(place: NDArray[np.float64], path: list[int]) -> list[int]:
+    """Reverse parts of a path while that shortens it; its first light stays."""
+    way = np.array(path)
+    for _ in range(20):
+        changed = False
+        for i in range(len(way) - 2):
+            a, b = place[way[i]], place[way[i + 1]]
+            ends = place[way[i + 2 :]]
+            after = np.vstack([place[way[i + 3 :]], np.zeros((1, 3))])
+            # the last light has nothing behind it: reversing up to it saves that step
+            old = np.linalg.norm(a - b) + np.linalg.norm(ends - after, axis=1)
+            new = np.linalg.norm(ends - a, axis=1) + np.linalg.norm(b - after, axis=1)
+            old[-1], new[-1] = np.linalg.norm(a - b), np.linalg.norm(ends[-1] - a)
+            gain = old - new
+            best = int(np.argmax(gain))
+            if gain[best] > 1e-12:
+                way[i + 1 : i + 3 + best] = way[i + 1 : i + 3 + best][::-1]
+                changed = True
+        if not changed:
+            break
+    return [int(k) for k in way]

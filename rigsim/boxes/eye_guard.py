@@ -1,0 +1,140 @@
+"""What the dome's box knows of the subject's eyes: how much its LEDs would flicker for them.
+
+The box judges by itself and with arithmetic of its own, so that a wrong plan on the host cannot
+hide from it: one eye between the subject's two, exact integrals of light that is switched, and
+Fourier sums instead of a transform.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Light
+
+__all__ = ["EyeGuard", "Lit"]
+
+EYE_MM = (0.0, 25.0, 80.0)
+"""Between the eyes of a nominal head, rig frame; it looks along +z."""
+BAND_HZ = (3.0, 65.0)
+BLUR_S = 1.0 / 65.0
+"""Shortest time in which flicker is seen."""
+GRID_S = 2e-3
+FLASH_SHARE = 0.1
+"""Least change of a flash, of the brightest light."""
+RMS_FROM_S = 2.0
+"""Shorter light is judged by its flashes alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lit:
+    """Light of one LED from one time to another, past or to come."""
+
+    led: int
+    """Number of the LED."""
+    level: float
+    """0 to 1."""
+    on_s: float
+    """World time, s."""
+    off_s: float
+    """World time, s."""
+
+
+class EyeGuard:
+    """Flicker at the eyes.
+
+    Parameters
+    ----------
+    lights
+        The LEDs, with their places.
+    """
+
+    def __init__(self, lights: Sequence[Light]) -> None:
+        self.weights = np.array([_at_eye(light) for light in lights])
+
+    def flashes_per_s(self, light: Iterable[Lit]) -> float:
+        """Return the flashes in the worst second: half the turns of a tenth of the brightest."""
+        times, integral = self._integral(light)
+        if times.size == 0:
+            return 0.0
+        grid = np.arange(times[0] - 0.1, times[-1] + 0.1, GRID_S)
+        upper = np.interp(grid + 0.5 * BLUR_S, times, integral)
+        seen = (upper - np.interp(grid - 0.5 * BLUR_S, times, integral)) / BLUR_S
+        if seen.max() <= 0.0:
+            return 0.0
+        turns = grid[_turns(seen, FLASH_SHARE * float(seen.max()))]
+        if turns.size == 0:
+            return 0.0
+        within = np.searchsorted(turns, turns + 1.0) - np.arange(turns.size)
+        return float(within.max()) / 2.0
+
+    def rms(self, light: Iterable[Lit]) -> float:
+        """Return the rms of the 3 to 65 Hz part over the mean, from first light to last; or 0."""
+        pulses = [pulse for pulse in light if pulse.off_s > pulse.on_s]
+        if not pulses:
+            return 0.0
+        on = np.array([pulse.on_s for pulse in pulses])
+        off = np.array([pulse.off_s for pulse in pulses])
+        weight = np.array([self.weights[pulse.led] * pulse.level for pulse in pulses])
+        start, span = float(on.min()), float(off.max() - on.min())
+        mean = float((weight * (off - on)).sum()) / span
+        if span < RMS_FROM_S or mean <= 0.0:
+            return 0.0
+        orders = np.arange(math.ceil(BAND_HZ[0] * span), math.floor(BAND_HZ[1] * span) + 1)
+        omega = 2.0 * np.pi * orders / span
+        power = 0.0
+        for part in np.array_split(omega, max(1, omega.size * on.size // 200_000)):
+            turn = np.exp(-1j * np.outer(part, off - start)) - np.exp(
+                -1j * np.outer(part, on - start)
+            )
+            power += float((np.abs((turn @ weight) / (part * span)) ** 2).sum())
+        return math.sqrt(2.0 * power) / mean
+
+    def _integral(self, light: Iterable[Lit]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return times at which light is switched, and the light until then, W s/m^2."""
+        changes: dict[float, float] = {}
+        for pulse in light:
+            step = float(self.weights[pulse.led]) * pulse.level
+            changes[pulse.on_s] = changes.get(pulse.on_s, 0.0) + step
+            changes[pulse.off_s] = changes.get(pulse.off_s, 0.0) - step
+        times = np.array(sorted(changes))
+        rate = np.cumsum([changes[t] for t in times])
+        total = np.concatenate([[0.0], np.cumsum(rate[:-1] * np.diff(times))])
+        return times, total[: times.size]
+
+
+def _at_eye(light: Light) -> float:
+    """Return the irradiance of an LED at level 1 on the eye, W/m^2."""
+    x, y, z = (e - p for e, p in zip(EYE_MM, light.position_mm, strict=True))
+    distance_mm = math.hypot(x, y, z)
+    cosine = max(-z / distance_mm, 0.0)
+    px, py, pz = light.position_mm
+    along = -(x * px + y * py + z * pz) / (distance_mm * math.hypot(px, py, pz))
+    half_rad = math.radians(light.half_intensity_deg or 60.0)
+    order = -math.log(2.0) / math.log(math.cos(half_rad))
+    spread = (order + 1.0) / (2.0 * math.pi) * max(along, 0.0) ** order
+    return (light.power_w or 0.0) * spread * cosine / (1e-3 * distance_mm) ** 2
+
+
+def _turns(values: NDArray[np.float64], least: float) -> list[int]:
+    """Return where a curve has risen, or fallen, by ``least`` since its last turn."""
+    found: list[int] = []
+    low = high = float(values[0])
+    direction = 0
+    for place, value in enumerate(values.tolist()):
+        low, high = min(low, value), max(high, value)
+        if direction <= 0 and value >= low + least:
+            direction, high = 1, value
+            found.append(place)
+        elif direction >= 0 and value <= high - least:
+            direction, low = -1, value
+            found.append(place)
+        if direction > 0:
+            low = high
+        elif direction < 0:
+            high = low
+    return found

@@ -1,0 +1,224 @@
+"""The LEDs of the dome and their driver: switching, heat, duty and dose; sans-I/O."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+
+from capture.devices.wire import Code
+from capture.rig import LedLimits, Light
+
+from .controller import Refused
+from .eye_guard import Lit
+
+__all__ = ["LedBank"]
+
+CLEAR_SHARE = 0.5
+"""Temperature, of the trip's, below which a hot LED may be lit again."""
+
+
+class LedBank:
+    """LEDs that are lit and dark, and what their driver remembers of it.
+
+    Parameters
+    ----------
+    lights, limits
+        What they are, and what they may do.
+    on_light
+        Called with each stretch of light when it ends: LED, level, start and end in s.
+    dead
+        Numbers of LEDs that draw no current.
+    weak
+        Light of aged LEDs relative to a new one, by number; the driver does not notice.
+    heat
+        Temperature of all at power-up, 0 to 1.
+    """
+
+    def __init__(
+        self,
+        lights: Sequence[Light],
+        limits: LedLimits,
+        *,
+        on_light: Callable[[Lit], None],
+        dead: frozenset[int] = frozenset(),
+        weak: Mapping[int, float] | None = None,
+        heat: float = 0.0,
+    ) -> None:
+        self.limits = limits
+        self.dead = dead
+        self.count = len(lights)
+        self._power_w = np.array([light.power_w or 0.0 for light in lights])
+        self._weak = dict(weak or {})
+        self._on_light = on_light
+        # number -> (level, since, end); a stretch of light that is still going on
+        self._lit: dict[int, tuple[float, float, float]] = {}
+        self._past: dict[int, deque[Lit]] = {}
+        self._heat = np.full(self.count, heat)
+        self._hot = self._heat >= limits.thermal_trip
+        self._heat_at = 0.0
+        self._dose_ws = np.zeros(self.count)
+
+    # now --------------------------------------------------------------------------------------
+
+    @property
+    def lit(self) -> tuple[int, ...]:
+        """Numbers of the LEDs that are on, sorted."""
+        return tuple(sorted(self._lit))
+
+    @property
+    def any_hot(self) -> bool:
+        """Whether the driver has tripped for an LED."""
+        return bool(self._hot.any())
+
+    def dose_ws(self, led: int) -> float:
+        """Return what an LED has sent out to this subject, Ws."""
+        return float(self._dose_ws[led])
+
+    def new_subject(self) -> None:
+        """Begin to count the dose anew."""
+        self._dose_ws[:] = 0.0
+
+    # time -------------------------------------------------------------------------------------
+
+    def deadline(self) -> float:
+        """Return when an LED goes off or its driver trips, in s; inf for never."""
+        due = math.inf
+        trip, tau = self.limits.thermal_trip, self.limits.thermal_tau_s
+        for led, (level, _, end_s) in self._lit.items():
+            due = min(due, end_s)
+            if level > trip:
+                ratio = (level - float(self._heat[led])) / (level - trip)
+                due = min(due, self._heat_at + tau * math.log(max(ratio, 1.0)))
+        return due
+
+    def advance(self, now: float) -> list[int]:
+        """Let time pass up to `now`, at most one deadline; return LEDs that have tripped."""
+        self._heat_until(now)
+        tripped = [k for k in self._lit if self._heat[k] >= self.limits.thermal_trip - 1e-9]
+        for led in tripped:
+            self._hot[led] = True
+        for led in [k for k, (_, _, end_s) in self._lit.items() if end_s <= now]:
+            self.switch_off(led, now)
+        self._hot &= self._heat >= CLEAR_SHARE * self.limits.thermal_trip
+        return tripped
+
+    def _heat_until(self, now: float) -> None:
+        if now <= self._heat_at:
+            return
+        goal = np.zeros(self.count)
+        for led, (level, _, _) in self._lit.items():
+            goal[led] = level
+        fade = math.exp(-(now - self._heat_at) / self.limits.thermal_tau_s)
+        self._heat = goal + (self._heat - goal) * fade
+        self._heat_at = now
+
+    # switching --------------------------------------------------------------------------------
+
+    def switch_on(self, led: int, level: float, now: float, *, end_s: float = math.inf) -> bool:
+        """Light an LED until `end_s`; return False when it draws no current."""
+        self.switch_off(led, now)
+        if led in self.dead:
+            return False
+        if level > 0.0:
+            self._heat_until(now)
+            self._lit[led] = (level, now, end_s)
+        return True
+
+    def switch_off(self, led: int, now: float) -> None:
+        """Put an LED out."""
+        if led not in self._lit:
+            return
+        self._heat_until(now)
+        level, since, _ = self._lit.pop(led)
+        if now <= since:
+            return
+        self._dose_ws[led] += self._power_w[led] * level * (now - since)
+        self._past.setdefault(led, deque(maxlen=256)).append(Lit(led, level, since, now))
+        self._on_light(Lit(led, level * self._weak.get(led, 1.0), since, now))
+
+    def all_off(self, now: float) -> None:
+        """Put every LED out."""
+        for led in list(self._lit):
+            self.switch_off(led, now)
+
+    def going_on(self, now: float) -> list[Lit]:
+        """Return the stretches of light that have not ended, as given so far."""
+        return [
+            Lit(led, level * self._weak.get(led, 1.0), since, max(now, since))
+            for led, (level, since, _) in self._lit.items()
+        ]
+
+    # what is asked for ------------------------------------------------------------------------
+
+    def since(self, start_s: float) -> list[Lit]:
+        """Return light driven after `start_s` and, to its end, what is still going on."""
+        past = [pulse for row in self._past.values() for pulse in row if pulse.off_s > start_s]
+        still = [Lit(led, level, on, end) for led, (level, on, end) in self._lit.items()]
+        return past + [pulse for pulse in still if math.isfinite(pulse.off_s)]
+
+    def require(self, wanted: Iterable[Lit], now: float) -> tuple[float, float, float]:
+        """Return most duty, heat and dose (Ws) with `wanted` light; refuse what is too much."""
+        limits = self.limits
+        rows: dict[int, list[Lit]] = {}
+        for pulse in wanted:
+            rows.setdefault(pulse.led, []).append(pulse)
+        most_duty = most_heat = most_dose = 0.0
+        self._heat_until(now)
+        for led, new in rows.items():
+            if self._hot[led]:
+                raise Refused(Code.THERMAL, f"LED {led}, wait until it has cooled")
+            duty = self._duty(led, new, now)
+            if duty > limits.max_duty + 1e-9:
+                raise Refused(Code.DUTY, f"LED {led}, {duty:.3f} over {limits.duty_window_s:g} s")
+            heat = self._heat_after(led, new, now)
+            if heat >= limits.thermal_trip:
+                raise Refused(Code.THERMAL, f"LED {led} would reach {heat:.2f}")
+            give = sum(pulse.level * (pulse.off_s - pulse.on_s) for pulse in new)
+            dose = float(self._dose_ws[led] + self._power_w[led] * give)
+            if dose > limits.dose_ws:
+                raise Refused(Code.LIGHT_DOSE, f"LED {led}, {dose:.2f} of {limits.dose_ws:g} Ws")
+            most_duty, most_heat = max(most_duty, duty), max(most_heat, heat)
+            most_dose = max(most_dose, dose)
+        return most_duty, most_heat, most_dose
+
+    def _duty(self, led: int, new: Sequence[Lit], now: float) -> float:
+        """Return the most mean level of an LED in any window that ends in `new` light."""
+        window = self.limits.duty_window_s
+        past = [pulse for pulse in self._past.get(led, ()) if pulse.off_s > now - window]
+        if led in self._lit and self._lit[led][1] < now:
+            # what goes on is replaced by what is asked for, but what it has given counts
+            past.append(Lit(led, self._lit[led][0], self._lit[led][1], now))
+        pulses = sorted([*past, *new], key=lambda pulse: pulse.on_s)
+        ends = sorted(pulse.off_s for pulse in pulses)
+        # the mean is greatest where light ends, or where a window's far edge leaves darkness
+        edges = {pulse.off_s for pulse in new}
+        edges |= {pulse.on_s + window for pulse in pulses} | {
+            pulse.off_s + window for pulse in past
+        }
+        last, first = max(pulse.off_s for pulse in new), min(pulse.on_s for pulse in new)
+        most = 0.0
+        for end in edges:
+            if not first < end <= last:
+                continue
+            begin = bisect_right(ends, end - window)
+            total = sum(
+                pulse.level * max(0.0, min(pulse.off_s, end) - max(pulse.on_s, end - window))
+                for pulse in pulses[begin:]
+                if pulse.on_s < end
+            )
+            most = max(most, total / window)
+        return most
+
+    def _heat_after(self, led: int, new: Sequence[Lit], now: float) -> float:
+        """Return the highest temperature that an LED will reach."""
+        heat, at, most = float(self._heat[led]), now, 0.0
+        for pulse in sorted(new, key=lambda pulse: pulse.on_s):
+            heat *= math.exp(-max(0.0, pulse.on_s - at) / self.limits.thermal_tau_s)
+            fade = math.exp(-(pulse.off_s - pulse.on_s) / self.limits.thermal_tau_s)
+            heat = pulse.level + (heat - pulse.level) * fade
+            at, most = pulse.off_s, max(most, heat)
+        return most
