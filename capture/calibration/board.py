@@ -1,0 +1,374 @@
+"""Chessboards and ChArUco boards: found in images, and one camera's lens from them."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration.record import CalibrationError
+
+__all__ = [
+    "Board",
+    "BoardError",
+    "Intrinsics",
+    "Pattern",
+    "Sighting",
+    "calibrate_intrinsics",
+    "find_board",
+    "find_markers",
+    "gray8",
+]
+
+logger = logging.getLogger(__name__)
+
+FloatArray = NDArray[np.float64]
+Pattern: TypeAlias = tuple[str, int, int] | tuple[str, int, int, str]
+
+MARKER_SHARE = 0.75  # side of a marker over that of a square, as most boards are printed
+LEAST_CORNERS = 6  # of a board in an image: fewer fix its place badly
+LEAST_IMAGES = 3
+REFINE_SHARE = 0.35  # half window of corner refinement over the distance of neighbours
+REFINE_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
+
+
+class BoardError(CalibrationError):
+    """Images or a board from which no camera can be calibrated; the message names them."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat board of squares; x right, y down as seen from its front, z into it.
+
+    Attributes
+    ----------
+    kind : {"chessboard", "charuco"}
+        Plain, or with a marker in every white square.
+    columns, rows : int
+        Inner corners of a chessboard, squares of a ChArUco board.
+    square_mm : float
+        Side of a square, > 0.
+    marker_mm : float
+        Side of a marker.
+    dictionary : str
+        ArUco dictionary by OpenCV's name without its prefix, such as "4X4_50".
+    """
+
+    kind: Literal["chessboard", "charuco"]
+    columns: int
+    rows: int
+    square_mm: float = 1.0
+    marker_mm: float = 0.0
+    dictionary: str = ""
+
+    @classmethod
+    def of(cls, pattern: Pattern, *, square_mm: float = 1.0) -> Board:
+        """Return the board that a pattern names.
+
+        Parameters
+        ----------
+        pattern : tuple
+            ``("chessboard", inner columns, inner rows)`` or ``("charuco", columns, rows,
+            dictionary)``, the latter in squares; markers have 3/4 of a square's side.
+        square_mm : float
+            Side of a square, > 0.
+
+        Examples
+        --------
+        >>> Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0).points_mm.shape
+        (24, 3)
+        """
+        kind = pattern[0] if pattern else None
+        sizes = {"chessboard": 3, "charuco": 4}
+        if kind not in sizes or len(pattern) != sizes[kind] or min(pattern[1:3]) < 3:
+            raise BoardError(
+                f"pattern: got {pattern!r}, expected ('chessboard', columns, rows) or"
+                " ('charuco', columns, rows, dictionary) with at least 3 columns and rows"
+            )
+        if not 0 < square_mm < np.inf:
+            raise BoardError(f"square_mm: got {square_mm}, expected > 0")
+        dictionary = str(pattern[3]).removeprefix("DICT_") if len(pattern) == 4 else ""
+        if dictionary and not hasattr(cv2.aruco, f"DICT_{dictionary}"):
+            raise BoardError(f"dictionary: got {dictionary!r}, expected one such as '4X4_50'")
+        marker = MARKER_SHARE * square_mm if dictionary else 0.0
+        chosen: Any = kind
+        return cls(chosen, int(pattern[1]), int(pattern[2]), square_mm, marker, dictionary)
+
+    @cached_property
+    def points_mm(self) -> FloatArray:
+        """Inner corners, shape (N, 3), from the board's top left outer corner, z = 0."""
+        if self.kind == "charuco":
+            return np.asarray(self._charuco.getChessboardCorners(), np.float64)
+        y, x = np.mgrid[1 : self.rows + 1, 1 : self.columns + 1]
+        grid = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+        return np.asarray(grid * self.square_mm, np.float64)
+
+    @cached_property
+    def size_mm(self) -> tuple[float, float]:
+        """Width and height."""
+        more = 0 if self.kind == "charuco" else 1
+        return (self.columns + more) * self.square_mm, (self.rows + more) * self.square_mm
+
+    @cached_property
+    def _charuco(self) -> Any:
+        dictionary = cv2.aruco.getPredefinedDictionary(
+            getattr(cv2.aruco, f"DICT_{self.dictionary}")
+        )
+        return cv2.aruco.CharucoBoard(
+            (self.columns, self.rows), self.square_mm, self.marker_mm, dictionary
+        )
+
+    @cached_property
+    def detector(self) -> Any:
+        """OpenCV's detector of a ChArUco board."""
+        return cv2.aruco.CharucoDetector(self._charuco)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """Corners of a target found in an image.
+
+    Attributes
+    ----------
+    ids : ndarray of int64, shape (n,)
+        Indices into the target's points.
+    pixels : ndarray of float64, shape (n, 2)
+        Column and row, px; pixel (0, 0)'s centre is (0, 0).
+    """
+
+    ids: NDArray[np.int64]
+    pixels: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Intrinsics:
+    """One camera's pinhole and lens.
+
+    Attributes
+    ----------
+    matrix : ndarray of float64, shape (3, 3)
+        Focal lengths and principal point, px.
+    distortion : ndarray of float64, shape (5,)
+        k1, k2, p1, p2, k3.
+    image_size : tuple of int
+        Columns and rows.
+    rms_px : float
+        Root mean square distance of the corners to where the fit puts them.
+    stderr : ndarray of float64, shape (9,)
+        Standard errors of fx, fy, cx, cy (px), k1, k2, p1, p2, k3.
+    per_image_px : ndarray of float64, shape (used images,)
+        The same of each image that showed the board.
+    used, missing : tuple of str
+        Names of the images in which the board was and was not found.
+    """
+
+    matrix: FloatArray
+    distortion: FloatArray
+    image_size: tuple[int, int]
+    rms_px: float
+    stderr: FloatArray
+    per_image_px: FloatArray
+    used: tuple[str, ...]
+    missing: tuple[str, ...]
+
+
+def gray8(image: NDArray) -> NDArray[np.uint8]:
+    """Return an image as 8-bit gray, stretched between its 1 % and 99.5 % quantiles.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, uint16 or float, shape (H, W) or (H, W, 3)
+        Any linear or display scale. Channels are balanced first, so that a gray target is gray.
+    """
+    values = np.asarray(image)
+    if values.ndim == 3 and values.shape[2] == 3:
+        planes = values.astype(np.float32)
+        level = np.asarray(planes.reshape(-1, 3).mean(axis=0), np.float32)
+        values = (planes / np.where(level > 0, level, np.float32(1))).sum(axis=2)
+    if values.ndim != 2 or min(values.shape, default=0) < 8:
+        raise BoardError(f"image: got shape {np.shape(image)}, expected (H, W) or (H, W, 3)")
+    if values.dtype == np.uint8:
+        return values
+    low, high = np.quantile(values[::2, ::2], [0.01, 0.995])
+    scale = 255.0 / max(float(high) - float(low), 1e-30)
+    scaled = np.clip((values.astype(np.float32) - np.float32(low)) * np.float32(scale), 0, 255)
+    return np.asarray(np.rint(scaled), np.uint8)
+
+
+def find_board(image: NDArray, board: Board) -> Sighting | None:
+    """Find a board's inner corners to a fraction of a pixel.
+
+    Parameters
+    ----------
+    image : ndarray
+        See `gray8`.
+    board : Board
+        What to look for.
+
+    Returns
+    -------
+    Sighting or None
+        At least 6 corners (all of a chessboard's), or None where there is no such board.
+    """
+    gray = gray8(image)
+    if board.kind == "chessboard":
+        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, corners = cv2.findChessboardCorners(gray, (board.columns, board.rows), flags=flags)
+        if not found:
+            return None
+        pixels = np.asarray(corners, np.float64).reshape(-1, 2)
+        return Sighting(np.arange(len(pixels)), _refined(gray, pixels, board))
+    corners, ids, _, _ = board.detector.detectBoard(gray)
+    if ids is None or len(ids) < LEAST_CORNERS:
+        return None
+    number = np.asarray(ids, np.int64).ravel()
+    pixels = np.asarray(corners, np.float64).reshape(-1, 2)
+    if np.linalg.matrix_rank(board.points_mm[number, :2] - board.points_mm[number[0], :2]) < 2:
+        return None  # all on one line of the board
+    return Sighting(number, pixels)
+
+
+def _refined(gray: NDArray[np.uint8], pixels: FloatArray, board: Board) -> FloatArray:
+    grid = pixels.reshape(board.rows, board.columns, 2)
+    gaps = [np.linalg.norm(np.diff(grid, axis=k), axis=-1).min() for k in (0, 1)]
+    half = int(np.clip(REFINE_SHARE * min(gaps), 2, 11))
+    points = pixels.astype(np.float32)
+    cv2.cornerSubPix(gray, points, (half, half), (-1, -1), REFINE_STOP)
+    return points.astype(np.float64)
+
+
+def find_markers(image: NDArray, dictionary: str, ids: Iterable[int]) -> Sighting | None:
+    """Find the corners of single markers.
+
+    Parameters
+    ----------
+    image : ndarray
+        See `gray8`.
+    dictionary : str
+        As of `Board`.
+    ids : iterable of int
+        Numbers of the markers; the k-th of them has the points 4 k to 4 k + 3, clockwise from
+        its top left.
+
+    Returns
+    -------
+    Sighting or None
+        None where fewer than two of the markers are found.
+    """
+    wanted = {number: k for k, number in enumerate(ids)}
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    parameters.cornerRefinementMaxIterations = 60
+    parameters.cornerRefinementMinAccuracy = 1e-3
+    detector = cv2.aruco.ArucoDetector(
+        cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}")), parameters
+    )
+    corners, found, _ = detector.detectMarkers(gray8(image))
+    rows = [
+        (4 * wanted[int(number)] + k, place)
+        for number, square in zip([] if found is None else np.ravel(found), corners, strict=True)
+        if int(number) in wanted
+        for k, place in enumerate(np.asarray(square, np.float64).reshape(4, 2))
+    ]
+    if len(rows) < 8:
+        return None
+    return Sighting(np.array([row[0] for row in rows]), np.array([row[1] for row in rows]))
+
+
+def calibrate_intrinsics(
+    images: Sequence[NDArray | str | Path],
+    *,
+    pattern: Pattern = ("chessboard", 9, 6),
+    square_mm: float = 1.0,
+) -> Intrinsics:
+    """Calibrate one camera's pinhole and lens from images of a flat board.
+
+    Parameters
+    ----------
+    images : sequence of ndarray or path
+        At least 3 that show the board at different tilts, all of one size.
+    pattern : tuple
+        ``("chessboard", inner columns, inner rows)`` or ``("charuco", columns, rows,
+        dictionary)``, see `Board.of`.
+    square_mm : float
+        Side of a square; it does not change the result.
+
+    Returns
+    -------
+    Intrinsics
+        The images without a board are named in ``missing``.
+
+    Raises
+    ------
+    BoardError
+        If fewer than 3 images show the board, or sizes differ.
+
+    References
+    ----------
+    Z. Zhang, "A flexible new technique for camera calibration", doi:10.1109/34.888718; solved by
+    OpenCV, whose standard errors these are.
+    """
+    board = Board.of(pattern, square_mm=square_mm)
+    used: list[str] = []
+    missing: list[str] = []
+    sightings: list[Sighting] = []
+    sizes: dict[str, tuple[int, int]] = {}
+    for k, entry in enumerate(images):
+        name = Path(entry).name if isinstance(entry, str | Path) else f"image {k}"
+        image = _read(entry) if isinstance(entry, str | Path) else entry
+        sizes[name] = (image.shape[1], image.shape[0])
+        sighting = find_board(image, board)
+        if sighting is None:
+            missing.append(name)
+            logger.warning("%s: no %s of %d x %d found", name, *pattern[:3])
+        else:
+            used.append(name)
+            sightings.append(sighting)
+    for (one, a), (other, b) in itertools.pairwise(sizes.items()):
+        if a != b:
+            raise BoardError(
+                f"images: got {a} px of {one} and {b} px of {other}, expected one size"
+            )
+    if len(used) < LEAST_IMAGES:
+        raise BoardError(
+            f"images: the {board.kind} of {board.columns} x {board.rows} was found in"
+            f" {len(used)} of {len(sizes)}, expected at least {LEAST_IMAGES}; not in"
+            f" {', '.join(missing) or 'any, there were none'}"
+        )
+    size = next(iter(sizes.values()))
+    objects = [board.points_mm[s.ids].astype(np.float32) for s in sightings]
+    pixels = [s.pixels.astype(np.float32) for s in sightings]
+    try:
+        rms, matrix, distortion, _, _, errors, _, each = cv2.calibrateCameraExtended(
+            objects, pixels, size, None, None
+        )
+    except cv2.error as exc:
+        raise BoardError(f"images: no camera fits them ({exc}); tilt the board more") from exc
+    found = (matrix, distortion, errors[:9], each)
+    if not all(np.isfinite(values).all() for values in found):
+        raise BoardError("images: no camera fits them; show the board at different tilts")
+    return Intrinsics(
+        np.asarray(matrix, np.float64),
+        np.asarray(distortion, np.float64).ravel()[:5],
+        size,
+        float(rms),
+        np.asarray(errors, np.float64).ravel()[:9],
+        np.asarray(each, np.float64).ravel(),
+        tuple(used),
+        tuple(missing),
+    )
+
+
+def _read(path: str | Path) -> NDArray[np.uint8]:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise BoardError(f"{path}: got no image, expected a JPEG, PNG or TIFF that can be read")
+    return np.asarray(image, np.uint8)
