@@ -78,6 +78,9 @@ class Flash(Protocol):
     def set_analyser(self, angle_deg: float) -> None:
         """Turn the analyser to an angle."""
 
+    def set_sync_delay(self, seconds: float) -> None:
+        """Set the time from the camera line to the pop."""
+
     def set_power(self, power: float) -> None:
         """Set the power, 0 to 1."""
 
@@ -172,12 +175,15 @@ def run_plan(
     box = boxes["flash"]
     check_serials(cameras, [(view.name, view.serial) for view in rig.views])
     _check_limits(plan, box.limits)
+    lag_s = _sync_delay_s(rig, box.limits)
     steps = _steps(session)
     taken = {(record.step_id, record.camera): record.attempt for record in session.frames()}
     counts = {"steps": 0, "frames": 0, "stale": 0, "retakes": 0}
     state: str | None = None
     try:
         box.dark()  # whatever was going on before
+        if "sync_max_us" in box.limits:
+            box.set_sync_delay(lag_s)
         for number, step in enumerate(steps, start=1):
             if interrupted is not None and interrupted():
                 raise Interrupted
@@ -188,7 +194,8 @@ def run_plan(
                     prompt(state)
             if progress is not None:
                 progress(f"{number}/{len(steps)} {step.id} {step.kind} {_index_text(step)}")
-            _take(step, rig, box, cameras, session, taken, clock, counts, run_id)
+            name = f"{run_id}.{number}"
+            _take(step, rig, box, cameras, session, taken, clock, counts, name)
     finally:
         _tear_down(box, cameras)
     return Acquired(**counts)
@@ -228,6 +235,18 @@ def _check_limits(plan: Plan, limits: Mapping[str, Any]) -> None:
             )
 
 
+def _sync_delay_s(rig: Rig, limits: Mapping[str, Any]) -> float:
+    """Return how long after the camera line the box must pop: when the last shutter is open."""
+    lag_s = max((view.shutter_lag_s for view in rig.views), default=0.0)
+    most_s = float(limits.get("sync_max_us", 0.0)) / 1e6
+    if lag_s > most_s:
+        raise AcquisitionError(
+            f"shutter_lag_s: got {lag_s:g} s in the rig file, the box waits {most_s:g} s at most "
+            "from camera line to pop; nothing was fired: every lit frame would be dark"
+        )
+    return lag_s
+
+
 def _take(
     step: Step,
     rig: Rig,
@@ -237,13 +256,13 @@ def _take(
     taken: Mapping[tuple[str, str], int],
     clock: Callable[[], float],
     counts: dict[str, int],
-    run_id: str,
+    name: str,
 ) -> None:
     """Take one step with all its cameras, or none: a step with one bad frame is shot again."""
     refusals: list[str] = []
     for attempt in range(1, MAX_ATTEMPTS + 1):
         try:
-            report, frames, stale = _expose(step, rig, box, cameras, _token(run_id, step, attempt))
+            report, frames, stale = _expose(step, rig, box, cameras, _token(name, attempt, step))
         except (FrameRefused, FrameTimeout, CommandRefused) as error:
             if isinstance(error, CommandRefused) and error.code != Code.HARDWARE:
                 raise
@@ -347,9 +366,9 @@ def _expose(
     return report, frames, stale
 
 
-def _token(run_id: str, step: Step, attempt: int) -> str:
-    """Name one flash: the run, the step and the try, in the 48 characters that a box takes."""
-    return f"{run_id}.{step.id[: MAX_TOKEN - len(run_id) - 4]}.{attempt}"
+def _token(name: str, attempt: int, step: Step) -> str:
+    """Name one flash: run, number in the run, try; then as much of the step as a box takes."""
+    return f"{name}.{attempt}.{step.id}"[:MAX_TOKEN]
 
 
 def _frame_timeout_s(step: Step, view: View) -> float:

@@ -187,6 +187,8 @@ class View:
     """Electrons at ``white_level``, > 0."""
     read_noise_e: float
     """Read noise, electrons rms, >= 0."""
+    shutter_lag_s: float = 0.0
+    """Time from the trigger's edge until the shutter is fully open, s, >= 0."""
 
     def __post_init__(self) -> None:
         checks = Checks(f"View {self.name!r}", RigError)
@@ -209,7 +211,9 @@ class View:
             size = getattr(self, field)
             even = 2 <= size <= MAX_SIDE_PX and size % step == 0
             checks.that(field, size, even, f"2 to {MAX_SIDE_PX}, even for a color filter array")
-        checks.that("readout_s", self.readout_s, 0 <= self.readout_s < math.inf, "seconds >= 0")
+        for field in ("readout_s", "shutter_lag_s"):
+            seconds = getattr(self, field)
+            checks.that(field, seconds, 0 <= seconds < math.inf, "seconds >= 0")
         checks.that("bit_depth", self.bit_depth, 8 <= self.bit_depth <= 16, "8 to 16")
         checks.that("cfa", self.cfa, self.cfa in PATTERNS, f"one of {', '.join(PATTERNS)}")
         checks.that("black_level", self.black_level, self.black_level >= 0, ">= 0")

@@ -7,7 +7,6 @@ forgotten it.
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 from collections.abc import Iterable, Mapping
@@ -148,7 +147,7 @@ class FlashBox:
                 "the addresses"
             )
         self._identity = hello
-        self._limits = self._capabilities()
+        self._limits = self._port.capabilities()
         return hello
 
     @property
@@ -165,16 +164,6 @@ class FlashBox:
     def limits(self) -> Mapping[str, Any]:
         """What the box allows (``SYST:CAP?``), units in the names; read at hello."""
         return self._limits
-
-    def _capabilities(self) -> Mapping[str, Any]:
-        payload = self._port.ask("SYST:CAP?")
-        try:
-            limits = json.loads(wire.unseal(payload))
-        except ValueError as exc:
-            raise self._bad("SYST:CAP?", payload, "sealed JSON") from exc
-        if not isinstance(limits, dict):
-            raise self._bad("SYST:CAP?", payload, "a JSON object")
-        return limits
 
     def identify(self) -> str:
         """Return maker, model, serial number and firmware."""
@@ -266,6 +255,14 @@ class FlashBox:
         """Return the power of the next pop, 0 to 1 of full."""
         return self._number("FLAS:POW?")
 
+    def set_sync_delay(self, seconds: float) -> None:
+        """Set how long after the camera line the flash pops, in s; 0 at power-up."""
+        self._port.ask(f"FLAS:SYNC {_decimal('seconds', seconds * 1e6)}")
+
+    def sync_delay_s(self) -> float:
+        """Return how long after the camera line the flash pops, in s."""
+        return self._number("FLAS:SYNC?") / 1e6
+
     def charge_state(self) -> ChargeState:
         """Tell whether a pop is possible, and when it will be."""
         payload = self._port.ask("FLAS:CHAR?")
@@ -299,7 +296,7 @@ class FlashBox:
             waited_s += pause_s
 
     def fire(self, token: str) -> FlashReport:
-        """Pulse the camera line and pop once.
+        """Pulse the camera line and pop once, after the delay that was set.
 
         A retry on the line never pops twice. After `PortTimeout` or `LinkLost` it is not known
         whether it popped: `last_pop` tells, unless the box has rebooted.

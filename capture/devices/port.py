@@ -14,6 +14,7 @@ import contextlib
 import errno
 import importlib
 import importlib.metadata
+import json
 import logging
 import secrets
 import threading
@@ -52,6 +53,7 @@ log = logging.getLogger(__name__)
 URL_HANDLERS = "capture.urlhandlers"
 READ_SLICE_S = 0.02
 """How long one read waits, in s; longer waits are made of slices."""
+MAX_CAPABILITY_PARTS = 1024
 NOISE_LIMIT_BYTES = 65_536
 """So many bytes without the answer among them end an attempt, whatever the clock says."""
 
@@ -289,6 +291,39 @@ class Port:
         if reply.code != Code.OK:
             raise CommandRefused(text, reply.code, reply.payload)
         return reply.payload
+
+    def capabilities(self) -> dict[str, Any]:
+        """Return what the box allows (``SYST:CAP?``), units in the names.
+
+        It is fetched in short parts: of a long line too few survive a bad cable, and each retry
+        would cost all of it.
+
+        Raises
+        ------
+        BadAnswer
+            Where the parts make no sealed JSON object.
+        """
+        parts: list[str] = []
+        last = "0"
+        while last != "1":
+            payload = self.ask(f"SYST:CAP:PART? {len(parts)}")
+            last, _, part = payload.partition(",")
+            parts.append(part)
+            if last not in ("0", "1") or not part or len(parts) > MAX_CAPABILITY_PARTS:
+                raise self._no_capabilities(payload)
+        text = "".join(parts)
+        try:
+            table = json.loads(wire.unseal(text))
+        except ValueError as exc:
+            raise self._no_capabilities(text) from exc
+        if not isinstance(table, dict):
+            raise self._no_capabilities(text)
+        return table
+
+    def _no_capabilities(self, got: str) -> BadAnswer:
+        return BadAnswer(
+            f"{self.url}: 'SYST:CAP:PART?' gave {got!r}, expected sealed JSON in parts"
+        )
 
     def listen(self, seconds: float) -> list[Event]:
         """Let `seconds` pass on the line and return the events that came, oldest first."""

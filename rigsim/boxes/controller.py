@@ -13,7 +13,7 @@ import json
 import math
 import re
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -22,10 +22,12 @@ import numpy as np
 from capture.devices import wire
 from capture.devices.wire import Code, Event, Reply, Request
 
-__all__ = ["Command", "Controller", "Device", "Refused", "choice", "number", "word"]
+__all__ = ["Command", "Controller", "Device", "Later", "Refused", "choice", "number", "word"]
 
 CACHED_REPLIES = 8
 ERROR_QUEUE = 16
+CAPABILITY_PART = 48
+"""Characters of the limits that one line carries: a short line survives a bad cable."""
 LEASE_MS = (300, 5000)
 DEFAULT_LEASE_MS = 1000
 
@@ -43,6 +45,8 @@ _TEXTS = {
     Code.DUTY: "Duty limit",
     Code.THERMAL: "Too hot",
     Code.RECYCLE: "Recycling",
+    Code.LIGHT_DOSE: "Light dose",
+    Code.FLICKER: "Flicker; SAFE:EYES says whether eyes are safe",
     Code.INTERLOCK: "Interlock open",
     Code.WATCHDOG_TRIPPED: "Watchdog tripped; SYST:ARM first",
     Code.BOOT_CHANGED: "Boot changed; SYST:HELLO? first",
@@ -62,11 +66,21 @@ class Refused(Exception):
 
 
 @dataclass(frozen=True, slots=True)
+class Later:
+    """An act that is under way: it is answered when it is over."""
+
+    at_s: float
+    """When, s, on the world's clock."""
+    outcome: Callable[[], str | Refused]
+    """Payload of the answer, or why there is none; asked for then."""
+
+
+@dataclass(frozen=True, slots=True)
 class Command:
     """One row of a command table."""
 
-    run: Callable[[str, float], str]
-    """(arguments, now in s) -> payload of the answer; raises `Refused`."""
+    run: Callable[[str, float], str | Later]
+    """(arguments, now in s) -> payload of the answer, or when it comes; raises `Refused`."""
     arguments: str = ""
     """What follows the header, as the manual writes it; empty: nothing may follow."""
     armed: bool = False
@@ -106,6 +120,9 @@ class Device(Protocol):
 
     def deadline(self) -> float:
         """Return when the device will next change by itself, in s; inf for never."""
+
+    def take_events(self) -> Iterable[tuple[str, str]]:
+        """Return and forget what the device has to say unasked: name and payload."""
 
 
 class Controller:
@@ -164,6 +181,7 @@ class Controller:
         self._splitter = wire.LineSplitter()
         self._errors: deque[tuple[int, str]] = deque()
         self._replies: deque[tuple[int, str, bytes]] = deque(maxlen=CACHED_REPLIES)
+        self._under_way: tuple[Request, Later] | None = None
         self._events = 0
         self._lease_ms = DEFAULT_LEASE_MS
         self._lease_end = math.inf
@@ -178,23 +196,28 @@ class Controller:
     def deadline(self) -> float:
         """Return when the box will next do something by itself, in s; inf for never."""
         ready = self._ready_at if self._announce else math.inf
-        return min(ready, self._lease_end, self.device.deadline())
+        over = math.inf if self._under_way is None else self._under_way[1].at_s
+        return min(ready, self._lease_end, over, self.device.deadline())
 
     def advance(self, now: float) -> bytes:
         """Let time pass up to `now`, in s, and return what the box says by itself."""
         output = b""
         while (due := self.deadline()) <= now:
             self.device.advance(due)
+            output += self._device_events()
             if self._announce and due >= self._ready_at:
                 self._announce = False
                 output += f"{self.device.model} {self._firmware} ready\n".encode()
                 output += self._event("BOOT", "POWER")
+            if self._under_way is not None and due >= self._under_way[1].at_s:
+                (request, later), self._under_way = self._under_way, None
+                output += self._answer(request, later.outcome(), due)
             if due >= self._lease_end:
                 self._disarm(due)
                 self.tripped = True
                 output += self._event("WDOG:TRIP", str(self._lease_ms))
         self.device.advance(now)
-        return output
+        return output + self._device_events()
 
     def feed(self, data: bytes, now: float) -> bytes:
         """Take bytes from the host at `now`, in s, and return what the box answers."""
@@ -204,7 +227,11 @@ class Controller:
         for line in self._splitter.feed(data):
             answer = self._framed if wire.looks_framed(line) else self._bare
             output += answer(line, now)
+            output += self._device_events()
         return output
+
+    def _device_events(self) -> bytes:
+        return b"".join(self._event(name, text) for name, text in self.device.take_events())
 
     # frames -----------------------------------------------------------------------------------
 
@@ -221,6 +248,8 @@ class Controller:
             refused = Refused(Code.BOOT_CHANGED)
             return wire.encode(Reply(frame.seq, self.boot, refused.code, refused.reason))
         self._renew_lease(now)
+        if self._under_way is not None and self._under_way[0] == frame:
+            return b""  # a retry: the answer comes when the act is over
         for seq, text, answer in self._replies:
             if self._same_request(seq, text, frame):
                 return answer
@@ -229,13 +258,24 @@ class Controller:
                 self._remember(refused)
                 return wire.encode(Reply(frame.seq, self.boot, refused.code, refused.reason))
         try:
-            reply = Reply(frame.seq, self.boot, Code.OK, self._execute(frame.text, now))
+            outcome = self._execute(frame.text, now)
         except Refused as refused:
-            self._remember(refused)
-            reply = Reply(frame.seq, self.boot, refused.code, refused.reason)
+            return self._answer(frame, refused, now)
+        if isinstance(outcome, Later):
+            self._under_way = (frame, outcome)
+            self._renew_lease(now)
+            return b""
+        return self._answer(frame, outcome, now)
+
+    def _answer(self, request: Request, outcome: str | Refused, now: float) -> bytes:
+        if isinstance(outcome, Refused):
+            self._remember(outcome)
+            reply = Reply(request.seq, self.boot, outcome.code, outcome.reason)
+        else:
+            reply = Reply(request.seq, self.boot, Code.OK, outcome)
         self._renew_lease(now)
         answer = wire.encode(reply)
-        self._replies.append((frame.seq, frame.text, answer))
+        self._replies.append((request.seq, request.text, answer))
         return answer
 
     def _bare(self, line: bytes, now: float) -> bytes:
@@ -251,7 +291,7 @@ class Controller:
             return b""
         return f"{payload}\n".encode() if header.endswith("?") else b""
 
-    def _execute(self, text: str, now: float) -> str:
+    def _execute(self, text: str, now: float) -> str | Later:
         header, _, arguments = text.partition(" ")
         command = self.commands.get(header.upper())
         if command is None:
@@ -299,6 +339,11 @@ class Controller:
             "SYST:ERR?": Command(self._error, manual="oldest error and its text, removed"),
             "SYST:HELLO?": Command(self._greet, manual="protocol, kind, serial number, firmware"),
             "SYST:CAP?": Command(self._capable, manual="limits as JSON, with its checksum"),
+            "SYST:CAP:PART?": Command(
+                self._capable_part,
+                "<n>",
+                manual="part n of SYST:CAP?, from 0: 1 for the last, text",
+            ),
             "SYST:WDOG": Command(self._set_lease, "<ms>", manual="lease, 300 to 5000 ms"),
             "SYST:WDOG?": Command(self._get_lease, manual="lease in ms"),
             "SYST:ARM": Command(self._arm, manual="allow light; starts the lease"),
@@ -346,6 +391,13 @@ class Controller:
             **self.device.capabilities(),
         }
         return wire.seal(json.dumps(table, separators=(",", ":"), allow_nan=False))
+
+    def _capable_part(self, arguments: str, now: float) -> str:
+        text = self._capable("", now)
+        last = (len(text) - 1) // CAPABILITY_PART
+        part = int(number(arguments, 0, last, "parts"))
+        start = part * CAPABILITY_PART
+        return f"{int(part == last)},{text[start : start + CAPABILITY_PART]}"
 
     def _set_lease(self, arguments: str, now: float) -> str:
         self._lease_ms = int(number(arguments, LEASE_MS[0], LEASE_MS[1], "ms"))

@@ -1,11 +1,13 @@
 """The flash box: two heads fired together, modelling lamps, a turning analyser, a camera line.
 
 Its manual is its command table (`FlashUnit.commands`) and these rules. A pop takes its share of the
-capacitor's energy; the charger brings it back. ``FLAS:FIRE`` pulses the camera line and pops at the
-same instant. It is refused while the analyser turns (-213), before the tube has recovered (103: the
-recycle time is proportional to the last power), beyond the pops per minute (101), before the charge
-suffices (-213), with the emergency stop open (107), and fails with -240 when the tube does not
-ignite; the camera line has pulsed then, so that frame is dark. Modelling lamps carry their own end,
+capacitor's energy; the charger brings it back. ``FLAS:FIRE`` pulses the camera line and pops. It is
+refused while the analyser turns (-213), before the tube has recovered (103: the recycle time is
+proportional to the last power), beyond the pops per minute (101), before the charge suffices
+(-213), with the emergency stop open (107), and fails with -240 when the tube does not ignite; the
+camera line has pulsed then, so that frame is dark. ``FLAS:SYNC`` sets how long after the camera
+line the tube pops, for cameras whose shutters take time to open; the answer comes after the pop,
+and what makes dark before it prevents it (-240 too). Modelling lamps carry their own end,
 go out before a pop, and their driver trips when too hot (102).
 """
 
@@ -21,7 +23,7 @@ import numpy as np
 
 from capture.devices.wire import Code
 
-from .controller import Command, Refused, choice, number, word
+from .controller import Command, Later, Refused, choice, number, word
 
 __all__ = ["FlashPop", "FlashUnit"]
 
@@ -30,6 +32,8 @@ Polarizer = Literal["parallel", "crossed"]
 MIN_POWER = 1.0 / 256.0
 LAMP_MS = (1.0, 500.0)
 ANALYSER_DEG = (0.0, 180.0)
+SYNC_US = (0.0, 50_000.0)
+"""Delay from camera line to pop; an answer may not keep the line waiting for longer."""
 POP_WINDOW_S = 60.0
 READINGS_DEG: dict[Polarizer, float] = {"parallel": 0.0, "crossed": 90.0}
 
@@ -134,6 +138,8 @@ class FlashUnit:
         self._volt_at = 0.0
         self._last_pop = -math.inf
         self._last_power = 0.0
+        self._coming: tuple[float, str] | None = None  # when the tube will pop, and its token
+        self._outcome: str | Refused = ""
         self.angle_deg = 0.0
         self._settled_at = 0.0
         self.reset(0.0, power_up=True)
@@ -146,6 +152,7 @@ class FlashUnit:
         if power_up:
             self._powered_at = now
         self.power = 1.0
+        self.sync_s = 0.0
         self.polarizer: Polarizer = "parallel"
         self.analyser_deg: float | None = None
         self.last_report = ""
@@ -158,6 +165,8 @@ class FlashUnit:
             "power_max": 1.0,
             "analyser_min_deg": ANALYSER_DEG[0],
             "analyser_max_deg": ANALYSER_DEG[1],
+            "sync_min_us": SYNC_US[0],
+            "sync_max_us": SYNC_US[1],
             "lamp_min_ms": LAMP_MS[0],
             "lamp_max_ms": LAMP_MS[1],
             "recycle_s": self._recycle_s,
@@ -178,6 +187,10 @@ class FlashUnit:
             "FLAS:POL:ANG?": Command(self._get_angle, manual="reading aimed at, degrees"),
             "FLAS:POW": Command(self._set_power, "<share>", manual="power, 1/256 to 1 of full"),
             "FLAS:POW?": Command(self._get_power, manual="power of the next pop"),
+            "FLAS:SYNC": Command(
+                self._set_sync, "<us>", manual="camera line to pop, 0 to 50000 us; 0 at power-up"
+            ),
+            "FLAS:SYNC?": Command(self._get_sync, manual="that delay, us"),
             "FLAS:CHAR?": Command(
                 self._get_charge, manual="charge 0 to 1, ready 0 or 1, ready in ms"
             ),
@@ -201,7 +214,11 @@ class FlashUnit:
     # time -------------------------------------------------------------------------------------
 
     def deadline(self) -> float:
-        """Return when a lamp will go out by itself, in s; inf for never."""
+        """Return when the tube will pop or a lamp go out by itself, in s; inf for never."""
+        pop = math.inf if self._coming is None else self._coming[0]
+        return min(pop, self._lamp_out())
+
+    def _lamp_out(self) -> float:
         if not self._lamp.lit:
             return math.inf
         span = (1.0 - self._lamp.heat) / (1.0 - HEAT_TRIP)
@@ -210,10 +227,14 @@ class FlashUnit:
     def advance(self, now: float) -> None:
         """Let time pass up to `now`, in s."""
         while (due := self.deadline()) <= now:
+            lamp_ends = self._lamp_out() <= due
             self._heat_until(due)
-            if self._lamp.heat >= HEAT_TRIP - 1e-9:
-                self._lamp.hot = True
-            self.go_dark(due)
+            if self._coming is not None and self._coming[0] <= due:
+                self._pop(due)
+            if lamp_ends:
+                if self._lamp.heat >= HEAT_TRIP - 1e-9:
+                    self._lamp.hot = True
+                self._lamps_out(due)
         self._heat_until(now)
         if self._lamp.heat < HEAT_CLEAR:
             self._lamp.hot = False
@@ -224,8 +245,18 @@ class FlashUnit:
         lamp.heat = goal + (lamp.heat - goal) * math.exp(-max(0.0, now - self._now) / LAMP_TAU_S)
         self._now = max(now, self._now)
 
+    def take_events(self) -> tuple[tuple[str, str], ...]:
+        """Return what the box has to say unasked: nothing."""
+        return ()
+
     def go_dark(self, now: float) -> None:
-        """Switch the lamps off."""
+        """Switch the lamps off and prevent a pop that has not come yet."""
+        self._lamps_out(now)
+        if self._coming is not None:
+            self._coming = None
+            self._outcome = Refused(Code.HARDWARE, "made dark before the pop")
+
+    def _lamps_out(self, now: float) -> None:
         if self._lamp.lit:
             self._lamp.lit = False
             self._lamp.end_s = math.inf
@@ -280,6 +311,13 @@ class FlashUnit:
     def _get_power(self, _: str, now: float) -> str:
         return f"{self.power:.8f}"
 
+    def _set_sync(self, arguments: str, now: float) -> str:
+        self.sync_s = number(arguments, *SYNC_US, "us") / 1e6
+        return ""
+
+    def _get_sync(self, _: str, now: float) -> str:
+        return f"{1e6 * self.sync_s:.0f}"
+
     def charge(self, now: float) -> float:
         """Return the energy in the capacitor at `now`, 0 to 1 of a full pop."""
         return self._voltage(now) ** 2
@@ -295,7 +333,9 @@ class FlashUnit:
         need = math.sqrt(self.power)
         gap = (CHARGER_HEADROOM - self._voltage(now)) / (CHARGER_HEADROOM - need)
         full = len(self._pops) == self._pops_per_min
+        coming_s = -math.inf if self._coming is None else self._coming[0] - now
         waits = [
+            (coming_s, Code.IGNORED, "about to pop"),
             (self._settled_at - now, Code.IGNORED, "analyser turning"),
             (self._last_pop + self._recycle_s * self._last_power - now, Code.RECYCLE, "tube"),
             (self._pops[0] + POP_WINDOW_S - now if full else 0.0, Code.DUTY, "pops per minute"),
@@ -307,7 +347,7 @@ class FlashUnit:
         wait_ms = math.ceil(max(0.0, self._wait_for_fire(now)[0]) * 1e3)
         return f"{self.charge(now):.4f},{int(wait_ms == 0)},{wait_ms}"
 
-    def _fire(self, arguments: str, now: float) -> str:
+    def _fire(self, arguments: str, now: float) -> str | Later:
         token = word(arguments)
         if self.interlock:
             raise Refused(Code.INTERLOCK)
@@ -315,10 +355,25 @@ class FlashUnit:
         # a clock of microseconds cannot tell a shorter wait from none
         if wait_s > 1e-6:
             raise Refused(code, f"{why}, {math.ceil(wait_s * 1e3)} ms")
-        self.go_dark(now)
+        self._lamps_out(now)
         self._on_trigger(now)
+        at_s = now + self.sync_s
+        self._coming = (at_s, token)
+        if self.sync_s > 0.0:
+            return Later(at_s, lambda: self._outcome)
+        self._pop(now)
+        if isinstance(self._outcome, Refused):
+            raise self._outcome
+        return self._outcome
+
+    def _pop(self, now: float) -> None:
+        """Let the tube pop as announced, and keep what is to be said of it."""
+        token = "" if self._coming is None else self._coming[1]
+        self._coming = None
+        self._lamps_out(now)
         if self._rng.random() < self._misfire:
-            raise Refused(Code.HARDWARE, "the tube did not ignite")
+            self._outcome = Refused(Code.HARDWARE, "the tube did not ignite")
+            return
         self._volt = math.sqrt(max(0.0, self._voltage(now) ** 2 - self.power))
         self._volt_at = self._last_pop = now
         self._last_power = self.power
@@ -335,7 +390,7 @@ class FlashUnit:
                 str(self.count),
             )
         )
-        return self.last_report
+        self._outcome = self.last_report
 
     def _get_last(self, _: str, now: float) -> str:
         return self.last_report or "NONE"
@@ -355,7 +410,7 @@ class FlashUnit:
         if choice(what, ("ON", "OFF")) == "OFF":
             if length:
                 raise Refused(Code.SYNTAX, "expected OFF")
-            self.go_dark(now)
+            self._lamps_out(now)
             return ""
         span_ms = number(length, *LAMP_MS, "ms")
         if self.interlock:

@@ -1,5 +1,6 @@
 """What every camera must do, over sim:// and over TCP."""
 
+import dataclasses
 import socket
 import sys
 import threading
@@ -88,6 +89,23 @@ def test_a_pop_before_the_shutter_opens_is_not_seen(bench):
     camera.arm(1, Trigger.SOFTWARE)
     camera.fire()
     assert camera.frame(5.0).image.max() == DARK
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.020, 0.030, 0.034, 0.045])
+def test_a_shutter_with_a_lag_sees_the_pop_that_waits_for_it(bench, delay_s):
+    """The shutter is open from 30 to 38 ms after the edge: earlier and later pops are missed."""
+    view = dataclasses.replace(bench.world.rig.views[0], shutter_lag_s=0.030)
+    camera, box = bench.camera(), bench.box()
+    bench.world.camera("cam").view = view
+    box.set_sync_delay(delay_s)
+    assert box.sync_delay_s() == pytest.approx(delay_s)
+    camera.configure(WANT)
+    camera.arm(1, Trigger.EDGE)
+    before = camera.clock_s()
+    report = pop(box)
+    frame, _ = next_frame(camera, seq=0, not_before_s=before, want=WANT, timeout_s=5.0)
+    assert frame.image.max() == (LIT if 0.030 <= delay_s <= 0.038 else DARK)
+    assert report.count == 1
 
 
 def test_frames_are_counted_from_arming(bench):

@@ -25,6 +25,7 @@ MANUAL = {
     "SYST:ERR?": ("SYST:ERR?", False, '0,"No error"'),
     "SYST:HELLO?": ("SYST:HELLO?", False, "1,flash,FL-0001,1.0"),
     "SYST:CAP?": ("SYST:CAP?", False, ANY),
+    "SYST:CAP:PART?": ("SYST:CAP:PART? 0", False, ANY),
     "SYST:WDOG": ("SYST:WDOG 300", False, ""),
     "SYST:WDOG?": ("SYST:WDOG?", False, "1000"),
     "SYST:ARM": ("SYST:ARM", False, ""),
@@ -39,6 +40,8 @@ MANUAL = {
     "FLAS:POL:ANG?": ("FLAS:POL:ANG?", False, "0.000"),
     "FLAS:POW": ("FLAS:POW 0.25", False, ""),
     "FLAS:POW?": ("FLAS:POW?", False, "1.00000000"),
+    "FLAS:SYNC": ("FLAS:SYNC 20000", False, ""),
+    "FLAS:SYNC?": ("FLAS:SYNC?", False, "0"),
     "FLAS:CHAR?": ("FLAS:CHAR?", False, "1.0000,1,0"),
     "FLAS:FIRE": ("FLAS:FIRE a1", True, "a1,1000000,1.00000000,PAR,0.000,1"),
     "FLAS:LAST?": ("FLAS:LAST?", False, "NONE"),
@@ -144,7 +147,7 @@ BAD_NUMBERS = ["x", "1e3", "nan", "inf", "-", "1.", ".5", "0x10", "1,2", "999999
 
 
 @pytest.mark.parametrize("text", BAD_NUMBERS)
-@pytest.mark.parametrize("header", ["SYST:WDOG", "FLAS:POL:ANG", "FLAS:POW"])
+@pytest.mark.parametrize("header", ["SYST:WDOG", "FLAS:POL:ANG", "FLAS:POW", "FLAS:SYNC"])
 def test_what_is_no_plain_number_is_a_syntax_error(bench, header, text):
     assert bench.code(f"{header} {text}") == Code.SYNTAX
 
@@ -153,6 +156,7 @@ def test_what_is_no_plain_number_is_a_syntax_error(bench, header, text):
     "text",
     [
         "SYST:WDOG 299", "SYST:WDOG 5001", "FLAS:POL:ANG -0.1", "FLAS:POL:ANG 180.1",
+        "FLAS:SYNC -1", "FLAS:SYNC 50001", "SYST:CAP:PART? -1", "SYST:CAP:PART? 99",
         "FLAS:POW 0", "FLAS:POW 1.000001", "FLAS:LAMP ON,0", "FLAS:LAMP ON,501",
     ],
 )  # fmt: skip
@@ -182,6 +186,7 @@ def test_settings_are_read_back(bench):
     for text, query, payload in [
         ("FLAS:POL CROS", "FLAS:POL?", "CROS"), ("FLAS:POL CROS", "FLAS:POL:ANG?", "90.000"),
         ("FLAS:POL:ANG 30", "FLAS:POL:ANG?", "30.000"), ("FLAS:POW 0.5", "FLAS:POW?", "0.50000000"),
+        ("FLAS:SYNC 12500", "FLAS:SYNC?", "12500"), ("*RST", "FLAS:SYNC?", "0"),
         ("SYST:WDOG 500", "SYST:WDOG?", "500"), ("SYST:ARM", "SYST:ARM?", "1"),
         ("SYST:ARM", "STAT?", "49"), ("*RST", "FLAS:POW?", "1.00000000"),
     ]:  # fmt: skip
@@ -196,6 +201,18 @@ def test_the_data_dictionary_carries_its_own_checksum(bench):
     assert limits["recycle_s"] == RIG.recycle_s
     assert limits["pops_per_min"] == RIG.max_pops_per_min
     assert (limits["lease_min_ms"], limits["lease_max_ms"]) == (300, 5000)
+    assert (limits["sync_min_us"], limits["sync_max_us"]) == (0, 50_000)
+
+
+def test_the_parts_of_the_data_dictionary_make_the_whole_in_short_lines(bench):
+    parts, last = [], "0"
+    while last == "0":
+        line = bench.raw(bench.frame(f"SYST:CAP:PART? {len(parts)}")).rstrip()
+        assert len(line) < 80
+        last, _, part = wire.decode(line).payload.partition(",")
+        parts.append(part)
+    assert "".join(parts) == bench.ask("SYST:CAP?")
+    assert len(parts) > 3
 
 
 # protocol -------------------------------------------------------------------------------------
@@ -420,6 +437,95 @@ def test_an_open_emergency_stop_forbids_light():
     assert bench.code("FLAS:FIRE a") == Code.INTERLOCK
     assert bench.code("FLAS:LAMP ON,10") == Code.INTERLOCK
     assert int(bench.ask("STAT?")) & 256
+
+
+# X-sync ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def edges(bench):
+    """Times of the pulses on the camera line."""
+    seen = []
+    bench.unit._on_trigger = seen.append
+    return seen
+
+
+def later(bench, text, seconds):
+    """Send a command and return all that the box says up to `seconds` later."""
+    said = bench.raw(bench.frame(text))
+    bench.now += seconds
+    return [wire.decode(line) for line in (said + bench.box.advance(bench.now)).splitlines()]
+
+
+@pytest.mark.parametrize("delay_us", [1, 12_500, 50_000])
+def test_the_pop_comes_the_set_time_after_the_camera_line_and_is_reported_then(
+    bench, edges, delay_us
+):
+    bench.ask(f"FLAS:SYNC {delay_us}")
+    bench.ask("SYST:ARM")
+    assert bench.raw(bench.frame("FLAS:FIRE a")) == b""
+    assert bench.box.advance(1.0 + 0.999e-6 * delay_us) == b""
+    assert (edges, bench.world.pops) == ([1.0], [])
+    reply = wire.decode(bench.box.advance(1.0 + 1e-6 * delay_us).rstrip())
+    assert reply.payload == f"a,{1_000_000 + delay_us},1.00000000,PAR,0.000,1"
+    assert [pop.t_s for pop in bench.world.pops] == [pytest.approx(1.0 + 1e-6 * delay_us)]
+
+
+def test_a_retry_before_a_delayed_pop_is_answered_once_after_it(bench, edges):
+    bench.ask("FLAS:SYNC 40000")
+    bench.ask("SYST:ARM")
+    frame = bench.frame("FLAS:FIRE a")
+    assert bench.raw(frame) == bench.raw(b"\n" + frame) == b""
+    bench.now = 1.05
+    (answer,) = bench.box.advance(bench.now).splitlines()
+    assert bench.raw(frame).rstrip() == answer
+    assert (edges, bench.unit.count) == ([1.0], 1)
+
+
+@pytest.mark.parametrize("word", ["SAFE", "*RST"])
+def test_what_makes_dark_before_a_delayed_pop_prevents_it(bench, edges, word):
+    bench.ask("FLAS:SYNC 40000")
+    bench.ask("SYST:ARM")
+    fire = bench.frame("FLAS:FIRE a")
+    bench.raw(fire)
+    bench.now = 1.02
+    bench.ask(word)
+    bench.now = 1.2
+    reply = wire.decode(bench.box.advance(bench.now).rstrip())
+    assert reply.code == Code.HARDWARE
+    assert (edges, bench.world.pops, bench.unit.count) == ([1.0], [], 0)
+    assert wire.decode(bench.raw(fire).rstrip()) == reply
+
+
+def test_no_second_pop_begins_while_one_is_coming(bench, edges):
+    bench.ask("FLAS:SYNC 40000")
+    bench.ask("SYST:ARM")
+    bench.raw(bench.frame("FLAS:FIRE a"))
+    bench.now = 1.01
+    assert bench.code("FLAS:FIRE b") == Code.IGNORED
+    ready, wait_ms = bench.ask("FLAS:CHAR?").split(",")[1:]
+    assert (ready, int(wait_ms) - 30 in (0, 1)) == ("0", True)  # rounded up
+    assert edges == [1.0]
+
+
+def test_a_delayed_misfire_is_told_when_it_is_known():
+    bench = Bench(misfire=1.0)
+    bench.ask("FLAS:SYNC 30000")
+    bench.ask("SYST:ARM")
+    (reply,) = later(bench, "FLAS:FIRE a", 0.03)
+    assert (reply.code, bench.world.pops) == (Code.HARDWARE, [])
+
+
+def test_a_lamp_lit_before_a_delayed_pop_is_out_when_it_comes(bench):
+    bench.ask("FLAS:SYNC 40000")
+    bench.ask("SYST:ARM")
+    bench.raw(bench.frame("FLAS:FIRE a"))
+    bench.now = 1.01
+    bench.ask("FLAS:LAMP ON,500")
+    bench.now = 1.1
+    bench.box.advance(bench.now)
+    assert bench.unit.lamp_times[-1] == pytest.approx((1.01, 1.04))
+    assert bench.unit.count == 1
 
 
 # lamps ----------------------------------------------------------------------------------------

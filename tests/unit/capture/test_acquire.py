@@ -14,7 +14,7 @@ from capture.devices.camera import (
     WrongCamera,
 )
 from capture.devices.port import LinkLost
-from capture.plan import flash_plan
+from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
 from capture.session import Session, Subject, verify
 
@@ -38,6 +38,9 @@ class Box:
 
     def set_analyser(self, angle_deg):
         self.polarizer = "other"
+
+    def set_sync_delay(self, seconds):
+        self.log.append(f"sync {seconds:g}")
 
     def set_power(self, power):
         self.power = power
@@ -156,6 +159,31 @@ def test_a_step_without_its_frame_is_shot_again_with_a_new_token(plan, session, 
     assert len(shots) == len(set(shots)) == 5
 
 
+def test_no_two_flashes_bear_one_token_though_steps_are_named_alike(plan, session, tmp_path):
+    log = []
+    with pytest.raises(LinkLost):
+        run(plan, session, Box(log, fail_at=3), Camera())
+    run(plan, session, Box(log), Camera())
+    tokens = [entry.split()[1] for entry in log if entry.startswith("fire")]
+    assert len(set(tokens)) == len(tokens) == 4
+    assert all(len(token) <= 48 for token in tokens)
+
+
+def test_a_token_fits_the_box_however_long_the_steps_name_is(tmp_path):
+    steps = tuple(
+        dataclasses.replace(step, id="S" * 63 + str(k))
+        for k, step in enumerate(flash_plan(RIG, darks=0).steps)
+    )
+    plan, log = Plan(RIG.name, steps), []
+    with Session.create(
+        tmp_path / "s", plan=plan, rig=RIG, devices={}, subject=Subject("p"), source="measured"
+    ) as session:
+        run(plan, session, Box(log), Camera())
+    tokens = [entry.split()[1] for entry in log if entry.startswith("fire")]
+    assert all(len(token) <= 48 for token in tokens)
+    assert len(set(tokens)) == len(tokens) == 2
+
+
 def test_a_step_that_keeps_failing_ends_dark_with_what_was_captured(plan, session):
     log = []
     with pytest.raises(AcquisitionError, match=r"failed 3 times.*--resume"):
@@ -179,6 +207,34 @@ def test_an_interrupt_ends_dark(plan, session):
     with pytest.raises(Interrupted):
         run(plan, session, Box(log), Camera(), interrupted=lambda: len(log) > 2)
     assert log[-1] == "dark"
+
+
+def with_lag(seconds):
+    return dataclasses.replace(RIG, views=(dataclasses.replace(VIEW, shutter_lag_s=seconds),))
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.025])
+def test_the_flash_waits_for_the_shutter_that_the_rig_file_describes(plan, session, lag_s):
+    box = Box([])
+    box.limits = {"power_max": 1.0, "sync_max_us": 50_000}
+    camera = Camera()
+    box.line = [camera]
+    run_plan(plan, with_lag(lag_s), boxes={"flash": box}, cameras={"cam": camera}, session=session)
+    # also a delay of 0 is set: a run before may have left another
+    assert [entry for entry in box.log if "sync" in entry] == [f"sync {lag_s:g}"]
+
+
+@pytest.mark.parametrize("limits", [{}, {"sync_max_us": 20_000}])
+def test_a_shutter_slower_than_the_box_waits_is_refused_before_a_frame_is_dark(
+    plan, session, limits
+):
+    box = Box([])
+    box.limits = {"power_max": 1.0, **limits}
+    with pytest.raises(AcquisitionError, match=r"shutter_lag_s.*nothing was fired"):
+        run_plan(
+            plan, with_lag(0.025), boxes={"flash": box}, cameras={"cam": Camera()}, session=session
+        )
+    assert box.log == []
 
 
 def test_a_plan_beyond_the_boxs_limits_is_refused_before_anything_flashes(plan, session):
