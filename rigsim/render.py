@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from capture.rig import View
 from rigsim.atlas import BoolArray, interpolate
+from rigsim.dome_build import unbend
 from rigsim.mesh import Float32Array, Int32Array, Mesh
 from rigsim.variant import Kind, VariantChoice, choose_variant
 
@@ -151,9 +152,13 @@ class Caster:
 
 
 def camera_rays(
-    view: View, *, subpixels: int = 1, rows: tuple[int, int] | None = None
+    view: View,
+    *,
+    subpixels: int = 1,
+    rows: tuple[int, int] | None = None,
+    distortion: ArrayLike | None = None,
 ) -> tuple[Float32Array, Float32Array]:
-    """Return the rays of a pinhole camera through its pixels or a regular grid inside them.
+    """Return the rays of a camera through its pixels or a regular grid inside them.
 
     Parameters
     ----------
@@ -163,6 +168,8 @@ def camera_rays(
         Rays along each side of a pixel.
     rows
         First row and the one after the last; ``None`` takes all.
+    distortion
+        k1, k2, p1, p2, k3 of the lens, see `rigsim.dome_build`; ``None`` for a pinhole.
 
     Returns
     -------
@@ -177,6 +184,13 @@ def camera_rays(
     x = (np.arange(view.width_px * k) + 0.5) / k - 0.5 - 0.5 * (view.width_px - 1)
     first, last = (0, view.height_px) if rows is None else rows
     y = (np.arange(first * k, last * k) + 0.5) / k - 0.5 - 0.5 * (view.height_px - 1)
+    if distortion is not None and np.any(distortion):
+        slopes = np.stack(np.meshgrid(x / view.focal_px, y / view.focal_px), axis=-1)
+        slopes = unbend(slopes, distortion)
+        bent = slopes[..., :1] * right - slopes[..., 1:] * up - back
+        bent /= np.linalg.norm(bent, axis=-1, keepdims=True)
+        directions = bent.astype(np.float32)
+        return np.broadcast_to(np.asarray(view.position_mm, np.float32), bent.shape), directions
     across, down = x[:, None] * right - view.focal_px * back, y[:, None] * up
     # The axes are perpendicular, so a ray's squared length is the sum of three squares.
     length = np.sqrt(x[None, :] ** 2 + y[:, None] ** 2 + view.focal_px**2)
@@ -186,7 +200,12 @@ def camera_rays(
 
 
 def g_buffer(
-    caster: Caster, view: View, *, subpixels: int = 1, rows: tuple[int, int] | None = None
+    caster: Caster,
+    view: View,
+    *,
+    subpixels: int = 1,
+    rows: tuple[int, int] | None = None,
+    distortion: ArrayLike | None = None,
 ) -> GBuffer:
     """Look at a mesh through a camera.
 
@@ -200,13 +219,15 @@ def g_buffer(
         Rays along each side of a pixel; buffers are that much larger.
     rows
         First row of pixels and the one after the last; ``None`` takes all.
+    distortion
+        As for `camera_rays`.
 
     Returns
     -------
     GBuffer
         Point samples; nothing is averaged over a pixel.
     """
-    origins, directions = camera_rays(view, subpixels=subpixels, rows=rows)
+    origins, directions = camera_rays(view, subpixels=subpixels, rows=rows, distortion=distortion)
     shape = directions.shape[:2]
     prim, weight = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
     _close_cracks(caster, origins, directions, prim, weight)

@@ -1,24 +1,23 @@
 """The light dome: LEDs lit one at a time around a face or a target, seen by many cameras.
 
 A camera's rays are traced once and serve all lights (see `rigsim.scenes.olat`). The unit of light
-is fixed by the rig alone: a perfect white diffuser at the rig's origin that faces an LED of
-`METER_LED` gets `METER_RATE_PER_S` of full scale per second in the strongest channel.
+is fixed by the rig alone, see `rigsim.led_light`.
 
 Notes
 -----
 For a camera c and a light l, before noise and vignetting, in fractions of full scale per second of
 on-time at level 1::
 
-    signal = I_l lobe_l(off axis) cos(theta) pi f_r / d^2,    I_l = `DomeScene.intensity(l)`
+    signal = gain_c I_l lobe_l(off axis) cos(theta) pi f_r / d^2,    I_l = `DomeScene.intensity(l)`
 
-averaged over the LED's disc and over the pixel. Positions and powers of the lights are those of the
-rig that is given: to simulate a dome that differs from its plan, give the dome as it is built.
+averaged over the pixel, and over the LED's disc where it casts shadows. A dome stands as its
+drawing says, or as it was built (`rigsim.dome_build`): with other places and powers, bent images,
+responses that differ, dead LEDs and crossed wires.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Final, Protocol
@@ -31,7 +30,9 @@ from model import spectra
 from model.skin import UNITS, SkinAppearance, SkinMap
 from rigsim import surface_brdf
 from rigsim.atlas import sample, spread, unwrap
+from rigsim.dome_build import BuiltDome
 from rigsim.head_motion import HeadMotion
+from rigsim.led_light import lobe_exponent, white_intensity
 from rigsim.mesh import Float32Array
 from rigsim.render import Caster, GBuffer
 from rigsim.scenes import olat
@@ -41,13 +42,6 @@ from rigsim.subject import Subject
 from rigsim.surface_brdf import SkinSurface, skin_surface
 from rigsim.targets import Target
 from rigsim.variant import VariantChoice
-
-METER_RATE_PER_S: Final = 24.0
-"""Full scales per second of the white reference in its strongest channel. Pale skin that faces the
-LED then takes 60 ms for 0.8 of full scale, as long as 300 pictures in 25 s leave."""
-
-METER_LED: Final = (1.0, 40.0, 700.0)
-"""Power in W, half-intensity angle in degrees and distance in mm of the LED that defines it."""
 
 POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of an LED's energy from pulse to pulse."""
@@ -89,9 +83,11 @@ class DomeScene:
     Parameters
     ----------
     rig
-        The dome; its lights must share one spectrum and be LEDs.
+        The drawing of the dome; its lights must share one spectrum and be LEDs.
     subject
-        A face or a target.
+        A face or a target (for the dome's own targets see `rigsim.scenes.dome_targets`).
+    dome
+        The dome as it stands; ``None`` stands as drawn.
     motion
         How the head moves; ``None`` holds it still. Targets stand still.
     sensor
@@ -113,6 +109,7 @@ class DomeScene:
         rig: Rig,
         subject: Subject | Target,
         *,
+        dome: BuiltDome | None = None,
         motion: HeadMotion | None = None,
         sensor: Sensor | None = None,
         seed: int = 0,
@@ -131,7 +128,11 @@ class DomeScene:
                 raise SceneError(f"light {light.name!r}: is no LED, it has no power_w")
         if subpixels < 1:
             raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
-        self.rig = rig
+        if dome is None:
+            axes = np.array([_toward_origin(light) for light in rig.lights])
+            dome = BuiltDome(rig, rig, axes)
+        self.dome = dome
+        self.rig = dome.rig
         self.subject = subject
         self.motion = motion
         self.seed = seed
@@ -180,12 +181,16 @@ class DomeScene:
         return np.asarray(white / white.max(), np.float32)
 
     def intensity(self, light: int, *, view_name: str | None = None) -> Float32Array:
-        """Return I_l of the module's equation, full scales per second times mm^2, shape (3,)."""
+        """Return I_l of the module's equation, full scales per second times mm^2, shape (3,).
+
+        See Also
+        --------
+        rigsim.led_light.white_intensity : the unit; a dead light has none.
+        """
         led = self.rig.lights[light]
-        power, half, distance_mm = METER_LED
-        unit = power * _per_steradian(_exponent(half)) / distance_mm**2
-        strength = float(led.power_w or 0.0) * _per_steradian(_exponent(led.half_intensity_deg))
-        return np.float32(METER_RATE_PER_S * strength / unit) * self.white_rgb(view_name)
+        if led.name in self.dome.dead:
+            return np.zeros(3, np.float32)
+        return white_intensity(led, self._view(view_name)).astype(np.float32)
 
     def sensor(self, view_name: str | None = None) -> Sensor:
         """Return the sensor of a view."""
@@ -254,7 +259,8 @@ class DomeScene:
             energy = on_s * (1.0 + POWER_DEVIATION * rng.standard_normal())
             if energy > 0.0:
                 middle = 0.5 * (pulse.t_on_s + pulse.t_off_s)
-                light += np.float32(energy) * self._frame(view, pulse.led, middle)
+                led = self.dome.answering(pulse.led)
+                light += np.float32(energy) * self._frame(view, led, middle)
         return expose(light, sensor=self._sensors[view.name], rng=rng, exposure_s=exposure_s)
 
     # truth ------------------------------------------------------------------------------------
@@ -432,9 +438,10 @@ class DomeScene:
         if isinstance(self.subject, Target) and self.subject.kind == "cap":
             return np.zeros(shape, np.float32)
         hits, caster = self._seen(view, t_s)
-        lamp = self._lamp(self.rig.lights[light], t_s)
+        lamp = self._lamp(light, t_s)
         image = olat.light_up(hits, lamp, olat.seen_from(hits, caster, lamp))
         image *= self.intensity(light, view_name=view.name)
+        image *= np.float32(self.dome.gain.get(view.name, 1.0))
         return image
 
     def _pose(self, t_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -442,15 +449,15 @@ class DomeScene:
             return np.eye(3), np.zeros(3)
         return self.motion.pose(t_s)
 
-    def _lamp(self, light: Light, t_s: float) -> Lamp:
+    def _lamp(self, light: int, t_s: float) -> Lamp:
         """Return a light in the frame of the mesh."""
         rotation, shift = self._pose(t_s)
-        place = np.asarray(light.position_mm)
+        led = self.rig.lights[light]
         return Lamp(
-            position_mm=(place - shift) @ rotation,
-            axis=-place / float(np.linalg.norm(place)) @ rotation,
-            exponent=_exponent(light.half_intensity_deg),
-            radius_mm=light.radius_mm,
+            position_mm=(np.asarray(led.position_mm) - shift) @ rotation,
+            axis=self.dome.axis[light] @ rotation,
+            exponent=lobe_exponent(led),
+            radius_mm=led.radius_mm,
         )
 
     def _seen(self, view: View, t_s: float) -> tuple[Hits, Caster]:
@@ -489,7 +496,13 @@ class DomeScene:
             values = sample(texture, uv, np.ones(len(rows), np.bool_))
             return _unit(values[:, 7:]), np.maximum(values[:, :7], 0.0)
 
-        hits = olat.find_hits(caster, moved, look_up, subpixels=self.subpixels)
+        hits = olat.find_hits(
+            caster,
+            moved,
+            look_up,
+            subpixels=self.subpixels,
+            distortion=self.dome.distortion.get(view.name),
+        )
         return hits, caster
 
     def _look_at_target(self, view: View, target: Target) -> Hits:
@@ -509,19 +522,19 @@ class DomeScene:
             return buffers.normal.reshape(-1, 3)[rows], surface
 
         kind = olat.METAL if metal else olat.MATT
-        return olat.find_hits(self._caster, view, look_up, subpixels=self.subpixels, kind=kind)
+        return olat.find_hits(
+            self._caster,
+            view,
+            look_up,
+            subpixels=self.subpixels,
+            kind=kind,
+            distortion=self.dome.distortion.get(view.name),
+        )
 
 
-def _exponent(half_intensity_deg: float | None) -> float:
-    """Return the exponent of the cosine that an LED's intensity follows; -1 for none."""
-    if half_intensity_deg is None:
-        return -1.0
-    return math.log(0.5) / math.log(math.cos(math.radians(half_intensity_deg)))
-
-
-def _per_steradian(exponent: float) -> float:
-    """Return the intensity on the axis of 1 W that follows a power of the cosine."""
-    return 1.0 / (4.0 * math.pi) if exponent < 0.0 else (exponent + 1.0) / (2.0 * math.pi)
+def _toward_origin(light: Light) -> NDArray[np.float64]:
+    place = np.asarray(light.position_mm, np.float64)
+    return np.asarray(-place / np.linalg.norm(place))
 
 
 def _unit(vectors: Float32Array) -> Float32Array:

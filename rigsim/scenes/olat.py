@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from capture.rig import View
 from rigsim.mesh import Float32Array, Int32Array
@@ -51,8 +51,7 @@ class Lamp:
     axis: FloatArray
     """Unit vector in which the disc shines, shape (3,)."""
     exponent: float
-    """Exponent of the cosine off the axis that the intensity follows; below 0: none, the same in
-    all directions."""
+    """Exponent of the cosine off the axis that the intensity follows; nothing shines backwards."""
     radius_mm: float
     """Radius of the disc, 0 for a point."""
 
@@ -133,7 +132,13 @@ def unpack_surface(surface: UInt16Array) -> Float32Array:
 
 
 def find_hits(
-    caster: Caster, view: View, look_up: LookUp, *, subpixels: int, kind: int = SKIN
+    caster: Caster,
+    view: View,
+    look_up: LookUp,
+    *,
+    subpixels: int,
+    kind: int = SKIN,
+    distortion: ArrayLike | None = None,
 ) -> Hits:
     """Trace a camera's rays and keep what they meet.
 
@@ -149,6 +154,8 @@ def find_hits(
         Rays along each side of a pixel.
     kind
         How rows reflect.
+    distortion
+        Of the lens, see `rigsim.render.camera_rays`.
 
     Returns
     -------
@@ -160,7 +167,7 @@ def find_hits(
     parts: list[tuple[NDArray[np.generic], ...]] = []
     for top in range(0, height, band):
         rows = (top, min(top + band, height))
-        buffers = g_buffer(caster, view, subpixels=k, rows=rows)
+        buffers = g_buffer(caster, view, subpixels=k, rows=rows, distortion=distortion)
         # Rows of one pixel stand together: (H, k, W, k) -> (H, W, k, k).
         tall = rows[1] - rows[0]
         grid = np.arange(buffers.mask.size, dtype=np.int32).reshape(tall, k, width, k)
@@ -382,11 +389,10 @@ def _shade(  # type: ignore[no-untyped-def]
             if nl <= 0.0:
                 continue
             strength = nl / squared
-            if exponent >= 0.0:
-                off = -(axis[0] * l0 + axis[1] * l1 + axis[2] * l2)
-                if off <= 0.0:
-                    continue
-                strength *= off**exponent
+            off = -(axis[0] * l0 + axis[1] * l1 + axis[2] * l2)
+            if off <= 0.0:
+                continue
+            strength *= off**exponent
             s0, s1, s2 = surface[i, 0] / FULL, surface[i, 1] / FULL, surface[i, 2] / FULL
             r0, r1, r2 = R_D_LIMIT * s0 * s0, R_D_LIMIT * s1 * s1, R_D_LIMIT * s2 * s2
             if kind == MATT:

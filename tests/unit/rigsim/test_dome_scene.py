@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from capture.rig import Rig, load_rig
+from rigsim.dome_build import BuiltDome, Tolerances, bend, build
 from rigsim.head_motion import MotionError, head_motion
+from rigsim.led_light import METER_RATE_PER_S
 from rigsim.scenes import olat
-from rigsim.scenes.dome import METER_RATE_PER_S, DomeScene, SceneError
+from rigsim.scenes.dome import DomeScene, SceneError
 from rigsim.subject import make_subject
 from rigsim.targets import make_target
 
@@ -86,13 +88,38 @@ def test_white_reference_facing_the_meter_led_gets_the_meter_rate(white):
     np.testing.assert_allclose(middle / middle.max(), white.white_rgb(), rtol=1e-5)
 
 
-def test_half_the_intensity_comes_off_axis_by_the_half_intensity_angle(rig):
-    assert rig.lights[0].half_intensity_deg is not None
-    lamp_cosine = math.cos(math.radians(rig.lights[0].half_intensity_deg))
-    from rigsim.scenes.dome import _exponent
+def test_a_dome_as_built_has_its_own_gains_dead_lights_and_wires(rig, white):
+    axes = np.array([-np.array(light.position_mm) for light in rig.lights])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    built = BuiltDome(
+        rig, rig, axes, gain={"C": 0.5}, dead=frozenset({"top"}), wiring=(1, 0, 2, 3, 4)
+    )
+    scene = DomeScene(rig, make_target("white"), dome=built)
+    every, plain = scene.radiance("C"), white.radiance("C")
+    np.testing.assert_allclose(every[:3], 0.5 * plain[:3], rtol=1e-6)
+    assert not every[3].any()
+    crossed = scene.exposure("C", pops=[Pulse(0, 1.0, 0.0, 0.03)], exposure_s=0.1, seed=1)
+    straight = white.exposure("C", pops=[Pulse(1, 0.5, 0.0, 0.03)], exposure_s=0.1, seed=1)
+    assert (crossed.mean() - 64.0) / (straight.mean() - 64.0) == pytest.approx(1.0, rel=0.01)
 
-    assert lamp_cosine ** _exponent(rig.lights[0].half_intensity_deg) == pytest.approx(0.5)
-    assert _exponent(None) == -1.0
+
+def test_a_bent_image_shows_points_where_the_lens_puts_them(rig, face):
+    """Tolerance: the middle of what a pixel of 3 mm covers, and rows kept as float32."""
+    built = build(rig, seed=2, tolerances=Tolerances(distortion=0.2))
+    scene = DomeScene(rig, face, dome=built)
+    truth, view = scene.truth(), built.rig.views[0]
+    rows, columns = np.nonzero(truth["mask"])
+    offset = truth["position_mm"][rows, columns] - np.array(view.position_mm)
+    right, up, back = (np.array(axis) for axis in view.axes)
+    slopes = np.stack([offset @ right, -(offset @ up)], axis=-1) / -(offset @ back)[:, None]
+
+    def miss(distortion):
+        middle = np.array([(view.width_px - 1) / 2, (view.height_px - 1) / 2])
+        px = bend(slopes, distortion) * view.focal_px + middle
+        return np.abs(px - np.stack([columns, rows], axis=-1)).max()
+
+    assert miss(built.distortion["C"]) < 0.02
+    assert miss(np.zeros(5)) > 0.1
 
 
 def test_light_from_the_right_brightens_the_right_and_from_above_the_top(scene):
@@ -174,15 +201,15 @@ def test_exposures_add_in_on_time_and_level(scene):
 
 
 def test_both_exposures_of_a_light_come_from_the_same_radiance(scene):
-    """Noise aside, 60 ms hold four times the light of 15 ms at every pixel."""
+    """Noise aside, 120 ms hold four times the light of 30 ms at every pixel."""
 
     def mean_frame(on_s):
         pulse = [Pulse(0, 1.0, 0.0, on_s)]
         seeds = range(8)
-        frames = [scene.exposure("C", pops=pulse, exposure_s=0.1, seed=s) for s in seeds]
+        frames = [scene.exposure("C", pops=pulse, exposure_s=0.2, seed=s) for s in seeds]
         return np.mean(frames, axis=0) - 64.0
 
-    long, short = mean_frame(0.06), mean_frame(0.015)
+    long, short = mean_frame(0.12), mean_frame(0.03)
     bright = (long > 400.0) & (long < 3800.0)
     assert bright.sum() > 500
     assert np.median(long[bright] / short[bright]) == pytest.approx(4.0, rel=0.01)
