@@ -1,0 +1,114 @@
+"""Rays against a triangle mesh, by Embree: what a ray meets first, and whether anything bars it."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.floating]
+
+RAYS_PER_CALL: Final = 1 << 20
+"""Rays traced in one call; bounds the memory that a batch takes."""
+
+
+class RayCaster:
+    """Trace rays against one mesh.
+
+    Parameters
+    ----------
+    vertices_mm : array_like, shape (V, 3)
+        Positions in mm.
+    faces : array_like of int, shape (F, 3)
+        Vertex indices.
+
+    Raises
+    ------
+    ValueError
+        Where there is no triangle, an index is out of range, or a position is not finite.
+
+    Examples
+    --------
+    >>> caster = RayCaster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> caster.blocked([[0.2, 0.2, 1.0]], [[0.0, 0.0, -1.0]], [2.0]).tolist()
+    [True]
+    """
+
+    def __init__(self, vertices_mm: ArrayLike, faces: ArrayLike) -> None:
+        vertices = np.ascontiguousarray(vertices_mm, np.float32)
+        triangles = np.ascontiguousarray(faces, np.int32)
+        if triangles.ndim != 2 or triangles.shape[-1] != 3 or not len(triangles):
+            raise ValueError(f"faces: got shape {triangles.shape}, expected (F, 3) with F > 0")
+        if vertices.ndim != 2 or vertices.shape[-1] != 3 or not np.isfinite(vertices).all():
+            raise ValueError(
+                f"vertices_mm: got shape {vertices.shape}, expected (V, 3) finite numbers"
+            )
+        if triangles.min() < 0 or triangles.max() >= len(vertices):
+            raise ValueError(
+                f"faces: got indices {triangles.min()} to {triangles.max()}, "
+                f"expected 0 to {len(vertices) - 1}"
+            )
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
+
+        self._scene: Any = rtcore_scene.EmbreeScene()
+        TriangleMesh(self._scene, vertices, triangles)
+
+    def first_hit(
+        self, origins_mm: ArrayLike, directions: ArrayLike
+    ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """Return the triangle that each ray meets first, and how far away.
+
+        Parameters
+        ----------
+        origins_mm, directions : array_like, shape (N, 3)
+            Start in mm, and unit vector.
+
+        Returns
+        -------
+        triangle : ndarray of int32, shape (N,)
+            -1 for none.
+        distance_mm : ndarray of float32, shape (N,)
+            Infinite for none.
+        """
+        start, way = _pair(origins_mm, directions)
+        triangle = np.full(len(start), -1, np.int32)
+        distance = np.full(len(start), np.inf, np.float32)
+        for at in range(0, len(start), RAYS_PER_CALL):
+            part = slice(at, at + RAYS_PER_CALL)
+            hit = self._scene.run(start[part], way[part], output=True)
+            triangle[part] = hit["primID"]
+            distance[part] = np.where(triangle[part] >= 0, hit["tfar"], np.inf)
+        return triangle, distance
+
+    def blocked(
+        self, origins_mm: ArrayLike, directions: ArrayLike, length_mm: ArrayLike
+    ) -> NDArray[np.bool_]:
+        """Return which rays meet a triangle before their end.
+
+        Parameters
+        ----------
+        origins_mm, directions : array_like, shape (N, 3)
+            Start in mm, and unit vector.
+        length_mm : array_like, shape (N,) or ()
+            Length of each ray, mm.
+        """
+        start, way = _pair(origins_mm, directions)
+        length = np.ascontiguousarray(np.broadcast_to(length_mm, len(start)), np.float32)
+        out = np.zeros(len(start), np.bool_)
+        for at in range(0, len(start), RAYS_PER_CALL):
+            part = slice(at, at + RAYS_PER_CALL)
+            found = self._scene.run(
+                start[part], way[part], dists=length[part].copy(), query="OCCLUDED"
+            )
+            out[part] = np.asarray(found) != -1
+        return out
+
+
+def _pair(origins: ArrayLike, directions: ArrayLike) -> tuple[Floats, Floats]:
+    start = np.ascontiguousarray(origins, np.float32)
+    way = np.ascontiguousarray(directions, np.float32)
+    if start.shape != way.shape or start.ndim != 2 or start.shape[1] != 3:
+        raise ValueError(f"rays: got shapes {start.shape} and {way.shape}, expected (N, 3) twice")
+    return start, way
