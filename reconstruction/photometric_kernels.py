@@ -168,16 +168,18 @@ def _noise(q, count):  # type: ignore[no-untyped-def]
     if count < 4:
         return q.dtype.type(0.0)
     rank = count - (3 + (count - 3 + 1) // 2) + 1  # from the largest
-    return _kth_largest(q, rank) / q.dtype.type(_MAD)
+    # few residuals: Rousseeuw and Leroy (1987), chapter 5, eq. (1.3)
+    return _kth_largest(q, rank) / q.dtype.type(_MAD) * q.dtype.type(1.0 + 5.0 / (count - 3))
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _moments(x, y, z, v, s, b0, b1, b2, per_reach2, least, sums):  # type: ignore[no-untyped-def]
+def _moments(x, y, z, v, s, e, b0, b1, b2, per_reach2, least, sums):  # type: ignore[no-untyped-def]
     """Sum what the standard errors need over the samples with weight; return their number."""
     zero, one, five = x.dtype.type(0.0), x.dtype.type(1.0), x.dtype.type(5.0)
     xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero
     dxx, dxy, dxz, dyy, dyz, dzz = zero, zero, zero, zero, zero, zero
-    used, psi2, slope, slope2, raw2 = zero, zero, zero, zero, zero
+    txx, txy, txz, tyy, tyz, tzz = zero, zero, zero, zero, zero, zero
+    used, psi2, slope, slope2, raw2, e2 = zero, zero, zero, zero, zero, zero
     for k in range(x.size):
         xk, yk, zk, sk = x[k], y[k], z[k], s[k]
         fit = xk * b0 + yk * b1 + zk * b2
@@ -194,6 +196,14 @@ def _moments(x, y, z, v, s, b0, b1, b2, per_reach2, least, sums):  # type: ignor
         yy += wy * yk
         yz += wy * zk
         zz += wz * zk
+        t2 = e[k] * e[k]
+        txx += t2 * wx * xk
+        txy += t2 * wx * yk
+        txz += t2 * wx * zk
+        tyy += t2 * wy * yk
+        tyz += t2 * wy * zk
+        tzz += t2 * wz * zk
+        e2 += t2 * w
         px, py, pz = per * xk, per * yk, per * zk
         dxx += px * xk
         dxy += px * yk
@@ -210,12 +220,15 @@ def _moments(x, y, z, v, s, b0, b1, b2, per_reach2, least, sums):  # type: ignor
         raw2 += per * r * r
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = xx, xy, xz, yy, yz, zz
     sums[6], sums[7], sums[8], sums[9], sums[10], sums[11] = dxx, dxy, dxz, dyy, dyz, dzz
-    sums[12], sums[13], sums[14], sums[15] = psi2, slope, slope2, raw2
+    sums[12], sums[13], sums[14], sums[15], sums[16] = psi2, slope, slope2, raw2, e2
+    sums[17], sums[18], sums[19], sums[20], sums[21], sums[22] = txx, txy, txz, tyy, tyz, tzz
     return int(used)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _finish(x, y, z, v, s, b0, b1, b2, scale, known, robust, settings, sums, out):  # type: ignore[no-untyped-def]
+def _finish(  # type: ignore[no-untyped-def]
+    x, y, z, v, s, e, b0, b1, b2, scale, known, robust, settings, sums, out,
+):  # fmt: skip
     """Write normal, albedo, residual and standard errors of one point; False where it has none."""
     kind = x.dtype.type
     length = math.sqrt(float(b0) * b0 + float(b1) * b1 + float(b2) * b2)
@@ -224,10 +237,13 @@ def _finish(x, y, z, v, s, b0, b1, b2, scale, known, robust, settings, sums, out
     least = settings[GRAZING] * kind(length) if robust else -kind(math.inf)
     reach = settings[TUKEY] * scale
     per_reach2 = kind(1.0) / (reach * reach) if robust and reach > kind(0.0) else kind(0.0)
-    used = _moments(x, y, z, v, s, b0, b1, b2, per_reach2, least, sums)
+    used = _moments(x, y, z, v, s, e, b0, b1, b2, per_reach2, least, sums)
     if used < 3:
         return False
-    xx, xy, xz, yy, yz, zz, dxx, dxy, dxz, dyy, dyz, dzz, psi2, slope, slope2, raw2 = sums
+    xx, xy, xz, yy, yz, zz = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+    dxx, dxy, dxz, dyy, dyz, dzz = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11]
+    psi2, slope, slope2, raw2, e2 = sums[12], sums[13], sums[14], sums[15], sums[16]
+    txx, txy, txz, tyy, tyz, tzz = sums[17], sums[18], sums[19], sums[20], sums[21], sums[22]
     # the least eigenvalue of the directions used, over their trace (which is their number)
     minors = dxx * dyy - dxy * dxy + dxx * dzz - dxz * dxz + dyy * dzz - dyz * dyz
     det = (
@@ -245,7 +261,7 @@ def _finish(x, y, z, v, s, b0, b1, b2, scale, known, robust, settings, sums, out
         mean = slope / used
         spread = max(slope2 / used - mean * mean, 0.0)
         correction = 1.0 + 3.0 / used * spread / (mean * mean)
-        variance = psi2 / free / (mean * mean) * correction * correction
+        variance = psi2 * used / (e2 * free) / (mean * mean) * correction * correction
     if known:
         least_variance = 1.0 / TUKEY_EFFICIENCY if robust else 1.0
         # misfit beyond chance (3 sigma of a chi square) widens the errors
@@ -257,12 +273,34 @@ def _finish(x, y, z, v, s, b0, b1, b2, scale, known, robust, settings, sums, out
     full = xx * cxx + xy * cxy + xz * cxz
     if not full > 0.0:
         return False
+    # covariance C T C: with weights of their own the samples' noise is not one
+    hxx, hxy, hxz = (
+        cxx * txx + cxy * txy + cxz * txz,
+        cxx * txy + cxy * tyy + cxz * tyz,
+        cxx * txz + cxy * tyz + cxz * tzz,
+    )
+    hyx, hyy, hyz = (
+        cxy * txx + cyy * txy + cyz * txz,
+        cxy * txy + cyy * tyy + cyz * tyz,
+        cxy * txz + cyy * tyz + cyz * tzz,
+    )
+    hzx, hzy, hzz = (
+        cxz * txx + cyz * txy + czz * txz,
+        cxz * txy + cyz * tyy + czz * tyz,
+        cxz * txz + cyz * tyz + czz * tzz,
+    )
+    vxx = hxx * cxx + hxy * cxy + hxz * cxz
+    vxy = hxx * cxy + hxy * cyy + hxz * cyz
+    vxz = hxx * cxz + hxy * cyz + hxz * czz
+    vyy = hyx * cxy + hyy * cyy + hyz * cyz
+    vyz = hyx * cxz + hyy * cyz + hyz * czz
+    vzz = hzx * cxz + hzy * cyz + hzz * czz
     along = (
-        nx * (cxx * nx + 2.0 * (cxy * ny + cxz * nz))
-        + ny * (cyy * ny + 2.0 * cyz * nz)
-        + nz * czz * nz
-    ) / full
-    across = max((cxx + cyy + czz) / full - along, 0.0)
+        nx * (vxx * nx + 2.0 * (vxy * ny + vxz * nz))
+        + ny * (vyy * ny + 2.0 * vyz * nz)
+        + nz * vzz * nz
+    ) / (full * full)
+    across = max((vxx + vyy + vzz) / (full * full) - along, 0.0)
     angle, error = math.pi, math.inf
     if variance < math.inf:
         angle = math.sqrt(variance * across) / length
@@ -281,7 +319,7 @@ def _finish(x, y, z, v, s, b0, b1, b2, scale, known, robust, settings, sums, out
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fit_point(  # type: ignore[no-untyped-def]
-    x, y, z, v, s, q, m, robust, known, l1_steps, steps, settings, sums, out,
+    x, y, z, v, s, e, q, m, robust, known, l1_steps, steps, settings, sums, out,
 ):  # fmt: skip
     """Fit one point: v = x b0 + y b1 + z b2 on samples with s > 0."""
     kind = x.dtype.type
@@ -294,19 +332,26 @@ def _fit_point(  # type: ignore[no-untyped-def]
         n += 1 if usable else 0
     if n < 3:
         return False
-    if not robust:
-        for _ in range(2):  # the second step refines the digits of the first
-            d0, d1, d2 = _step_squares(x, y, z, v, m, b0, b1, b2)
-            b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
-        return _finish(x, y, z, v, s, b0, b1, b2, one, known, False, settings, sums, out)
     # lit samples: those above a part of a bright one, which is not the brightest for highlights
     total = zero
     for k in range(x.size):
         q[k] = v[k] / s[k] if m[k] > zero else -one
-    rank = min(n, max(4, int(n * settings[BRIGHT_PART])))
+        e[k] = one
+    rank = min(n, max(4, int(n * settings[BRIGHT_PART]))) if robust else 1
     bright = _kth_largest(q, rank)
     if not bright > zero:
         return False
+    if not known and not robust:
+        # nothing says how good the samples are, nothing finds the bad: dark ones are the doubtful
+        for k in range(x.size):
+            e[k] = min(max(q[k], zero) / bright, one)
+            x[k], y[k], z[k] = x[k] * e[k], y[k] * e[k], z[k] * e[k]
+            v[k], s[k] = v[k] * e[k], s[k] * e[k]
+    if not robust:
+        for _ in range(2):  # the second step refines the digits of the first
+            d0, d1, d2 = _step_squares(x, y, z, v, m, b0, b1, b2)
+            b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
+        return _finish(x, y, z, v, s, e, b0, b1, b2, one, known, False, settings, sums, out)
     dark = settings[SHADOW] * bright
     lit = 0
     for k in range(x.size):
@@ -341,7 +386,7 @@ def _fit_point(  # type: ignore[no-untyped-def]
         b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
         if step > 2 and d0 * d0 + d1 * d1 + d2 * d2 < near * (b0 * b0 + b1 * b1 + b2 * b2):
             break
-    return _finish(x, y, z, v, s, b0, b1, b2, scale, known, True, settings, sums, out)
+    return _finish(x, y, z, v, s, e, b0, b1, b2, scale, known, True, settings, sums, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -373,8 +418,8 @@ def fit_points(  # type: ignore[no-untyped-def]
     v = np.zeros((BLOCK, lanes), out.dtype)
     s = np.zeros((BLOCK, lanes), out.dtype)
     x, y, z = np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype)
-    q, m = np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype)
-    sums = np.empty(16, np.float64)
+    q, m, e = np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype)
+    sums = np.empty(23, np.float64)
     for start in range(0, count, BLOCK):
         size = min(BLOCK, count - start)
         for k in range(lights):
@@ -429,6 +474,7 @@ def fit_points(  # type: ignore[no-untyped-def]
                 z,
                 v[p],
                 s[p],
+                e,
                 q,
                 m,
                 robust,

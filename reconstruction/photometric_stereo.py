@@ -144,7 +144,9 @@ def estimate_normals(
     valid : ndarray of bool, shape (N, ...) or (...), optional
         Samples, or points, to use: not saturated, not occluded.
     robust : bool
-        False: least squares of all valid samples.
+        False: least squares of all valid samples, for matte surfaces under few lights. Where no
+        variance is given, a sample's weight is the square of its intensity, so that shadows count
+        for nothing and dark samples for little.
     robustness : Robustness, optional
         Settings of the robust fit.
     executor : Executor, optional
