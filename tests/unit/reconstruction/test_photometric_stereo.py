@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from model.metrics import angular_error_rad
 from reconstruction import photometric_stereo as stereo
@@ -353,5 +352,8 @@ def test_the_biweight_keeps_95_percent_of_the_efficiency_of_least_squares(rng):
     squares = estimate_normals(samples, lights, robust=False, variance=1e-4)
     plain = angular_error_rad(squares.normals, normals)
     efficiency = np.mean(plain**2) / np.mean(robust**2)
-    assert 0.88 < efficiency < 1.0
-    assert stats.wilcoxon(plain[:500], robust[:500], alternative="less").pvalue < 0.01
+    draws = [rng.integers(0, 6000, 6000) for _ in range(200)]
+    spread = np.std([np.mean(plain[k] ** 2) / np.mean(robust[k] ** 2) for k in draws])
+    # 95 % for many lights, less for 60; five sigma
+    assert 0.90 - 5 * spread < efficiency < 0.97 + 5 * spread
+    assert spread < 0.01
