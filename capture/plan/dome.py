@@ -20,7 +20,7 @@ EXPOSURES_S = (0.048, 0.012)
 FRAMES_PER_S = 12.0
 TRACKING_EVERY = 25
 """Lights between two tracking frames."""
-TRACKING_LIGHTS = 12
+TRACKING_LIGHTS = 6
 TRACKING_FLOOR = 0.25
 """Least light of a tracking frame at the eyes, of the brightest single light."""
 LEVEL_STEPS = 1000
@@ -167,7 +167,7 @@ def dome_calibration_plan(
 
 
 def tracking_lights(rig: Rig) -> list[int]:
-    """Return lights spread over the half of the dome in front of the subject, at most 12.
+    """Return lights spread over the half of the dome in front of the subject, at most 6.
 
     Each next one is the farthest from those before it, beginning with the most frontal.
     """

@@ -1,22 +1,23 @@
-"""Run a plan on a rig: set up, expose, tear down; whatever happens, the lights end dark.
-
-The driver decides nothing and this module nothing about bytes: what to shoot is the plan's, what is
-missing is the session's, whether a frame is the right one is the camera rule's.
-"""
+"""Run a plan on the flash rig: one pop a step, its frame believed or the step shot again."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
-import secrets
-import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
-
-from capture import raw
+from capture.acquire.frames import configure, encode, frame_timeout_s, wanted_exposure
+from capture.acquire.outcome import (
+    MAX_ATTEMPTS,
+    Acquired,
+    AcquisitionError,
+    Operator,
+    attempts_so_far,
+    given_up,
+    steps_to_do,
+    tear_down,
+)
 from capture.devices.camera import (
     Camera,
     CameraError,
@@ -25,31 +26,19 @@ from capture.devices.camera import (
     FrameRefused,
     FrameTimeout,
     Trigger,
-    check_serials,
     next_frame,
 )
-from capture.devices.port import CommandRefused, DeviceError
+from capture.devices.port import CommandRefused
 from capture.devices.wire import Code
 from capture.plan import Plan, Step
-from capture.rig import Rig, View
+from capture.rig import Rig
 from capture.session import Session
 
 log = logging.getLogger(__name__)
 
-MAX_ATTEMPTS = 3
 CHARGE_TIMEOUT_S = 60.0
 MAX_TOKEN = 48
 """Characters of the longest token that a box takes."""
-FRAME_MARGIN_S = 5.0
-"""How much longer than exposure and read-out a frame may take to come."""
-
-
-class AcquisitionError(DeviceError, RuntimeError):
-    """A plan could not be carried out; what was captured is safe in the session."""
-
-
-class Interrupted(KeyboardInterrupt):
-    """The operator stopped the capture; the session can be resumed."""
 
 
 class FlashReport(Protocol):
@@ -94,90 +83,20 @@ class Flash(Protocol):
         """Put all light out and disarm."""
 
 
-@dataclass(frozen=True, slots=True)
-class Acquired:
-    """What a run of a plan did.
-
-    Attributes
-    ----------
-    steps
-        Steps captured in this run.
-    frames
-        Frames committed.
-    stale
-        Stale frames that were dropped.
-    retakes
-        Steps that had to be shot again.
-    """
-
-    steps: int
-    frames: int
-    stale: int
-    retakes: int
-
-
-def run_plan(
+def run_flash(
     plan: Plan,
     rig: Rig,
     *,
-    boxes: Mapping[str, Flash],
+    box: Flash,
     cameras: Mapping[str, Camera],
     session: Session,
-    progress: Callable[[str], None] | None = None,
-    prompt: Callable[[str], None] | None = None,
-    interrupted: Callable[[], bool] | None = None,
-    clock: Callable[[], float] = time.time,
-    run_id: str = "",
+    operator: Operator,
 ) -> Acquired:
-    """Capture what the session still lacks of a plan.
-
-    Parameters
-    ----------
-    plan
-        What to capture; steps that the session holds already are not repeated.
-    rig
-        The rig that the plan is for.
-    boxes, cameras
-        Open drivers by name: the box "flash", and a camera for each view.
-    session
-        Open for writing.
-    progress
-        Called with one line a step.
-    prompt
-        Called with the state ("smile") before the first step that needs it, so that the subject
-        can take it; returns when the subject is ready.
-    interrupted
-        Asked before each step; True stops in good order.
-    clock
-        The host's time, s since 1970, for the journal.
-    run_id
-        Begins the token of every flash of this run; drawn at random by default, so that no two
-        flashes bear one token, also after a resume.
-
-    Returns
-    -------
-    Acquired
-
-    Raises
-    ------
-    AcquisitionError
-        When a step fails three times, or the plan goes beyond what the box allows; this is found
-        before anything flashes.
-    DeviceError
-        When a box or camera is lost; what was captured is safe in the session.
-    Interrupted
-        When ``interrupted`` said so.
-    """
-    run_id = run_id or secrets.token_hex(4)
-    plan.check(rig)
-    if "flash" not in boxes:
-        raise AcquisitionError("box 'flash': no port was given; add --port flash=URL")
-    box = boxes["flash"]
-    check_serials(cameras, [(view.name, view.serial) for view in rig.views])
+    """Capture what the session still lacks of a plan of the flash rig; see `run_plan`."""
     _check_limits(plan, box.limits)
     lag_s = _sync_delay_s(rig, box.limits)
-    steps = _steps(session)
-    taken = {(record.step_id, record.camera): record.attempt for record in session.frames()}
+    steps = steps_to_do(session)
+    taken = attempts_so_far(session)
     counts = {"steps": 0, "frames": 0, "stale": 0, "retakes": 0}
     state: str | None = None
     try:
@@ -185,28 +104,17 @@ def run_plan(
         if "sync_max_us" in box.limits:
             box.set_sync_delay(lag_s)
         for number, step in enumerate(steps, start=1):
-            if interrupted is not None and interrupted():
-                raise Interrupted
+            operator.stop_if_asked()
             wanted = step.index.get("state")
             if wanted is not None and wanted != state:
                 state = str(wanted)
-                if prompt is not None:
-                    prompt(state)
-            if progress is not None:
-                progress(f"{number}/{len(steps)} {step.id} {step.kind} {_index_text(step)}")
-            name = f"{run_id}.{number}"
-            _take(step, rig, box, cameras, session, taken, clock, counts, name)
+                operator.prompt(state)
+            operator.progress(f"{number}/{len(steps)} {step.id} {step.kind} {_index_text(step)}")
+            name = f"{operator.run_id}.{number}"
+            _take(step, rig, box, cameras, session, taken, operator.clock, counts, name)
     finally:
-        _tear_down(box, cameras)
-    return Acquired(**counts)
-
-
-def _steps(session: Session) -> list[Step]:
-    """Return the steps that lack a frame of any camera, once each, in the plan's order."""
-    found: dict[str, Step] = {}
-    for step, _ in session.todo():
-        found.setdefault(step.id, step)
-    return list(found.values())
+        tear_down(box, cameras)
+    return Acquired(counts["steps"], counts["frames"], counts["stale"], counts["retakes"])
 
 
 def _index_text(step: Step) -> str:
@@ -274,13 +182,13 @@ def _take(
                     # a misfire has pulsed the camera line: a dark frame is being read out, and
                     # until it has come the camera would miss the next pulse
                     with contextlib.suppress(CameraError):
-                        cameras[name].frame(_frame_timeout_s(step, rig.view(name)))
+                        cameras[name].frame(frame_timeout_s(step, rig.view(name)))
                 cameras[name].abort()
             continue
         counts["stale"] += stale
         light = _light(report)
         for name, frame in frames.items():
-            blob = _dng(frame, rig.view(name), cameras[name], step, session, light)
+            blob = encode(frame, rig.view(name), cameras[name], step, session, light)
             session.commit(
                 step.id,
                 name,
@@ -301,18 +209,14 @@ def _take(
             counts["frames"] += 1
         counts["steps"] += 1
         return
-    safe = "what was captured is safe: mend the cause and run the same command with --resume"
-    raise AcquisitionError(
-        f"step {step.id}: failed {MAX_ATTEMPTS} times ({refusals[-1]}); "
-        + (safe if session.frames() else "nothing was captured: mend the cause and start again")
-    )
+    raise given_up(f"step {step.id}", refusals[-1], session)
 
 
 def _expose(
     step: Step, rig: Rig, box: Flash, cameras: Mapping[str, Camera], token: str
 ) -> tuple[Any | None, dict[str, Frame], int]:
     """Set the light and the cameras, make the exposure, and collect one frame a camera."""
-    want = Exposure(float(step.settings["exposure_s"]), int(step.settings["iso"]))
+    want = wanted_exposure(step)
     power = 0.0 if step.kind == "dark" else float(step.settings.get("power", 1.0))
     if power > 0:
         if "analyser_deg" in step.settings:
@@ -337,12 +241,7 @@ def _expose(
     asked: dict[str, Exposure] = {}
     not_before: dict[str, float] = {}
     for name, camera in chosen.items():
-        got = camera.configure(want)
-        if abs(got.deviation_ev(want)) > 1.0 / 3.0 + 1e-9:
-            raise CameraError(
-                f"view {name!r}: the camera sets {got.exposure_s:g} s at ISO {got.iso}, the plan "
-                f"wants {want.exposure_s:g} s at ISO {want.iso}; choose settings it has"
-            )
+        configure(name, camera, want)
         asked[name] = want
         camera.arm(1, triggers[name])
         not_before[name] = camera.clock_s()
@@ -358,7 +257,7 @@ def _expose(
     frames: dict[str, Frame] = {}
     stale = 0
     for name, camera in chosen.items():
-        timeout_s = _frame_timeout_s(step, rig.view(name))
+        timeout_s = frame_timeout_s(step, rig.view(name))
         frames[name], dropped = next_frame(
             camera, seq=0, not_before_s=not_before[name], want=asked[name], timeout_s=timeout_s
         )
@@ -369,10 +268,6 @@ def _expose(
 def _token(name: str, attempt: int, step: Step) -> str:
     """Name one flash: run, number in the run, try; then as much of the step as a box takes."""
     return f"{name}.{attempt}.{step.id}"[:MAX_TOKEN]
-
-
-def _frame_timeout_s(step: Step, view: View) -> float:
-    return float(step.settings["exposure_s"]) + view.readout_s + FRAME_MARGIN_S
 
 
 def _light(report: Any | None) -> dict[str, str | float]:
@@ -386,59 +281,3 @@ def _light(report: Any | None) -> dict[str, str | float]:
         "polarizer": str(report.polarizer),
         "analyser_deg": float(report.analyser_deg),
     }
-
-
-def _dng(
-    frame: Frame,
-    view: View,
-    camera: Camera,
-    step: Step,
-    session: Session,
-    light: Mapping[str, str | float],
-) -> bytes:
-    """Encode a frame as our DNG, with the step and the light in it."""
-    if isinstance(frame.image, bytes):
-        # a maker's raw file is written anew: its own metadata can name people and places
-        picture = raw.decode(memoryview(frame.image), where=f"step {step.id}, view {view.name}")
-        cfa, pattern, black, white = picture.cfa, picture.pattern, picture.black, picture.white
-        matrix, profile, neutral = picture.color_matrix, picture.noise_profile, picture.neutral
-    else:
-        info = camera.info
-        cfa, pattern, black, white = frame.image, info.pattern, info.black, info.white
-        matrix, neutral = None, None
-        profile = raw.noise_profile(
-            view.gain_e_per_dn,
-            view.read_noise_e,
-            black=float(np.mean(info.black)),
-            white=float(info.white),
-        )
-    return raw.encode_dng(
-        cfa,
-        pattern=pattern,
-        black=black,
-        white=white,
-        exposure_s=frame.exposure.exposure_s,
-        iso=frame.exposure.iso,
-        camera_model=camera.info.model,
-        camera_serial=frame.serial,
-        color_matrix=matrix,
-        neutral=neutral,
-        noise_profile=profile,
-        f_number=view.f_number,
-        focal_mm=view.focal_mm,
-        step_id=step.id,
-        session_id=session.id,
-        light=light,
-    )
-
-
-def _tear_down(box: Flash, cameras: Mapping[str, Camera]) -> None:
-    """Put the light out and let the cameras go; nothing here hides the error that led here."""
-    try:
-        box.dark()
-    except DeviceError as error:
-        # the box's own lease puts the light out when the host is not heard
-        log.error("the box could not be told to go dark: %s; its lease ends the light", error)
-    for camera in cameras.values():
-        with contextlib.suppress(DeviceError):
-            camera.abort()

@@ -1,0 +1,10 @@
+"""Run a plan on a rig: set up, expose, tear down; whatever happens, the lights end dark.
+
+The driver decides nothing and this package nothing about bytes: what to shoot is the plan's, what
+is missing is the session's, whether a frame is the right one is the camera rule's.
+"""
+
+from capture.acquire.outcome import Acquired, AcquisitionError, Interrupted
+from capture.acquire.run import run_plan
+
+__all__ = ["Acquired", "AcquisitionError", "Interrupted", "run_plan"]

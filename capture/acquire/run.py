@@ -1,0 +1,101 @@
+"""Run a plan on the rig that it is for."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from capture.acquire.dome import run_dome
+from capture.acquire.flash import run_flash
+from capture.acquire.outcome import Acquired, AcquisitionError, Operator
+from capture.devices.camera import Camera, check_serials
+from capture.devices.dome import Eyes
+from capture.plan import Plan
+from capture.rig import Rig
+from capture.session import Session
+
+
+def run_plan(
+    plan: Plan,
+    rig: Rig,
+    *,
+    boxes: Mapping[str, Any],
+    cameras: Mapping[str, Camera],
+    session: Session,
+    progress: Callable[[str], None] | None = None,
+    prompt: Callable[[str], None] | None = None,
+    interrupted: Callable[[], bool] | None = None,
+    clock: Callable[[], float] = time.time,
+    run_id: str = "",
+    eyes: Eyes = "open",
+) -> Acquired:
+    """Capture what the session still lacks of a plan.
+
+    Parameters
+    ----------
+    plan
+        What to capture; steps that the session holds already are not repeated.
+    rig
+        The rig that the plan is for.
+    boxes, cameras
+        Open drivers by name: the box of the rig ("flash" or "dome"), and a camera for each view.
+    session
+        Open for writing.
+    progress
+        Called with one line a step, or a second of a sequence.
+    prompt
+        Called before the first step that needs it with the state ("smile"), or with the place of
+        the target on the dome ("pose 3"); returns when the subject or the target is ready.
+    interrupted
+        Asked before each step, or each sequence; True stops in good order.
+    clock
+        The host's time, s since 1970, for the journal.
+    run_id
+        Begins the token of every flash or sequence of this run; drawn at random by default, so
+        that no two bear one token, also after a resume.
+    eyes
+        What a person says of the subject's eyes: "open", "closed" or "shielded". Light that
+        flickers too much for open eyes is refused.
+
+    Returns
+    -------
+    Acquired
+
+    Raises
+    ------
+    AcquisitionError
+        When a step fails three times, or the plan goes beyond what the box allows; this is found
+        before anything flashes.
+    DeviceError
+        When a box or camera is lost; what was captured is safe in the session.
+    Interrupted
+        When ``interrupted`` said so.
+    """
+    plan.check(rig)
+    kind = "dome" if "dome" in rig.boxes else "flash"
+    if kind not in boxes:
+        raise AcquisitionError(f"box {kind!r}: no port was given; add --port {kind}=URL")
+    check_serials(cameras, [(view.name, view.serial) for view in rig.views])
+    operator = Operator(
+        progress=progress or _ignore,
+        prompt=prompt or _ignore,
+        interrupted=interrupted or _never,
+        clock=clock,
+        run_id=run_id or secrets.token_hex(4),
+    )
+    box = boxes[kind]
+    if kind == "dome":
+        return run_dome(
+            plan, rig, box=box, cameras=cameras, session=session, operator=operator, eyes=eyes
+        )
+    return run_flash(plan, rig, box=box, cameras=cameras, session=session, operator=operator)
+
+
+def _ignore(_: str) -> None:
+    """Do nothing."""
+
+
+def _never() -> bool:
+    return False
