@@ -388,6 +388,28 @@ def verify(
 
 
 @app.command()
+def export(
+    session: Annotated[Path, typer.Argument(help="SESSION/ folder.")],
+    to: Annotated[str, typer.Option(help="mhl, frames or event-model.")],
+    use: Annotated[str, typer.Option(help="What it is for; the consent must cover it.")],
+    out: Out,
+    json: Json = False,
+) -> None:
+    """Copy a session for another program, within the subject's consent, with an ASC MHL manifest.
+
+    Example: skinrig export session --to frames --use research --out delivery
+    """
+    from skinrig.export import export as hand_on
+
+    console = Console(json)
+    done = hand_on(session, out, to=to, use=use)
+    console.say(f"{done.path}: {done.files} files, listed in {done.manifest}")
+    console.document(
+        "skinrig.export/1", {"path": done.path, "files": done.files, "manifest": done.manifest}
+    )
+
+
+@app.command()
 def doctor(json: Json = False) -> None:
     """Say what is installed, which renderer runs and why, and how to mend what is not.
 
