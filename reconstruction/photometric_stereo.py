@@ -11,24 +11,27 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reconstruction import photometric_kernels as kernels
+from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
+from reconstruction.normal_refinement import refine
 from reconstruction.tiles import map_tiles
+
+__all__ = [
+    "NormalMaps", "PhotometricStereoError", "Robustness", "estimate_normals", "refine",
+    "require_spread",
+]  # fmt: skip
 
 Floating = NDArray[np.floating]
 
 TILE_POINTS = 8192
 FLATTEST = 3e-3
 """Least over largest singular value of the light directions, below which they lie in a plane."""
-
-
-class PhotometricStereoError(ValueError):
-    """Images, lights or masks that no normal can be computed from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,41 +73,6 @@ class Robustness:
                 raise PhotometricStereoError(
                     f"Robustness.{name}: got {getattr(self, name)}, expected {expected}"
                 )
-
-
-@dataclass(frozen=True, slots=True)
-class NormalMaps:
-    """Normals with what is known about them; every array has the points' shape.
-
-    Where `valid` is False, normals and albedo are 0 and the standard error is pi; nothing is NaN.
-
-    Attributes
-    ----------
-    normals : ndarray, shape (..., 3)
-        Unit vectors, outward, in the frame of the light directions.
-    albedo : ndarray, shape (...)
-        In the unit of intensity over that of `light_intensity`; 1 for a white Lambertian surface
-        where the lights' intensity says so. Above 1 is possible.
-    residual : ndarray, shape (...)
-        Root mean square of intensity over light intensity, less the fit, over the samples used.
-    valid : ndarray of bool, shape (...)
-        At least three samples from directions that span space, and a signal above its noise.
-    stderr_rad : ndarray, shape (...)
-        Root mean square angle between estimate and truth that noise leads to, rad, at most pi,
-        which is given where three samples leave no residual and no variance is known.
-    stderr_albedo : ndarray, shape (...)
-        Standard error of `albedo`; infinite in the same case.
-    used : ndarray of int, shape (...)
-        Number of samples with weight.
-    """
-
-    normals: Floating
-    albedo: Floating
-    residual: Floating
-    valid: NDArray[np.bool_]
-    stderr_rad: Floating
-    stderr_albedo: Floating = field(default_factory=lambda: np.zeros(0))
-    used: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
 
 def estimate_normals(

@@ -1,0 +1,49 @@
+"""Normals with what is known about them: what every estimator of normals returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floating = NDArray[np.floating]
+
+
+class PhotometricStereoError(ValueError):
+    """Images, lights or masks that no normal can be computed from."""
+
+
+@dataclass(frozen=True, slots=True)
+class NormalMaps:
+    """Normals with what is known about them; every array has the points' shape.
+
+    Where `valid` is False, normals and albedo are 0 and the standard error is pi; nothing is NaN.
+
+    Attributes
+    ----------
+    normals : ndarray, shape (..., 3)
+        Unit vectors, outward, in the frame of the light directions.
+    albedo : ndarray, shape (...)
+        In the unit of intensity over that of `light_intensity`; 1 for a white Lambertian surface
+        where the lights' intensity says so. Above 1 is possible.
+    residual : ndarray, shape (...)
+        Root mean square of intensity over light intensity, less the fit, over the samples used.
+    valid : ndarray of bool, shape (...)
+        At least three samples from directions that span space, and a signal above its noise.
+    stderr_rad : ndarray, shape (...)
+        Root mean square angle between estimate and truth that noise leads to, rad, at most pi,
+        which is given where three samples leave no residual and no variance is known.
+    stderr_albedo : ndarray, shape (...)
+        Standard error of `albedo`; infinite in the same case.
+    used : ndarray of int, shape (...)
+        Number of samples with weight.
+    """
+
+    normals: Floating
+    albedo: Floating
+    residual: Floating
+    valid: NDArray[np.bool_]
+    stderr_rad: Floating
+    stderr_albedo: Floating = field(default_factory=lambda: np.zeros(0))
+    used: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
