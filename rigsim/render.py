@@ -25,6 +25,7 @@ from rigsim.variant import Kind, VariantChoice, choose_variant
 __all__ = [
     "Caster",
     "GBuffer",
+    "MovedLight",
     "RenderError",
     "VariantChoice",
     "camera_rays",
@@ -357,7 +358,7 @@ def radiance(
     ----------
     description
         Mitsuba's scene dictionary, with numbers, texts and arrays only; a ``to_world`` is a 4 x 4
-        array.
+        array, a ``bitmap`` an image; a shape of type ``mesh`` has a `rigsim.mesh.Mesh` as ``mesh``.
     kind
         Variant kind, see `rigsim.variant.choose_variant`.
     samples
@@ -382,6 +383,42 @@ def radiance(
     if bad:
         raise RenderError(f"Mitsuba gave {bad} pixels that are not finite, expected none")
     return image
+
+
+class MovedLight:
+    """A described scene whose one point light is moved from render to render.
+
+    Nothing is compiled or parsed anew when the light moves, so that the time of a call is the time
+    of rendering.
+
+    Parameters
+    ----------
+    description
+        As for `radiance`; the entry ``light`` must be a point light.
+    kind
+        Variant kind.
+    """
+
+    def __init__(self, description: Mapping[str, Any], *, kind: Kind) -> None:
+        self._choice = choose_variant(kind)
+        mi = load(self._choice)
+        self._scene = mi.load_dict(_with_transforms(mi, description))
+        self._parameters = mi.traverse(self._scene)
+
+    def radiance(self, light_mm: ArrayLike, *, samples: int, seed: int = 0) -> NDArray[np.float32]:
+        """Render with the light at a place, shape (H, W, channels).
+
+        Parameters
+        ----------
+        light_mm
+            Where it stands, shape (3,).
+        samples, seed
+            As for `radiance`.
+        """
+        mi = load(self._choice)
+        self._parameters["light.position"] = mi.Point3f(*(float(x) for x in np.ravel(light_mm)))
+        self._parameters.update()
+        return np.array(mi.render(self._scene, spp=samples, seed=seed).numpy(), np.float32)
 
 
 def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:
@@ -410,15 +447,41 @@ def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[np.f
 
 
 def _with_transforms(mi: Any, description: Mapping[str, Any]) -> dict[str, Any]:
-    out = {}
+    out: dict[str, Any] = {}
     for name, value in description.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and value.get("type") == "mesh":
+            out[name] = _shape(mi, name, value)
+        elif isinstance(value, Mapping):
             out[name] = _with_transforms(mi, value)
+        elif isinstance(value, np.ndarray) and name == "bitmap":
+            out[name] = mi.Bitmap(np.ascontiguousarray(value, np.float32))
         elif name == "to_world":
             out[name] = mi.ScalarTransform4f(np.asarray(value, np.float64))
         else:
             out[name] = value
     return out
+
+
+def _shape(mi: Any, name: str, description: Mapping[str, Any]) -> Any:
+    """Return Mitsuba's mesh with normals, texture coordinates and a material."""
+    mesh: Mesh = description["mesh"]
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(_with_transforms(mi, description["bsdf"]))
+    shape = mi.Mesh(
+        name,
+        len(mesh.vertices_mm),
+        len(mesh.faces),
+        has_vertex_normals=True,
+        has_vertex_texcoords=True,
+        props=properties,
+    )
+    parameters = mi.traverse(shape)
+    parameters["vertex_positions"] = np.ravel(mesh.vertices_mm)
+    parameters["vertex_normals"] = np.ravel(mesh.normals)
+    parameters["vertex_texcoords"] = np.ravel(mesh.uv)
+    parameters["faces"] = np.ravel(mesh.faces).astype(np.uint32)
+    parameters.update()
+    return shape
 
 
 def load(choice: VariantChoice) -> Any:

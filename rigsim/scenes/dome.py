@@ -327,7 +327,7 @@ class DomeScene:
             valid on bare skin.
         """
         subject = self._face()
-        surface = self._surface(self._view(view_name))
+        surface = self.surface(self._view(view_name))
         valid = subject.atlas.covered & (subject.hair < HAIR_LIMIT)
         floor = np.zeros(valid.shape, np.float32)
         floor[valid] = surface_brdf.surface_floor(surface.packed()[valid])
@@ -401,7 +401,8 @@ class DomeScene:
         except RigError as error:
             raise SceneError(str(error)) from error
 
-    def _surface(self, view: View) -> SkinSurface:
+    def surface(self, view: View) -> SkinSurface:
+        """Return how the face reflects for a camera."""
         camera = view.spectral_sensitivity
         if camera not in self._surfaces:
             self._surfaces[camera] = skin_surface(self._face(), camera, self._illuminant)
@@ -411,7 +412,7 @@ class DomeScene:
         """Return the surface and its normals with relief, shape (N, N, 10)."""
         camera = view.spectral_sensitivity
         if camera not in self._textures:
-            atlas, surface = self._face().atlas, self._surface(view)
+            atlas, surface = self._face().atlas, self.surface(view)
             layers = np.concatenate([surface.packed(), surface.normal], axis=-1)
             self._textures[camera] = spread(layers, atlas.covered)
         return self._textures[camera]

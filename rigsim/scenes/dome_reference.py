@@ -1,0 +1,257 @@
+"""The dome by Mitsuba's own integrators, one light after the other, to judge `DomeScene` by.
+
+Mitsuba has no lobe for vellus hair, and knows relief only as a texture in another frame, so the
+face that both sides render has neither; everything else (diffuse term behind the boundary,
+Beckmann facets and GGX oil, all from textures) is put together from Mitsuba's own materials.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from capture.rig import Rig, View, load_rig
+from rigsim.atlas import spread
+from rigsim.mesh import Float32Array
+from rigsim.render import MovedLight, look_at, radiance
+from rigsim.scenes.dome import DomeScene
+from rigsim.skin_layers import ETA
+from rigsim.subject import Subject, make_subject
+from rigsim.surface_brdf import ETA_OIL, OIL_SMOOTHING, SkinSurface
+
+Integrator = Literal["path", "direct"]
+
+SAMPLES: Final = 4
+"""Rays in a pixel of all three ways that are timed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Seconds and errors of three ways to render one view of the dome."""
+
+    lights: int
+    """Lights that Mitsuba rendered; ours rendered all."""
+    ours_s: float
+    """Seconds a light, the first look at the geometry shared out among them."""
+    path_s: float
+    """Seconds a light of Mitsuba's path tracer."""
+    direct_s: float
+    """Seconds a light of Mitsuba's direct integrator."""
+    ours_error: float
+    """Relative root mean square error over all images."""
+    path_error: float
+    """The same for the path tracer."""
+    direct_error: float
+    """The same for the direct integrator."""
+    mean_ratio: float
+    """Mean of the path tracer's images over that of the reference: 1 but for noise."""
+
+
+def plain_face(preset: str = "III", *, seed: int = 0, size: int = 512) -> Subject:
+    """Return a face whose normals are those of its mesh: without pores and wrinkles."""
+    face = make_subject(preset, seed=seed, size=size)
+    return dataclasses.replace(face, normal=face.atlas.normal)
+
+
+class PlainScene(DomeScene):
+    """A dome whose skin has no vellus hair and no brows."""
+
+    def surface(self, view: View) -> SkinSurface:
+        """Return how the face reflects for a camera."""
+        surface = super().surface(view)
+        none = np.zeros_like(surface.fuzz)
+        return dataclasses.replace(surface, fuzz=none, bare=np.ones_like(none))
+
+
+def compare(
+    *, width_px: int, lights: int, subpixels: int = 2, fine: int = 8, seed: int = 0
+) -> Comparison:
+    """Render one view of the dome in three ways.
+
+    Parameters
+    ----------
+    width_px
+        Width of the images.
+    lights
+        How many of the dome's lights Mitsuba renders, spread over the dome; ours renders all 150,
+        and is judged on the same.
+    subpixels
+        Rays along each side of our pixels; Mitsuba gets as many samples.
+    fine
+        Rays along each side of the reference's pixels.
+    seed
+        Of Mitsuba's sampler.
+
+    Returns
+    -------
+    Comparison
+        Best of two alternating runs; compiling and building of meshes are done before.
+    """
+    rig = point_rig(load_rig("dome").resized(width_px).subset(views=["C02"]))
+    view = rig.views[0]
+    face = plain_face()
+    chosen = [int(k) for k in np.linspace(0, len(rig.lights) - 1, lights).round()]
+    truth = PlainScene(rig, face, subpixels=fine)
+    reference = np.stack([_per_steradian(truth, k) for k in chosen])
+    scene = PlainScene(rig, face, subpixels=subpixels)
+    scene.radiance(view.name, [0])
+    theirs = {name: MovedLight(describe(truth, view, name), kind="rgb") for name in _INTEGRATORS}
+    for renderer in theirs.values():
+        renderer.radiance((0.0, 0.0, 700.0), samples=subpixels**2)
+    seconds = {"ours": math.inf, "path": math.inf, "direct": math.inf}
+    images: dict[str, list[Float32Array]] = {}
+    for _ in range(2):
+        scene = PlainScene(rig, face, subpixels=subpixels)
+        scene.brdf([[0.5, 0.5]], (0.0, 0.0, 1.0), (0.0, 0.0, 1.0))  # textures are ready
+        start = time.perf_counter()
+        for k in range(len(rig.lights)):
+            scene.radiance(view.name, [k])
+        seconds["ours"] = min(seconds["ours"], (time.perf_counter() - start) / len(rig.lights))
+        images["ours"] = [_per_steradian(scene, k) for k in chosen]
+        for name, renderer in theirs.items():
+            start = time.perf_counter()
+            images[name] = [
+                2.0
+                * renderer.radiance(rig.lights[k].position_mm, samples=subpixels**2, seed=seed + n)[
+                    ..., :3
+                ]
+                for n, k in enumerate(chosen)
+            ]
+            seconds[name] = min(seconds[name], (time.perf_counter() - start) / lights)
+
+    def error(name: str) -> float:
+        difference = (np.stack(images[name]) - reference).astype(np.float64)
+        return float(np.sqrt(np.mean(difference**2)) / reference.mean())
+
+    return Comparison(
+        lights=lights,
+        ours_s=seconds["ours"],
+        path_s=seconds["path"],
+        direct_s=seconds["direct"],
+        ours_error=error("ours"),
+        path_error=error("path"),
+        direct_error=error("direct"),
+        mean_ratio=float(np.stack(images["path"]).mean() / reference.mean()),
+    )
+
+
+def _per_steradian(scene: PlainScene, light: int) -> Float32Array:
+    """Return an image of the first view under a light of intensity 1 per steradian."""
+    image = scene.radiance(scene.rig.views[0].name, [light])[0]
+    return np.asarray(image / scene.intensity(light) / np.float32(math.pi), np.float32)
+
+
+def point_rig(rig: Rig) -> Rig:
+    """Return a dome whose lights are points that shine evenly, as Mitsuba's point light does."""
+    lights = tuple(
+        dataclasses.replace(light, half_intensity_deg=None, radius_mm=1e-3) for light in rig.lights
+    )
+    return dataclasses.replace(rig, lights=lights)
+
+
+def mitsuba_image(
+    scene: PlainScene, view: View, light: dict[str, Any], *, samples: int, seed: int
+) -> Float32Array:
+    """Return one image by Mitsuba's path tracer, shape (H, W, 3), for any described light."""
+    description = describe(scene, view, "path") | {"light": light}
+    return radiance(description, kind="rgb", samples=samples, seed=seed)[..., :3]
+
+
+_INTEGRATORS: dict[Integrator, dict[str, Any]] = {
+    "path": {"type": "path", "max_depth": 2},
+    "direct": {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0},
+}
+
+
+def describe(scene: PlainScene, view: View, integrator: Integrator) -> dict[str, Any]:
+    """Return Mitsuba's scene of a face in the dome, lit by a point of intensity 1 per steradian."""
+    subject = scene.subject
+    if not isinstance(subject, Subject):
+        raise TypeError(f"subject: got the target {subject.name!r}, expected a face")
+    return {
+        "type": "scene",
+        "integrator": _INTEGRATORS[integrator],
+        "sensor": {
+            "type": "perspective",
+            "fov": math.degrees(2.0 * math.atan(0.5 * view.width_px / view.focal_px)),
+            "fov_axis": "x",
+            "near_clip": 1.0,
+            "far_clip": 1e4,
+            "to_world": look_at(view.position_mm, view.target_mm, view.up),
+            "film": {
+                "type": "hdrfilm",
+                "width": view.width_px,
+                "height": view.height_px,
+                "pixel_format": "rgb",
+                "rfilter": {"type": "box"},
+            },
+        },
+        "face": {"type": "mesh", "mesh": subject.mesh, "bsdf": _skin(scene.surface(view), subject)},
+        "light": {
+            "type": "point",
+            "position": [0.0, 0.0, 700.0],
+            "intensity": {"type": "rgb", "value": [1.0, 1.0, 1.0]},
+        },
+    }
+
+
+def _plastic_scale(eta: float) -> float:
+    """Return eta^2 (1 - F_inner) with the polynomial that Mitsuba takes for the latter.
+
+    References
+    ----------
+    Egan and Hilgeman 1973, doi:10.1364/AO.12.001816; 0.1 % off the exact value at 1.4.
+    """
+    inner = -1.4399 / eta**2 + 0.7099 / eta + 0.6681 + 0.0636 * eta
+    return eta * eta * (1.0 - inner)
+
+
+def _skin(surface: SkinSurface, subject: Subject) -> dict[str, Any]:
+    """Return our reflection as a blend of Mitsuba's materials, at half its strength.
+
+    Its ``plastic`` divides by 1 minus the inner diffuse reflectance and by the index squared; the
+    face is rendered with R_d of twice as much as here times that factor, since a blend averages.
+    """
+    covered = subject.atlas.covered
+
+    def texture(values: Float32Array) -> dict[str, Any]:
+        filled = np.flipud(spread(values, covered))  # Mitsuba's v runs down the rows
+        return {
+            "type": "bitmap",
+            "bitmap": filled if filled.ndim == 3 else filled[..., None],
+            "raw": True,
+            "filter_type": "bilinear",
+            "wrap_mode": "clamp",
+        }
+
+    def metal(kind: str, eta: float, alpha: Float32Array) -> dict[str, Any]:
+        # A conductor without absorption reflects as a dielectric does.
+        return {
+            "type": "roughconductor",
+            "distribution": kind,
+            "alpha": texture(alpha),
+            "eta": eta,
+            "k": 0.0,
+        }
+
+    return {
+        "type": "blendbsdf",
+        "weight": 0.5,
+        "inside": {
+            "type": "plastic",
+            "int_ior": ETA,
+            "ext_ior": 1.0,
+            "diffuse_reflectance": texture(surface.r_d * np.float32(_plastic_scale(ETA))),
+        },
+        "outside": {
+            "type": "blendbsdf",
+            "weight": texture(surface.oil),
+            "skin": metal("beckmann", ETA, surface.roughness),
+            "oil": metal("ggx", ETA_OIL, np.float32(OIL_SMOOTHING) * surface.roughness),
+        },
+    }
