@@ -5,17 +5,21 @@ from __future__ import annotations
 import contextlib
 import json
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast, get_args
 
+from capture.devices.dome import Eyes
 from capture.plan import Plan, flash_calibration_plan, flash_plan
+from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
 from capture.rig import Rig, load_rig
 from capture.session import Session, Subject
 from skinrig.console import Console
 from skinrig.errors import UsageError
+from skinrig.light_safety import light_figures, light_lines
 
 CALIBRATION_TARGETS = ("dark", "flat", "chart", "malus")
 RETRY_S = 10.0
@@ -64,10 +68,24 @@ def require_addresses(rig: Rig, boxes: Mapping[str, str], cameras: Mapping[str, 
         )
 
 
+def eyes_of(text: str) -> Eyes:
+    """Return what is said of the subject's eyes.
+
+    Raises
+    ------
+    UsageError
+    """
+    if text not in get_args(Eyes):
+        raise UsageError(f"--eyes: got {text!r}, expected one of {', '.join(get_args(Eyes))}")
+    return cast(Eyes, text)
+
+
 def choose_plan(rig: Rig, file: Path | None, target: str | None) -> Plan:
     """Return the plan in ``file``, or the rig's own for a target, or for a subject."""
     if file is not None:
         return Plan.from_json(file.read_text(encoding="utf-8"), where=str(file))
+    if "dome" in rig.boxes:
+        return _dome_plan(rig, target)
     if target is None:
         return flash_plan(rig)
     if target == "white":
@@ -76,6 +94,15 @@ def choose_plan(rig: Rig, file: Path | None, target: str | None) -> Plan:
         expected = ", ".join(("white", *CALIBRATION_TARGETS))
         raise CaptureError(f"target: got {target!r}, expected one of {expected}")
     return flash_calibration_plan(rig, target)  # type: ignore[arg-type]
+
+
+def _dome_plan(rig: Rig, target: str | None) -> Plan:
+    if target is None:
+        return dome_plan(rig)
+    if target not in get_args(DomeTarget):
+        expected = ", ".join(get_args(DomeTarget))
+        raise CaptureError(f"target: got {target!r}, expected one of {expected}")
+    return dome_calibration_plan(rig, cast(DomeTarget, target))
 
 
 def write_plan(plan: Plan, file: Path) -> None:
@@ -107,6 +134,7 @@ def capture_session(
     plan_out: Path | None,
     resume: bool,
     console: Console,
+    eyes: Eyes = "open",
 ) -> Mapping[str, Any]:
     """Capture into ``out`` and return the command's document.
 
@@ -128,6 +156,11 @@ def capture_session(
     if out is None and not dry_run:
         raise UsageError("a capture needs --out SESSION")
     console.say(f"{len(chosen.steps)} steps, about {seconds:.0f} s")
+    light: Mapping[str, Any] = {}
+    if "dome" in rig.boxes:
+        light = light_figures(chosen, rig)
+        for line in light_lines(chosen, rig):
+            console.say(line)
     if plan_out is not None:
         write_plan(chosen, plan_out)
         console.say(f"{plan_out}: the plan; change it and hand it over with --plan {plan_out}")
@@ -137,8 +170,10 @@ def capture_session(
             [(s.id, s.kind, " ".join(f"{k}={v}" for k, v in s.settings.items()))
              for s in chosen.steps],
         )  # fmt: skip
-        return {"steps": len(chosen.steps), "estimated_s": seconds, "captured": 0}
-    return _run(rig, chosen, out, box_urls, camera_urls, subject, resume, console)
+        return {
+            "steps": len(chosen.steps), "estimated_s": seconds, "captured": 0, "light": light,
+        }  # fmt: skip
+    return _run(rig, chosen, out, box_urls, camera_urls, subject, resume, console, eyes)
 
 
 def _run(
@@ -150,14 +185,22 @@ def _run(
     subject: Subject,
     resume: bool,
     console: Console,
+    eyes: Eyes,
 ) -> Mapping[str, Any]:
     from capture.acquire import run_plan
     from capture.devices.camera import open_camera
+    from capture.devices.dome import DomeBox
     from capture.devices.flash import FlashBox
     from capture.devices.port import Port
 
+    kind: Literal["dome", "flash"] = "dome" if "dome" in rig.boxes else "flash"
+
+    def open_box() -> DomeBox | FlashBox:
+        port = Port(box_urls[kind])
+        return DomeBox(port) if kind == "dome" else FlashBox(port)
+
     with contextlib.ExitStack() as stack:
-        box = patiently(lambda: FlashBox(Port(box_urls["flash"])), console.progress)
+        box = patiently(open_box, console.progress)
         stack.callback(box.close)
         opened = {}
         for view in rig.views:
@@ -176,7 +219,7 @@ def _run(
             fresh = not out.exists()
             session = Session.create(
                 out, plan=plan, rig=rig,
-                devices={"flash": box_urls["flash"],
+                devices={kind: box_urls[kind],
                          **{name: camera.info.serial for name, camera in opened.items()}},
                 subject=subject, source=_source(box.identify()),
             )  # fmt: skip
@@ -184,17 +227,29 @@ def _run(
         stack.callback(session.release)
         with _stop_on_signal() as stopped:
             done = run_plan(
-                plan, rig, boxes={"flash": box}, cameras=opened, session=session,
-                progress=console.progress, prompt=lambda s: console.progress(f"state: {s}"),
-                interrupted=stopped,
+                plan, rig, boxes={kind: box}, cameras=opened, session=session,
+                progress=console.progress, prompt=partial(ask, console.progress),
+                interrupted=stopped, eyes=eyes,
             )  # fmt: skip
         session.close()
+    if done.dead_lights:
+        console.say(f"dead lights: {', '.join(done.dead_lights)}; their frames are dark")
     console.say(f"{out}: {done.frames} frames in {done.steps} steps, {done.retakes} retaken")
     console.say(f"next: skinrig verify {out}")
     return {
         "session": out, "captured": done.frames, "retakes": done.retakes,
-        "stale_frames": done.stale, "steps": len(plan.steps),
+        "stale_frames": done.stale, "steps": len(plan.steps), "dead_lights": done.dead_lights,
     }  # fmt: skip
+
+
+def ask(progress: Callable[[str], None], what: str) -> None:
+    """Say what the operator has to make ready, and wait for Enter where there is a keyboard."""
+    what = what if what.startswith("step ") else f"make ready: {what}"
+    if sys.stdin is None or not sys.stdin.isatty():
+        progress(what)
+        return
+    progress(f"{what}; then press Enter")
+    sys.stdin.readline()
 
 
 def patiently(

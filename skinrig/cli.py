@@ -78,15 +78,21 @@ def demo(
 
 @app.command()
 def simulate(
-    rig: Annotated[str, typer.Argument(help="Name of a rig: flash.")],
+    rig: Annotated[str, typer.Argument(help="Name of a rig: flash or dome.")],
     out: Out,
     size: Annotated[str, typer.Option(help="small or full.")] = "small",
+    lights: Annotated[int | None, typer.Option(help="So many lights of the dome.")] = None,
+    views: Annotated[int | None, typer.Option(help="So many cameras of the dome.")] = None,
+    move: Annotated[bool, typer.Option("--move", help="The face in the dome moves.")] = False,
     seed: Seed = 0,
     subject: Annotated[str, typer.Option(help="Preset, I to VI, palest or darkest.")] = "III",
     mesh: Annotated[Path | None, typer.Option(help="Face mesh, .npz or .obj.")] = None,
     target: Annotated[
         str | None,
-        typer.Option(help="A target instead of a face: white, chart, flat, dark, malus."),
+        typer.Option(
+            help="A target instead of a face: white, dark; of the flash rig chart, flat, malus; "
+            "of the dome charuco, mirror."
+        ),
     ] = None,
     state: Annotated[list[str] | None, typer.Option(help="State of the face; repeatable.")] = None,
     consent: Consent = None,
@@ -104,19 +110,22 @@ def simulate(
     console = Console(json)
     done = simulate_session(
         rig, out, size=size, seed=seed, subject=subject, mesh=mesh, target=target,
-        states=tuple(state or ("neutral",)), resume=resume, progress=console.progress,
+        states=tuple(state or ("neutral",)), resume=resume, lights=lights, views=views, move=move,
+        progress=console.progress,
         person=subject_of(f"simulated-{subject}-{seed}", consent or USES, consent_expires),
     )  # fmt: skip
     console.say(
         f"{done.session}: {done.frames} frames" + (f", truth in {done.truth}" if done.truth else "")
     )
-    console.say(f"next: {_next_step(out, target)}")
+    console.say(f"next: {_next_step(rig, out, target)}")
     console.document("skinrig.simulate/1", done.document())
 
 
-def _next_step(session: Path, target: str | None) -> str:
+def _next_step(rig: str, session: Path, target: str | None) -> str:
     kinds = {"white": "white", "flat": "sensor", "dark": "sensor", "chart": "color",
              "malus": "polarization"}  # fmt: skip
+    if rig == "dome":
+        kinds = {"charuco": "geometry", "mirror": "lights", "white": "lights", "dark": "sensor"}
     if target is None:
         return f"skinrig reconstruct {session} --want melanin,hemoglobin --out appearance"
     return f"skinrig calibrate {kinds[target]} {session} --out calibration"
@@ -135,6 +144,9 @@ def capture(
     consent_expires: ConsentExpires = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print the plan.")] = False,
     plan_out: Annotated[Path | None, typer.Option(help="New file for the plan, JSON.")] = None,
+    eyes: Annotated[
+        str, typer.Option(help="The subject's eyes in the dome: open, closed or shielded.")
+    ] = "open",
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
     json: Json = False,
 ) -> None:
@@ -143,14 +155,14 @@ def capture(
     Example: skinrig capture flash --port flash=/dev/ttyUSB0 --camera cam=hotfolder:incoming
     --out session
     """
-    from skinrig.acquisition import capture_session
+    from skinrig.acquisition import capture_session, eyes_of
     from skinrig.consent import subject_of
 
     console = Console(json)
     done = capture_session(
         rig, out, ports=port or [], cameras=camera or [], plan=plan, target=target,
         subject=subject_of(subject, consent, consent_expires), dry_run=dry_run,
-        plan_out=plan_out, resume=resume, console=console,
+        plan_out=plan_out, resume=resume, console=console, eyes=eyes_of(eyes),
     )  # fmt: skip
     console.document("skinrig.capture/1", done)
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
-from capture.rig import load_rig
-from skinrig.simulation import WIDTHS_PX, SimulationError
+from capture.rig import Rig, load_rig
+from skinrig import simulating_dome, simulating_flash
+from skinrig.simulation import SIZES, SimulationError
 
 
 def serve_rig(
@@ -20,6 +22,9 @@ def serve_rig(
     seconds: float | None = None,
 ) -> None:
     """Print the addresses of boxes and cameras, one ``NAME URL`` a line, and serve.
+
+    A dome is served with all its lights and cameras at either size: who captures from it uses the
+    rig file, which must fit.
 
     Parameters
     ----------
@@ -36,18 +41,15 @@ def serve_rig(
     seconds
         How long; None serves until Ctrl-C.
     """
-    from rigsim.scenes.flash import FlashScene
     from rigsim.serve import serve
-    from rigsim.subject import make_subject
 
-    if size not in WIDTHS_PX:
-        raise SimulationError(f"size: got {size!r}, expected one of {', '.join(WIDTHS_PX)}")
+    if size not in SIZES:
+        raise SimulationError(f"size: got {size!r}, expected one of {', '.join(SIZES)}")
     rig = load_rig(rig_name)
-    width = WIDTHS_PX[size]
+    dome = "dome" in rig.boxes
+    width = (simulating_dome if dome else simulating_flash).WIDTHS_PX[size]
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
-    scene = FlashScene(rig, make_subject(subject, seed=seed), seed=seed)
-    # rendered before anybody asks, so that no client waits for it
-    scene.radiance("crossed")
+    scene = _dome_scene(rig, subject, seed) if dome else _flash_scene(rig, subject, seed)
     with serve(rig, pty=pty, tcp=tcp, allow_remote=allow_remote, seed=seed, scene=scene) as served:
         for name, url in served.addresses.items():
             print(f"{name} {url}", flush=True)
@@ -62,3 +64,22 @@ def serve_rig(
         except KeyboardInterrupt:
             print("no longer served; the lights are dark", file=sys.stderr)
             raise
+
+
+def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
+    from rigsim.scenes.flash import FlashScene
+    from rigsim.subject import make_subject
+
+    scene = FlashScene(rig, make_subject(subject, seed=seed), seed=seed)
+    # rendered before anybody asks, so that no client waits for it
+    scene.radiance("crossed")
+    return scene
+
+
+def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
+    from rigsim.dome_build import build
+    from rigsim.scenes.dome import DomeScene
+    from rigsim.subject import make_subject
+
+    person = make_subject(subject, seed=seed)
+    return DomeScene(rig, person, dome=build(rig, seed=seed), seed=seed)

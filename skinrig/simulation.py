@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from capture.plan import Plan, flash_calibration_plan, flash_plan
-from capture.rig import Rig, load_rig
+from capture.acquire import run_plan
+from capture.devices.camera import open_camera
+from capture.devices.dome import DomeBox, Eyes
+from capture.devices.flash import FlashBox
+from capture.devices.port import Port
+from capture.plan import Plan
+from capture.rig import Rig
 from capture.session import Session, Subject
-from model import store
-from model.skin import UNITS, SkinAppearance, SkinMap
 
-WIDTHS_PX = {"small": 768, "full": 3024}
-TARGETS = ("white", "chart", "flat", "dark", "malus")
-RIGS = ("flash",)
+RIGS = ("flash", "dome")
+SIZES = ("small", "full")
 USES = ("research", "publication")
 """What may be done with a face that is nobody's, unless said otherwise."""
 
@@ -41,6 +40,8 @@ class Simulated:
     """What the scene did not build, and why."""
     blur_mm: tuple[float, ...] = ()
     """Width from 10 to 90 % of an edge that light spreading in the skin blurs, R, G, B, mm."""
+    light: Mapping[str, float | str] = field(default_factory=dict)
+    """Figures of the dome's light, see `skinrig.light_safety`; empty for the flash rig."""
 
     def document(self) -> Mapping[str, Any]:
         """Return this as JSON values."""
@@ -51,6 +52,7 @@ class Simulated:
             "rig_seconds": self.rig_seconds,
             "left_out": self.left_out,
             "blur_mm": self.blur_mm,
+            "light": dict(self.light),
         }
 
 
@@ -67,6 +69,40 @@ def truth_folder(session: Path) -> Path:
     return session.with_name(f"truth-{short}")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """What is to be simulated; see `simulate_session`."""
+
+    out: Path
+    size: str
+    seed: int
+    subject: str
+    mesh: str | Path | None
+    target: str | None
+    states: tuple[str, ...]
+    repeats: int
+    resume: bool
+    width_px: int | None
+    lights: int | None
+    views: int | None
+    move: bool
+    created: datetime | None
+    person: Subject | None
+    progress: Callable[[str], None] | None
+
+    def __post_init__(self) -> None:
+        if self.size not in SIZES:
+            raise SimulationError(f"size: got {self.size!r}, expected one of {', '.join(SIZES)}")
+        if self.seed < 0:
+            raise SimulationError(f"seed: got {self.seed}, expected 0 or more")
+
+    def refuse(self, rig: str, **unset: object) -> None:
+        """Raise where something was asked for that the rig does not know."""
+        for name, value in unset.items():
+            if getattr(self, name) != value:
+                raise SimulationError(f"{name}: the {rig} rig knows nothing of it; leave it out")
+
+
 def simulate_session(
     rig_name: str,
     out: str | Path,
@@ -80,6 +116,9 @@ def simulate_session(
     repeats: int = 1,
     resume: bool = False,
     width_px: int | None = None,
+    lights: int | None = None,
+    views: int | None = None,
+    move: bool = False,
     created: datetime | None = None,
     person: Subject | None = None,
     progress: Callable[[str], None] | None = None,
@@ -89,11 +128,12 @@ def simulate_session(
     Parameters
     ----------
     rig_name
-        "flash".
+        One of :data:`RIGS`.
     out
         The session's folder. The truth goes to ``truth-NAME`` beside ``session-NAME``.
     size
-        "small" (768 pixels across) or "full" (the camera's own 3024).
+        "small" or "full": of the flash rig 768 pixels across or the camera's own 3024; of the dome
+        6 cameras, 200 pixels across, and 48 lights, or all that it has.
     seed
         Of the subject, the sensor and the boxes.
     subject
@@ -101,15 +141,20 @@ def simulate_session(
     mesh
         A face mesh to wear the skin instead of the procedural head.
     target
-        One of :data:`TARGETS` instead of a face.
+        Something else instead of a face: of the flash rig "white", "chart", "flat", "dark" or
+        "malus"; of the dome "charuco", "mirror", "white" or "dark".
     states
-        Expressions and physiological states, captured one after the other.
+        Expressions and physiological states, captured one after the other by the flash rig.
     repeats
-        Image pairs a state.
+        Image pairs a state of the flash rig.
     resume
         Go on with a session that was interrupted; what is on disk is kept.
     width_px
         Pixels across, instead of ``size``.
+    lights, views
+        So many lights and cameras of the dome, spread evenly; None: as many as ``size`` says.
+    move
+        Whether the face in the dome drifts and twitches during the capture.
     created
         Date of the session; None: now.
     person
@@ -124,115 +169,95 @@ def simulate_session(
     """
     if rig_name not in RIGS:
         raise SimulationError(f"rig: got {rig_name!r}, expected one of {', '.join(RIGS)}")
-    if size not in WIDTHS_PX:
-        raise SimulationError(f"size: got {size!r}, expected one of {', '.join(WIDTHS_PX)}")
-    if target is not None and target not in TARGETS:
-        raise SimulationError(f"target: got {target!r}, expected one of {', '.join(TARGETS)}")
-    if seed < 0:
-        raise SimulationError(f"seed: got {seed}, expected 0 or more")
-    if target is None:
-        from rigsim.perfusion import STATES
+    order = Order(
+        out=Path(out), size=size, seed=seed, subject=subject, mesh=mesh, target=target,
+        states=tuple(states), repeats=repeats, resume=resume, width_px=width_px, lights=lights,
+        views=views, move=move, created=created, person=person, progress=progress,
+    )  # fmt: skip
+    if rig_name == "dome":
+        from skinrig.simulating_dome import simulate_dome
 
-        unknown = [state for state in states if state not in STATES]
-        if unknown:
-            raise SimulationError(f"state: got {unknown[0]!r}, expected one of {', '.join(STATES)}")
-    path = Path(out)
-    width = width_px or WIDTHS_PX[size]
-    rig = load_rig(rig_name)
-    rig = rig.resized(width) if width != rig.views[0].width_px else rig
-    asked = {
-        "rig": rig_name, "width_px": width, "subject": subject, "target": target or "",
-        "mesh": str(mesh or ""), "states": list(states), "repeats": repeats,
-    }  # fmt: skip
-    # what cannot be built must fail before a folder is made
-    scenes = _scenes(rig, target, subject, mesh, states, seed)
-    if resume:
-        session = Session.resume(path)
-        if session.manifest.extra.get("simulation") != asked or session.seed != seed:
+        return simulate_dome(order)
+    from skinrig.simulating_flash import simulate_flash
+
+    return simulate_flash(order)
+
+
+def open_session(order: Order, plan: Plan, rig: Rig, asked: Mapping[str, Any]) -> Session:
+    """Begin the session of an order, or go on with it where it was begun with the same settings."""
+    if order.resume:
+        session = Session.resume(order.out)
+        if session.manifest.extra.get("simulation") != asked or session.seed != order.seed:
             session.release()
             raise SimulationError(
-                f"{path}: was simulated with {session.manifest.extra.get('simulation')} and seed "
-                f"{session.seed}; resume with the same settings"
+                f"{order.out}: was simulated with {session.manifest.extra.get('simulation')} and "
+                f"seed {session.seed}; resume with the same settings"
             )
-    else:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        session = Session.create(
-            path,
-            plan=_plan(rig, target, states, repeats),
-            rig=rig,
-            devices={"flash": "rigsim flash box", "cam": rig.views[0].serial},
-            subject=person or Subject(f"simulated-{subject}-{seed}", USES),
-            source="simulated",
-            seed=seed,
-            extra={"simulation": asked},
-            now=None if created is None else (lambda: created),
-        )
-    rig_seconds = _drive(session, rig, scenes, seed, progress)
-    truth = None
-    if target is None:
-        truth = truth_folder(path)
-        for state, scene in scenes.items():
-            folder = truth if state == states[0] else truth.with_name(f"{truth.name}-{state}")
-            store.write(folder, _truth(scene.truth(), seed, session.content_hash, state))
-    first = next(iter(scenes.values()))
-    blur = () if target else tuple(float(width) for width in first.resolution_mm())
-    left_out = tuple(first.left_out)
-    return Simulated(path, truth, len(session.frames()), rig_seconds, left_out, blur)
+        return session
+    order.out.parent.mkdir(parents=True, exist_ok=True)
+    created = order.created
+    return Session.create(
+        order.out,
+        plan=plan,
+        rig=rig,
+        devices={
+            **{name: f"rigsim {name} box" for name in rig.boxes},
+            **{view.name: view.serial for view in rig.views},
+        },
+        subject=order.person or Subject(f"simulated-{order.subject}-{order.seed}", USES),
+        source="simulated",
+        seed=order.seed,
+        extra={"simulation": dict(asked)},
+        now=None if created is None else (lambda: created),
+    )
 
 
-def _plan(rig: Rig, target: str | None, states: tuple[str, ...], repeats: int) -> Plan:
-    if target is None:
-        return flash_plan(rig, states=states, repeats=repeats)
-    if target == "white":
-        return flash_plan(rig, states=("white",), repeats=max(4, repeats))
-    return flash_calibration_plan(rig, target)  # type: ignore[arg-type]
-
-
-def _scenes(
+def drive(
+    session: Session,
     rig: Rig,
-    target: str | None,
-    subject: str,
-    mesh: str | Path | None,
-    states: tuple[str, ...],
+    kind: str,
+    scene: Any,
     seed: int,
-) -> dict[str, Any]:
-    from rigsim import targets
-    from rigsim.scenes.flash import FlashScene
-    from rigsim.subject import make_subject
-
-    if target is not None:
-        state = "white" if target == "white" else ""
-        return {state: FlashScene(rig, targets.make_target(target), seed=seed)}
-    person = make_subject(subject, seed=seed, mesh=mesh)
-    return {state: FlashScene(rig, person, state=state, seed=seed) for state in states}
-
-
-def _drive(
-    session: Any,
-    rig: Rig,
-    scenes: Mapping[str, Any],
-    seed: int,
+    prompt: Callable[[Any, str], None],
     progress: Callable[[str], None] | None,
+    *,
+    eyes: Eyes = "open",
 ) -> float:
-    """Run the session's plan through the drivers, on a world registered under its id."""
-    from capture.acquire import run_plan
-    from capture.devices.camera import open_camera
-    from capture.devices.flash import FlashBox
-    from capture.devices.port import Port
+    """Run a session's plan through the drivers, on a world registered under its id, and close it.
+
+    Parameters
+    ----------
+    session, rig
+        Open for writing; the rig as it is drawn.
+    kind
+        Of the box: "flash" or "dome".
+    scene
+        What the cameras see first.
+    seed
+        Of the world.
+    prompt
+        Called with the world and what the operator is asked for.
+    progress
+        Called with one line now and then.
+    eyes
+        What is said of the subject's eyes.
+
+    Returns
+    -------
+    float
+        Time that has passed on the rig, s.
+    """
     from rigsim.world import World
 
-    world = World(rig, seed=seed, clock="virtual", scene=next(iter(scenes.values())))
+    world = World(rig, seed=seed, clock="virtual", scene=scene)
     name = world.register(session.id)
-    box = FlashBox(Port(f"sim://flash?world={name}"))
+    port = Port(f"sim://{kind}?world={name}", clock=world.clock)
+    box = DomeBox(port) if kind == "dome" else FlashBox(port)
     cameras = {view.name: open_camera(f"sim://{name}/{view.name}") for view in rig.views}
-
-    def prompt(state: str) -> None:
-        world.scene = scenes[state]
-
     try:
         run_plan(
-            session.plan, rig, boxes={"flash": box}, cameras=cameras, session=session,
-            progress=progress, prompt=prompt,
+            session.plan, rig, boxes={kind: box}, cameras=cameras, session=session,
+            progress=progress, prompt=lambda text: prompt(world, text), eyes=eyes,
         )  # fmt: skip
         session.close()
         return float(world.now)
@@ -242,61 +267,3 @@ def _drive(
         box.close()
         world.unregister()
         session.release()
-
-
-def to_superpixels(values: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> NDArray[Any]:
-    """Average 2 x 2 pixels, over those inside ``mask`` only.
-
-    Parameters
-    ----------
-    values
-        (H, W) or (H, W, C) with even H and W.
-    mask
-        (H, W); a block without any pixel inside is 0.
-
-    Examples
-    --------
-    >>> to_superpixels(np.arange(4.0).reshape(2, 2)).tolist()
-    [[1.5]]
-    """
-    height, width = values.shape[0] // 2, values.shape[1] // 2
-
-    def blocks(image: NDArray[Any]) -> NDArray[Any]:
-        shape = (height, 2, width, 2, *image.shape[2:])
-        return np.asarray(image[: 2 * height, : 2 * width].reshape(shape))
-
-    if mask is None:
-        return np.asarray(blocks(values).mean(axis=(1, 3)))
-    weight = mask.astype(np.float64)
-    if values.ndim == 3:
-        weight = weight[..., None]
-    total = blocks(np.where(weight > 0, values, 0.0)).sum(axis=(1, 3))
-    count = blocks(weight).sum(axis=(1, 3))
-    return np.asarray(total / np.maximum(count, 1.0))
-
-
-_TRUTH_NAMES = {"diffuse": "diffuse_radiance", "specular": "specular_radiance", "shading": "light"}
-"""The simulator's light is in its own unit; an estimate's is relative to a white tile."""
-
-
-def _truth(maps: Mapping[str, NDArray[Any]], seed: int, session: str, state: str) -> SkinAppearance:
-    mask = np.asarray(maps["mask"], bool)
-    # a superpixel on the outline mixes skin and background: no truth is claimed for it
-    # and where hair covers the skin there is none
-    bare = mask & (np.asarray(maps["melanin"]) > 0)
-    whole = to_superpixels(bare.astype(float)) == 1.0
-    kept = {}
-    for name, values in maps.items():
-        if name == "mask" or (np.ndim(values) == 3 and np.shape(values)[2] != 3):
-            continue
-        small = to_superpixels(np.asarray(values, np.float64), mask).astype(np.float32)
-        unit = "mm" if name.endswith("_mm") else UNITS.get(name.removesuffix("_blurred"), "1")
-        kept[_TRUTH_NAMES.get(name, name)] = SkinMap(small, unit, valid=whole)
-    kept["mask"] = SkinMap(whole.astype(np.float32), "1")
-    return SkinAppearance(
-        kept,
-        "simulated",
-        parameters={"kind": "truth", "state": state},
-        inputs={"session": session},
-        seed=seed,
-    )

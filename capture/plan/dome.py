@@ -15,7 +15,7 @@ from capture.rig import LedLimits, Rig
 
 DomeTarget = Literal["charuco", "mirror", "white", "dark"]
 
-EXPOSURES_S = (0.048, 0.012)
+EXPOSURES_S = (0.06, 0.015)
 """Two stops apart; the longer one and its read-out fit into a twelfth of a second."""
 FRAMES_PER_S = 12.0
 TRACKING_EVERY = 25
@@ -76,7 +76,7 @@ def dome_plan(
     >>> dome = load_rig("dome")
     >>> plan = dome_plan(dome)
     >>> sum(step.kind == "olat" for step in plan.steps), round(plan.estimated_s(dome), 1)
-    (300, 26.6)
+    (300, 26.5)
     """
     require(tracking_every >= 0, "tracking_every", tracking_every, ">= 0")
     require(darks >= 0, "darks", darks, ">= 0")
@@ -103,8 +103,9 @@ def dome_calibration_plan(
     target: DomeTarget,
     *,
     exposures_s: Sequence[float] = EXPOSURES_S,
-    poses: int = 12,
-    spheres: int = 3,
+    poses: int = 14,
+    spheres: int = 4,
+    plates: int = 7,
     darks: int = 2,
     level: float = 1.0,
     iso: int = 100,
@@ -118,12 +119,14 @@ def dome_calibration_plan(
     target : {"charuco", "mirror", "white", "dark"}
         "charuco": a board in ``poses`` poses, each lit by several lights at the first exposure;
         "mirror": a mirror sphere at ``spheres`` places, each lit by every light at the last
-        exposure; "white": a white target lit by every light at the last exposure; "dark":
-        ``8 * darks`` frames with the caps on, at every exposure.
+        exposure; "white": a white plate in ``plates`` poses (no pose faces all lights), each lit by
+        every light at the first exposure; "dark": ``8 * darks`` frames with the caps on, at every
+        exposure.
     exposures_s : sequence of float
         As for `dome_plan`.
-    poses, spheres : int
-        Poses of the board and places of the sphere, >= 1; a person moves them in between.
+    poses, spheres, plates : int
+        Poses of the board, places of the sphere and poses of the plate, >= 1; a person moves them
+        in between.
     darks : int
         Frames with no light at the exposure in use, >= 0.
     level, iso
@@ -139,7 +142,7 @@ def dome_calibration_plan(
     targets = get_args(DomeTarget)
     require(target in targets, "target", target, f"one of {', '.join(targets)}")
     require(darks >= 0, "darks", darks, ">= 0")
-    for name, count in (("poses", poses), ("spheres", spheres)):
+    for name, count in (("poses", poses), ("spheres", spheres), ("plates", plates)):
         require(count >= 1, name, count, ">= 1")
     series = _Series(rig, frames_per_s=FRAMES_PER_S, iso=iso)
     if target == "dark":
@@ -151,17 +154,17 @@ def dome_calibration_plan(
         for pose in range(poses):
             series.several(f"P{pose:02d}", "charuco", {"pose": pose}, exposures_s[0], level)
         return series.plan()
-    last = len(exposures_s) - 1
-    series.darks(darks, exposures_s[last], last)
+    # a mirror shows the lights themselves, a white plate shows less than full scale
+    exposure = len(exposures_s) - 1 if target == "mirror" else 0
+    series.darks(darks, exposures_s[exposure], exposure)
     order = best_order(rig, dwell_s=series.dwell_s)
-    for sphere in range(spheres if target == "mirror" else 1):
+    places, word = (spheres, "sphere") if target == "mirror" else (plates, "pose")
+    for place in range(places):
         for light in order:
             name = rig.lights[light].name
-            mirror = target == "mirror"
-            index: dict[str, str | int | float] = {"sphere": sphere} if mirror else {}
             series.add(
-                f"M{sphere}-{name}" if mirror else f"W-{name}", target, {**index, "light": name},
-                exposures_s[last], light=name, level=level,
+                f"{target[0].upper()}{place}-{name}", target, {word: place, "light": name},
+                exposures_s[exposure], light=name, level=level,
             )  # fmt: skip
     return series.plan()
 

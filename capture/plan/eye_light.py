@@ -64,7 +64,7 @@ def eye_light(
     >>> light = eye_light(dome)
     >>> front = max(range(150), key=lambda k: dome.lights[k].position_mm[2])
     >>> bool(light[front] == light.max()), int((light == 0).sum())
-    (True, 68)
+    (True, 81)
     """
     places = np.array([light.position_mm for light in rig.lights], np.float64)
     axes = -places / np.linalg.norm(places, axis=1)[:, None]

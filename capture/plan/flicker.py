@@ -115,7 +115,7 @@ def count_flashes(signal: NDArray[np.float64], *, least: float) -> float:
     times = np.array(turns) * SAMPLE_S
     if times.size == 0:
         return 0.0
-    inside = np.searchsorted(times, times + 1.0, side="left") - np.arange(times.size)
+    inside = np.searchsorted(times, times + 1.0 - 0.5 * SAMPLE_S) - np.arange(times.size)
     return float(inside.max()) / 2.0
 
 

@@ -69,7 +69,7 @@ class EyeGuard:
         turns = grid[_turns(seen, FLASH_SHARE * float(seen.max()))]
         if turns.size == 0:
             return 0.0
-        within = np.searchsorted(turns, turns + 1.0) - np.arange(turns.size)
+        within = np.searchsorted(turns, turns + 1.0 - 0.5 * GRID_S) - np.arange(turns.size)
         return float(within.max()) / 2.0
 
     def rms(self, light: Iterable[Lit]) -> float:

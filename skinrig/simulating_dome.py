@@ -1,0 +1,181 @@
+"""The light dome simulated: a face or a target, a scan of the face, and the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, cast, get_args
+
+import numpy as np
+
+from capture.plan import Plan
+from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
+from capture.rig import Rig, load_rig
+from model import store
+from skinrig.light_safety import light_figures, light_lines
+from skinrig.simulation import Order, Simulated, SimulationError, drive, open_session, truth_folder
+
+WIDTHS_PX = {"small": 200, "full": 1300}
+LIGHTS = {"small": 48, "full": None}
+VIEWS = {"small": 6, "full": None}
+SCAN = "scan.ply"
+SCAN_TRIANGLES = {"small": 12_000, "full": 40_000}
+TRACKING_EVERY = 24
+
+
+def simulate_dome(order: Order) -> Simulated:
+    """Simulate a capture with the dome; see `skinrig.simulation.simulate_session`."""
+    targets = get_args(DomeTarget)
+    if order.target is not None and order.target not in targets:
+        raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
+    order.refuse("dome", states=("neutral",), repeats=1)
+    rig = small_dome(
+        load_rig("dome"),
+        lights=order.lights or LIGHTS[order.size],
+        views=order.views or VIEWS[order.size],
+        width_px=order.width_px or WIDTHS_PX[order.size],
+    )
+    plan = _plan(rig, order.target)
+    figures = light_figures(plan, rig)
+    if order.progress is not None:
+        for line in light_lines(plan, rig):
+            order.progress(line)
+    asked = {
+        "rig": "dome", "width_px": rig.views[0].width_px, "subject": order.subject,
+        "target": order.target or "", "mesh": str(order.mesh or ""), "lights": len(rig.lights),
+        "views": len(rig.views), "move": order.move,
+    }  # fmt: skip
+    scene = _scene(rig, order)
+    session = open_session(order, plan, rig, asked)
+    try:
+        scan = _attach_scan(session, scene, order) if order.target is None else {}
+    except BaseException:
+        session.release()
+        raise
+
+    def prompt(world: Any, text: str) -> None:
+        # "pose 3" and "sphere 1": the operator puts the target there
+        scene.show(int(text.rpartition(" ")[2]))
+
+    # nobody sits in front of a target; a face is asked to close its eyes where that is needed
+    safe = order.target is not None or figures["open_eyes"] != "allowed"
+    rig_seconds = drive(
+        session, rig, "dome", scene, order.seed, prompt, order.progress,
+        eyes="closed" if safe else "open",
+    )  # fmt: skip
+    truth = None
+    if order.target is None:
+        truth = truth_folder(order.out)
+        appearance = scene.truth_appearance()
+        appearance = dataclasses.replace(
+            appearance,
+            parameters={"kind": "truth", "state": "neutral", **appearance.parameters, **scan},
+            inputs={"session": session.content_hash},
+            seed=order.seed,
+        )
+        store.write(truth, appearance)
+    return Simulated(
+        order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures
+    )
+
+
+def small_dome(
+    rig: Rig, *, lights: int | None = None, views: int | None = None, width_px: int | None = None
+) -> Rig:
+    """Return a dome with fewer lights, cameras and pixels, those kept spread evenly.
+
+    Parameters
+    ----------
+    rig : Rig
+    lights, views : int, optional
+        How many to keep, 1 to all; all by default.
+    width_px : int, optional
+        Pixels across each camera.
+
+    Raises
+    ------
+    SimulationError
+        For a number that the rig cannot give.
+
+    Examples
+    --------
+    >>> small = small_dome(load_rig("dome"), lights=12, views=3, width_px=130)
+    >>> len(small.lights), len(small.views), small.views[0].height_px
+    (12, 3, 104)
+    """
+    kept: dict[str, list[str] | None] = {"lights": None, "views": None}
+    for field, count in (("lights", lights), ("views", views)):
+        rows = getattr(rig, field)
+        if count is None:
+            continue
+        if not 1 <= count <= len(rows):
+            raise SimulationError(f"{field}: got {count}, expected 1 to {len(rows)}")
+        kept[field] = [rows[k].name for k in spread(np.array([r.position_mm for r in rows]), count)]
+    rig = rig.subset(lights=kept["lights"], views=kept["views"])
+    return rig if width_px in (None, rig.views[0].width_px) else rig.resized(int(width_px or 0))
+
+
+def spread(places: np.ndarray[Any, Any], count: int) -> list[int]:
+    """Return the numbers of ``count`` directions, each next one the farthest from those before.
+
+    Parameters
+    ----------
+    places : ndarray
+        (N, 3), any length; the first chosen is the one most towards +z.
+    count : int
+        1 to N.
+
+    Examples
+    --------
+    >>> spread(np.array([[1.0, 0, 0], [0, 0, 1], [-1, 0, 0], [0.9, 0, 0.1]]), 3)
+    [1, 0, 2]
+    """
+    way = places / np.linalg.norm(places, axis=1)[:, None]
+    chosen = [int(np.argmax(way[:, 2]))]
+    while len(chosen) < count:
+        nearest = (way @ way[chosen].T).max(axis=1)
+        nearest[chosen] = np.inf
+        chosen.append(int(np.argmin(nearest)))
+    return chosen
+
+
+def _plan(rig: Rig, target: str | None) -> Plan:
+    if target is None:
+        return dome_plan(rig, tracking_every=TRACKING_EVERY)
+    from rigsim.scenes.dome_targets import PLACES
+
+    return dome_calibration_plan(
+        rig, cast(DomeTarget, target), poses=PLACES["charuco"], spheres=PLACES["mirror"],
+        plates=PLACES["white"],
+    )  # fmt: skip
+
+
+def _scene(rig: Rig, order: Order) -> Any:
+    from rigsim.dome_build import build
+    from rigsim.head_motion import head_motion
+    from rigsim.scenes.dome import DomeScene
+    from rigsim.scenes.dome_targets import target_scene
+    from rigsim.subject import make_subject
+    from rigsim.targets import make_target
+
+    built = build(rig, seed=order.seed)
+    if order.target == "dark":
+        return DomeScene(rig, make_target("dark"), dome=built, seed=order.seed)
+    if order.target is not None:
+        return target_scene(order.target, rig, seed=order.seed, dome=built)  # type: ignore[arg-type]
+    person = make_subject(order.subject, seed=order.seed, mesh=order.mesh)
+    motion = head_motion(order.seed) if order.move else None
+    return DomeScene(rig, person, dome=built, motion=motion, seed=order.seed)
+
+
+def _attach_scan(session: Any, scene: Any, order: Order) -> dict[str, Any]:
+    """Scan the face into the session; return what the truth keeps of it."""
+    from rigsim.scanner import Scanner, scan_face
+
+    scan = scan_face(
+        scene.subject.mesh,
+        rng=np.random.default_rng([order.seed, 7]),
+        scanner=Scanner(triangles=SCAN_TRIANGLES[order.size]),
+    )
+    if SCAN not in session.attachments():
+        session.attach(SCAN, scan.ply, about={"kind": "scanned mesh", "unit": "mm"})
+    return {"scan_to_dome": scan.to_dome.tolist()}
