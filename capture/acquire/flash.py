@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 from capture.acquire.frames import configure, encode, frame_timeout_s, wanted_exposure
@@ -37,6 +37,8 @@ from capture.session import Session
 log = logging.getLogger(__name__)
 
 CHARGE_TIMEOUT_S = 60.0
+HAND_S = 60.0
+"""How long a person has for pressing a shutter."""
 MAX_TOKEN = 48
 """Characters of the longest token that a box takes."""
 
@@ -79,6 +81,9 @@ class Flash(Protocol):
     def fire(self, token: str) -> Any:
         """Fire once; a retry on the line never fires twice."""
 
+    def trigger_cameras(self, token: str) -> float:
+        """Pulse the camera line without light."""
+
     def dark(self) -> None:
         """Put all light out and disarm."""
 
@@ -110,8 +115,8 @@ def run_flash(
                 state = str(wanted)
                 operator.prompt(state)
             operator.progress(f"{number}/{len(steps)} {step.id} {step.kind} {_index_text(step)}")
-            name = f"{operator.run_id}.{number}"
-            _take(step, rig, box, cameras, session, taken, operator.clock, counts, name)
+            prefix = f"{operator.run_id}.{number}"
+            _take(step, rig, box, cameras, session, taken, operator, counts, prefix)
     finally:
         tear_down(box, cameras)
     return Acquired(counts["steps"], counts["frames"], counts["stale"], counts["retakes"])
@@ -162,15 +167,16 @@ def _take(
     cameras: Mapping[str, Camera],
     session: Session,
     taken: Mapping[tuple[str, str], int],
-    clock: Callable[[], float],
+    operator: Operator,
     counts: dict[str, int],
-    name: str,
+    prefix: str,
 ) -> None:
     """Take one step with all its cameras, or none: a step with one bad frame is shot again."""
     refusals: list[str] = []
     for attempt in range(1, MAX_ATTEMPTS + 1):
         try:
-            report, frames, stale = _expose(step, rig, box, cameras, _token(name, attempt, step))
+            token = _token(prefix, attempt, step)
+            report, frames, stale = _expose(step, rig, box, cameras, operator, token)
         except (FrameRefused, FrameTimeout, CommandRefused) as error:
             if isinstance(error, CommandRefused) and error.code != Code.HARDWARE:
                 raise
@@ -202,7 +208,7 @@ def _take(
                     **light,
                 },
                 t_box_s=None if report is None else float(report.t_box_s),
-                t_host_s=clock(),
+                t_host_s=operator.clock(),
                 # a step of which only some cameras were kept is shot again with all of them
                 attempt=taken.get((step.id, name), 0) + 1,
             )
@@ -213,7 +219,12 @@ def _take(
 
 
 def _expose(
-    step: Step, rig: Rig, box: Flash, cameras: Mapping[str, Camera], token: str
+    step: Step,
+    rig: Rig,
+    box: Flash,
+    cameras: Mapping[str, Camera],
+    operator: Operator,
+    token: str,
 ) -> tuple[Any | None, dict[str, Frame], int]:
     """Set the light and the cameras, make the exposure, and collect one frame a camera."""
     want = wanted_exposure(step)
@@ -227,17 +238,7 @@ def _expose(
         box.wait_charged(CHARGE_TIMEOUT_S)
     chosen = {name: cameras[name] for name in step.cameras}
     lit_by_box = power > 0
-    for name, camera in chosen.items():
-        if lit_by_box and Trigger.EDGE not in camera.info.triggers:
-            # exposing on request would miss the flash: every lit frame would be dark
-            raise CameraError(
-                f"view {name!r}: the camera {camera.info.serial} cannot be released by the flash "
-                "box's trigger line; release it from the box and let a tethering program write "
-                "its files into a hot folder"
-            )
-    triggers = {
-        name: Trigger.EDGE if lit_by_box else Trigger.SOFTWARE for name, camera in chosen.items()
-    }
+    triggers = {name: _trigger(name, camera, lit_by_box) for name, camera in chosen.items()}
     asked: dict[str, Exposure] = {}
     not_before: dict[str, float] = {}
     for name, camera in chosen.items():
@@ -254,10 +255,20 @@ def _expose(
         box.arm()
         report = box.fire(token)
         box.dark()
+    elif Trigger.EDGE in triggers.values():
+        box.trigger_cameras(token)
+    for name, camera in chosen.items():
+        if triggers[name] is Trigger.HAND:
+            operator.prompt(
+                f"step {step.id}: press the shutter of camera {name} ({camera.info.serial}) once, "
+                f"at {want.exposure_s:g} s and ISO {want.iso}, without any light; within "
+                f"{HAND_S:g} s"
+            )
     frames: dict[str, Frame] = {}
     stale = 0
     for name, camera in chosen.items():
         timeout_s = frame_timeout_s(step, rig.view(name))
+        timeout_s += HAND_S if triggers[name] is Trigger.HAND else 0.0
         frames[name], dropped = next_frame(
             camera, seq=0, not_before_s=not_before[name], want=asked[name], timeout_s=timeout_s
         )
@@ -265,9 +276,26 @@ def _expose(
     return report, frames, stale
 
 
-def _token(name: str, attempt: int, step: Step) -> str:
+def _trigger(name: str, camera: Camera, lit: bool) -> Trigger:
+    """Return what releases a camera for a step: the box where there is light to meet."""
+    known = camera.info.triggers
+    if not lit:
+        for trigger in (Trigger.SOFTWARE, Trigger.EDGE, Trigger.HAND):
+            if trigger in known:
+                return trigger
+    if Trigger.EDGE not in known:
+        # exposing on request would miss the flash: every lit frame would be dark
+        raise CameraError(
+            f"view {name!r}: the camera {camera.info.serial} cannot be released by the flash "
+            "box's trigger line; release it from the box and let a tethering program write "
+            "its files into a hot folder"
+        )
+    return Trigger.EDGE
+
+
+def _token(prefix: str, attempt: int, step: Step) -> str:
     """Name one flash: run, number in the run, try; then as much of the step as a box takes."""
-    return f"{name}.{attempt}.{step.id}"[:MAX_TOKEN]
+    return f"{prefix}.{attempt}.{step.id}"[:MAX_TOKEN]
 
 
 def _light(report: Any | None) -> dict[str, str | float]:

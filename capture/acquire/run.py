@@ -47,7 +47,8 @@ def run_plan(
         Called with one line a step, or a second of a sequence.
     prompt
         Called before the first step that needs it with the state ("smile"), or with the place of
-        the target on the dome ("pose 3"); returns when the subject or the target is ready.
+        the target on the dome ("pose 3"); returns when the subject or the target is ready. Called
+        too with what to press when only a hand can release a camera.
     interrupted
         Asked before each step, or each sequence; True stops in good order.
     clock

@@ -61,6 +61,8 @@ class Trigger(StrEnum):
     SOFTWARE = "software"
     EDGE = "edge"
     LEVEL = "level"
+    HAND = "hand"
+    """A person's finger on the shutter."""
 
 
 @dataclass(frozen=True, slots=True)

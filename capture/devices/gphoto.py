@@ -1,8 +1,17 @@
-"""Cameras that libgphoto2 knows, by serial number; needs the extra ``gphoto``."""
+"""Cameras that libgphoto2 knows, by serial number; needs the extra ``gphoto``.
+
+The flash box's line releases the camera and its file is fetched when it says that there is one; for
+frames without light the computer releases it. The way through this module is tested against a
+stand-in for the library; no camera has been at hand.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 from capture import raw
@@ -15,6 +24,11 @@ from capture.devices.camera import (
     FrameTimeout,
     Trigger,
 )
+
+DRAIN_MS = 50
+"""How long old events are waited for when the camera is armed, ms."""
+EVENT_MS = 500
+"""Longest wait for one event, ms."""
 
 
 class MissingGphoto2(CameraError, ImportError):
@@ -42,16 +56,23 @@ class GphotoCamera:
     serial
         As the camera itself reports it. Port names are not used: they move from camera to
         camera when a cable is plugged in again.
+    clock
+        The host's, s; for tests.
     """
 
-    def __init__(self, library: Any, serial: str) -> None:
+    def __init__(
+        self, library: Any, serial: str, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._library = library
+        self._clock = clock
         self._camera = self._find(serial)
         self._serial = serial
         self._want = Exposure(0.01, 100)
         self._seq = 0
         self._info: CameraInfo | None = None
         self._fired_s = float("-inf")
+        self._trigger = Trigger.SOFTWARE
+        self._last: tuple[bytes, float] = (b"", float("-inf"))
 
     def _find(self, serial: str) -> Any:
         found = []
@@ -88,17 +109,21 @@ class GphotoCamera:
                 pattern=picture.pattern,
                 black=picture.black,
                 white=picture.white,
-                triggers=(Trigger.SOFTWARE,),
+                triggers=(Trigger.SOFTWARE, Trigger.EDGE),
             )
         return self._info
 
     def clock_s(self) -> float:
         """Return the host's clock, which stamps the frames."""
-        return time.monotonic()
+        return self._clock()
 
     def configure(self, want: Exposure) -> Exposure:
         """Set shutter and ISO to the nearest the camera has."""
         self._want = want
+        with self._translated():
+            return self._configure(want)
+
+    def _configure(self, want: Exposure) -> Exposure:
         tree = self._camera.get_config()
         got = {}
         for name, value in (("shutterspeed", want.exposure_s), ("iso", float(want.iso))):
@@ -107,19 +132,22 @@ class GphotoCamera:
             known = {c: v for c, v in choices.items() if v is not None and v > 0}
             if not known:
                 raise CameraError(f"gphoto2:{self._serial}: offers no {name}; set the dial to M")
-            best = min(known, key=lambda c: abs(known[c] / value - 1.0))
+            best = min(known, key=lambda c: abs(math.log(known[c] / value)))
             widget.set_value(best)
             got[name] = known[best]
         self._camera.set_config(tree)
         return Exposure(got["shutterspeed"], int(got["iso"]))
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """Make ready; only the software trigger is known to libgphoto2."""
-        if trigger is not Trigger.SOFTWARE:
-            raise CameraError(
-                f"gphoto2:{self._serial}: cannot be triggered by {trigger}; sync the flash from "
-                "its hot shoe, or use a hot folder"
-            )
+        """Make ready for the computer's release or the box's; files of before are let go."""
+        if trigger not in (Trigger.SOFTWARE, Trigger.EDGE):
+            raise CameraError(f"gphoto2:{self._serial}: cannot be triggered by {trigger}")
+        if count < 1:
+            raise CameraError(f"count: got {count}, expected 1 or more")
+        with self._translated():
+            while self._event(DRAIN_MS) is not None:
+                pass
+        self._trigger = trigger
         self._seq = 0
 
     def fire(self) -> None:
@@ -127,18 +155,31 @@ class GphotoCamera:
         self._fired_s = self.clock_s()
 
     def frame(self, timeout_s: float) -> Frame:
-        """Expose and download one raw file."""
+        """Expose now, or wait for what the box has released, and download the raw file.
+
+        A file whose bytes are those of the last one is that one again: it bears its old time, by
+        which it is known as stale. Another file that was released before the camera was armed, and
+        told of later only, cannot be told from the right one.
+        """
         start = self.clock_s()
-        if self._fired_s == float("-inf"):
+        if self._trigger is Trigger.EDGE:
+            blob = self._await_file(start + timeout_s)
+            start = self.clock_s() - self._want.exposure_s
+        elif self._fired_s == float("-inf"):
             raise FrameTimeout(f"gphoto2:{self._serial}: was not fired")
-        blob = self._capture()
+        else:
+            blob = self._capture()
         self._fired_s = float("-inf")
+        digest = hashlib.sha256(blob).digest()
+        stale = digest == self._last[0]
+        start = self._last[1] if stale else start
+        self._last = (digest, start)
         picture = raw.decode(memoryview(blob), where=f"gphoto2:{self._serial}")
         exposure = Exposure(
             picture.exposure_s or self._want.exposure_s, picture.iso or self._want.iso
         )
         frame = Frame(self._serial, self._seq, start, self.clock_s(), exposure, blob)
-        self._seq += 1
+        self._seq += not stale
         return frame
 
     def abort(self) -> None:
@@ -150,12 +191,36 @@ class GphotoCamera:
         self._camera.exit()
 
     def _capture(self) -> bytes:
-        library = self._library
+        with self._translated():
+            return self._download(self._camera.capture(self._library.GP_CAPTURE_IMAGE))
+
+    def _await_file(self, until_s: float) -> bytes:
+        with self._translated():
+            while True:
+                left_ms = round(1e3 * (until_s - self.clock_s()))
+                if left_ms <= 0:
+                    raise FrameTimeout(
+                        f"gphoto2:{self._serial}: no new file came; is the box's trigger line "
+                        "plugged into the camera?"
+                    )
+                event = self._event(min(left_ms, EVENT_MS))
+                if event is not None and event[0] == self._library.GP_EVENT_FILE_ADDED:
+                    return self._download(event[1])
+
+    def _event(self, timeout_ms: int) -> tuple[int, Any] | None:
+        """Return kind and content of the next event, None when none came."""
+        kind, content = self._camera.wait_for_event(timeout_ms)
+        return None if kind == self._library.GP_EVENT_TIMEOUT else (kind, content)
+
+    def _download(self, path: Any) -> bytes:
+        file = self._camera.file_get(path.folder, path.name, self._library.GP_FILE_TYPE_NORMAL)
+        return bytes(file.get_data_and_size())
+
+    @contextlib.contextmanager
+    def _translated(self) -> Any:
         try:
-            path = self._camera.capture(library.GP_CAPTURE_IMAGE)
-            file = self._camera.file_get(path.folder, path.name, library.GP_FILE_TYPE_NORMAL)
-            return bytes(file.get_data_and_size())
-        except library.GPhoto2Error as error:
+            yield
+        except self._library.GPhoto2Error as error:
             raise CameraError(f"gphoto2:{self._serial}: {error}") from error
 
 

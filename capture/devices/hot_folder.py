@@ -1,7 +1,8 @@
 """A folder as a camera: any tethering program that writes raw files there will do.
 
-The program and a person's finger, or the flash box's trigger line, take the picture. A frame is a
-raw file that appeared after the camera was armed and has stopped growing.
+The flash box's trigger line releases the camera, with light and without, or a person's finger where
+the address says ``release=hand``. A frame is a raw file that appeared after the camera was armed
+and has stopped growing.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from urllib.parse import parse_qsl
 
 from capture import raw
 from capture.devices.camera import (
@@ -30,12 +32,15 @@ SUFFIXES = frozenset(
 
 
 def open_camera(rest: str) -> HotFolder:
-    """Open ``hotfolder:PATH`` or ``hotfolder:PATH?serial=NUMBER``."""
+    """Open ``hotfolder:PATH``, with ``?serial=NUMBER`` and ``release=hand`` where they apply."""
     path, _, query = rest.partition("?")
-    serial = query.removeprefix("serial=") if query.startswith("serial=") else ""
-    if query and not serial:
-        raise CameraUrlError(f"hotfolder:{rest}: got {query!r}, expected serial=NUMBER")
-    return HotFolder(Path(path), serial=serial)
+    words = dict(parse_qsl(query, keep_blank_values=True))
+    serial, release = words.pop("serial", ""), words.pop("release", "box")
+    if words or release not in ("box", "hand") or (query and not (serial or "release=" in query)):
+        raise CameraUrlError(
+            f"hotfolder:{rest}: got {query!r}, expected serial=NUMBER or release=hand, joined by &"
+        )
+    return HotFolder(Path(path), serial=serial, by_hand=release == "hand")
 
 
 class HotFolder:
@@ -48,6 +53,8 @@ class HotFolder:
     serial
         Serial number that frames must carry; empty: that of the first file in the folder, which
         must then hold one.
+    by_hand
+        Whether nothing but a person can release the camera.
     clock, sleep
         For tests; the clock must be the one that stamps files (seconds since 1970).
 
@@ -62,6 +69,7 @@ class HotFolder:
         path: Path,
         *,
         serial: str = "",
+        by_hand: bool = False,
         clock: Callable[[], float] = time.time,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
@@ -89,7 +97,7 @@ class HotFolder:
             pattern=frame.pattern,
             black=frame.black,
             white=frame.white,
-            triggers=(Trigger.EDGE, Trigger.SOFTWARE),
+            triggers=(Trigger.HAND,) if by_hand else (Trigger.EDGE,),
         )
 
     @property
@@ -110,12 +118,21 @@ class HotFolder:
         """Ignore all that is in the folder now."""
         if count < 1:
             raise CameraError(f"count: got {count}, expected 1 or more")
+        if trigger not in self._info.triggers:
+            raise CameraError(f"hotfolder:{self._path}: cannot be released by {trigger}")
         self._seen |= set(self._files())
         self._seq = 0
         self._armed = count
 
     def fire(self) -> None:
-        """Do nothing: a folder takes no picture; the operator or the trigger line does."""
+        """Refuse: a folder takes no picture.
+
+        Raises
+        ------
+        CameraError
+            Always.
+        """
+        raise CameraError(f"hotfolder:{self._path}: is released by the box or by hand, not by fire")
 
     def frame(self, timeout_s: float) -> Frame:
         """Wait for a new raw file that has stopped growing, and read it."""

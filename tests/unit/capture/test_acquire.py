@@ -60,6 +60,11 @@ class Box:
             analyser_deg=90.0 if self.polarizer == "crossed" else 0.0,
         )  # fmt: skip
 
+    def trigger_cameras(self, token):
+        self.log.append(f"trigger {token}")
+        for camera in self.line:
+            camera.expose()
+
     def dark(self):
         self.log.append("dark")
 
@@ -256,6 +261,52 @@ def test_a_camera_that_is_not_the_rigs_is_refused_before_anything_flashes(plan, 
 def test_a_missing_box_is_named_with_what_to_type(plan, session):
     with pytest.raises(AcquisitionError, match="--port flash=URL"):
         run_plan(plan, RIG, boxes={}, cameras={"cam": Camera()}, session=session)
+
+
+def released_by(*triggers):
+    camera = Camera()
+    camera.info = dataclasses.replace(camera.info, triggers=triggers)
+    return camera
+
+
+def test_a_camera_on_the_boxs_line_is_released_by_it_for_darks_too(plan, session):
+    camera, log = released_by(Trigger.EDGE), []
+    camera.fire = lambda: pytest.fail("is not released by the computer")
+    done = run(plan, session, Box(log), camera)
+    assert done.frames == 5
+    (dark,) = [entry for entry in log if entry.startswith("trigger")]
+    assert dark.endswith(".D000")
+    # no light was allowed before the pulse
+    assert "arm" not in log[: log.index(dark)]
+
+
+def test_a_camera_that_only_a_hand_releases_is_asked_for_clearly_and_waited_for(session, plan):
+    camera, asked, waited = released_by(Trigger.HAND), [], []
+
+    def press(text):
+        asked.append(text)
+        camera.expose()
+
+    def frame(timeout_s):
+        waited.append(timeout_s)
+        return camera.queue.pop(0)
+
+    camera.frame = frame
+    with pytest.raises(CameraError, match="trigger line"):  # the lit step after the dark
+        run(plan, session, Box([]), camera, prompt=press)
+    (text,) = [text for text in asked if text != "neutral"]
+    for word in ("D000", "press the shutter", "cam", VIEW.serial, "0.008 s", "ISO 100", "60 s"):
+        assert word in text
+    assert waited[0] > 60.0
+    assert [record.step_id for record in session.frames()] == ["D000"]
+
+
+def test_a_try_after_a_misfire_bears_the_runs_name_too(plan, session):
+    log = []
+    run(plan, session, Box(log), Camera(spoil=[{}, "dropped"]), run_id="run1")
+    tokens = [entry.split()[1] for entry in log if entry.startswith("fire")]
+    assert all(token.startswith("run1.") for token in tokens)
+    assert tokens[:2] == ["run1.2.1.S000", "run1.2.2.S000"]
 
 
 def test_a_camera_that_the_box_cannot_release_is_refused_before_a_flash_is_lost(plan, session):

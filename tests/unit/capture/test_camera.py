@@ -141,6 +141,23 @@ def test_files_from_before_arming_are_no_frames(folder):
         camera.frame(5.0)
 
 
+def test_a_folder_is_released_by_the_box_or_by_hand_as_its_address_says(folder):
+    for query, known in (
+        ("", Trigger.EDGE), ("?serial=A1", Trigger.EDGE), ("?release=hand", Trigger.HAND),
+        ("?serial=A1&release=hand", Trigger.HAND), ("?release=box", Trigger.EDGE),
+    ):  # fmt: skip
+        camera = cameras.open_camera(f"hotfolder:{folder}{query}")
+        assert camera.info.triggers == (known,)
+        camera.arm(1, known)
+        with pytest.raises(cameras.CameraError, match="cannot be released"):
+            camera.arm(1, Trigger.SOFTWARE)
+        with pytest.raises(cameras.CameraError, match="by the box or by hand"):
+            camera.fire()
+    for query in ("?release=foot", "?seriel=A1", "?serial=", "?x"):
+        with pytest.raises(cameras.CameraUrlError, match="release=hand"):
+            cameras.open_camera(f"hotfolder:{folder}{query}")
+
+
 def test_a_folder_without_a_test_picture_tells_what_to_do(tmp_path):
     with pytest.raises(cameras.CameraUrlError, match="test picture"):
         HotFolder(tmp_path)
