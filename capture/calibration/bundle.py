@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
 
 from capture.calibration.board import LEAST_CORNERS, Board, Sighting
 from capture.calibration.geometry import CameraPose, distort
@@ -207,7 +208,8 @@ def adjust(
     else:
         cameras = dict(start)
     problem = _Problem(sightings, board, start, prior or LensPrior(), gauge)
-    cameras, places = problem.solve(cameras, places)
+    with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
+        cameras, places = problem.solve(cameras, places)
     if gauge == "cameras":
         found = np.array([cameras[name].center_mm for name in problem.names])
         wanted = np.array([start[name].center_mm for name in problem.names])

@@ -6,7 +6,6 @@ the gap beside it show it. An LED is a flat disc of even radiance.
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 import numpy as np
@@ -25,6 +24,7 @@ CLOTH_ROWS: Final = 48
 """Rows of the map of light on the cloth; it has twice as many columns."""
 
 
+@njit(cache=True, nogil=True)
 def light_on_cloth(
     lamp_mm: FloatArray, lamp_axis: FloatArray, lamp_exponent: FloatArray, strength: FloatArray
 ) -> FloatArray:
@@ -33,48 +33,55 @@ def light_on_cloth(
     In the unit of a white's signal; rows by elevation from +y down, columns by azimuth
     atan2(x, z) from -pi.
     """
-    elevation = np.pi / 2 - (np.arange(CLOTH_ROWS) + 0.5) * np.pi / CLOTH_ROWS
-    azimuth = (np.arange(2 * CLOTH_ROWS) + 0.5) * np.pi / CLOTH_ROWS - np.pi
-    e, a = np.meshgrid(elevation, azimuth, indexing="ij")
-    outward = np.stack([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)], axis=-1)
-    places = CLOTH_MM * outward
-    total = np.zeros(e.shape)
-    for place, axis, exponent, power in zip(
-        lamp_mm, lamp_axis, lamp_exponent, strength, strict=True
-    ):
-        offset = places - place
-        d2 = np.sum(offset**2, axis=-1)
-        off = np.clip(offset @ axis / np.sqrt(d2), 0.0, None)
-        cosine = np.clip(np.sum(offset * outward, axis=-1) / np.sqrt(d2), 0.0, None)
-        total += power * np.where(off > 0, off, 1.0) ** exponent * (off > 0) * cosine / d2
-    return CLOTH_REFLECTANCE * total
+    out = np.zeros((CLOTH_ROWS, 2 * CLOTH_ROWS))
+    for row in range(CLOTH_ROWS):
+        elevation = np.pi / 2 - (row + 0.5) * np.pi / CLOTH_ROWS
+        for column in range(2 * CLOTH_ROWS):
+            azimuth = (column + 0.5) * np.pi / CLOTH_ROWS - np.pi
+            x = np.cos(elevation) * np.sin(azimuth)
+            y = np.sin(elevation)
+            z = np.cos(elevation) * np.cos(azimuth)
+            total = 0.0
+            for m in range(lamp_mm.shape[0]):
+                dx = CLOTH_MM * x - lamp_mm[m, 0]
+                dy = CLOTH_MM * y - lamp_mm[m, 1]
+                dz = CLOTH_MM * z - lamp_mm[m, 2]
+                square = dx * dx + dy * dy + dz * dz
+                d = square**0.5
+                off = (dx * lamp_axis[m, 0] + dy * lamp_axis[m, 1] + dz * lamp_axis[m, 2]) / d
+                cosine = (dx * x + dy * y + dz * z) / d
+                if off > 0.0 and cosine > 0.0:
+                    total += strength[m] * off ** lamp_exponent[m] * cosine / square
+            out[row, column] = CLOTH_REFLECTANCE * total
+    return out
 
 
+@njit(cache=True, nogil=True)
 def reflection_point(
     eye_mm: FloatArray, lamp_mm: FloatArray, ball_mm: FloatArray, radius_mm: float
 ) -> FloatArray:
     """Return where a ball shows a lamp to an eye, by halving the angle (Alhazen's problem)."""
     to_eye, to_lamp = eye_mm - ball_mm, lamp_mm - ball_mm
-    e = to_eye / np.linalg.norm(to_eye)
-    across = to_lamp - (to_lamp @ e) * e
-    length = float(np.linalg.norm(across))
+    e = to_eye / np.sqrt(np.sum(to_eye**2))
+    across = to_lamp - np.sum(to_lamp * e) * e
+    length = np.sqrt(np.sum(across**2))
     if length < 1e-9:
-        return np.asarray(ball_mm + radius_mm * e)
-    across /= length
-
-    def miss(angle: float) -> float:
-        normal = math.cos(angle) * e + math.sin(angle) * across
-        point = radius_mm * normal
-        out, back = to_lamp - point, to_eye - point
-        tangent = -math.sin(angle) * e + math.cos(angle) * across
-        return float(out @ tangent / np.linalg.norm(out) + back @ tangent / np.linalg.norm(back))
-
-    low, high = 0.0, math.pi
-    for _ in range(60):
+        return ball_mm + radius_mm * e
+    across = across / length
+    low, high = 0.0, np.pi
+    for _ in range(50):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if miss(middle) > 0 else (low, middle)
-    normal = math.cos(low) * e + math.sin(low) * across
-    return np.asarray(ball_mm + radius_mm * normal)
+        normal = np.cos(middle) * e + np.sin(middle) * across
+        tangent = -np.sin(middle) * e + np.cos(middle) * across
+        out = to_lamp - radius_mm * normal
+        back = to_eye - radius_mm * normal
+        miss = np.sum(out * tangent) / np.sqrt(np.sum(out**2))
+        miss += np.sum(back * tangent) / np.sqrt(np.sum(back**2))
+        if miss > 0.0:
+            low = middle
+        else:
+            high = middle
+    return ball_mm + radius_mm * (np.cos(low) * e + np.sin(low) * across)
 
 
 @njit(cache=True, nogil=True)

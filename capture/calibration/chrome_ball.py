@@ -1,0 +1,115 @@
+"""Light directions from photographs of a chrome ball, seen from far away."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from capture.calibration.record import CalibrationError
+
+__all__ = ["ChromeBallError", "directions_from_chrome_ball", "highlight_center"]
+
+FloatArray = NDArray[np.float64]
+
+BRIGHT_SHARE = 0.9  # of the brightest pixel: what belongs to a highlight
+LEAST_CONTRAST = 4.0  # brightest pixel over the median: below, nothing stands out
+LEAST_BALL_PX = 100
+
+
+class ChromeBallError(CalibrationError):
+    """Photographs of a ball that show no light; the message names them."""
+
+
+def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> FloatArray:
+    """Return the directions to distant lights from their highlights on a mirror ball.
+
+    Parameters
+    ----------
+    images : sequence of ndarray, shape (H, W) or (H, W, 3)
+        One photograph a light, any monotonic scale, the ball at one place.
+    mask : ndarray, shape (H, W) or (H, W, 3)
+        Where the ball is: bool, or brighter than half its largest value.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+        Unit vectors to the lights: x right, y up, z towards the camera.
+
+    Raises
+    ------
+    ChromeBallError
+        If shapes differ, the mask holds no ball, or an image shows no highlight; it is named.
+
+    Notes
+    -----
+    The camera looks along -z from far away (orthographic): a highlight at the place of normal n
+    shows a light in the direction 2 (n . z) n - z. Perspective would turn it by up to the angle
+    at which the ball is seen.
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[:81, :81] - 40
+    >>> ball = x**2 + y**2 <= 30**2
+    >>> spot = np.exp(-((x - 15) ** 2 + y**2) / 4.0)
+    >>> directions_from_chrome_ball([spot], ball).round(2).tolist()
+    [[0.86, -0.0, 0.52]]
+    """
+    inside = np.asarray(mask)
+    inside = inside.max(axis=-1) if inside.ndim == 3 else inside
+    inside = inside if inside.dtype == bool else inside > 0.5 * inside.max(initial=0)
+    count = int(np.count_nonzero(inside))
+    if inside.ndim != 2 or count < LEAST_BALL_PX:
+        raise ChromeBallError(
+            f"mask: got {count} pixels of a ball in shape {inside.shape}, expected (H, W) and at"
+            f" least {LEAST_BALL_PX}"
+        )
+    rows, columns = np.nonzero(inside)
+    middle = np.array([columns.min() + columns.max(), rows.min() + rows.max()]) / 2
+    radius = (np.ptp(columns) + np.ptp(rows) + 2) / 4
+    directions = []
+    for number, image in enumerate(images):
+        gray = np.asarray(image, np.float64)
+        gray = gray.mean(axis=-1) if gray.ndim == 3 else gray
+        if gray.shape != inside.shape:
+            raise ChromeBallError(
+                f"image {number}: got shape {gray.shape}, expected {inside.shape} as the mask"
+            )
+        spot = highlight_center(gray, inside)
+        if spot is None:
+            raise ChromeBallError(
+                f"image {number}: shows no highlight on the ball, expected one that stands out;"
+                " leave it out, or light the ball"
+            )
+        across = (spot - middle) / radius
+        x, y = float(across[0]), -float(across[1])
+        z = float(np.sqrt(max(1.0 - x * x - y * y, 0.0)))
+        n = np.array([x, y, z])
+        direction = 2.0 * z * n - np.array([0.0, 0.0, 1.0])
+        directions.append(direction / np.linalg.norm(direction))
+    return np.array(directions).reshape(-1, 3)
+
+
+def highlight_center(gray: NDArray, inside: NDArray[np.bool_]) -> FloatArray | None:
+    """Return column and row of the middle of the brightest spot, or None where none stands out.
+
+    Parameters
+    ----------
+    gray : ndarray of float, shape (H, W)
+    inside : ndarray of bool, shape (H, W)
+        Where to look.
+    """
+    values = np.where(inside & np.isfinite(gray), gray, 0.0)
+    brightest = float(values.max(initial=0.0))
+    usual = float(np.median(values[inside])) if inside.any() else 0.0
+    if not brightest > max(LEAST_CONTRAST * usual, 0.0):
+        return None
+    spots, count = label(values >= BRIGHT_SHARE * brightest)
+    sizes = np.bincount(spots.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    spot = spots == int(np.argmax(sizes))
+    rows, columns = np.nonzero(spot)
+    weights = values[spot]
+    return np.array([columns @ weights, rows @ weights]) / weights.sum()

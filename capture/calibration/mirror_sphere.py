@@ -1,0 +1,488 @@
+"""A mirror sphere in calibrated cameras: where it is, and what it shows where.
+
+The rays that touch a sphere form a cone around the ray to its centre; a camera sees the cone as an
+ellipse whose middle is not the centre's image. Centres are therefore fitted to rays, never to a
+circle in the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from capture.calibration.geometry import CameraPose
+from capture.calibration.record import CalibrationError
+
+__all__ = [
+    "SphereError",
+    "SpherePlace",
+    "contour",
+    "find_outline",
+    "locate_sphere",
+    "reflect",
+    "reflection_pixels",
+    "reflection_points",
+]
+
+FloatArray = NDArray[np.float64]
+
+ANGLES = 180  # places on the outline where an edge is sought
+REACH = 0.12  # how far from the outline, of its radius, in the first search
+LEAST_REACH_PX = 3.0
+EDGE_STEP_PX = 0.25
+FINE_STEP_PX = 0.125
+FINE_REACH_PX = 1.5
+FINE_WINDOW_PX = 9.0
+PIXEL_BLUR_PX = 0.5  # a pixel's square and the interpolation between pixels, as a Gaussian
+LEAST_EDGES = 30
+HUBER = 2.5
+GLARE = 1.15  # root of the brightest over the usual background along a line across the edge
+VOTES_STEP_PX = 2.0  # cells of the search for the sphere
+RADIUS_SIGMAS = 5.0
+STOP_RAD = 1e-12
+RADIUS_LIMIT = 0.002  # relative difference of the radius below which nothing is said
+
+
+class SphereError(CalibrationError):
+    """Images in which a mirror sphere cannot be located; the message names them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpherePlace:
+    """Where a sphere is.
+
+    Attributes
+    ----------
+    center_mm : ndarray of float64, shape (3,)
+        Rig frame.
+    radius_mm : float
+        As given.
+    covariance_mm2 : ndarray of float64, shape (3, 3)
+        Of the centre.
+    rms_px : float
+        Root mean square distance of edges to the fitted outline.
+    fitted_radius_mm, fitted_radius_stderr_mm : float
+        What the outlines say of the radius when it is left free; infinite error with one camera.
+    cameras : tuple of str
+        Those whose outline was used.
+    """
+
+    center_mm: FloatArray
+    radius_mm: float
+    covariance_mm2: FloatArray
+    rms_px: float
+    fitted_radius_mm: float
+    fitted_radius_stderr_mm: float
+    cameras: tuple[str, ...]
+
+
+def find_outline(image: NDArray, camera: CameraPose, radius_mm: float) -> FloatArray | None:
+    """Find a sphere near the rig's origin in an image, and edges on its outline.
+
+    Parameters
+    ----------
+    image : ndarray of float, shape (H, W)
+        Gray, linear, noise even enough; the sphere is darker than what is behind it.
+    camera : CameraPose
+    radius_mm : float
+        Of the sphere.
+
+    Returns
+    -------
+    ndarray of float64, shape (n, 2), or None
+        Columns and rows of edges, px; None where no outline stands out.
+    """
+    gray = np.sqrt(np.clip(np.asarray(image, np.float64), 0.0, None))  # even noise
+    distance = float(np.linalg.norm(camera.center_mm))
+    focal = float(camera.matrix[0, 0])
+    start = _vote(gray, [focal * radius_mm / (distance * f) for f in (0.9, 0.95, 1.0, 1.05, 1.1)])
+    if start is None:
+        return None
+    middle, radius_px = start
+    direction = camera.rays(middle)
+    range_mm = radius_mm / np.sin(np.arctan(radius_px / focal))
+    center = camera.center_mm + range_mm * direction
+    reach = max(REACH * radius_px, LEAST_REACH_PX)
+    for _ in range(3):
+        edges = _edges(gray, camera, center, radius_mm, reach)
+        if len(edges) < LEAST_EDGES:
+            return None
+        center, sigma, _ = _fit({"": edges}, {"": camera}, center, radius_mm)
+        reach = max(LEAST_REACH_PX, min(reach / 2, 8.0 * sigma))
+    for _ in range(2):
+        edges = _fine_edges(np.asarray(image, np.float64), camera, center, radius_mm)
+        if len(edges) < LEAST_EDGES:
+            return None
+        center, _, _ = _fit({"": edges}, {"": camera}, center, radius_mm)
+    return edges
+
+
+def locate_sphere(
+    outlines: Mapping[str, FloatArray],
+    cameras: Mapping[str, CameraPose],
+    radius_mm: float,
+    *,
+    check_radius: bool = True,
+) -> SpherePlace:
+    """Locate one sphere from its outlines in one or several cameras.
+
+    Parameters
+    ----------
+    outlines : mapping of str to ndarray, shape (n, 2)
+        Edges by view name, see `find_outline`.
+    cameras : mapping of str to CameraPose
+    radius_mm : float
+        Of the sphere, > 0.
+    check_radius : bool
+        Whether outlines that contradict the radius are an error.
+
+    Returns
+    -------
+    SpherePlace
+
+    Raises
+    ------
+    SphereError
+        If there is no outline, or the outlines of several cameras contradict the radius.
+    """
+    if not outlines or not radius_mm > 0:
+        raise SphereError(
+            f"sphere: got outlines of {len(outlines)} cameras and radius {radius_mm} mm, expected"
+            " at least one outline and a radius > 0"
+        )
+    start = np.mean([_alone(edges, cameras[n], radius_mm) for n, edges in outlines.items()], axis=0)
+    center, sigma, H = _fit(outlines, cameras, start, radius_mm)
+    free_radius, free_stderr = np.inf, np.inf
+    if len(outlines) > 1:
+        free, free_sigma, free_H = _fit(outlines, cameras, center, radius_mm, free_radius=True)
+        free_radius = float(free[3])
+        free_stderr = float(free_sigma * np.sqrt(np.linalg.inv(free_H)[3, 3]))
+        gap = abs(free_radius - radius_mm)
+        if check_radius and gap > max(RADIUS_SIGMAS * free_stderr, RADIUS_LIMIT * radius_mm):
+            raise SphereError(
+                f"radius_mm: got {radius_mm:g}, but the outlines in {len(outlines)} cameras say"
+                f" {free_radius:.3f} ± {free_stderr:.3f} mm; measure the sphere, or calibrate the"
+                " cameras"
+            )
+    residual = np.concatenate(
+        [_outline_px(cameras[n], edges, center, radius_mm) for n, edges in outlines.items()]
+    )
+    return SpherePlace(
+        center[:3],
+        radius_mm,
+        np.asarray(sigma**2 * np.linalg.inv(H)),
+        float(np.sqrt(np.mean(residual**2))),
+        free_radius,
+        free_stderr,
+        tuple(outlines),
+    )
+
+
+def contour(camera: CameraPose, center_mm: FloatArray, radius_mm: float, count: int) -> FloatArray:
+    """Return points of a sphere's outline in an image, shape (count, 2); NaN behind the camera."""
+    to_center = center_mm - camera.center_mm
+    distance = float(np.linalg.norm(to_center))
+    if distance <= radius_mm:
+        raise SphereError(f"sphere at {center_mm.tolist()}: camera {camera.serial} is inside it")
+    axis = to_center / distance
+    side = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    other = np.cross(axis, side)
+    turn = np.arange(count) * 2 * np.pi / count
+    ring = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * other
+    sine = radius_mm / distance
+    # where rays touch: the circle in which the polar plane cuts the sphere
+    touch = camera.center_mm + distance * (1 - sine**2) * axis
+    return camera.project(touch + radius_mm * np.sqrt(1 - sine**2) * ring)
+
+
+def reflect(
+    camera: CameraPose, pixels: FloatArray, center_mm: FloatArray, radius_mm: float
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return where rays of pixels meet a sphere and where they go from there.
+
+    Parameters
+    ----------
+    camera : CameraPose
+    pixels : ndarray, shape (n, 2)
+    center_mm, radius_mm
+        The sphere.
+
+    Returns
+    -------
+    point_mm, direction : ndarray of float64, shape (n, 3)
+        Rig frame; the directions are unit vectors away from the sphere. NaN where not `hit`.
+    hit : ndarray of bool, shape (n,)
+    """
+    rays = camera.rays(pixels)
+    offset = camera.center_mm - center_mm
+    along = rays @ offset
+    square = along**2 - (offset @ offset - radius_mm**2)
+    hit = square > 0
+    t = np.where(hit, -along - np.sqrt(np.where(hit, square, 0.0)), np.nan)
+    point = camera.center_mm + t[:, None] * rays
+    normal = (point - center_mm) / radius_mm
+    return point, rays - 2 * np.sum(rays * normal, axis=1, keepdims=True) * normal, hit
+
+
+def reflection_points(
+    eyes_mm: FloatArray, centers_mm: FloatArray, radius_mm: float, lights_mm: FloatArray
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return where spheres show lights to eyes.
+
+    Parameters
+    ----------
+    eyes_mm, centers_mm, lights_mm : ndarray, shape (n, 3)
+        Centres of projection, of the spheres, and points outside the spheres.
+    radius_mm : float
+        Of the spheres.
+
+    Returns
+    -------
+    point_mm : ndarray of float64, shape (n, 3)
+    seen : ndarray of bool, shape (n,)
+        False where the point is turned away from the eye or the light.
+
+    Notes
+    -----
+    Alhazen's problem, solved by Newton's method, safeguarded by bisection, for the angle between
+    the normal and the direction to the eye.
+    """
+    r = radius_mm
+    to_eye, to_light = eyes_mm - centers_mm, lights_mm - centers_mm
+    D = np.linalg.norm(to_eye, axis=-1)
+    e = to_eye / D[:, None]
+    x = np.sum(to_light * e, axis=-1)
+    across = to_light - x[:, None] * e
+    y = np.linalg.norm(across, axis=-1)
+    across /= np.where(y > 0, y, 1.0)[:, None]
+    square = x**2 + y**2
+    low, high = np.zeros_like(D), np.arctan2(y, x)
+    angle = 0.5 * high
+    for _ in range(60):
+        # reflection: the angle at the normal to the eye equals that to the light
+        s, c = np.sin(angle), np.cos(angle)
+        eye_n, eye_t = D * c - r, D * s
+        light_n, light_t = x * c + y * s - r, y * c - x * s
+        miss = np.arctan2(eye_t, eye_n) - np.arctan2(light_t, light_n)
+        low, high = np.where(miss < 0, angle, low), np.where(miss < 0, high, angle)
+        slope = D * (D - r * c) / (eye_n**2 + eye_t**2)
+        slope += (square - r * (light_n + r)) / (light_n**2 + light_t**2)
+        newton = angle - miss / slope
+        new = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+        done = np.abs(new - angle).max(initial=0.0) < STOP_RAD
+        angle = new
+        if done:
+            break
+    normal = np.cos(angle)[:, None] * e + np.sin(angle)[:, None] * across
+    seen = (D * np.cos(angle) > r) & (np.sum(normal * to_light, axis=-1) > r)
+    return centers_mm + r * normal, seen
+
+
+def reflection_pixels(
+    camera: CameraPose, center_mm: FloatArray, radius_mm: float, lights_mm: FloatArray
+) -> FloatArray:
+    """Return where a sphere shows lights to a camera, shape (n, 2); NaN where it does not.
+
+    Parameters
+    ----------
+    camera : CameraPose
+    center_mm, radius_mm
+        The sphere.
+    lights_mm : ndarray, shape (n, 3)
+        Points outside the sphere.
+    """
+    eyes = np.broadcast_to(camera.center_mm, lights_mm.shape)
+    centers = np.broadcast_to(center_mm, lights_mm.shape)
+    point, seen = reflection_points(eyes, centers, radius_mm, lights_mm)
+    return np.where(seen[:, None], camera.project(point), np.nan)
+
+
+def _vote(gray: FloatArray, radii_px: list[float]) -> tuple[FloatArray, float] | None:
+    """Return middle and radius of the dark disc that most edges point away from."""
+    smooth = gaussian_filter(gray, 1.5)
+    gy, gx = np.gradient(smooth)
+    size = np.hypot(gx, gy)
+    limit = np.quantile(size, 0.9)
+    rows, columns = np.nonzero(size > max(limit, 1e-12))
+    if not rows.size:
+        return None
+    ux, uy = gx[rows, columns] / size[rows, columns], gy[rows, columns] / size[rows, columns]
+    shape = tuple(int(n / VOTES_STEP_PX) + 1 for n in gray.shape)
+    best: tuple[float, FloatArray, float] | None = None
+    for radius in radii_px:
+        x = ((columns - radius * ux) / VOTES_STEP_PX).astype(int)
+        y = ((rows - radius * uy) / VOTES_STEP_PX).astype(int)
+        good = (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+        votes = np.bincount(y[good] * shape[1] + x[good], minlength=shape[0] * shape[1])
+        field = gaussian_filter(votes.reshape(shape).astype(float), max(0.03 * radius, 1.0))
+        peak = int(np.argmax(field))
+        if best is None or field.flat[peak] > best[0]:
+            row, column = divmod(peak, shape[1])
+            middle = (np.array([column, row]) + 0.5) * VOTES_STEP_PX
+            best = float(field.flat[peak]), middle, radius
+    return (best[1], best[2]) if best is not None else None
+
+
+def _edges(
+    gray: FloatArray, camera: CameraPose, center: FloatArray, radius_mm: float, reach: float
+) -> FloatArray:
+    """Return subpixel edges, dark inside, along normals of the expected outline."""
+    outline, outward = _outline(camera, center, radius_mm)
+    steps = np.arange(-reach - 2.0, reach + 2.0 + EDGE_STEP_PX / 2, EDGE_STEP_PX)
+    places = outline[:, None] + steps[None, :, None] * outward[:, None]
+    lines = map_coordinates(gray, [places[..., 1], places[..., 0]], order=1, mode="nearest")
+    # slope of a line smoothed over about a pixel
+    slope = gaussian_filter(lines, (0, 0.7 / EDGE_STEP_PX), order=(0, 1), mode="nearest")
+    within = np.abs(steps) <= reach
+    slope[:, ~within] = 0.0
+    at = np.argmax(slope, axis=1)
+    rows = np.arange(len(at))
+    peak = slope[rows, at]
+    fine = (at > 0) & (at < len(steps) - 1) & (peak > 0)
+    left, right = slope[rows, at - 1], slope[rows, (at + 1) % len(steps)]
+    bend = left - 2 * peak + right
+    shift = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1.0), 0.0)
+    found = outline + (steps[at] + np.clip(shift, -1, 1) * EDGE_STEP_PX)[:, None] * outward
+    inside = _in_image(found, gray.shape, 1.0)
+    # edges much weaker than most are none, and lights near the rim or behind it make false ones
+    strong = peak > 0.3 * np.median(peak[fine]) if fine.any() else fine
+    background = np.median(lines[:, steps > 0])
+    dark = lines.max(axis=1) < GLARE * background
+    return np.asarray(found[fine & inside & strong & dark])
+
+
+def _fine_edges(
+    image: FloatArray, camera: CameraPose, center: FloatArray, radius_mm: float
+) -> FloatArray:
+    """Return edges to a few hundredths of a pixel, near an outline known to about one.
+
+    Just inside the rim a sphere shows what is just behind it, then, as the root of the distance,
+    what is farther round: the steep slope moves the place of the steepest slope. Each line across
+    the edge is therefore fitted by a straight background outside and by a constant, a root and a
+    slope inside, blurred by a pixel; the edge is where such a line fits best.
+    """
+    outline, outward = _outline(camera, center, radius_mm)
+    half = min(
+        FINE_WINDOW_PX, 0.2 * float(np.linalg.norm(outline - outline.mean(axis=0), axis=1).min())
+    )
+    steps = np.arange(-half, half + FINE_STEP_PX / 2, FINE_STEP_PX)
+    places = outline[:, None] + steps[None, :, None] * outward[:, None]
+    lines = map_coordinates(image, [places[..., 1], places[..., 0]], order=1, mode="nearest")
+    shifts = np.arange(-FINE_REACH_PX, FINE_REACH_PX + FINE_STEP_PX / 2, FINE_STEP_PX)
+    power = np.stack(
+        [np.sum((lines @ _edge_basis(steps, at)) ** 2, axis=1) for at in shifts], axis=1
+    )
+    best = np.argmax(power, axis=1)
+    rows = np.arange(len(best))
+    fine = (best > 0) & (best < len(shifts) - 1)
+    middle = np.clip(best, 1, len(shifts) - 2)
+    left, peak, right = (power[rows, middle + k] for k in (-1, 0, 1))
+    bend = left - 2 * peak + right
+    part = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1.0), 0.0)
+    offset = shifts[middle] + np.clip(part, -1, 1) * FINE_STEP_PX
+    found = outline + offset[:, None] * outward
+    outside, within = lines[:, steps > 1.5].mean(axis=1), lines[:, steps < -1.5].mean(axis=1)
+    background = np.median(outside)
+    dark = lines.max(axis=1) < GLARE**2 * background
+    fine &= dark & (within < outside) & _in_image(found, image.shape, half)
+    return np.asarray(found[fine])
+
+
+@lru_cache(maxsize=512)
+def _edge_basis_cached(steps: tuple[float, ...], at: float) -> FloatArray:
+    s = np.array(steps)
+    fine = np.arange(s[0] - 3.0, s[-1] + 3.0, 0.05)
+    d = at - fine  # depth inside the rim
+    inside = (d > 0).astype(float)
+    root = np.sqrt(np.clip(d, 0.0, None))
+    columns = np.stack([1 - inside, (1 - inside) * fine, inside, root, inside * d])
+    blurred = gaussian_filter(columns, (0, PIXEL_BLUR_PX / 0.05), mode="nearest")
+    basis = np.stack([np.interp(s, fine, column) for column in blurred], axis=1)
+    return np.asarray(np.linalg.qr(basis)[0])
+
+
+def _edge_basis(steps: FloatArray, at: float) -> FloatArray:
+    """Return an orthonormal basis of lines with an edge at a place, shape (steps, 5)."""
+    return _edge_basis_cached(tuple(np.round(steps, 6).tolist()), round(float(at), 6))
+
+
+def _outline(
+    camera: CameraPose, center: FloatArray, radius_mm: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return points of the expected outline, and unit vectors out of it."""
+    outline = contour(camera, center[:3], radius_mm, ANGLES)
+    outward = outline - outline.mean(axis=0)
+    return outline, outward / np.linalg.norm(outward, axis=1, keepdims=True)
+
+
+def _in_image(pixels: FloatArray, shape: tuple[int, ...], margin: float) -> NDArray[np.bool_]:
+    height, width = shape
+    low = (pixels > margin).all(axis=1)
+    return np.asarray(
+        low & (pixels[:, 0] < width - 1 - margin) & (pixels[:, 1] < height - 1 - margin)
+    )
+
+
+def _alone(edges: FloatArray, camera: CameraPose, radius_mm: float) -> FloatArray:
+    """Return a centre from one outline: by the axis and angle of its cone."""
+    rays = camera.rays(edges)
+    # rays of a cone end in a plane: rays @ a = 1 with a along the axis
+    a = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]
+    cosine = min(1.0 / float(np.linalg.norm(a)), 1 - 1e-12)
+    range_mm = radius_mm / np.sqrt(1 - cosine**2)
+    return np.asarray(camera.center_mm + range_mm * a / np.linalg.norm(a))
+
+
+def _outline_px(
+    camera: CameraPose, edges: FloatArray, sphere: FloatArray, radius_mm: float
+) -> FloatArray:
+    """Return how far edges are outside the outline, px near the image's middle."""
+    radius = sphere[3] if len(sphere) == 4 else radius_mm
+    to_center = sphere[:3] - camera.center_mm
+    distance = np.linalg.norm(to_center)
+    rays = camera.rays(edges)
+    sine = np.linalg.norm(np.cross(rays, to_center / distance), axis=1)
+    off = np.arctan2(sine, rays @ to_center / distance) - np.arcsin(min(radius / distance, 1.0))
+    return np.asarray(camera.matrix[0, 0] * off)
+
+
+def _fit(
+    outlines: Mapping[str, FloatArray],
+    cameras: Mapping[str, CameraPose],
+    start: FloatArray,
+    radius_mm: float,
+    *,
+    free_radius: bool = False,
+) -> tuple[FloatArray, float, FloatArray]:
+    """Return centre (and radius), the edges' noise and the normal matrix of a robust fit."""
+    sphere = np.append(start[:3], radius_mm) if free_radius else np.array(start[:3])
+
+    def residuals(at: FloatArray) -> FloatArray:
+        parts = [_outline_px(cameras[n], e, at, radius_mm) for n, e in outlines.items()]
+        return np.concatenate(parts)
+
+    sigma, H = 1.0, np.eye(len(sphere))
+    for _ in range(30):
+        r = residuals(sphere)
+        sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-6)
+        w = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12))
+        J = np.empty((len(r), len(sphere)))
+        for k in range(len(sphere)):
+            step = np.zeros(len(sphere))
+            step[k] = 1e-4
+            J[:, k] = (residuals(sphere + step) - residuals(sphere - step)) / 2e-4
+        H = (J * w[:, None]).T @ J
+        change = np.linalg.solve(H + 1e-9 * np.eye(len(H)) * np.trace(H), -J.T @ (w * r))
+        sphere = sphere + change
+        if np.linalg.norm(change) < 1e-7:
+            break
+    r = residuals(sphere)
+    w = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12))
+    noise = float(np.sqrt((w * r**2).sum() / max(w.sum() - len(sphere), 1.0)))
+    return sphere, noise, H
