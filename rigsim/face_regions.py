@@ -123,9 +123,16 @@ def _lips(points: Float32Array) -> Float32Array:
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     top, bottom = lip_outline(x)
     border_mm = 0.7  # the vermilion border is crisp
-    inside = _step((top - y) / border_mm) * _step((y - bottom) / border_mm)
-    return np.asarray(inside * _step((z + 22.0) / 4.0) * (np.abs(x) < 26.0), np.float32)
+    inside = soft_step((top - y) / border_mm) * soft_step((y - bottom) / border_mm)
+    return np.asarray(inside * soft_step((z + 22.0) / 4.0) * (np.abs(x) < 26.0), np.float32)
 
 
-def _step(t: NDArray[np.floating]) -> NDArray[np.floating]:
+def soft_step(t: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return how far each place lies inside a border: 0 far below 0, 1 far above, smooth between.
+
+    Parameters
+    ----------
+    t
+        Distance from the border over its half width, any shape.
+    """
     return 0.5 * (1.0 + np.tanh(t))

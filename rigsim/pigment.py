@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from rigsim.face_regions import soft_step
 from rigsim.mesh import Float32Array
 from rigsim.surface_noise import scattered_spots, smooth_noise
 
@@ -77,11 +78,11 @@ def _tan(points: Float32Array, base: float, rng: np.random.Generator) -> NDArray
     gain = float(rng.uniform(0.25, 0.5)) * (0.4 + 0.6 * float(np.exp(-base / 0.1)))
     if rng.random() < 0.5:
         edge = float(rng.uniform(56.0, 70.0))  # a cap down to this height
-        hidden = _step((y - edge - 0.0025 * x * x) / 1.5)
+        hidden = soft_step((y - edge - 0.0025 * x * x) / 1.5)
     else:
         half_width, half_height = rng.uniform(22.0, 25.0), rng.uniform(13.0, 17.0)
         q = ((np.abs(x) - 34.0) / half_width) ** 4 + ((y - 21.0) / half_height) ** 4
-        hidden = _step((1.0 - q) * 4.0) * _step((z + 40.0) / 5.0)
+        hidden = soft_step((1.0 - q) * 4.0) * soft_step((z + 40.0) / 5.0)
     return gain * (0.45 - hidden)
 
 
@@ -116,7 +117,3 @@ def _moles(
     )
     # Nevi hold several times the melanin of the skin around them.
     return float(rng.uniform(1.4, 2.0)) * (1.0 + 0.6 * float(np.exp(-base / 0.05))) * spots
-
-
-def _step(t: NDArray[np.floating]) -> NDArray[np.floating]:
-    return 0.5 * (1.0 + np.tanh(t))

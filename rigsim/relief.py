@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigsim.atlas import Atlas
+from rigsim.face_regions import soft_step
 from rigsim.mesh import Float32Array
 from rigsim.surface_noise import line_network, scattered_spots, smooth_noise
 
@@ -89,7 +90,7 @@ def hair_map(points_mm: Float32Array, *, seed: int) -> Float32Array:
     arch = 38.5 + float(rng.uniform(2.5, 4.5)) * np.sin(2.4 * along) - 3.0 * along**3
     thick = (1.0 - 0.65 * along) * float(rng.uniform(3.0, 4.2))
     brow = np.exp(-(((y - arch) / thick) ** 4))
-    brow *= _rise((x - 10.5) / 2.5) * _rise((49.0 - x) / 2.5)
+    brow *= soft_step((x - 10.5) / 2.5) * soft_step((49.0 - x) / 2.5)
     # Strands run outwards and slightly up.
     strands = np.stack(
         [0.16 * x, y - 0.35 * x, 0.3 * points_mm[..., 2] + 40.0 * np.sign(points_mm[..., 0])],
@@ -98,14 +99,10 @@ def hair_map(points_mm: Float32Array, *, seed: int) -> Float32Array:
     brow *= np.clip(0.68 + 0.3 * smooth_noise(strands, (0.9, 0.45), seed=seed + 91), 0.25, 1.0)
     # The lashes of closed eyes lie along the line between the lids.
     line = 16.6 + 0.011 * (x - 31.0) ** 2
-    lash = 0.85 * np.exp(-(((y - line) / 0.9) ** 2)) * _rise((x - 17.0) / 1.5)
-    lash *= _rise((46.0 - x) / 1.5)
+    lash = 0.85 * np.exp(-(((y - line) / 0.9) ** 2)) * soft_step((x - 17.0) / 1.5)
+    lash *= soft_step((46.0 - x) / 1.5)
     cover = np.maximum(brow, lash) * front
     return np.where(cover > 0.02, cover, 0.0).astype(np.float32)
-
-
-def _rise(t: NDArray[np.floating]) -> NDArray[np.floating]:
-    return 0.5 * (1.0 + np.tanh(t))
 
 
 def roughness_map(

@@ -1,9 +1,7 @@
 """Color calibration: from the patches of a chart to a camera matrix with its Delta E."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import date
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +15,7 @@ from capture.calibration.colorimetry import (
     white_point,
     xyz_to_linear_srgb,
 )
-from capture.calibration.record import Calibration, Quantity, Source, default_validity
+from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
 
 __all__ = [
     "ChartError",
@@ -226,40 +224,25 @@ def neutral_white(
 def to_calibration(
     fit: ColorMatrix,
     white: Quantity,
-    *,
-    serial: str,
-    rig: str,
-    source: Source,
-    created: date,
-    valid_until: date | None = None,
-    inputs: Mapping[str, str] | None = None,
-    versions: Mapping[str, str] | None = None,
+    **about: Unpack[Provenance],
 ) -> Calibration:
     """Return a fit as a `Calibration` of kind "color" for one camera."""
-    return Calibration(
-        kind="color",
-        rig=rig,
-        serials=(serial,),
-        created=created,
-        valid_until=valid_until or default_validity(created),
-        source=source,
-        values={
-            serial: {
-                "camera_to_xyz": Quantity(fit.matrix, fit.stderr),
-                "white_rgb": white,
-                "delta_e_mean": Quantity(np.array(fit.mean_delta_e)),
-                "delta_e_max": Quantity(np.array(fit.max_delta_e)),
-                "delta_e_fitted_mean": Quantity(np.array(float(np.nanmean(fit.fitted_delta_e)))),
-                "patches": Quantity(np.array(float(np.isfinite(fit.delta_e).sum()))),
-            }
+    return of_one_device(
+        "color",
+        {
+            "camera_to_xyz": Quantity(fit.matrix, fit.stderr),
+            "white_rgb": white,
+            "delta_e_mean": Quantity(np.array(fit.mean_delta_e)),
+            "delta_e_max": Quantity(np.array(fit.max_delta_e)),
+            "delta_e_fitted_mean": Quantity(np.array(float(np.nanmean(fit.fitted_delta_e)))),
+            "patches": Quantity(np.array(float(np.isfinite(fit.delta_e).sum()))),
         },
         notes={
             "method": fit.method,
             "illuminant": fit.illuminant,
             "delta_e": "CIEDE2000, each patch held out of its fit",
         },
-        inputs=dict(inputs or {}),
-        versions=dict(versions or {}),
+        **about,
     )
 
 

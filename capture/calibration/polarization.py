@@ -1,8 +1,8 @@
 """Polarization calibration: analyser zero and extinction of a pair of polarizers (Malus's law)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import date
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,9 +12,9 @@ from scipy.stats import t as student
 from capture.calibration.record import (
     Calibration,
     CalibrationError,
+    Provenance,
     Quantity,
-    Source,
-    default_validity,
+    of_one_device,
 )
 
 __all__ = [
@@ -110,14 +110,7 @@ class PolarizationCalibration:
 
     def to_calibration(
         self,
-        *,
-        serial: str,
-        rig: str,
-        source: Source,
-        created: date,
-        valid_until: date | None = None,
-        inputs: Mapping[str, str] | None = None,
-        versions: Mapping[str, str] | None = None,
+        **about: Unpack[Provenance],
     ) -> Calibration:
         """Return this as a `Calibration` of kind "polarization" for one camera."""
         values = {
@@ -130,20 +123,14 @@ class PolarizationCalibration:
             values[f"extinction_{color.lower()}"] = Quantity(
                 np.array(float(middle)), interval=interval
             )
-        return Calibration(
-            kind="polarization",
-            rig=rig,
-            serials=(serial,),
-            created=created,
-            valid_until=valid_until or default_validity(created),
-            source=source,
-            values={serial: values},
+        return of_one_device(
+            "polarization",
+            values,
             notes={
                 "colors": " ".join(self.colors),
                 "extinction": "middle of its 95 % interval; the lower end where there is no upper",
             },
-            inputs=dict(inputs or {}),
-            versions=dict(versions or {}),
+            **about,
         )
 
     @classmethod

@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import date, timedelta
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NotRequired, TypeAlias, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,12 @@ __all__ = [
     "CalibrationExpired",
     "CalibrationMismatch",
     "CalibrationMissing",
+    "Provenance",
     "Quantity",
     "Source",
     "default_validity",
     "digest_arrays",
+    "of_one_device",
     "require_plain_name",
 ]
 
@@ -171,6 +173,52 @@ class Calibration:
                 f" holds {sorted(self.values[serial])}; calibrate again with this version"
             )
         return self.values[serial][name]
+
+
+class Provenance(TypedDict):
+    """For which device a calibration holds, from when to when, and what it was made from."""
+
+    serial: str
+    rig: str
+    source: Source
+    created: date
+    valid_until: NotRequired[date | None]
+    """Default: `DEFAULT_VALIDITY_DAYS` after `created`."""
+    inputs: NotRequired[Mapping[str, str] | None]
+    versions: NotRequired[Mapping[str, str] | None]
+
+
+def of_one_device(
+    kind: str,
+    values: Mapping[str, Quantity],
+    *,
+    maps: Mapping[str, NDArray[np.float32]] | None = None,
+    notes: Mapping[str, str] | None = None,
+    **about: Unpack[Provenance],
+) -> Calibration:
+    """Return the `Calibration` of one device.
+
+    Parameters
+    ----------
+    kind, values, maps, notes
+        As in `Calibration`; `values` of the one device.
+    **about
+        See `Provenance`.
+    """
+    serial, created = about["serial"], about["created"]
+    return Calibration(
+        kind=kind,
+        rig=about["rig"],
+        serials=(serial,),
+        created=created,
+        valid_until=about.get("valid_until") or default_validity(created),
+        source=about["source"],
+        values={serial: values},
+        maps=maps or {},
+        notes=notes or {},
+        inputs=dict(about.get("inputs") or {}),
+        versions=dict(about.get("versions") or {}),
+    )
 
 
 def digest_arrays(*arrays: NDArray[Any]) -> str:

@@ -4,9 +4,9 @@ Everything is estimated from darks and from pairs of flats at several amounts of
 color, with standard errors; see `capture.calibration.photon_transfer` for the curve itself.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import date
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from capture.calibration.photon_transfer import (
     fit_curve,
     plane,
 )
-from capture.calibration.record import Calibration, Quantity, Source, default_validity
+from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
 
 __all__ = ["FlatPair", "PhotonTransferError", "SensorCalibration", "photon_transfer"]
 
@@ -127,14 +127,7 @@ class SensorCalibration:
 
     def to_calibration(
         self,
-        *,
-        serial: str,
-        rig: str,
-        source: Source,
-        created: date,
-        valid_until: date | None = None,
-        inputs: Mapping[str, str] | None = None,
-        versions: Mapping[str, str] | None = None,
+        **about: Unpack[Provenance],
     ) -> Calibration:
         """Return this as a `Calibration` of kind "sensor" for one camera."""
         values: dict[str, Quantity] = {name: getattr(self, name) for name in _PER_COLOR}
@@ -147,21 +140,15 @@ class SensorCalibration:
             np.stack([f.coefficients for f in self.flat]), np.stack([f.stderr for f in self.flat])
         )
         values["flat_residual"] = Quantity(np.array([f.residual for f in self.flat]))
-        return Calibration(
-            kind="sensor",
-            rig=rig,
-            serials=(serial,),
-            created=created,
-            valid_until=valid_until or default_validity(created),
-            source=source,
-            values={serial: values},
+        return of_one_device(
+            "sensor",
+            values,
             notes={
                 "pattern": self.pattern,
                 "colors": " ".join(self.colors),
                 "saturated_by": ", ".join(self.saturated_by),
             },
-            inputs=dict(inputs or {}),
-            versions=dict(versions or {}),
+            **about,
         )
 
     @classmethod

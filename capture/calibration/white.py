@@ -1,15 +1,15 @@
 """White reference: what light falls where, as this camera sees it, from a white tile."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import date
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from capture.calibration.flat_field import fit_smooth_field
 from capture.calibration.photon_transfer import block_sums
-from capture.calibration.record import Calibration, Quantity, Source, default_validity
+from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
 
 __all__ = ["WhiteReference", "white_reference"]
 
@@ -80,37 +80,19 @@ class WhiteReference:
 
     def to_calibration(
         self,
-        *,
-        serial: str,
-        rig: str,
-        source: Source,
-        created: date,
-        valid_until: date | None = None,
-        inputs: Mapping[str, str] | None = None,
-        versions: Mapping[str, str] | None = None,
+        **about: Unpack[Provenance],
     ) -> Calibration:
         """Return this as a `Calibration` of kind "white" for one camera; not valid is 0 there."""
         white = np.nanmean(self.signal[self.valid].astype(np.float64), axis=0)
-        return Calibration(
-            kind="white",
-            rig=rig,
-            serials=(serial,),
-            created=created,
-            valid_until=valid_until or default_validity(created),
-            source=source,
-            values={
-                serial: {
-                    "mean_signal": Quantity(white),
-                    "residual": Quantity(self.residual),
-                }
-            },
+        return of_one_device(
+            "white",
+            {"mean_signal": Quantity(white), "residual": Quantity(self.residual)},
             maps={
                 "signal": np.where(self.valid[..., None], self.signal, np.float32(0.0)),
                 "stderr": np.where(self.valid[..., None], self.stderr, np.float32(0.0)),
             },
             notes={"unit": "fraction of full scale for reflectance 1 at unit light"},
-            inputs=dict(inputs or {}),
-            versions=dict(versions or {}),
+            **about,
         )
 
     @classmethod
