@@ -12,7 +12,7 @@ from typing import Any
 from capture.session import Session
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from reconstruction import flash_stages, stages
+from reconstruction import flash_stages, stack_stages, stages
 from reconstruction.evidence import Evidence, EvidenceError
 
 
@@ -29,6 +29,8 @@ RECIPES: Mapping[str, Recipe] = {
     "subject": Recipe(flash_stages.MAPS, flash_stages.graph),
 }
 """By the kind of step that shows the subject."""
+LIGHT_LIST = Recipe(stack_stages.MAPS, stack_stages.graph)
+"""Pictures under listed lights, imported without a rig."""
 
 
 def recipe_of(session: Session) -> Recipe:
@@ -39,6 +41,8 @@ def recipe_of(session: Session) -> Recipe:
     EvidenceError
         When no step of its plan shows a subject.
     """
+    if "light_list" in session.manifest.extra:
+        return LIGHT_LIST
     kinds = {step.kind for step in session.plan.steps}
     for kind, recipe in RECIPES.items():
         if kind in kinds:

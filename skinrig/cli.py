@@ -127,7 +127,8 @@ def _next_step(rig: str, session: Path, target: str | None) -> str:
     if rig == "dome":
         kinds = {"charuco": "geometry", "mirror": "lights", "white": "lights", "dark": "sensor"}
     if target is None:
-        return f"skinrig reconstruct {session} --want melanin,hemoglobin --out appearance"
+        want = "normals,r_d" if rig == "dome" else "melanin,hemoglobin"
+        return f"skinrig reconstruct {session} --want {want} --out appearance"
     return f"skinrig calibrate {kinds[target]} {session} --out calibration"
 
 
@@ -291,6 +292,48 @@ def import_mesh(
         {"path": done.path, "vertices": done.vertices, "faces": done.faces,
          "has_uv": done.has_uv, "extent_mm": done.extent_mm, "reopened": done.reopened},
     )  # fmt: skip
+
+
+@import_app.command("lp")
+def import_lp(
+    directory: Annotated[Path, typer.Argument(help="Folder of pictures, one a light.")],
+    out: Out,
+    lights: Annotated[
+        Path | None, typer.Option(help=".lp, list of directions, or folder of a chrome ball.")
+    ] = None,
+    mask: Annotated[Path | None, typer.Option(help="Picture that is bright at the object.")] = None,
+    encoding: Annotated[str, typer.Option(help="Of values: auto, sRGB or linear.")] = "auto",
+    mm_per_px: Annotated[
+        float | None, typer.Option(help="Pixel size: the list's rows are positions in mm.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Turn pictures of one object under many lights, with their light list, into a session.
+
+    Example: skinrig import lp rti-folder --out session-rti
+    """
+    from capture.importers import import_light_list
+
+    console = Console(json)
+    done = import_light_list(
+        directory, out=out, lights=lights, mask=mask,
+        encoding=encoding, mm_per_px=mm_per_px,  # type: ignore[arg-type]
+    )  # fmt: skip
+    for text in done.assumed:
+        console.say(f"assumed: {text}")
+    console.say(f"{done.path}: {done.frames} pictures, lights of {done.lights}")
+    console.say(f"next: skinrig reconstruct {out} --want normals,albedo --out appearance")
+    console.document(
+        "skinrig.import/1",
+        {
+            "path": done.path,
+            "frames": done.frames,
+            "lights": done.lights,
+            "encoding": done.encoding,
+            "mask": done.mask,
+            "assumed": done.assumed,
+        },
+    )
 
 
 @app.command()

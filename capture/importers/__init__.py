@@ -1,6 +1,17 @@
 """Foreign data into SESSION/: photographs stripped of what identifies people, scanned meshes."""
 
+from capture.importers.image_stacks import ImportedStack, import_light_list
+from capture.importers.light_lists import LightListError
 from capture.importers.photos import Imported, import_photos
 from capture.importers.pictures import Photo, PhotoError, read_photo
 
-__all__ = ["Imported", "Photo", "PhotoError", "import_photos", "read_photo"]
+__all__ = [
+    "Imported",
+    "ImportedStack",
+    "LightListError",
+    "Photo",
+    "PhotoError",
+    "import_light_list",
+    "import_photos",
+    "read_photo",
+]

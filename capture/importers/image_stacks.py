@@ -1,0 +1,361 @@
+"""Pictures of one object under many lights into a closed SESSION/."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture import raw
+from capture.documents import Fault
+from capture.importers import light_lists
+from capture.importers.light_lists import LightList, LightListError
+from capture.importers.pictures import Photo, PhotoError, read_photo
+from capture.plan import Plan, Step, Value
+from capture.rig import Light, Rig, View
+from capture.session import Session, Subject
+
+Encoding = Literal["auto", "sRGB", "linear"]
+Floats = NDArray[np.float64]
+
+RIG_NAME = "light-list"
+FAR_MM = 1000.0
+SAMPLE_POINTS = 3000
+CLEARLY = 0.8
+"""Linear values are believed when they leave less than this part of the misfit."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedStack:
+    """What an import of pictures with a light list made."""
+
+    path: str
+    """The SESSION/ folder."""
+    frames: int
+    lights: str
+    """Where the lights are from: file or folder, and kind."""
+    encoding: str
+    """How the values were read: "raw", "linear" or "sRGB"."""
+    mask: str
+    """Name of the mask's file, empty where there is none."""
+    assumed: list[str]
+
+
+def import_light_list(
+    directory: str | Path,
+    *,
+    out: str | Path,
+    lights: str | Path | None = None,
+    mask: str | Path | None = None,
+    encoding: Encoding = "auto",
+    mm_per_px: float | None = None,
+    subject: Subject | None = None,
+    now: Callable[[], datetime] | None = None,
+) -> ImportedStack:
+    """Turn pictures of one object under many lights into a closed session; all, or none.
+
+    Parameters
+    ----------
+    directory : str or Path
+        Folder of the pictures, in any format that `read_photo` takes; see `light_lists.find`.
+    out : str or Path
+        The new SESSION/ folder.
+    lights : str or Path, optional
+        Light list or folder of a chrome ball, where it is not found by itself.
+    mask : str or Path, optional
+        Picture that is bright where the object is; default the folder's own ``*mask*``.
+    encoding : {"auto", "sRGB", "linear"}
+        Of 8-bit and PNG values. "auto" reads them as linear where three images explain the others
+        clearly better so, as light that adds up must.
+    mm_per_px : float, optional
+        Size of a pixel at the object: then the list's rows are positions in mm around the
+        picture's middle, and the lights count as near.
+    subject : Subject, optional
+        What is shown; default an unnamed one.
+    now : callable, optional
+        Clock, returns a time with its zone.
+
+    Returns
+    -------
+    ImportedStack
+
+    Raises
+    ------
+    LightListError, PhotoError
+        Naming what does not fit; then nothing is written.
+    SessionError
+        Where `out` is not free.
+    """
+    clock = now or (lambda: datetime.now(UTC))
+    if encoding not in ("auto", "sRGB", "linear"):
+        raise LightListError(
+            "cannot be read so", faults=[Fault("encoding", encoding, "auto, sRGB or linear")]
+        )
+    found = light_lists.find(Path(directory), lights=Path(lights) if lights else None)
+    if len(found.pictures) < 3:
+        raise LightListError(
+            "has too few pictures",
+            where=str(directory),
+            faults=[Fault("pictures", str(len(found.pictures)), "at least 3, one a light")],
+        )
+    near = mm_per_px is not None
+    if mm_per_px is not None and not 0 < mm_per_px < 1e3:
+        raise LightListError(
+            "has no such scale", faults=[Fault("mm_per_px", str(mm_per_px), "0 < mm < 1000")]
+        )
+    where_mask = Path(mask) if mask else light_lists.mask_of(found.pictures[0].parent)
+    sampled, first, notes = _sample(found, where_mask)
+    as_linear = first.encoding == "sRGB" and (
+        encoding == "linear" or (encoding == "auto" and _adds_up_as_codes(sampled, found))
+    )
+    shown = "linear" if as_linear else first.encoding
+    assumed = _assumed(found, notes, near=near, as_linear=as_linear, encoding=encoding)
+    rig = _rig(found, first.frame, near=near)
+    steps = _steps(found)
+    target = Path(out)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise PhotoError(
+            "cannot write here",
+            where=str(target),
+            faults=[Fault("out", "something that exists", "a new or empty folder")],
+            advice="Choose a new folder.",
+        )
+    part = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        session = Session.create(
+            part,
+            plan=Plan(rig.name, steps),
+            rig=rig,
+            devices={},
+            subject=subject or Subject("unnamed"),
+            source="measured",
+            extra={
+                "assumed": assumed,
+                "light_list": {
+                    "kind": found.kind,
+                    "near": near,
+                    "mm_per_px": mm_per_px,
+                    "encoding": shown,
+                    "intensity": None if found.intensity is None else found.intensity.tolist(),
+                },
+                "photographs": [
+                    {"step": step.id, "sha256": _sha256(file), "encoding": shown}
+                    for step, file in zip(steps, found.pictures, strict=True)
+                ],
+            },
+            now=clock,
+        )
+        with session:
+            if where_mask is not None:
+                session.attach("mask.png", _mask_png(where_mask, first.frame))
+            for step, file in zip(steps, found.pictures, strict=True):
+                _commit(session, step, file, clock, as_linear=as_linear)
+            session.close()
+        if target.exists():
+            target.rmdir()
+        part.rename(target)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    return ImportedStack(
+        str(target), len(steps), f"{found.file} ({found.kind})", shown,
+        where_mask.name if where_mask else "", assumed,
+    )  # fmt: skip
+
+
+def pixels_of(frame: raw.RawFrame) -> tuple[int, int]:
+    """Return rows and columns of an imported picture: a 2 x 2 cell is one pixel, unless MONO."""
+    height, width = frame.cfa.shape
+    return (height, width) if frame.pattern == "MONO" else (height // 2, width // 2)
+
+
+def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return display values of linear light in [0, 1], IEC 61966-2-1.
+
+    Examples
+    --------
+    >>> encode_srgb(np.array([0.0, 0.214041, 1.0])).round(5).tolist()
+    [0.0, 0.5, 1.0]
+    """
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def _sha256(file: Path) -> str:
+    return f"sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}"
+
+
+def _sample(found: LightList, mask: Path | None) -> tuple[Floats, Photo, dict[str, None]]:
+    """Read every picture once; return samples (N, P) over white, the first photo, and its notes."""
+    rows, notes, faults = [], {}, []
+    first: Photo | None = None
+    chosen: NDArray[np.intp] | None = None
+    for file in found.pictures:
+        photo = read_photo(file)
+        frame = photo.frame
+        notes.update(dict.fromkeys(photo.notes))
+        shape = pixels_of(frame)
+        if first is None:
+            first = photo
+            inside = np.ones(shape, bool) if mask is None else light_lists.read_mask(mask, shape)
+            places = np.flatnonzero(inside)
+            chosen = places[:: max(1, places.size // SAMPLE_POINTS)]
+        same = (first.encoding, first.frame.pattern, first.frame.cfa.shape, first.frame.white)
+        if (photo.encoding, frame.pattern, frame.cfa.shape, frame.white) != same:
+            got = f"{photo.encoding} {shape[1]} x {shape[0]} {frame.pattern}"
+            wanted = pixels_of(first.frame)
+            expected = f"{first.encoding} {wanted[1]} x {wanted[0]} {first.frame.pattern}"
+            faults.append(Fault(file.name, got, expected))
+            continue
+        gray = light_lists.gray(frame).reshape(-1)[chosen]
+        rows.append(gray.astype(np.float64) / frame.white)
+    if faults or first is None:
+        raise PhotoError(
+            "pictures differ",
+            where=str(found.pictures[0].parent),
+            faults=faults,
+            advice="All pictures must be of one camera and one setting.",
+        )
+    return np.array(rows), first, notes
+
+
+def _adds_up_as_codes(samples: Floats, found: LightList) -> bool:
+    """Return whether the files' values obey the shading better than the light they should code."""
+    decoded = np.clip(samples, 0.0, 1.0)
+    codes = np.asarray(encode_srgb(decoded))
+    return _misfit(codes, found.directions) < CLEARLY * _misfit(decoded, found.directions)
+
+
+def _misfit(samples: Floats, directions: Floats) -> float:
+    """Return the mean residual of a matte shading, bright samples first, over the mean."""
+    lit = samples[:, samples.mean(axis=0) > 0.02]
+    if lit.shape[1] < 10 or len(lit) < 4:
+        return 1.0
+    weight = lit**2
+    A = np.einsum("np,ni,nj->pij", weight, directions, directions)
+    A = A + 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    b = np.linalg.solve(A, np.einsum("np,ni->pi", weight * lit, directions)[..., None])[..., 0]
+    residual = np.abs(lit - np.maximum(directions @ b.T, 0.0))
+    return float(residual.mean() / lit.mean())
+
+
+def _assumed(
+    found: LightList, notes: dict[str, None], *, near: bool, as_linear: bool, encoding: Encoding
+) -> list[str]:
+    texts = [n for n in notes if not (as_linear and "were decoded by the sRGB curve" in n)]
+    if as_linear:
+        why = "as asked" if encoding == "linear" else "since shading adds up so, not as sRGB"
+        texts.append(f"the files' values count as linear light, {why}")
+    if not near:
+        texts.append("the lights are far away: only their directions count")
+        if not found.are_unit:
+            texts.append("the list's rows are positions; give mm_per_px to use them as such")
+    if found.intensity is None:
+        texts.append("all lights are of one strength, over the exposure where files state it")
+    if found.kind != "lp":
+        texts.append("the lights are in the order of the pictures' names, counted as people do")
+    return texts
+
+
+def _rig(found: LightList, frame: raw.RawFrame, *, near: bool) -> Rig:
+    positions = found.vectors if near else FAR_MM * found.directions
+    height, width = frame.cfa.shape
+    black = round(sum(frame.black) / len(frame.black))
+    return Rig(
+        name=RIG_NAME,
+        lights=tuple(
+            Light(
+                name=f"L{k:03d}",
+                position_mm=tuple(map(float, position)),  # type: ignore[arg-type]
+                illuminant="D65",
+                energy_ws=1.0,
+                radius_mm=1.0,
+            )
+            for k, position in enumerate(positions)
+        ),
+        views=(
+            View(
+                name="cam",
+                camera_model=frame.camera_model or "unknown camera",
+                serial="unknown",
+                position_mm=(0.0, 0.0, FAR_MM),
+                target_mm=(0.0, 0.0, 0.0),
+                up=(0.0, 1.0, 0.0),
+                focal_mm=frame.focal_mm or 50.0,
+                pixel_um=36e3 / width,  # of the full-frame sensor that stands in for an unknown one
+                width_px=width,
+                height_px=height,
+                f_number=8.0,
+                readout_s=0.0,
+                bit_depth=min(max(frame.white.bit_length(), 8), 16),
+                cfa=frame.pattern,  # type: ignore[arg-type]
+                black_level=black,
+                white_level=frame.white,
+                spectral_sensitivity="linear sRGB",
+                full_well_e=20_000.0,
+                read_noise_e=10.0,
+            ),
+        ),
+        boxes=(),
+        recycle_s=0.0,
+    )
+
+
+def _steps(found: LightList) -> tuple[Step, ...]:
+    steps = []
+    for number in range(len(found.pictures)):
+        light = f"L{number:03d}"
+        index: dict[str, str | int | float] = {"light": light, "exposure": 0, "pass": 0}
+        settings: dict[str, Value] = {"light": light}
+        steps.append(Step(f"P{number:04d}", "olat", index, settings, ("cam",)))
+    return tuple(steps)
+
+
+def _mask_png(path: Path, frame: raw.RawFrame) -> bytes:
+    import cv2
+
+    inside = light_lists.read_mask(path, pixels_of(frame))
+    _, data = cv2.imencode(".png", inside.astype(np.uint8) * 255)
+    return bytes(data)
+
+
+def _commit(
+    session: Session, step: Step, file: Path, clock: Callable[[], datetime], *, as_linear: bool
+) -> None:
+    frame = read_photo(file).frame
+    if as_linear:
+        share = np.arange(frame.white + 1) / frame.white
+        undone = np.rint(frame.white * encode_srgb(share)).astype(np.uint16)
+        frame = replace(frame, cfa=undone[np.minimum(frame.cfa, frame.white)])
+    settings: dict[str, Value] = dict(step.settings)
+    if frame.exposure_s is not None:
+        settings["exposure_s"] = frame.exposure_s
+    if frame.iso is not None:
+        settings["iso"] = frame.iso
+    blob = raw.encode_dng(
+        frame.cfa,
+        pattern=frame.pattern,
+        black=frame.black,
+        white=frame.white,
+        exposure_s=frame.exposure_s,
+        iso=frame.iso,
+        camera_model=frame.camera_model,
+        camera_serial="unknown",
+        color_matrix=frame.color_matrix,
+        color_illuminant=frame.color_illuminant,
+        neutral=frame.neutral,
+        noise_profile=frame.noise_profile,
+        f_number=frame.f_number,
+        focal_mm=frame.focal_mm,
+        step_id=step.id,
+        session_id=session.id,
+    )
+    session.commit(step.id, "cam", blob, settings=settings, actual={}, t_host_s=clock().timestamp())

@@ -1,0 +1,350 @@
+"""Light lists of the field: .lp, lights.txt, light_directions.txt, chrome balls.
+
+Directions are towards the lights: x right, y up, z towards the camera, as .lp files have them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.documents import Fault, InputError
+from capture.importers.pictures import read_photo
+from capture.raw import RawFrame
+
+Floats = NDArray[np.float64]
+Kind = Literal["lp", "list", "chrome ball"]
+
+PICTURES = frozenset(
+    ".png .jpg .jpeg .tif .tiff .exr .dng .nef .cr2 .cr3 .arw .orf .rw2 .raf .pef .srw .kdc".split()
+)
+BALL_NAMES = ("chrome", "ball", "sphere", "mirror")
+MAX_LIGHTS = 10_000
+UNIT_RANGE = (0.98, 1.02)
+"""Lengths up to which the rows of a list count as directions rounded in the file."""
+
+
+class LightListError(InputError):
+    """A light list, or a folder of pictures with one, that cannot be imported."""
+
+
+@dataclass(frozen=True, slots=True)
+class LightList:
+    """Lights in the order of the pictures."""
+
+    pictures: tuple[Path, ...]
+    vectors: Floats
+    """(N, 3), as in the file: unit vectors, or positions."""
+    kind: Kind
+    file: str
+    """Name of the file or folder they are from."""
+    intensity: Floats | None = None
+    """(N, 3), relative strength per channel, where the folder has it."""
+
+    @property
+    def directions(self) -> Floats:
+        """Unit vectors towards the lights, (N, 3)."""
+        return np.asarray(self.vectors / np.linalg.norm(self.vectors, axis=1, keepdims=True))
+
+    @property
+    def are_unit(self) -> bool:
+        """Whether the rows are directions rather than positions."""
+        length = np.linalg.norm(self.vectors, axis=1)
+        return bool((length > UNIT_RANGE[0]).all() and (length < UNIT_RANGE[1]).all())
+
+
+def natural(name: str) -> tuple[tuple[int, int | str], ...]:
+    """Return a key that sorts names as people count: 2 before 10.
+
+    Examples
+    --------
+    >>> sorted(["b.10.png", "b.2.png", "a.png"], key=natural)
+    ['a.png', 'b.2.png', 'b.10.png']
+    """
+    parts = re.split(r"(\d+)", name.casefold())
+    return tuple((0, int(part)) if part.isdigit() else (1, part) for part in parts if part)
+
+
+def find(directory: Path, *, lights: Path | None = None) -> LightList:
+    """Find the pictures of a folder and the lights they were taken under.
+
+    Parameters
+    ----------
+    directory : Path
+        The folder of the pictures, or one above it that holds a single such folder.
+    lights : Path, optional
+        A .lp file, a text file of directions, or a folder of a chrome ball; default: what is found
+        in the folder or beside it, in that order.
+
+    Returns
+    -------
+    LightList
+
+    Raises
+    ------
+    LightListError
+        Where there are no pictures or no lights, or their numbers or names do not fit.
+    """
+    if not directory.is_dir():
+        raise LightListError(
+            "there is no such folder", where=str(directory), advice="Name a folder of pictures."
+        )
+    directory, source = _folder(directory), lights or None
+    if source is None:
+        source = _source(directory)
+    if not source.exists():
+        raise LightListError("there is no such light list", where=str(source))
+    if source.is_dir():
+        pictures = pictures_in(directory)
+        return LightList(pictures, _from_ball(source, len(pictures)), "chrome ball", source.name)
+    if source.suffix.lower() == ".lp":
+        return _from_lp(source, directory)
+    return _from_text(source, directory)
+
+
+def pictures_in(directory: Path) -> tuple[Path, ...]:
+    """Return the pictures of a folder in natural order, without its masks.
+
+    A ``filenames.txt`` names them in its own order.
+    """
+    listed = directory / "filenames.txt"
+    if listed.is_file():
+        names = [line.strip() for line in _text(listed).splitlines() if line.strip()]
+        return tuple(_named(name, directory, listed) for name in names)
+    return tuple(
+        sorted(
+            (
+                file
+                for file in directory.iterdir()
+                if file.is_file()
+                and file.suffix.lower() in PICTURES
+                and not file.name.startswith(".")
+                and not is_mask(file)
+            ),
+            key=lambda file: natural(file.name),
+        )
+    )
+
+
+def is_mask(file: Path) -> bool:
+    """Return whether a picture's name says that it is a mask.
+
+    Examples
+    --------
+    >>> is_mask(Path("buddha.mask.png")), is_mask(Path("damask.png"))
+    (True, False)
+    """
+    return "mask" in re.split(r"[^a-z]+", file.stem.lower())
+
+
+def mask_of(directory: Path) -> Path | None:
+    """Return the mask of a folder of pictures, None where it has none or several."""
+    found = [f for f in directory.iterdir() if f.suffix.lower() in PICTURES and is_mask(f)]
+    return found[0] if len(found) == 1 else None
+
+
+def read_mask(path: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return where a mask is brighter than half of its brightest pixel, (H, W).
+
+    Raises
+    ------
+    LightListError
+        Where it is of another size than the pictures, or black.
+    """
+    values = gray(read_photo(path).frame)
+    if values.shape != shape:
+        got, wanted = f"{values.shape[1]} x {values.shape[0]}", f"{shape[1]} x {shape[0]}"
+        raise LightListError(
+            "does not fit the pictures", where=str(path), faults=[Fault("mask", got, wanted)]
+        )
+    top = float(values.max())
+    if top <= 0:
+        raise LightListError("is black", where=str(path), faults=[Fault("mask", "no pixel", "one")])
+    return np.asarray(values > 0.5 * top)
+
+
+def gray(frame: RawFrame) -> NDArray[np.float32]:
+    """Return the mean of an imported picture's channels, (H, W), DN; each 2 x 2 cell is a pixel."""
+    cells = frame.cfa.astype(np.float32)
+    if frame.pattern == "MONO":
+        return cells
+    mean = cells[::2, ::2] + cells[::2, 1::2] + cells[1::2, ::2] + cells[1::2, 1::2]
+    mean *= np.float32(0.25)
+    return mean
+
+
+def _folder(directory: Path) -> Path:
+    """Return the folder of the pictures: this one, or the only one below that is no ball's."""
+    if pictures_in(directory):
+        return directory
+    below = [
+        folder
+        for folder in sorted(directory.iterdir())
+        if folder.is_dir() and not _is_ball(folder) and pictures_in(folder)
+    ]
+    if len(below) != 1:
+        got = ", ".join(folder.name for folder in below) or "no pictures"
+        raise LightListError(
+            "is no folder of one object under many lights",
+            where=str(directory),
+            faults=[Fault("folders with pictures", got, "one")],
+            advice="Name the folder that holds the object's pictures.",
+        )
+    return below[0]
+
+
+def _is_ball(folder: Path) -> bool:
+    return any(word in folder.name.lower() for word in BALL_NAMES)
+
+
+def _source(directory: Path) -> Path:
+    for folder in (directory, directory.parent):
+        lists = sorted(folder.glob("*.lp")) + sorted(folder.glob("*.LP"))
+        if len(set(lists)) > 1:
+            raise LightListError(
+                "has several light lists",
+                where=str(folder),
+                faults=[Fault("*.lp", ", ".join(f.name for f in lists), "one")],
+                advice="Say which with --lights.",
+            )
+        for candidate in (*lists, folder / "light_directions.txt", folder / "lights.txt"):
+            if candidate.is_file():
+                return candidate
+    for folder in (directory, directory.parent):
+        for ball in sorted(f for f in folder.iterdir() if f.is_dir() and _is_ball(f)):
+            if ball != directory and pictures_in(ball):
+                return ball
+    raise LightListError(
+        "has no light list",
+        where=str(directory),
+        faults=[Fault("lights", "none", "*.lp, lights.txt, light_directions.txt or chrome/")],
+        advice="Put one beside the pictures, or name it with --lights.",
+    )
+
+
+def _text(path: Path) -> str:
+    try:
+        data = path.read_bytes()
+    except OSError as exc:
+        raise LightListError(f"cannot be read: {exc.strerror}", where=str(path)) from exc
+    if len(data) > 2**24 or b"\0" in data:
+        raise LightListError("is no light list", where=str(path))
+    return data.decode("utf-8-sig", "replace")
+
+
+def _vector(words: Sequence[str], where: str) -> list[float]:
+    try:
+        vector = [float(word.replace(",", ".") if "." not in word else word) for word in words]
+    except ValueError:
+        vector = []
+    if len(vector) != 3 or not all(map(math.isfinite, vector)) or not any(vector):
+        got = " ".join(words)[:60] or "nothing"
+        raise LightListError(
+            "is no light list", where=where, faults=[Fault("light", got, "three numbers x y z")]
+        )
+    return vector
+
+
+def _from_lp(path: Path, directory: Path) -> LightList:
+    """Read an .lp file: a count, then a file name and x y z in each line."""
+    lines = [line.strip() for line in _text(path).splitlines() if line.strip()]
+    count = int(lines[0]) if lines and re.fullmatch(r"\d+", lines[0]) else None
+    rows = lines[1:] if count is not None else lines
+    if not rows or (count is not None and count != len(rows)) or len(rows) > MAX_LIGHTS:
+        expected = "one line a picture" if count is None else f"{count}, as its first line says"
+        raise LightListError(
+            "is no complete light list",
+            where=str(path),
+            faults=[Fault("lines", str(len(rows)), expected)],
+        )
+    pictures, vectors = [], []
+    for number, row in enumerate(rows, start=1 if count is None else 2):
+        words = row.split()
+        where = f"{path}, line {number}"
+        vectors.append(_vector(words[-3:], where))
+        pictures.append(_named(" ".join(words[:-3]), directory, path))
+    if len(set(pictures)) < len(pictures):
+        raise LightListError("names a picture twice", where=str(path))
+    return LightList(tuple(pictures), np.array(vectors), "lp", path.name)
+
+
+def _named(name: str, directory: Path, source: Path) -> Path:
+    """Return the file an entry means: by name, without its folder, or with another suffix."""
+    base = re.split(r"[\\/]", name)[-1]
+    files = {file.name.casefold(): file for file in directory.iterdir() if file.is_file()}
+    if base.casefold() in files:
+        return files[base.casefold()]
+    stem = base.casefold().rsplit(".", 1)[0]
+    alike = [
+        file
+        for file in files.values()
+        if file.stem.casefold() == stem and file.suffix.lower() in PICTURES
+    ]
+    if len(alike) == 1:
+        return alike[0]
+    raise LightListError(
+        "names a picture that is not there",
+        where=str(source),
+        faults=[Fault("picture", repr(name), f"a file in {directory}")],
+    )
+
+
+def _from_text(path: Path, directory: Path) -> LightList:
+    """Read rows x y z, after a count or not, for the pictures in their natural order."""
+    rows = [line.split() for line in _text(path).splitlines() if line.split()]
+    count = None
+    if rows and len(rows[0]) == 1 and rows[0][0].isdigit():
+        count, rows = int(rows[0][0]), rows[1:]
+    if len(rows) > MAX_LIGHTS or (count is not None and count != len(rows)):
+        raise LightListError(
+            "is no complete light list",
+            where=str(path),
+            faults=[Fault("lines", str(len(rows)), f"{count}, as its first line says")],
+        )
+    vectors = np.array([_vector(row, f"{path}, light {k + 1}") for k, row in enumerate(rows)])
+    pictures = pictures_in(directory)
+    if len(pictures) != len(rows):
+        raise LightListError(
+            "does not fit the pictures",
+            where=str(path),
+            faults=[Fault("lights", str(len(rows)), f"{len(pictures)}, one a picture")],
+            advice="Move pictures that are none of the series away, or name the mask *mask*.",
+        )
+    strengths = directory / "light_intensities.txt"
+    intensity = None
+    if strengths.is_file():
+        lines = [line.split() for line in _text(strengths).splitlines() if line.split()]
+        intensity = np.array([_vector(row, f"{strengths}, light {k}") for k, row in
+                              enumerate(lines)])  # fmt: skip
+        if intensity.shape != vectors.shape or (intensity <= 0).any():
+            raise LightListError(
+                "does not fit the lights",
+                where=str(strengths),
+                faults=[Fault("rows", str(len(lines)), f"{len(rows)} of numbers > 0")],
+            )
+    return LightList(pictures, vectors, "list", path.name, intensity)
+
+
+def _from_ball(folder: Path, count: int) -> Floats:
+    from capture.calibration.chrome_ball import ChromeBallError, directions_from_chrome_ball
+
+    pictures, mask = pictures_in(folder), mask_of(folder)
+    if len(pictures) != count or mask is None:
+        got = f"{len(pictures)} pictures, {'a' if mask else 'no'} mask"
+        raise LightListError(
+            "does not fit the pictures",
+            where=str(folder),
+            faults=[Fault("ball", got, f"{count} pictures and one mask")],
+        )
+    grays = [gray(read_photo(picture).frame) for picture in pictures]
+    try:
+        return np.asarray(directions_from_chrome_ball(grays, read_mask(mask, grays[0].shape)))
+    except ChromeBallError as exc:
+        raise LightListError(str(exc), where=str(folder)) from exc

@@ -1,0 +1,103 @@
+"""Pictures with a light list, from the folder to normals, by the command line's own functions."""
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from model import store
+from model.metrics import angular_error_rad
+from reconstruction import pipeline
+from skinrig.cli import main
+
+
+def ball(count=14, side=64, noise=0.004):
+    """Return a matte ball's images (N, H, W), lights, normals and mask."""
+    rng = np.random.default_rng(5)
+    k = np.arange(count) + 0.5
+    z = 1.0 - 0.4 * k / count
+    phi = np.pi * (1.0 + np.sqrt(5.0)) * k
+    r = np.sqrt(1.0 - z * z)
+    lights = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
+    y, x = np.mgrid[0:side, 0:side]
+    u, v = (x - (side - 1) / 2) / (0.45 * side), ((side - 1) / 2 - y) / (0.45 * side)
+    inside = u * u + v * v < 0.8
+    n = np.stack([u, v, np.sqrt(np.maximum(1.0 - u * u - v * v, 0.0))], axis=-1)
+    images = 0.7 * np.maximum(np.einsum("hwk,nk->nhw", n, lights), 0.0)
+    return images + noise * rng.standard_normal(images.shape), lights, n, inside
+
+
+def write(folder, images, lights, inside):
+    folder.mkdir()
+    for number, image in enumerate(images):
+        codes = np.rint(65535 * np.clip(image, 0, 1)).astype(np.uint16)
+        rgb = np.stack([codes, codes, codes // 2], axis=-1)
+        tifffile.imwrite(folder / f"{number:02d}.tif", rgb, photometric="rgb")
+    rows = [f"{k:02d}.tif {x} {y} {z}" for k, (x, y, z) in enumerate(lights)]
+    (folder / "a.lp").write_text("\n".join([str(len(rows)), *rows]))
+    cv2.imwrite(str(folder / "mask.png"), inside.astype(np.uint8) * 255)
+
+
+def made(tmp_path, folder, capsys):
+    assert main(["import", "lp", str(folder), "--out", str(tmp_path / "s")]) == 0
+    argv = ["reconstruct", str(tmp_path / "s"), "--want", "normals,albedo", "--out"]
+    assert main([*argv, str(tmp_path / "a")]) == 0
+    capsys.readouterr()
+    return store.read(tmp_path / "a")
+
+
+def error_deg(appearance, n, inside):
+    normals = appearance.maps["normals"]
+    seen = normals.valid & inside
+    assert seen.sum() > 0.95 * inside.sum()
+    return np.degrees(angular_error_rad(normals.values[seen], n[seen]))
+
+
+def test_a_ball_comes_out_round_and_of_its_color(tmp_path, capsys):
+    images, lights, n, inside = ball()
+    write(tmp_path / "f", images, lights, inside)
+    found = made(tmp_path, tmp_path / "f", capsys)
+    assert error_deg(found, n, inside).mean() < 0.5
+    albedo = found.maps["albedo"].values[found.maps["albedo"].valid]
+    np.testing.assert_allclose(np.median(albedo, axis=0), [0.7, 0.7, 0.35], rtol=0.02)
+    assert not (found.maps["normals"].valid & ~inside).any()
+
+
+def test_a_reversed_list_is_named_and_mended(tmp_path, capsys):
+    images, lights, n, inside = ball()
+    write(tmp_path / "f", images, lights[::-1], inside)
+    found = made(tmp_path, tmp_path / "f", capsys)
+    assert found.parameters["light_check"]["order"] == "reversed"
+    assert any("light list is reversed" in text for text in found.parameters["assumed"])
+    assert error_deg(found, n, inside).mean() < 0.5
+
+
+def test_a_dead_light_is_named_and_left_out(tmp_path, capsys):
+    images, lights, n, inside = ball()
+    images[4] = 0.0
+    write(tmp_path / "f", images, lights, inside)
+    found = made(tmp_path, tmp_path / "f", capsys)
+    assert any("light 5 of the list gave no light" in t for t in found.parameters["assumed"])
+    assert error_deg(found, n, inside).mean() < 0.5
+
+
+def test_the_real_buddha_agrees_with_its_reference(tmp_path, capsys, test_data):
+    found = made(tmp_path, test_data / "photometric_stereo" / "buddha", capsys)
+    reference = np.load(test_data / "photometric_stereo" / "buddha" / "buddha_ref.npz")["normals"]
+    reference = reference[::-1].astype(np.float64)  # its rows begin at the bottom
+    inside = np.linalg.norm(reference, axis=-1) > 0.5
+    normals = found.maps["normals"]
+    seen = normals.valid & inside
+    assert seen.sum() > 0.95 * inside.sum()
+    error = np.degrees(angular_error_rad(normals.values[seen], reference[seen]))
+    assert error.mean() <= 1.2
+    upside_down = angular_error_rad(normals.values[seen], reference[::-1][seen])
+    assert np.degrees(np.nanmean(upside_down)) > 5.0
+
+
+def test_what_a_stack_cannot_be_made_into_is_refused(tmp_path, capsys):
+    images, lights, _, inside = ball()
+    write(tmp_path / "f", images, lights, inside)
+    assert main(["import", "lp", str(tmp_path / "f"), "--out", str(tmp_path / "s")]) == 0
+    with pytest.raises(ValueError, match="melanin"):
+        pipeline.reconstruct(tmp_path / "s", want=["melanin"], out=tmp_path / "a")
