@@ -71,6 +71,8 @@ class GBuffer:
 
 
 class _Tracer(Protocol):
+    scene: Any
+
     def first_hit(
         self, origins: Float32Array, directions: Float32Array
     ) -> tuple[Int32Array, Float32Array]: ...
@@ -100,6 +102,11 @@ class Caster:
             self._tracer = _MitsubaTracer(mesh, self.choice)
         else:
             self._tracer = _EmbreeTracer(mesh)
+
+    @property
+    def scene(self) -> Any:
+        """Mitsuba's scene of the mesh, for kernels that trace and shade at once, or None."""
+        return self._tracer.scene
 
     def first_hit(
         self, origins: ArrayLike, directions: ArrayLike
@@ -538,7 +545,7 @@ class _MitsubaTracer:
         parameters["vertex_positions"] = np.ravel(mesh.vertices_mm)
         parameters["faces"] = np.ravel(mesh.faces).astype(np.uint32)
         parameters.update()
-        self._scene = mi.load_dict({"type": "scene", "mesh": shape})
+        self.scene: Any = mi.load_dict({"type": "scene", "mesh": shape})
 
     def _ray(
         self, mi: Any, origins: Float32Array, directions: Float32Array, length: Any = None
@@ -554,7 +561,7 @@ class _MitsubaTracer:
         self, origins: Float32Array, directions: Float32Array
     ) -> tuple[Int32Array, Float32Array]:
         mi = load(self._choice)
-        hit = self._scene.ray_intersect_preliminary(
+        hit = self.scene.ray_intersect_preliminary(
             self._ray(mi, origins, directions), coherent=True
         )
         valid = np.array(hit.is_valid())
@@ -566,7 +573,7 @@ class _MitsubaTracer:
         self, origins: Float32Array, directions: Float32Array, length: Float32Array
     ) -> BoolArray:
         mi = load(self._choice)
-        hit = self._scene.ray_test(self._ray(mi, origins, directions, length), coherent=True)
+        hit = self.scene.ray_test(self._ray(mi, origins, directions, length), coherent=True)
         return np.array(hit, np.bool_)
 
 
@@ -575,6 +582,7 @@ class _EmbreeTracer:
         from embreex import rtcore_scene
         from embreex.mesh_construction import TriangleMesh
 
+        self.scene: Any = None
         self._scene = rtcore_scene.EmbreeScene()
         TriangleMesh(self._scene, mesh.vertices_mm, mesh.faces)
 

@@ -37,6 +37,7 @@ from rigsim.mesh import Float32Array
 from rigsim.render import Caster, GBuffer
 from rigsim.scenes import olat
 from rigsim.scenes.olat import Hits, Lamp
+from rigsim.scenes.olat_vector import VectorLight
 from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.subject import Subject
 from rigsim.surface_brdf import SkinSurface, skin_surface
@@ -50,7 +51,8 @@ HAIR_LIMIT: Final = 0.02
 """Pixels with more hair than this part are not skin."""
 
 KEPT_FRAMES: Final = 16
-"""Latest frames that are kept, so that the second exposure of each camera costs nothing."""
+KEPT_BYTES: Final = 2**28
+"""Latest frames that are kept, the more of the two, so that a second exposure costs nothing."""
 
 
 class SceneError(ValueError):
@@ -147,6 +149,7 @@ class DomeScene:
         self._surfaces: dict[str, SkinSurface] = {}
         self._textures: dict[str, Float32Array] = {}
         self._hits: OrderedDict[tuple[str, float], tuple[Hits, Caster]] = OrderedDict()
+        self._vector: dict[tuple[str, float], VectorLight] = {}
         self._frames: OrderedDict[tuple[str, int, float], Float32Array] = OrderedDict()
 
     @property
@@ -422,7 +425,9 @@ class DomeScene:
             raise SceneError(f"light: got {light}, expected 0 to {len(self.rig.lights) - 1}")
         key = (view.name, light, self._instant(t_s))
         if key not in self._frames:
-            while len(self._frames) >= KEPT_FRAMES:
+            # a capture comes back to each light in its next pass
+            most = max(KEPT_FRAMES, KEPT_BYTES // (12 * view.width_px * view.height_px))
+            while len(self._frames) >= most:
                 self._frames.popitem(last=False)
             self._frames[key] = self._render(view, light, key[2])
         self._frames.move_to_end(key)
@@ -440,7 +445,12 @@ class DomeScene:
             return np.zeros(shape, np.float32)
         hits, caster = self._seen(view, t_s)
         lamp = self._lamp(light, t_s)
-        image = olat.light_up(hits, lamp, olat.seen_from(hits, caster, lamp))
+        if hits.kind == olat.SKIN and caster.scene is not None:
+            if (view.name, t_s) not in self._vector:
+                self._vector[view.name, t_s] = VectorLight(hits, caster)
+            image = self._vector[view.name, t_s].light_up(lamp)
+        else:
+            image = olat.light_up(hits, lamp, olat.seen_from(hits, caster, lamp))
         image *= self.intensity(light, view_name=view.name)
         image *= np.float32(self.dome.gain.get(view.name, 1.0))
         return image
@@ -467,7 +477,8 @@ class DomeScene:
             # Still heads need every camera's rows again for every light; moving ones never do.
             most = len(self.rig.views) if self._instant(1.0) == 0.0 else 2
             while len(self._hits) >= most:
-                self._hits.popitem(last=False)
+                old, _ = self._hits.popitem(last=False)
+                self._vector.pop(old, None)
             self._hits[key] = self._look(view, t_s)
         self._hits.move_to_end(key)
         return self._hits[key]

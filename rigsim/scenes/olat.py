@@ -33,6 +33,12 @@ BAND_RAYS: Final = 1 << 20
 CHUNK: Final = 1 << 13
 """Rows that one thread works on at a time."""
 
+PLASTIC: Final = 0.7548776662466927
+"""Inverse of the plastic number, the root of x^3 = x + 1."""
+
+DISC_POINTS: Final = 1 << 12
+"""Points on a light's disc that rows take in turn."""
+
 SKIN, MATT, METAL = 0, 1, 2
 """How rows reflect: skin of `rigsim.surface_brdf`, Lambertian, GGX facets of a metal."""
 
@@ -54,6 +60,14 @@ class Lamp:
     """Exponent of the cosine off the axis that the intensity follows; nothing shines backwards."""
     radius_mm: float
     """Radius of the disc, 0 for a point."""
+
+    def radii(self) -> tuple[FloatArray, FloatArray]:
+        """Return two perpendicular radii of the disc, mm, shape (3,) each."""
+        axis = np.asarray(self.axis, np.float64)
+        helper = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+        side = np.cross(helper, axis)
+        side *= self.radius_mm / float(np.linalg.norm(side))
+        return side, np.cross(axis, side)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +240,11 @@ def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> NDArray[np.bool_]:
     ndarray of bool
         Shape (n,).
     """
-    center, _, side, other, _ = _disc(lamp)
+    center = np.ascontiguousarray(lamp.position_mm, np.float64)
+    side, other = lamp.radii()
+    across, along = disc_points(DISC_POINTS)
+    points = np.stack([across, along])[:, :, None] * np.stack([side, other])[:, None]
+    targets = center + points.sum(axis=0)
     chunks = -(-len(hits.position_mm) // CHUNK)
     count = np.zeros(chunks + 1, np.int64)
     _count_facing(hits.position_mm, hits.normal, center, count)
@@ -237,11 +255,30 @@ def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> NDArray[np.bool_]:
     length = np.empty(count[-1], np.float32)
     _aim(
         hits.position_mm, hits.normal, hits.prim, caster.mesh.vertices_mm, caster.mesh.faces,
-        center, side, other, count, index, start, way, length,
+        center, targets, count, index, start, way, length,
     )  # fmt: skip
     visible = np.zeros(len(hits.position_mm), np.bool_)
     visible[index] = ~caster.blocked(start, way, length)
     return visible
+
+
+def lift(hits: Hits, caster: Caster) -> Float32Array:
+    """Return where the rows' shadow rays start, above their triangles, shape (n, 3)."""
+    corners = caster.mesh.vertices_mm[caster.mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal = np.divide(OFFSET_MM * normal, length, out=np.zeros_like(normal), where=length > 0.0)
+    return np.asarray(hits.position_mm + normal[hits.prim], np.float32)
+
+
+def sum_rows(
+    hits: Hits, red: Float32Array, green: Float32Array, blue: Float32Array
+) -> Float32Array:
+    """Sum what rows send, shape (n,) each, into whole pixels, shape (H, W, 3)."""
+    out = np.zeros((hits.shape[0] * hits.shape[1], 3), np.float32)
+    share = np.float32(1.0 / hits.subpixels**2)
+    _sum_rows(hits.pixel, hits.first, red, green, blue, share, out)
+    return out.reshape(*hits.shape, 3)
 
 
 def light_up(
@@ -270,36 +307,37 @@ def light_up(
     """
     out = np.zeros((hits.shape[0] * hits.shape[1], 3), np.float32)
     extra = np.zeros((0, 3), np.float32) if glow is None else glow
-    center, axis, _, _, exponent = _disc(lamp)
+    center = np.ascontiguousarray(lamp.position_mm, np.float64)
+    axis = np.ascontiguousarray(lamp.axis, np.float64)
     _shade(
         hits.pixel, hits.first, hits.position_mm, hits.normal, hits.surface, hits.camera_mm,
-        hits.kind, center, axis, exponent, visible, extra, 1.0 / hits.subpixels**2, out,
+        hits.kind, center, axis, float(lamp.exponent), visible, extra, 1.0 / hits.subpixels**2, out,
     )  # fmt: skip
     return out.reshape(*hits.shape, 3)
 
 
-def _disc(lamp: Lamp) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
-    """Return centre, axis, the disc's two radii as vectors, and the exponent."""
-    axis = np.asarray(lamp.axis, np.float64)
-    helper = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
-    side = np.cross(helper, axis)
-    side *= lamp.radius_mm / float(np.linalg.norm(side))
-    center = np.ascontiguousarray(lamp.position_mm, np.float64)
-    return center, axis, side, np.cross(axis, side), float(lamp.exponent)
+def disc_points(count: int) -> tuple[Float32Array, Float32Array]:
+    """Return points of the unit disc, shape (count,) each; neighbours are spread evenly over it.
+
+    The additive sequence of the plastic number, mapped to the disc with even density.
+    """
+    index = np.arange(count)
+    u, v = (0.5 + index * PLASTIC) % 1.0, (0.5 + index * PLASTIC**2) % 1.0
+    radius, angle = np.sqrt(u), 2.0 * np.pi * v
+    return (radius * np.cos(angle)).astype(np.float32), (radius * np.sin(angle)).astype(np.float32)
 
 
-@njit(cache=True, inline="always")
-def _target(i, center, side, other):  # type: ignore[no-untyped-def]
-    # The additive sequence of the plastic number spreads neighbours' points evenly.
-    u = (0.5 + i * 0.7548776662466927) % 1.0
-    v = (0.5 + i * 0.5698402909980532) % 1.0
-    r = math.sqrt(u)
-    a, b = r * math.cos(2.0 * math.pi * v), r * math.sin(2.0 * math.pi * v)
-    return (
-        center[0] + a * side[0] + b * other[0],
-        center[1] + a * side[1] + b * other[1],
-        center[2] + a * side[2] + b * other[2],
-    )
+@njit(cache=True)  # a few ms at most: waiting for a second thread would take longer
+def _sum_rows(pixel, first, red, green, blue, share, out):  # type: ignore[no-untyped-def]
+    for p in range(pixel.shape[0]):
+        r = g = b = np.float32(0.0)
+        for i in range(first[p], first[p + 1]):
+            r += red[i]
+            g += green[i]
+            b += blue[i]
+        out[pixel[p], 0] = share * r
+        out[pixel[p], 1] = share * g
+        out[pixel[p], 2] = share * b
 
 
 @njit(cache=True, inline="always")
@@ -323,14 +361,15 @@ def _count_facing(position, normal, center, count):  # type: ignore[no-untyped-d
 
 @njit(parallel=True, cache=True)
 def _aim(  # type: ignore[no-untyped-def]
-    position, normal, prim, vertices, faces, center, side, other, count, index, start, way, length,
+    position, normal, prim, vertices, faces, center, targets, count, index, start, way, length,
 ):  # fmt: skip
     for chunk in prange(count.shape[0] - 1):
         at = count[chunk]
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, position.shape[0])):
             if not _faces(i, position, normal, center):
                 continue
-            x, y, z = _target(i, center, side, other)
+            k = i % targets.shape[0]
+            x, y, z = targets[k, 0], targets[k, 1], targets[k, 2]
             p0, p1, p2 = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
             a, b, c = faces[prim[i], 0], faces[prim[i], 1], faces[prim[i], 2]
             e0 = float(vertices[b, 0]) - vertices[a, 0]

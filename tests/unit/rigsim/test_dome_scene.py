@@ -14,6 +14,7 @@ from rigsim.scenes import olat
 from rigsim.scenes.dome import DomeScene, SceneError
 from rigsim.subject import make_subject
 from rigsim.targets import make_target
+from rigsim.variant import VariantChoice, choose_variant
 
 pytestmark = pytest.mark.render
 
@@ -301,6 +302,18 @@ def test_a_target_stays_where_it_stands(rig, white):
     moving = DomeScene(rig, make_target("white"), motion=head_motion(1))
     np.testing.assert_array_equal(moving.radiance("C", [1], t_s=5.0), white.radiance("C", [1]))
     assert not DomeScene(rig, make_target("dark")).radiance("C", [0]).any()
+
+
+def test_the_vectorized_kernel_and_the_plain_one_agree(rig, face, scene):
+    """Two codes of one formula, two ray tracers; float32 against float64, and rays at edges."""
+    if not choose_variant("rgb").is_vectorized:
+        pytest.skip("no LLVM: there is one kernel only")
+    plain = DomeScene(rig, face, choice=VariantChoice("scalar_rgb", "asked for by the test", ""))
+    for light in (0, 1, 3):
+        one, two = scene.radiance("C", [light])[0], plain.radiance("C", [light])[0]
+        assert one.sum() == pytest.approx(two.sum(), rel=2e-3)
+        agree = np.abs(one - two) < 1e-4 * two.max()
+        assert agree.mean() > 0.995
 
 
 def test_what_cannot_be_is_refused(rig, face, scene):

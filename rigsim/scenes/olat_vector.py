@@ -1,0 +1,151 @@
+"""The same as `rigsim.scenes.olat` for skin, in one vectorized kernel: rays, shading, all at once.
+
+The kernel is compiled once by Dr.Jit; lights come in as numbers it does not know beforehand. It
+needs Mitsuba's LLVM variants; without them, and for targets, `rigsim.scenes.olat` does the work.
+The reflection is written a second time here, from the same formulas; a test holds both together.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.mesh import Float32Array
+from rigsim.render import Caster, load
+from rigsim.scenes.olat import (
+    DISC_POINTS,
+    Hits,
+    Lamp,
+    disc_points,
+    lift,
+    sum_rows,
+    unpack_surface,
+)
+from rigsim.skin_layers import ETA
+from rigsim.surface_brdf import ETA_OIL, FUZZ_ALBEDO, OIL_SMOOTHING
+
+
+class VectorLight:
+    """Rows of skin, ready to be lit.
+
+    Parameters
+    ----------
+    hits
+        Rows of kind ``SKIN``.
+    caster
+        The mesh; its ``scene`` must not be None.
+    """
+
+    def __init__(self, hits: Hits, caster: Caster) -> None:
+        self._choice = caster.choice
+        self._scene = caster.scene
+        self.hits = hits
+        mi = load(self._choice)
+        start, normal = lift(hits, caster), hits.normals()
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        self._start = mi.Point3f(*_columns(start))
+        self._normal = mi.Vector3f(*_columns(normal))
+        self._surface = [mi.Float(column) for column in _columns(unpack_surface(hits.surface))]
+        across, along = (np.resize(p, len(start)) for p in disc_points(DISC_POINTS))
+        self._across, self._along = mi.Float(across), mi.Float(along)
+
+    def light_up(self, lamp: Lamp, glow: Float32Array | None = None) -> Float32Array:
+        """Trace shadow rays, shade and sum into pixels; see `rigsim.scenes.olat.light_up`.
+
+        Parameters
+        ----------
+        lamp, glow
+            As there.
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (H, W, 3), as there.
+        """
+        if not len(self.hits.position_mm):
+            return np.zeros((*self.hits.shape, 3), np.float32)
+        import drjit as dr
+
+        mi = load(self._choice)
+
+        def number(value: float) -> Any:
+            return dr.opaque(mi.Float, float(value))
+
+        def vector(values: NDArray[np.float64]) -> Any:
+            return mi.Vector3f(*(number(v) for v in values))
+
+        side, other = lamp.radii()
+        center, axis = vector(lamp.position_mm), vector(lamp.axis)
+        way = center - self._start
+        squared = dr.squared_norm(way)
+        to_light = way * dr.rsqrt(squared)
+        to_camera = dr.normalize(vector(self.hits.camera_mm) - self._start)
+        nl = dr.minimum(dr.dot(self._normal, to_light), 1.0)
+        nv = dr.minimum(dr.dot(self._normal, to_camera), 1.0)
+        off = -dr.dot(axis, to_light)
+        active = (nl > 0.0) & (nv > 0.0) & (off > 0.0)
+        target = way + self._across * vector(side) + self._along * vector(other)
+        far = dr.norm(target)
+        ray = mi.Ray3f(self._start, target / far)
+        ray.maxt = 0.999 * far
+        active &= ~self._scene.ray_test(ray, True, active)
+        lobe = dr.power(dr.maximum(off, 1e-9), number(lamp.exponent))
+        strength = dr.select(active, nl / squared * lobe, 0.0)
+        red, green, blue, roughness, oil, fuzz, bare = self._surface
+        half = to_light + to_camera
+        length = dr.norm(half)
+        nh, lh = dr.minimum((nl + nv) / length, 1.0), 0.5 * length
+        # Cosines below zero are masked out; keep their square roots real.
+        cl, cv = dr.maximum(nl, 1e-6), dr.maximum(nv, 1e-6)
+        surface = (1.0 - oil) * _fresnel(dr, lh, ETA) * _beckmann(dr, cl, cv, nh, roughness)
+        surface += oil * _fresnel(dr, lh, ETA_OIL) * _ggx(dr, cl, cv, nh, OIL_SMOOTHING * roughness)
+        through = 1.0 - dr.exp(-fuzz * (1.0 / cl + 1.0 / cv))
+        surface += FUZZ_ALBEDO / (4.0 * math.pi) * through / (cl + cv)
+        gloss = math.pi * strength * bare * surface
+        leaving = 1.0 - _fresnel(dr, cv, ETA)
+        if glow is None:
+            inside = strength * (1.0 - _fresnel(dr, cl, ETA)) * leaving
+            rows = [gloss + inside * color for color in (red, green, blue)]
+        else:
+            leaving = dr.select(nv > 0.0, leaving, 0.0)
+            rows = [gloss + leaving * mi.Float(column) for column in _columns(glow)]
+        dr.eval(rows)
+        r, g, b = (np.asarray(row.numpy(), np.float32) for row in rows)
+        return sum_rows(self.hits, r, g, b)
+
+
+def _columns(rows: Float32Array) -> list[Float32Array]:
+    return [np.ascontiguousarray(rows[:, k], np.float32) for k in range(rows.shape[1])]
+
+
+def _fresnel(dr: Any, cosine: Any, eta: float) -> Any:
+    c = dr.clip(cosine, 0.0, 1.0)
+    inside = dr.sqrt(1.0 - (1.0 - c * c) / (eta * eta))
+    rs = (c - eta * inside) / (c + eta * inside)
+    rp = (eta * c - inside) / (eta * c + inside)
+    return 0.5 * (rs * rs + rp * rp)
+
+
+def _beckmann(dr: Any, nl: Any, nv: Any, nh: Any, alpha: Any) -> Any:
+    a2, c2 = alpha * alpha, nh * nh
+    lobe = dr.minimum((1.0 - c2) / (dr.maximum(c2, 1e-12) * a2), 60.0)
+    density = dr.exp(-lobe) / (math.pi * a2 * c2 * c2)
+    return density * _beckmann_g1(dr, nl, alpha) * _beckmann_g1(dr, nv, alpha) / (4.0 * nl * nv)
+
+
+def _beckmann_g1(dr: Any, cosine: Any, alpha: Any) -> Any:
+    slope = alpha * dr.sqrt(dr.maximum(1.0 - cosine * cosine, 0.0)) / cosine
+    a = 1.0 / dr.maximum(slope, 1e-6)
+    partly = (3.535 * a + 2.181 * a * a) / (1.0 + 2.276 * a + 2.577 * a * a)
+    return dr.select(slope < 0.625, 1.0, partly)
+
+
+def _ggx(dr: Any, nl: Any, nv: Any, nh: Any, alpha: Any) -> Any:
+    a2 = alpha * alpha
+    t = nh * nh * (a2 - 1.0) + 1.0
+    gl = nl + dr.sqrt(a2 + (1.0 - a2) * nl * nl)
+    gv = nv + dr.sqrt(a2 + (1.0 - a2) * nv * nv)
+    return a2 / (math.pi * t * t) / (gl * gv)
