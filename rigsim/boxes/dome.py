@@ -12,6 +12,7 @@ that open eyes may see (105). Light carries its own end; LEDs that draw no curre
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -36,6 +37,7 @@ from .led_table import (
 
 __all__ = ["DomeUnit", "LedPulse"]
 
+_MASK = re.compile(r"[0-9A-Fa-f]{1,8}")
 LED_MS = (1.0, 500.0)
 DEFAULT_MS = 100.0
 EYES = ("OPEN", "CLOSED", "SHIELDED")
@@ -445,12 +447,9 @@ class DomeUnit:
     # cameras, eyes, dose ----------------------------------------------------------------------
 
     def _set_mask(self, arguments: str, now: float) -> str:
-        try:
-            mask = int(arguments, 16) if len(arguments) <= 8 and arguments.isalnum() else -1
-        except ValueError:
-            mask = -1
-        if mask < 0:
+        if _MASK.fullmatch(arguments) is None:
             raise Refused(Code.SYNTAX, "expected a mask in hexadecimal digits")
+        mask = int(arguments, 16)
         if mask >= 1 << self._cameras:
             raise Refused(Code.OUT_OF_RANGE, f"expected a mask of {self._cameras} cameras")
         self._require_still()

@@ -1,0 +1,569 @@
+"""Every row of the dome box's manual, on the box itself: bytes and time in, bytes out."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+
+from capture.devices import wire
+from capture.devices.wire import Code, Event, Reply, Request
+from capture.plan.dome import as_table, dome_plan
+from capture.plan.eye_light import eye_light
+from capture.plan.flicker import flicker_of_rows
+from capture.plan.light_order import ORDERS
+from capture.plan.rows import LedRow, led_rows
+from capture.rig import load_rig
+from rigsim.boxes.led_table import LEVEL_STEPS, Row, table_crc
+from rigsim.faults import Faults
+from rigsim.world import World
+
+DOME = load_rig("dome")
+RIG = DOME.subset(views=["C00", "C05", "C15"]).resized(16)
+
+ANY = object()
+# header -> (text, needs arming, what must come before, expected payload)
+MANUAL = {
+    "SEQ:CLE": ("SEQ:CLE", (), ""),
+    "SEQ:DEF": ("SEQ:DEF 0,3+17:500:83333:7;-:0:50000:0", (), ""),
+    "SEQ:CRC?": ("SEQ:CRC?", (), "0,FFFF"),
+    "SEQ:ARM": ("SEQ:ARM 1", ("SYST:ARM", "SEQ:DEF 0,140:1000:80000:7"), ANY),
+    "TRIG": ("TRIG a1", ("SYST:ARM", "SEQ:DEF 0,140:1000:80000:7", "SEQ:ARM 1"), "a1,1000000"),
+    "SEQ:POS?": ("SEQ:POS?", (), "IDLE,-1,0,-"),
+    "SEQ:STEP?": ("SEQ:STEP? 0", (), "NONE"),
+    "LED:ON": ("LED:ON 3+17,80,500", ("SYST:ARM",), ""),
+    "LED:OFF": ("LED:OFF ALL", (), ""),
+    "LED?": ("LED?", (), "-"),
+    "CAM:MASK": ("CAM:MASK 5", (), ""),
+    "CAM:MASK?": ("CAM:MASK?", (), "7"),
+    "CAM:TRIG": ("CAM:TRIG d1", (), "d1,1000000"),
+    "SAFE:EYES": ("SAFE:EYES CLOSED", (), ""),
+    "SAFE:EYES?": ("SAFE:EYES?", (), "OPEN"),
+    "DOSE?": ("DOSE? 3", (), "0.000000"),
+    "DOSE:NEW": ("DOSE:NEW P042", (), ""),
+}
+SHARED = {
+    "*IDN?", "*RST", "*CLS", "*OPC?", "SYST:ERR?", "SYST:HELLO?", "SYST:CAP?", "SYST:CAP:PART?",
+    "SYST:WDOG", "SYST:WDOG?", "SYST:ARM", "SYST:ARM?", "SYST:PING?", "SAFE", "ABOR", "STAT?",
+}  # fmt: skip
+
+
+class Bench:
+    """A box at one second past power-up, spoken to in frames with the right numbers."""
+
+    def __init__(self, rig=RIG, **faults):
+        self.world = World(rig, seed=3, faults=Faults(**faults))
+        self.box = self.world.box("dome")
+        self.unit = self.box.device
+        self.edges = []
+        self.unit._on_trigger = lambda now, mask: self.edges.append((now, mask))
+        self.now = 1.0
+        self.seq = 100
+        self.said = []
+
+    def raw(self, data):
+        answer = self.box.feed(data, self.now)
+        self.hear(answer)
+        return answer
+
+    def hear(self, data):
+        for line in data.splitlines():
+            if line[:1] == b"!":
+                event = wire.decode(line)
+                self.said.append((event.name, event.payload))
+
+    def reply(self, text):
+        self.seq += 1
+        data = self.raw(wire.encode(Request(self.seq, self.box.boot, text)))
+        frames = [wire.decode(line) for line in data.splitlines()]
+        (reply,) = [frame for frame in frames if isinstance(frame, Reply)]
+        return reply
+
+    def ask(self, text):
+        reply = self.reply(text)
+        assert reply.code == Code.OK, (text, reply)
+        return reply.payload
+
+    def code(self, text):
+        return self.reply(text).code
+
+    def wait(self, seconds, *, ping_s=0.2):
+        """Let time pass; the host is alive."""
+        until = self.now + seconds
+        while self.now < until - 1e-12:
+            self.now = min(self.now + ping_s, until)
+            self.ask("SYST:PING?")
+
+    def silence(self, seconds):
+        """Let time pass; the host is not."""
+        self.now += seconds
+        self.hear(self.box.advance(self.now))
+
+    def load(self, rows):
+        self.ask("SEQ:CLE")
+        for first in range(0, len(rows), 10):
+            self.ask(f"SEQ:DEF {first},{';'.join(str(row) for row in rows[first : first + 10])}")
+
+    def run(self, rows, token="r1"):
+        self.ask("SYST:ARM")
+        self.load(rows)
+        self.ask(f"SEQ:ARM {len(rows)}")
+        self.ask(f"TRIG {token}")
+
+
+def rows_of(leds, *, ms=80, level=LEVEL_STEPS, mask=7):
+    return [Row((led,), level, ms * 1000, mask) for led in leds]
+
+
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+def front(count):
+    """Numbers of the LEDs that the eyes see best."""
+    return [int(k) for k in np.argsort(-eye_light(RIG))[:count]]
+
+
+def behind(count):
+    """Numbers of LEDs that the eyes do not see."""
+    return [int(k) for k in np.argsort(eye_light(RIG), kind="stable")[:count]]
+
+
+def test_the_manual_is_complete(bench):
+    assert set(MANUAL) | SHARED == set(bench.box.commands)
+    assert all(command.manual for command in bench.box.commands.values())
+
+
+@pytest.mark.parametrize("header", MANUAL)
+def test_a_framed_command_is_answered_as_its_manual_says(bench, header):
+    text, before, expected = MANUAL[header]
+    for line in before:
+        bench.ask(line)
+    payload = bench.ask(text)
+    assert expected is ANY or payload == expected
+
+
+@pytest.mark.parametrize("header", [h for h in MANUAL if not h.endswith("?")])
+def test_a_bare_command_is_refused_and_changes_nothing(bench, header):
+    bench.ask("SYST:ARM")
+    before = bench.ask("SEQ:CRC?"), bench.unit.mask, bench.unit.eyes, bench.unit.bank.lit
+    assert bench.raw(MANUAL[header][0].encode() + b"\n") == b""
+    assert bench.raw(b"SYST:ERR?\n") == b'203,"Unframed command"\n'
+    assert before == (
+        bench.ask("SEQ:CRC?"), bench.unit.mask, bench.unit.eyes, bench.unit.bank.lit
+    )  # fmt: skip
+    assert bench.edges == []
+
+
+@pytest.mark.parametrize("header", [h for h in MANUAL if h.endswith("?")])
+def test_a_bare_query_is_answered_plainly(bench, header):
+    text, _, expected = MANUAL[header]
+    assert bench.raw(text.encode() + b"\n") == expected.encode() + b"\n"
+
+
+@pytest.mark.parametrize("header", ["LED:ON", "SEQ:ARM", "TRIG"])
+def test_what_makes_light_is_refused_unless_armed(bench, header):
+    bench.ask("SEQ:DEF 0,140:1000:80000:7")
+    assert bench.code(MANUAL[header][0]) == Code.NOT_ARMED
+    assert not bench.unit.lit
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("LED:ON 150,80", Code.OUT_OF_RANGE),
+        ("LED:ON 3,501", Code.OUT_OF_RANGE),
+        ("LED:ON 3,0", Code.OUT_OF_RANGE),
+        ("LED:ON 3,80,1001", Code.OUT_OF_RANGE),
+        ("LED:ON 3,80,0", Code.OUT_OF_RANGE),
+        ("LED:ON 3+3,80", Code.SYNTAX),
+        ("LED:ON x,80", Code.SYNTAX),
+        ("LED:ON 3,80,5,5", Code.SYNTAX),
+        ("LED:ON 3+", Code.SYNTAX),
+        ("LED:ON " + "+".join(map(str, range(25))) + ",5,10", Code.OUT_OF_RANGE),
+        ("LED:OFF 150", Code.OUT_OF_RANGE),
+        ("LED:OFF all+1", Code.SYNTAX),
+        ("SEQ:DEF 1,3:1000:80000:7", Code.OUT_OF_RANGE),
+        ("SEQ:DEF 0", Code.SYNTAX),
+        ("SEQ:DEF 0,3:1000:80000", Code.SYNTAX),
+        ("SEQ:DEF 0,3:1000:80000:7;", Code.SYNTAX),
+        ("SEQ:DEF 0,3:1001:80000:7", Code.OUT_OF_RANGE),
+        ("SEQ:DEF 0,3:0:80000:7", Code.OUT_OF_RANGE),
+        ("SEQ:DEF 0,-:1:80000:7", Code.OUT_OF_RANGE),
+        ("SEQ:DEF 0,3:1:1999:7", Code.OUT_OF_RANGE),
+        ("SEQ:DEF 0,3:1:500001:7", Code.OUT_OF_RANGE),
+        ("SEQ:DEF 0,3:1:80000:8", Code.OUT_OF_RANGE),
+        ("SEQ:DEF 0,150:1:80000:7", Code.OUT_OF_RANGE),
+        ("SEQ:DEF -1,3:1:80000:7", Code.SYNTAX),
+        ("SEQ:ARM 2", Code.OUT_OF_RANGE),
+        ("SEQ:ARM 0", Code.OUT_OF_RANGE),
+        ("SEQ:ARM x", Code.SYNTAX),
+        ("SEQ:STEP? 1024", Code.OUT_OF_RANGE),
+        ("SEQ:STEP? -1", Code.SYNTAX),
+        ("CAM:MASK 8", Code.OUT_OF_RANGE),
+        ("CAM:MASK 0x5", Code.SYNTAX),
+        ("CAM:MASK -1", Code.SYNTAX),
+        ("SAFE:EYES SHUT", Code.SYNTAX),
+        ("DOSE? 150", Code.OUT_OF_RANGE),
+        ("DOSE:NEW a b", Code.SYNTAX),
+        ("TRIG a b", Code.SYNTAX),
+        ("CAM:TRIG " + "x" * 49, Code.SYNTAX),
+    ],
+)
+def test_what_makes_no_sense_is_refused_and_does_nothing(bench, text, code):
+    bench.ask("SYST:ARM")
+    before = bench.ask("SEQ:CRC?")
+    assert bench.code(text) == code
+    assert bench.ask("SEQ:CRC?") == before
+    assert not bench.unit.lit
+    assert bench.edges == []
+
+
+def test_the_data_dictionary_holds_the_rigs_limits(bench):
+    limits = json.loads(wire.unseal(bench.ask("SYST:CAP?")))
+    assert (limits["kind"], limits["leds"], limits["cameras"]) == ("dome", 150, 3)
+    for name in ("max_duty", "thermal_trip", "dose_ws", "max_flashes_per_s", "max_flicker_rms"):
+        assert limits[name] == getattr(RIG.leds, name)
+    assert limits["overlap_us"] == round(1e6 * RIG.leds.overlap_s)
+
+
+# tables and sequences -------------------------------------------------------------------------
+
+
+def test_a_tables_checksum_is_that_of_its_rows_in_one_spelling(bench):
+    rows = [Row((3, 17), 500, 83333, 7), Row((), 0, 50000, 0), Row((149,), 1000, 2000, 1)]
+    bench.load(rows)
+    text = "3+17:500:83333:7\n-:0:50000:0\n149:1000:2000:1"
+    assert bench.ask("SEQ:CRC?") == f"3,{wire.crc16(text.encode()):04X}"
+    assert table_crc(rows) == f"{wire.crc16(text.encode()):04X}"
+    bench.ask("SEQ:DEF 1,5:10:2000:2")  # a row is replaced, the others stay
+    assert bench.ask("SEQ:CRC?").startswith("3,")
+    assert bench.ask("SEQ:CRC?") != f"3,{wire.crc16(text.encode()):04X}"
+    bench.ask("SEQ:CLE")
+    assert bench.ask("SEQ:CRC?") == "0,FFFF"
+
+
+def test_a_sequence_steps_by_itself_and_reports_each_release(bench):
+    rows = rows_of(behind(5), ms=50)
+    bench.run(rows)
+    start = bench.now
+    bench.wait(0.5)
+    steps = [payload for name, payload in bench.said if name == "SEQ:STEP"]
+    settle_s = RIG.leds.settle_s
+    assert [int(step.split(",")[0]) for step in steps] == [0, 1, 2, 3, 4]
+    times = [1e-6 * int(step.split(",")[1]) for step in steps]
+    np.testing.assert_allclose(times, start + 0.05 * np.arange(5) + settle_s, atol=1e-6)
+    np.testing.assert_allclose([t for t, _ in bench.edges], times, atol=1e-6)
+    assert bench.said[-1][0] == "SEQ:DONE"
+    assert bench.ask("SEQ:POS?") == "DONE,4,5,r1"
+    assert bench.ask("SEQ:STEP? 4") == steps[4].split(",")[1]
+    assert not bench.unit.lit
+
+
+def test_the_next_led_is_on_before_the_last_goes_off_and_alone_when_cameras_are_released(bench):
+    rows = rows_of(behind(6), ms=40)
+    bench.run(rows)
+    bench.wait(0.4)
+    pulses = sorted(bench.world.pulses, key=lambda pulse: pulse.t_on_s)
+    assert [pulse.led for pulse in pulses] == [row.leds[0] for row in rows]
+    for before, after in itertools.pairwise(pulses):
+        assert before.t_off_s - after.t_on_s == pytest.approx(RIG.leds.overlap_s, abs=1e-9)
+    for (t_s, _), pulse in zip(bench.edges, pulses, strict=True):
+        lit = [p.led for p in pulses if p.t_on_s <= t_s < p.t_off_s]
+        assert lit == [pulse.led]
+
+
+def test_an_led_of_two_rows_that_follow_stays_on(bench):
+    a, b, c = behind(3)
+    rows = [Row(tuple(sorted(leds)), 300, 50_000, 7) for leds in ((a, b), (b, c), (b, c))]
+    bench.run(rows)
+    bench.wait(0.3)
+    spans = {pulse.led: pulse.t_off_s - pulse.t_on_s for pulse in bench.world.pulses}
+    assert len(bench.world.pulses) == 3
+    assert spans[b] == pytest.approx(0.15)
+    assert spans[c] == pytest.approx(0.1 + RIG.leds.overlap_s)
+
+
+def test_only_the_cameras_of_the_row_and_of_the_mask_are_released(bench):
+    rows = [Row((led,), 1000, 50_000, mask) for led, mask in zip(behind(3), (7, 2, 5), strict=True)]
+    bench.ask("CAM:MASK 3")
+    bench.run(rows)
+    bench.wait(0.3)
+    assert [mask for _, mask in bench.edges] == [3, 2, 1]
+
+
+def test_a_sequence_runs_once_for_each_arming(bench):
+    bench.run(rows_of(behind(2)))
+    assert bench.code("TRIG r2") == Code.IGNORED
+    bench.wait(0.4)
+    assert bench.code("TRIG r2") == Code.NOT_ARMED
+    assert [token for token, _ in bench.unit.runs] == ["r1"]
+
+
+@pytest.mark.parametrize(
+    "text", ["SEQ:CLE", "SEQ:DEF 0,3:1:80000:7", "SEQ:ARM 2", "LED:ON 3,80", "CAM:MASK 1",
+             "CAM:TRIG x", "LED:OFF ALL", "DOSE:NEW p"],
+)  # fmt: skip
+def test_a_running_sequence_is_not_meddled_with(bench, text):
+    bench.run(rows_of(behind(2)))
+    assert bench.code(text) == Code.IGNORED
+    assert bench.ask("*OPC?") == "0"
+
+
+@pytest.mark.parametrize("text", ["SAFE", "ABOR", "*RST"])
+def test_a_sequence_can_be_stopped_at_once(bench, text):
+    bench.run(rows_of(behind(4)))
+    bench.wait(0.1)
+    assert bench.unit.lit
+    bench.ask(text)
+    assert not bench.unit.lit
+    assert "SEQ:STOP" in [name for name, _ in bench.said]
+    edges = len(bench.edges)
+    bench.silence(1.0)
+    assert len(bench.edges) == edges
+
+
+def test_a_sequence_of_a_silent_host_ends_dark_within_the_lease(bench):
+    bench.ask("SYST:WDOG 300")
+    bench.run(rows_of(behind(40)))
+    fell_silent = bench.now
+    bench.silence(2.0)
+    assert not bench.unit.lit
+    assert max(p.t_off_s for p in bench.world.pulses) <= fell_silent + 0.3 + 1e-9
+    names = [name for name, _ in bench.said]
+    assert names[-2:] == ["WDOG:TRIP", "SEQ:STOP"] or names[-2:] == ["SEQ:STOP", "WDOG:TRIP"]
+    assert bench.ask("SEQ:POS?").startswith("STOP,")
+    assert bench.code("TRIG r2") == Code.WATCHDOG_TRIPPED
+
+
+def test_one_big_step_equals_many_small_ones():
+    def play(step_s):
+        bench = Bench()
+        bench.ask("SYST:WDOG 5000")
+        bench.run(rows_of(behind(20)))
+        while bench.now < 4.0:
+            bench.silence(step_s)
+        return bench.world.pulses, bench.edges, bench.said
+
+    assert play(3.0)[0] == pytest.approx(play(0.013)[0])
+    assert play(3.0)[2] == play(0.013)[2]
+
+
+# light and its limits -------------------------------------------------------------------------
+
+
+def test_light_carries_its_own_end(bench):
+    bench.ask("SYST:ARM")
+    bench.ask("LED:ON 3+17,80,500")
+    assert bench.ask("LED?") == "3+17"
+    bench.wait(0.1)
+    assert bench.ask("LED?") == "-"
+    assert {(p.led, p.level) for p in bench.world.pulses} == {(3, 0.5), (17, 0.5)}
+    assert all(p.t_off_s - p.t_on_s == pytest.approx(0.08) for p in bench.world.pulses)
+
+
+def test_leds_are_put_out_one_by_one_or_all(bench):
+    bench.ask("SYST:ARM")
+    bench.ask("LED:ON 3+17+20,80,500")
+    bench.ask("LED:OFF 17")
+    assert bench.ask("LED?") == "3+20"
+    bench.ask("LED:OFF all")
+    assert bench.ask("LED?") == "-"
+
+
+def test_an_led_gives_no_more_than_a_quarter_of_any_second(bench):
+    led = behind(1)[0]
+    bench.ask("SYST:ARM")
+    bench.ask(f"LED:ON {led},200")
+    bench.wait(0.3)
+    assert bench.code(f"LED:ON {led},60") == Code.DUTY
+    assert bench.code(f"LED:ON {led},50") == Code.OK
+    bench.wait(0.2)
+    assert bench.code(f"LED:ON {led},10") == Code.DUTY
+    bench.wait(0.75)
+    assert bench.code(f"LED:ON {led},100") == Code.OK
+    assert bench.code(f"LED:ON {led},500,900") == Code.DUTY
+
+
+def test_a_table_beyond_the_duty_is_refused_whole(bench):
+    a, b = behind(2)
+    bench.ask("SYST:ARM")
+    bench.load(rows_of([a, b, a, b, a, b], ms=90))
+    assert bench.code("SEQ:ARM 6") == Code.DUTY
+    bench.load(rows_of([a, b, a, b], ms=90))
+    judged = bench.ask("SEQ:ARM 4").split(",")
+    assert float(judged[2]) == pytest.approx(0.18, abs=1e-3)
+
+
+def test_duty_counts_light_of_before_the_table(bench):
+    led = behind(1)[0]
+    bench.ask("SYST:ARM")
+    bench.ask(f"LED:ON {led},200")
+    bench.wait(0.25)
+    bench.load(rows_of([led]))
+    assert bench.code("SEQ:ARM 1") == Code.DUTY
+
+
+def test_an_led_warms_as_a_resistor_and_a_capacitor_and_trips():
+    bench = Bench(heat=0.55)
+    led = behind(1)[0]
+    tau, trip = RIG.leds.thermal_tau_s, RIG.leds.thermal_trip
+    cooled = 0.55 * np.exp(-1.0 / tau)
+    bench.ask("SYST:ARM")
+    bench.load(rows_of([led], ms=50))
+    heat = float(bench.ask("SEQ:ARM 1").split(",")[3])
+    assert heat == pytest.approx(1.0 + (cooled - 1.0) * np.exp(-0.05 / tau), abs=1e-4)
+    hot = Bench(heat=0.9)
+    hot.ask("SYST:ARM")
+    assert hot.code(f"LED:ON {led},5") == Code.THERMAL
+    assert int(hot.ask("STAT?")) & 128
+    wait_s = tau * np.log(0.9 / (0.5 * trip)) - 1.0
+    hot.wait(wait_s - 0.1)
+    assert hot.code(f"LED:ON {led},5") == Code.THERMAL
+    hot.wait(0.2)
+    assert hot.code(f"LED:ON {led},5") == Code.OK
+
+
+def test_an_led_that_gets_too_hot_in_spite_of_all_goes_out(bench, monkeypatch):
+    monkeypatch.setattr(bench.unit.bank, "require", lambda wanted, now: (0.0, 0.0, 0.0))
+    led = behind(1)[0]
+    bench.ask("SYST:ARM")
+    bench.unit.bank._heat[led] = 0.59
+    bench.ask(f"LED:ON {led},500")
+    bench.silence(0.45)
+    assert not bench.unit.lit
+    assert ("LED:HOT", str(led)) in bench.said
+
+
+def test_the_dose_of_an_led_adds_up_and_its_limit_holds(bench):
+    led = behind(1)[0]
+    bench.ask("SYST:ARM")
+    bench.ask(f"LED:ON {led},200,500")
+    bench.wait(0.3)
+    assert float(bench.ask(f"DOSE? {led}")) == pytest.approx(0.1)
+    bench.unit.bank._dose_ws[led] = RIG.leds.dose_ws - 0.01
+    assert bench.code(f"LED:ON {led},50") == Code.LIGHT_DOSE
+    bench.load(rows_of([led]))
+    assert bench.code("SEQ:ARM 1") == Code.LIGHT_DOSE
+    bench.ask("*RST")
+    assert float(bench.ask(f"DOSE? {led}")) > 1.0  # survives a reset
+    bench.ask("DOSE:NEW P2")
+    assert float(bench.ask(f"DOSE? {led}")) == 0.0
+
+
+def test_a_table_that_flickers_is_refused_unless_a_person_says_the_eyes_are_safe(bench):
+    on, off = front(1)[0], behind(1)[0]
+    rows = rows_of([on, off] * 6, ms=40, level=300)
+    bench.ask("SYST:ARM")
+    bench.load(rows)
+    assert bench.code("SEQ:ARM 12") == Code.FLICKER
+    for word in ("CLOSED", "SHIELDED"):
+        bench.ask(f"SAFE:EYES {word}")
+        assert float(bench.ask("SEQ:ARM 12").split(",")[0]) >= 3.0
+        assert int(bench.ask("STAT?")) & 512
+    bench.ask("SAFE:EYES OPEN")
+    assert bench.code("SEQ:ARM 12") == Code.FLICKER
+
+
+@pytest.mark.parametrize("forget", ["*RST", "DOSE:NEW p2"])
+def test_what_was_said_of_the_eyes_does_not_outlive_the_subject_or_a_reset(bench, forget):
+    bench.ask("SAFE:EYES CLOSED")
+    bench.ask(forget)
+    assert bench.ask("SAFE:EYES?") == "OPEN"
+
+
+def test_what_was_said_of_the_eyes_does_not_outlive_a_brown_out(bench):
+    bench.ask("SAFE:EYES CLOSED")
+    bench.box.power_cycle(bench.now, boot_s=0.0, announce=False)
+    assert bench.ask("SAFE:EYES?") == "OPEN"
+
+
+def test_single_leds_cannot_be_made_to_flicker_either(bench):
+    leds = front(4)
+    bench.ask("SYST:ARM")
+    codes = []
+    for number in range(6):
+        codes.append(bench.code(f"LED:ON {leds[number % 4]},20"))
+        bench.wait(0.12)
+    assert codes[0] == Code.OK
+    assert Code.FLICKER in codes
+    bench.wait(1.1)
+    assert bench.code(f"LED:ON {leds[0]},20") == Code.OK
+    bench.ask("SAFE:EYES SHIELDED")
+    bench.wait(0.1)
+    assert [bench.code(f"LED:ON {led},5") for led in leds[1:]] == [Code.OK] * 3
+
+
+def test_the_planned_order_is_accepted_and_a_bad_one_refused():
+    bench = Bench(rig=DOME.resized(16))
+    rig, plan = bench.world.rig, dome_plan(DOME)
+    steps = [step for step in plan.steps if step.index.get("pass") == 0]
+    table = as_table(led_rows(steps, rig))
+    bench.ask("SYST:ARM")
+    bench.load([Row(tuple(sorted(leds)), level, us, 0xFFFF) for leds, level, us in table])
+    flashes, rms, duty, _, dose = (float(x) for x in bench.ask(f"SEQ:ARM {len(steps)}").split(","))
+    # the box's own arithmetic, with one eye and Fourier sums, against the planner's two and FFT
+    host = flicker_of_rows(led_rows(steps, rig), eye_light(rig), overlap_s=rig.leds.overlap_s)
+    assert rms == pytest.approx(host.rms, rel=0.05)
+    assert abs(flashes - host.flashes_per_s) <= 0.5
+    assert duty < rig.leds.max_duty
+    assert dose < 1.0
+    bad = [LedRow((k,), 1.0, 1 / 12) for k in ORDERS["name"](rig)]
+    bench.load([Row(r.leds, 1000, 83333, 0xFFFF) for r in bad])
+    assert bench.code("SEQ:ARM 150") == Code.FLICKER
+
+
+# faults ---------------------------------------------------------------------------------------
+
+
+def test_a_dead_led_is_refused_alone_and_named_in_a_sequence():
+    a, b = behind(2)
+    bench = Bench(led_dead=str(b))
+    bench.ask("SYST:ARM")
+    assert bench.code(f"LED:ON {b},50") == Code.HARDWARE
+    bench.run(rows_of([a, b]))
+    bench.wait(0.3)
+    assert ("LED:FAIL", str(b)) in bench.said
+    assert [pulse.led for pulse in bench.world.pulses] == [a]
+    assert len(bench.edges) == 2
+
+
+def test_a_weak_led_gives_less_than_it_is_driven_for_and_nobody_notices():
+    a, b = behind(2)
+    bench = Bench(led_weak=f"{b}=0.25")
+    bench.run(rows_of([a, b]))
+    bench.wait(0.3)
+    assert [(p.led, p.level) for p in bench.world.pulses] == [(a, 1.0), (b, 0.25)]
+    assert not [name for name, _ in bench.said if name.startswith("LED:")]
+
+
+def test_the_emergency_stop_is_reported_and_nothing_lights():
+    bench = Bench(interlock=True)
+    bench.ask("SYST:ARM")
+    assert int(bench.ask("STAT?")) & 256
+    assert bench.code("LED:ON 3,50") == Code.INTERLOCK
+    bench.load(rows_of(behind(2)))
+    assert bench.code("SEQ:ARM 2") == Code.INTERLOCK
+
+
+def test_a_retry_of_the_trigger_runs_the_table_once(bench):
+    bench.ask("SYST:ARM")
+    bench.load(rows_of(behind(2)))
+    bench.ask("SEQ:ARM 2")
+    bench.seq += 1
+    frame = wire.encode(Request(bench.seq, bench.box.boot, "TRIG once"))
+    first, again = bench.raw(frame), bench.raw(frame)
+    assert [line for line in first.splitlines() if line[:1] == b"="] == again.splitlines()
+    bench.wait(0.3)
+    assert bench.code("TRIG once") == Code.NOT_ARMED
+    assert [token for token, _ in bench.unit.runs] == ["once"]
+
+
+def test_an_event_of_the_sequence_is_a_frame_with_its_own_number(bench):
+    bench.run(rows_of(behind(1)))
+    bench.now += 0.2
+    events = [wire.decode(line) for line in bench.box.advance(bench.now).splitlines()]
+    assert all(isinstance(event, Event) for event in events)
+    numbers = [event.number for event in events]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
