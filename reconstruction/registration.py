@@ -1,0 +1,162 @@
+"""Where points of one image are in another of the same scene: optical flow, checked both ways."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.floating]
+
+
+class RegistrationError(ValueError):
+    """Images or points that cannot be registered."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """Where points went.
+
+    Attributes
+    ----------
+    points_px : ndarray of float64, shape (K, 2)
+        Column and row in the second image; where not `valid`, where they were in the first.
+    valid : ndarray of bool, shape (K,)
+        Found, inside the image, and found again on the way back.
+    """
+
+    points_px: Floats
+    valid: NDArray[np.bool_]
+
+
+def evened(image: Image, *, sigma_px: float = 8.0) -> NDArray[np.uint8]:
+    """Return the local contrast of an image as 8-bit values: mean and brightness of light are gone.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W)
+        Linear values, any unit. What is not finite counts as 0.
+    sigma_px : float
+        Of the neighborhood, px, > 0.
+
+    Returns
+    -------
+    ndarray of uint8, shape (H, W)
+        128 is the local mean, 32 one local standard deviation.
+
+    Raises
+    ------
+    RegistrationError
+        When `image` is no (H, W) of at least 16 x 16.
+    """
+    if np.ndim(image) != 2 or min(np.shape(image)) < 16:
+        raise RegistrationError(
+            f"image: got shape {np.shape(image)}, expected (H, W), 16 x 16 or more"
+        )
+    known = np.isfinite(image)
+    values = np.sqrt(np.maximum(np.where(known, image, 0.0), 0.0)).astype(np.float32)
+    mean = cv2.GaussianBlur(values, (0, 0), sigma_px)
+    rest = values - mean
+    spread = np.sqrt(cv2.GaussianBlur(rest * rest, (0, 0), 2 * sigma_px))
+    floor = 1e-2 * float(spread.max(initial=0.0)) + 1e-12
+    return np.clip(np.rint(128 + 32 * rest / np.maximum(spread, floor)), 0, 255).astype(np.uint8)
+
+
+def textured(
+    even: NDArray[np.uint8],
+    points_px: Floats,
+    *,
+    count: int,
+    cell_px: int = 12,
+    margin_px: int = 12,
+) -> NDArray[np.intp]:
+    """Choose points that can be tracked: the one with most texture in each cell of the image.
+
+    Parameters
+    ----------
+    even : ndarray of uint8, shape (H, W)
+        As from `evened`.
+    points_px : ndarray, shape (P, 2)
+        Candidates; those that are not finite or too near the border are left out.
+    count : int
+        The most to choose; those with most texture.
+    cell_px, margin_px : int
+        Side of the cells, and width of the border, px.
+
+    Returns
+    -------
+    ndarray of int
+        Indices into `points_px`.
+    """
+    height, width = even.shape
+    with np.errstate(invalid="ignore"):
+        inside = np.isfinite(points_px).all(axis=-1)
+        inside &= (points_px >= margin_px).all(axis=-1)
+        inside &= (points_px <= [width - 1 - margin_px, height - 1 - margin_px]).all(axis=-1)
+    chosen = np.flatnonzero(inside)
+    if not chosen.size:
+        return chosen
+    places = np.rint(points_px[chosen]).astype(int)
+    texture = cv2.cornerMinEigenVal(even, 9, ksize=3)[places[:, 1], places[:, 0]]
+    cell = (places[:, 1] // cell_px) * (width // cell_px + 1) + places[:, 0] // cell_px
+    order = np.lexsort((-texture, cell))
+    first = np.ones(order.size, bool)
+    first[1:] = cell[order][1:] != cell[order][:-1]
+    best = order[first]
+    best = best[texture[best] > 0]
+    best = best[np.argsort(-texture[best], kind="stable")[:count]]
+    return np.sort(chosen[best])
+
+
+def track(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    points_px: Floats,
+    *,
+    window_px: int = 17,
+    levels: int = 3,
+    most_back_px: float = 0.3,
+) -> Tracks:
+    """Follow points from one image to another by pyramidal Lucas-Kanade, forth and back.
+
+    Parameters
+    ----------
+    first, second : ndarray of uint8, shape (H, W)
+        As from `evened`.
+    points_px : ndarray, shape (K, 2)
+        Column and row in `first`.
+    window_px : int
+        Side of the window, px.
+    levels : int
+        Levels of the pyramid above the image.
+    most_back_px : float
+        Farthest a point may end from where it began after the way back.
+
+    Returns
+    -------
+    Tracks
+    """
+    if first.shape != second.shape:
+        raise RegistrationError(f"images: got shapes {first.shape} and {second.shape}")
+    start: Any = np.ascontiguousarray(points_px, np.float32).reshape(-1, 1, 2)
+    if not len(start):
+        return Tracks(np.zeros((0, 2)), np.zeros(0, bool))
+    settings: dict[str, Any] = {
+        "winSize": (window_px, window_px),
+        "maxLevel": levels,
+        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.003),
+    }
+    one: Any = first
+    two: Any = second
+    there, found, _ = cv2.calcOpticalFlowPyrLK(one, two, start, None, **settings)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(two, one, there, None, **settings)
+    gap = np.linalg.norm(back - start, axis=-1).reshape(-1)
+    there = there.reshape(-1, 2).astype(np.float64)
+    height, width = first.shape
+    inside = (there >= 0).all(axis=1) & (there <= [width - 1, height - 1]).all(axis=1)
+    good = (found.reshape(-1) == 1) & (returned.reshape(-1) == 1) & inside & (gap <= most_back_px)
+    return Tracks(np.where(good[:, None], there, start.reshape(-1, 2)), good)
