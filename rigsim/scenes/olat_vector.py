@@ -52,12 +52,14 @@ class VectorLight:
         across, along = (np.resize(p, len(start)) for p in disc_points(DISC_POINTS))
         self._across, self._along = mi.Float(across), mi.Float(along)
 
-    def light_up(self, lamp: Lamp, glow: Float32Array | None = None) -> Float32Array:
+    def light_up(
+        self, lamp: Lamp, glow: Float32Array | None = None, *, diffuse: bool = True
+    ) -> Float32Array:
         """Trace shadow rays, shade and sum into pixels; see `rigsim.scenes.olat.light_up`.
 
         Parameters
         ----------
-        lamp, glow
+        lamp, glow, diffuse
             As there.
 
         Returns
@@ -104,14 +106,17 @@ class VectorLight:
         surface += oil * _fresnel(dr, lh, ETA_OIL) * _ggx(dr, cl, cv, nh, OIL_SMOOTHING * roughness)
         through = 1.0 - dr.exp(-fuzz * (1.0 / cl + 1.0 / cv))
         surface += FUZZ_ALBEDO / (4.0 * math.pi) * through / (cl + cv)
-        gloss = math.pi * strength * bare * surface
+        # Where light and camera are not both above, the half vector may lie in the surface: 0 * inf.
+        gloss = dr.select(active, math.pi * strength * bare * surface, 0.0)
         leaving = 1.0 - _fresnel(dr, cv, ETA)
-        if glow is None:
+        rows = [gloss] * 3
+        if diffuse:
             inside = strength * (1.0 - _fresnel(dr, cl, ETA)) * leaving
-            rows = [gloss + inside * color for color in (red, green, blue)]
-        else:
+            rows = [row + inside * r_d for row, r_d in zip(rows, (red, green, blue), strict=True)]
+        if glow is not None:
             leaving = dr.select(nv > 0.0, leaving, 0.0)
-            rows = [gloss + leaving * mi.Float(column) for column in _columns(glow)]
+            columns = [mi.Float(column) for column in _columns(glow)]
+            rows = [row + leaving * light for row, light in zip(rows, columns, strict=True)]
         dr.eval(rows)
         r, g, b = (np.asarray(row.numpy(), np.float32) for row in rows)
         return sum_rows(self.hits, r, g, b)
