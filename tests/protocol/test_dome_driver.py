@@ -1,0 +1,188 @@
+"""The driver of the dome's box, the same suite over sim://, a pty and TCP."""
+
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from capture.devices.dome import DomeBox, TableRow
+from capture.devices.port import BadAnswer, CommandRefused, Port, WrongDevice
+from capture.devices.wire import Code
+from capture.plan.eye_light import eye_light
+from capture.rig import load_rig
+from rigsim.faults import Faults
+from rigsim.serve import serve
+from rigsim.world import World
+
+RIG = load_rig("dome").subset(views=["C00", "C05"]).resized(16)
+NAMES = (f"dome-driver-{number}" for number in itertools.count())
+UNSEEN = [int(k) for k in np.argsort(eye_light(RIG), kind="stable")[:12]]
+SEEN = int(np.argmax(eye_light(RIG)))
+
+
+@pytest.fixture(params=["sim", "pty", "tcp"])
+def bench(request):
+    """A dome's box behind one transport, and its driver."""
+    if request.param == "sim":
+        world = World(RIG, seed=5)
+        name = world.register(next(NAMES))
+        box = DomeBox(Port(f"sim://dome?world={name}", clock=world.clock))
+        yield SimpleNamespace(world=world, box=box)
+        box.close()
+        world.unregister()
+        return
+    world = World(RIG, seed=5, clock="real", faults=Faults(baud=0.0))
+    with serve(RIG, world=world, pty=request.param == "pty") as served:
+        box = DomeBox(Port(served.addresses["dome"]))
+        yield SimpleNamespace(world=world, box=box)
+        box.close()
+
+
+def rows(leds, *, dwell_s=0.03, level=1.0, mask=3):
+    return [TableRow((led,), level, dwell_s, mask) for led in leds]
+
+
+def test_the_box_says_who_it_is_and_what_it_allows(bench):
+    assert bench.box.identify() == "RIGSIM,DOME1,DM-0001,1.0"
+    assert (bench.box.identity.kind, bench.box.identity.serial) == ("dome", "DM-0001")
+    assert bench.box.limits["leds"] == 150
+    assert bench.box.limits["max_duty"] == RIG.leds.max_duty
+
+
+def test_a_table_runs_once_armed_and_every_release_is_timed(bench):
+    box = bench.box
+    box.load(rows(UNSEEN[:8]))
+    with pytest.raises(CommandRefused) as caught:
+        box.arm_sequence(8)
+    assert caught.value.code == Code.NOT_ARMED
+    box.arm()
+    judged = box.arm_sequence(8)
+    assert judged.flashes_per_s == 0.0
+    assert judged.duty == pytest.approx(0.03, abs=1e-3)
+    assert box.position().state == "READY"
+    start_s = box.trigger("run-1")
+    times = {}
+    while box.position().state == "RUN":
+        times |= box.listen(0.05)
+    times |= box.listen(0.05)
+    assert sorted(times) == list(range(8))
+    found = np.array([times[row] for row in range(8)])
+    wanted = start_s + 0.03 * np.arange(8) + RIG.leds.settle_s
+    assert np.abs(found - wanted).max() <= (2e-6 if bench.world.virtual else 0.05)
+    assert box.step_time(7) == times[7]
+    assert box.step_time(8) is None
+    position = box.position()
+    assert (position.state, position.row, position.rows, position.token) == ("DONE", 7, 8, "run-1")
+    assert [pulse.led for pulse in bench.world.pulses] == UNSEEN[:8]
+
+
+def test_a_long_table_is_loaded_in_short_lines_and_its_checksum_compared(bench):
+    many = [TableRow(tuple(UNSEEN[:5]), 0.1, 0.05, 3)] * 60
+    bench.box.load(many)
+    assert len(bench.world.box("dome").device.table) == 60
+    bench.box.load(many[:2])
+    assert len(bench.world.box("dome").device.table) == 2
+
+
+def test_another_table_than_was_sent_is_noticed(bench, monkeypatch):
+    monkeypatch.setattr("rigsim.boxes.dome.table_crc", lambda table: "1234")
+    with pytest.raises(BadAnswer, match="the table that was sent"):
+        bench.box.load(rows(UNSEEN[:2]))
+
+
+def test_leds_go_out_by_themselves_and_by_command(bench):
+    box = bench.box
+    box.arm()
+    box.light(UNSEEN[:2], 0.4, level=0.25)
+    assert box.lit() == tuple(sorted(UNSEEN[:2]))
+    assert box.status().lit
+    box.put_out(UNSEEN[:1])
+    assert box.lit() == (UNSEEN[1],)
+    box.put_out()
+    assert box.lit() == ()
+    box.light(UNSEEN[2:3], 0.05)
+    box.listen(0.15)
+    assert box.lit() == ()
+    assert not box.status().lit
+
+
+def test_flicker_is_refused_until_a_person_says_the_eyes_are_safe(bench):
+    box = bench.box
+    box.arm()
+    flicker = rows([SEEN, UNSEEN[0]] * 8, level=0.4)
+    box.load(flicker)
+    with pytest.raises(CommandRefused) as caught:
+        box.arm_sequence(16)
+    assert caught.value.code == Code.FLICKER
+    box.set_eyes("closed")
+    assert box.eyes() == "closed"
+    assert box.status().eyes_safe
+    assert box.arm_sequence(16).flashes_per_s >= 3.0
+    box.new_subject("P043")
+    assert box.eyes() == "open"
+    with pytest.raises(ValueError, match="expected one of open, closed, shielded"):
+        box.set_eyes("shut")
+
+
+def test_the_dose_is_read_per_led(bench):
+    box = bench.box
+    box.arm()
+    box.light(UNSEEN[:1], 0.1, level=0.5)
+    box.listen(0.2)
+    assert box.dose_ws(UNSEEN[0]) == pytest.approx(0.05, abs=0.01)
+    assert box.dose_ws(UNSEEN[1]) == 0.0
+    box.new_subject("P043")
+    assert box.dose_ws(UNSEEN[0]) == 0.0
+
+
+def test_cameras_are_masked_and_released_without_light(bench):
+    box = bench.box
+    box.set_cameras(2)
+    assert box.cameras() == 2
+    assert 0.0 <= box.trigger_cameras("dark-1") <= box.ping()
+    assert bench.world.pulses == []
+
+
+def test_silence_stops_the_sequence_within_the_lease_and_arming_again_is_deliberate(bench):
+    box = bench.box
+    box.set_lease(0.3)
+    box.load(rows(UNSEEN * 3, dwell_s=0.05))
+    box.arm()
+    box.arm_sequence(36)
+    box.trigger("left-alone")
+    events = [event.name for event in box.port.listen(0.6)]
+    assert "WDOG:TRIP" in events
+    assert "SEQ:STOP" in events
+    assert not bench.world.box("dome").device.lit
+    assert box.status().tripped
+    with pytest.raises(CommandRefused) as caught:
+        box.arm_sequence(36)
+    assert caught.value.code == Code.WATCHDOG_TRIPPED
+    assert box.position().state == "STOP"
+
+
+def test_a_dead_led_is_named():
+    world = World(RIG, seed=5, faults=Faults(led_dead=str(UNSEEN[1])))
+    name = world.register(next(NAMES))
+    with DomeBox(Port(f"sim://dome?world={name}", clock=world.clock)) as box:
+        box.arm()
+        box.load(rows(UNSEEN[:3]))
+        box.arm_sequence(3)
+        box.trigger("r")
+        box.listen(0.3)
+        assert box.failed_leds == {UNSEEN[1]}
+    world.unregister()
+
+
+def test_a_flash_box_is_not_taken_for_a_domes():
+    world = World(seed=5)
+    name = world.register(next(NAMES))
+    with pytest.raises(WrongDevice, match="expected a 'dome' box"):
+        DomeBox(Port(f"sim://flash?world={name}", clock=world.clock))
+    world.unregister()
+
+
+def test_a_url_without_a_world_makes_a_dome():
+    with DomeBox(Port("sim://dome?seed=4")) as box:
+        assert box.limits["cameras"] == 16
