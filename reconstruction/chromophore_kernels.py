@@ -42,12 +42,6 @@ MAPS = (
     "gamut_distance",
 )
 MASKS = ("valid", "outside", "melanin_identifiable", "hemoglobin_identifiable", "ambiguous")
-VAGUE = 0.1
-"""Relative standard error of a shading from which on color is a better start than brightness."""
-SAME_SIDE = 0.1
-"""Distance, along the melanin axis, within which a solution is the lighter of two."""
-OTHER_SIDE = 0.2
-"""Distance, along the melanin axis, from which on color and brightness mean two solutions."""
 HUGE = 1e30
 """Colors and variances from here on count as infinite."""
 
@@ -192,9 +186,7 @@ def _given(dtype: types.Type, axes: int) -> types.Array:
         _given(float32, 2),  # covariance of the model's relative error (3, 3)
         _given(float32, 5),  # cells of the color table
         _given(float32, 1),  # ends of the axes as volume fractions (2,)
-        _given(float32, 2),  # projection of log rgb with its brightness, and offset (2, 4)
-        _given(float32, 3),  # start grid on it (g, g, 2)
-        _given(float32, 2),  # projection of log rgb without brightness, and offset (2, 4)
+        _given(float32, 2),  # projection of log rgb, and offset (2, 4)
         _given(float32, 3),  # start grid on it (g, g, 2)
         _given(float32, 2),  # mean log color of second solutions (g, g)
         float32,  # largest plausible log shading
@@ -220,10 +212,8 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     model,
     cells,
     ends,
-    surface,
-    surface_axes,
-    chroma,
-    chroma_axes,
+    projection,
+    start_axes,
     twin_log,
     log_shading_max,
     light_side,
@@ -241,7 +231,6 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     m11, m12, m22 = model[1, 1], model[1, 2], model[2, 2]
     plain = m01 == 0.0 and m02 == 0.0 and m12 == 0.0
     common_variance = max(min(m01, m02, m12), _ZERO)
-    vague = not free and common_variance > VAGUE * VAGUE
     each_variance = variance.shape[0] > 1
     each_shading = shading.shape[0] > 1
     each_usable = usable.shape[0] > 1
@@ -305,21 +294,13 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 np.float32(x5),
             )
             l0, l1, l2 = math.log(d0), math.log(d1), math.log(d2)
-            a = b = a_light = b_light = _ONE
+            y0, y1 = _project(projection, l0, l1, l2)
+            a, b = _guess(start_axes, y0, y1)
             twin_brightness = -np.float32(np.inf)
-            if free or vague:
-                y0, y1 = _project(chroma, l0, l1, l2)
-                a, b = _guess(chroma_axes, y0, y1)
-                a_light, b_light = a, b
+            if free:
                 g0 = min(max(int(y0 + _HALF), 0), grid - 1)
                 g1 = min(max(int(y1 + _HALF), 0), grid - 1)
                 twin_brightness = twin_log[g0, g1]
-            if not free:
-                y0, y1 = _project(surface, l0, l1, l2)
-                a_seen, b_seen = _guess(surface_axes, y0, y1)
-                # Color is the better start unless brightness says that it is the other solution.
-                if not vague or abs(a_seen - a_light) > OTHER_SIDE or twin_brightness > -HUGE:
-                    a, b = a_seen, b_seen
             a_before, b_before, cost_before = a, b, np.float32(np.inf)
             step_a = step_b = _ZERO
             s = _ONE
@@ -447,23 +428,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             maps[4, n] = relative_b * maps[1, n]
             maps[5, n] = residual
             maps[6, n] = distance
-            brightness = (l0 + l1 + l2) / _THREE
-            twin = False
-            if free:
-                twin = brightness <= twin_brightness + log_shading_max
-            elif vague and twin_brightness > -HUGE:
-                # The prior of the shading must favor this side of the fold by two sigma.
-                if abs(a - a_light) < SAME_SIDE:
-                    other = max(brightness - twin_brightness, _ZERO)
-                else:
-                    i, j = a_light * length, b_light * length
-                    row, column = min(int(i), last - 1), min(int(j), last - 1)
-                    x, y = i - np.float32(row), j - np.float32(column)
-                    f0, _, _ = _cell(cells[row, column, 0], x, y)
-                    f1, _, _ = _cell(cells[row, column, 1], x, y)
-                    f2, _, _ = _cell(cells[row, column, 2], x, y)
-                    other = brightness - math.log(f0 * f1 * f2) / _THREE
-                twin = other * other - shift * shift < _FOUR * common_variance
+            twin = free and (l0 + l1 + l2) / _THREE <= twin_brightness + log_shading_max
             outside = residual > OUTSIDE_SIGMAS and distance > OUTSIDE_DISTANCE
             close = max(abs(step_a) / a, abs(step_b) / b) < CONVERGED
             masks[0, n] = (done or close) and not outside

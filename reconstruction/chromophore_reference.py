@@ -1,16 +1,19 @@
 """The chromophore fit in plain NumPy: slow, double precision, and short enough to check by eye.
 
 It minimises the same sum as `reconstruction.chromophore_kernels`, by Levenberg-Marquardt on all
-pixels at once instead of damped Newton on each, and is what the kernel is tested against.
+pixels at once instead of damped Newton on each, and sums the same probability as
+`reconstruction.chromophore_ridge`, over a dense plane. Both kernels are tested against it.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from model.color_table import ColorTable
 from reconstruction.chromophore_start import LOWEST, evaluate, start_for
+from reconstruction.shading_prior import ShadingPrior
 
 Floats = NDArray[np.float64]
 
@@ -85,3 +88,60 @@ def _linearise(
 
 def _square(residual: Floats, weights: Floats) -> Floats:
     return np.asarray(np.einsum("nc,ncd,nd->n", residual, weights, residual))
+
+
+def weigh(
+    rgb: Floats,
+    table: ColorTable,
+    covariance: Floats,
+    prior: ShadingPrior,
+    *,
+    size: tuple[int, int] = (1200, 500),
+) -> Floats:
+    """Sum the probability of one pixel's chromophores over a dense plane of their cube roots.
+
+    Parameters
+    ----------
+    rgb
+        Shape (3,), positive, over that of a white tile.
+    table
+        Color table.
+    covariance
+        Shape (3, 3), of the relative errors: noise and model.
+    prior
+        Of the log shading.
+    size
+        Places along melanin and along blood.
+
+    Returns
+    -------
+    ndarray
+        Shape (2, 2): median and 68 % reach of C_m, and of C_hd.
+    """
+    edges = [np.linspace(LOWEST, 1.0, count + 1) for count in size]
+    a, b = np.meshgrid(*[0.5 * (edge[1:] + edge[:-1]) for edge in edges], indexing="ij")
+    residual = np.log(rgb / evaluate(table, a, b)[0])
+    weights = np.linalg.inv(covariance)
+    whole = weights.sum()
+    shading = residual @ weights.sum(axis=0) / whole
+    color = weights - np.outer(weights.sum(axis=0), weights.sum(axis=0)) / whole
+    log_density = np.einsum("...c,cd,...d->...", residual, -0.5 * color, residual)
+    log_density += np.interp(shading, prior.nodes, np.log(prior.density)) - np.log(a)
+    density = np.exp(log_density - log_density.max())
+    return np.array(
+        [
+            _median_and_reach(end * edge**3, density.sum(axis=axis))
+            for end, edge, axis in zip((table.c_m_max, table.c_hd_max), edges, (1, 0), strict=True)
+        ]
+    )
+
+
+def _median_and_reach(edges: Floats, density: Floats) -> tuple[float, float]:
+    below = np.concatenate([[0.0], np.cumsum(density)]) / density.sum()
+    center = float(np.interp(0.5, below, edges))
+
+    def missing(reach: float) -> float:
+        inside = np.interp([center - reach, center + reach], edges, below)
+        return float(inside[1] - inside[0]) - 0.682689492137086
+
+    return center, float(brentq(missing, 0.0, edges[-1], xtol=1e-9))

@@ -42,8 +42,8 @@ class ChromophoreMaps:
     hemoglobin: Map
     """Volume fraction of blood in the dermis, 2e-5 to 0.32; NaN where the input is unusable."""
     shading: Map
-    """Factor between the table's color and the pixel: fitted when free, else as given; when the
-    model error says that it is known roughly, the most probable factor."""
+    """Factor between the table's color and the pixel: fitted when free, else as given, times the
+    most probable factor where the model error has a part common to the channels."""
     stderr_melanin: Map
     """Standard error of `melanin`: Fisher information of noise and model error together."""
     stderr_hemoglobin: Map
@@ -62,8 +62,7 @@ class ChromophoreMaps:
     hemoglobin_identifiable: Mask
     """The same for hemoglobin."""
     ambiguous: Mask
-    """Darker skin under more light has the same color: with the shading free, or known so roughly
-    that it does not favor one of them by two standard errors."""
+    """Darker skin under more light has the same color, with the shading free."""
 
     @property
     def identifiable(self) -> Mask:
@@ -100,7 +99,8 @@ def invert(
     model_error
         Relative error of the table's colors, added to the noise: a standard error, one a channel,
         or a (3, 3) covariance. A covariance with s^2 in all its cells says that the shading is
-        known to the relative standard error s only. None: 0.
+        known to the relative standard error s only; where s is above some 10 percent, skin has
+        two solutions that `reconstruction.chromophore_posterior` weighs. None: 0.
     valid
         Shape (...): False where a pixel is saturated or masked otherwise. None: all may be used.
     shading_max
@@ -147,11 +147,9 @@ def invert(
     pixels = int(np.prod(shape, dtype=np.int64))
     maps = np.empty((len(kernels.MAPS), pixels), dtype=np.float32)
     masks = np.empty((len(kernels.MASKS), pixels), dtype=np.bool_)
-    covariance = _conditioned(model_covariance(model_error, variance is None), free)
-    vague = covariance.min() > kernels.VAGUE**2
-    chroma = start_for(table, True) if free or vague else None
-    surface = start_for(table, False) if chroma is None or not free else chroma
-    chroma = surface if chroma is None else chroma
+    covariance = model_covariance(model_error, variance is None)
+    covariance = without_brightness(covariance) if free else covariance
+    start = start_for(table, free)
     if shading_max is not None and not shading_max > 0.0:
         raise ChromophoreError(f"shading_max: expected a positive factor, got {shading_max}")
     kernels.fit_pixels(
@@ -163,13 +161,11 @@ def invert(
         covariance.astype(np.float32),
         _cells(table),
         np.array([table.c_m_max, table.c_hd_max], dtype=np.float32),
-        np.ascontiguousarray(surface.projection, dtype=np.float32),
-        surface.axes,
-        np.ascontiguousarray(chroma.projection, dtype=np.float32),
-        chroma.axes,
-        chroma.twin_log,
+        np.ascontiguousarray(start.projection, dtype=np.float32),
+        start.axes,
+        start.twin_log,
         np.float32(np.inf if shading_max is None else np.log(shading_max)),
-        np.float32(chroma.side),
+        np.float32(start.side),
         np.float32(limit),
         maps,
         masks,
@@ -257,9 +253,10 @@ def identifiability(
     seen = level * color
     noise = variance(seen) if callable(variance) else variance
     noise = np.zeros(3) if noise is None else np.asarray(noise, dtype=np.float64)
+    covariance = model_covariance(model_error, variance is None)
     weights = _weights(
         np.broadcast_to(noise, seen.shape) / seen**2,
-        _conditioned(model_covariance(model_error, variance is None), shading is None),
+        without_brightness(covariance) if shading is None else covariance,
         free=shading is None,
     )
     gradient = np.stack([by_a / color, by_b / color], axis=-1)
@@ -309,12 +306,17 @@ def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Floa
     return np.asarray(covariance + floor * np.eye(3))
 
 
-def _conditioned(covariance: Floats, free: bool) -> Floats:
-    """Add an error common to the channels where a free shading takes it up anyway.
+def without_brightness(covariance: Floats) -> Floats:
+    """Add an error common to the channels to a covariance whose weights will leave it out anyway.
 
     A covariance of colors without brightness has none, and its inverse would lose all digits.
+
+    Parameters
+    ----------
+    covariance
+        (3, 3), of relative errors.
     """
-    return covariance + (np.trace(covariance) / 3.0 + 1e-6 if free else 0.0)
+    return np.asarray(covariance + np.trace(covariance) / 3.0 + 1e-6)
 
 
 def _weights(relative_variance: Floats, covariance: Floats, *, free: bool) -> Floats:

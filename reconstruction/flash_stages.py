@@ -13,22 +13,31 @@ from capture import raw
 from capture.calibration.color import ColorMatrix
 from capture.calibration.color import from_calibration as color_matrix_from
 from capture.calibration.polarization import PolarizationCalibration
+from capture.calibration.sensor import QUANTIZATION_DN2, SensorCalibration
 from capture.calibration.white import WhiteReference
-from capture.session import Session
+from capture.session import FrameRecord, Session
 from model import color_table
 from model.skin import UNITS, SkinMap
 from model.tissue_optics import ANISOTROPY_SKIN
-from reconstruction import chromophores, model_error, polarization, stages, tsumura
+from reconstruction import (
+    chromophore_posterior,
+    model_error,
+    polarization,
+    shading_prior,
+    stages,
+    tsumura,
+)
 from reconstruction.detectability import detectable
 from reconstruction.evidence import Evidence, EvidenceError
 
-REVISION = 1
+REVISION = 2
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
 MAPS = (
     "melanin", "hemoglobin", "shading", "residual", "gamut_distance",
     "diffuse", "specular", "picture", "specular_picture",
     "tsumura_melanin", "tsumura_hemoglobin",
+    "melanin_noise_stderr", "hemoglobin_noise_stderr",
 )  # fmt: skip
 """Maps that can be made of a flash session."""
 
@@ -50,6 +59,7 @@ class Inputs:
 
     session: Session
     state: str
+    sensor: SensorCalibration | None
     white: WhiteReference | None
     polarization: PolarizationCalibration | None
     color: ColorMatrix | None
@@ -77,7 +87,8 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
         ),
         stages.Stage(
             "chromophores", ("diffuse",),
-            ("melanin", "hemoglobin", "shading", "residual", "gamut_distance"),
+            ("melanin", "hemoglobin", "shading", "residual", "gamut_distance",
+             "melanin_noise_stderr", "hemoglobin_noise_stderr"),
             lambda diffuse: _chromophores(inputs, diffuse), table | model_error.identity(),
         ),
         stages.Stage(
@@ -97,6 +108,9 @@ def _inputs(evidence: Evidence) -> Inputs:
     view = session.rig.view(shots[0].camera) if shots else session.rig.views[0]
     imported = "photographs" in session.manifest.extra
 
+    sensor = evidence.load(
+        "sensor", [view.serial], "the frames are as noisy as they say of themselves"
+    )
     white = evidence.load(
         "white",
         [view.serial],
@@ -115,6 +129,7 @@ def _inputs(evidence: Evidence) -> Inputs:
     return Inputs(
         session=session,
         state=evidence.state,
+        sensor=SensorCalibration.from_calibration(sensor, view.serial) if sensor else None,
         white=WhiteReference.from_calibration(white, view.serial) if white else None,
         polarization=PolarizationCalibration.from_calibration(malus, view.serial)
         if malus
@@ -133,9 +148,13 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
     # the cells of an imported picture are its pixels; a sensor's sites stand beside each other
     imported = "photographs" in session.manifest.extra
     demosaic: raw.Demosaic = "superpixel" if imported else "centered"
-    darks = [
-        raw.linear_rgb(session.read(record), demosaic=demosaic) for record in session.frames("dark")
-    ]
+    gain, read_noise = _noise(inputs.sensor)
+
+    def linear_light(record: FrameRecord) -> raw.LinearImage:
+        frame = session.read(record)
+        return raw.linear_rgb(frame, demosaic=demosaic, gain=gain, read_noise=read_noise)
+
+    darks = [linear_light(record) for record in session.frames("dark")]
     dark: NDArray[np.float64] | float = (
         np.mean([d.rgb for d in darks], axis=0, dtype=np.float64) if darks else 0.0
     )
@@ -147,7 +166,7 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
     images: dict[str, Image | None] = {}
     for polarizer in ("parallel", "crossed"):
         shots = session.frames("subject", state=inputs.state, polarizer=polarizer)
-        linear = [raw.linear_rgb(session.read(record), demosaic=demosaic) for record in shots]
+        linear = [linear_light(record) for record in shots]
         if not linear:
             images[polarizer] = None
             continue
@@ -175,6 +194,18 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
             f"it has the states {', '.join(states) or 'none'}"
         )
     return images
+
+
+def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None, None]:
+    """Return gain (electrons per DN) and read noise with rounding, electrons; or leave both open.
+
+    What the camera was measured to do goes before what its frames say of themselves.
+    """
+    if sensor is None:
+        return None, None
+    gain = float(sensor.mean_gain_e_per_dn().value)
+    read = float(sensor.mean_read_noise_e().value)
+    return gain, float(np.hypot(read, gain * np.sqrt(QUANTIZATION_DN2)))
 
 
 def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping[str, SkinMap]:
@@ -258,41 +289,40 @@ def _stderr(skin_map: SkinMap) -> Float32:
 
 def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     table = color_table.build(inputs.camera, inputs.illuminant, anisotropy=ANISOTROPY_SKIN)
-    center, spread = SHADING_PRIOR if inputs.white is not None else SHADING_PRIOR_UNCALIBRATED
+    prior = shading_prior.of_faces()
+    if inputs.white is None:
+        prior = prior.broadened(EXPOSURE_SPREAD)
     rgb = np.where(_valid(diffuse)[..., None], diffuse.values, np.nan)
-    found = chromophores.invert(
-        rgb,
-        table,
-        shading=np.full(rgb.shape[:2], center),
-        variance=np.square(_stderr(diffuse)),
-        # a relative error common to the channels: the shading is known about so well and no better
-        model_error=model_error.load() + spread**2,
+    variance = np.square(_stderr(diffuse))
+    found = chromophore_posterior.weigh(
+        rgb, table, prior=prior, variance=variance, model_error=model_error.load()
     )
-    usable = found.valid | (~found.outside & np.isfinite(found.melanin))
+    noise_alone = chromophore_posterior.weigh(rgb, table, prior=prior, variance=variance)
+    usable = found.valid
 
     def chromophore(
-        name: str, values: NDArray[Any], stderr: NDArray[Any], fine: NDArray[np.bool_]
-    ) -> SkinMap:
-        good = detectable(values, stderr, usable & fine)
-        return SkinMap(
-            np.where(good, values, 0.0), UNITS[name], np.where(good, stderr, 0.0), good,
-            "invalid where noise and model error leave it unknown",
-        )  # fmt: skip
+        name: str, values: Float32, stderr: Float32, without_model_error: Float32
+    ) -> dict[str, SkinMap]:
+        good = detectable(values, stderr, usable & np.isfinite(without_model_error))
+        why = "invalid where noise and model error leave it unknown"
+        return {
+            name: SkinMap(
+                np.where(good, values, 0.0), UNITS[name], np.where(good, stderr, 0.0), good, why
+            ),
+            name + NOISE_STDERR: SkinMap(
+                np.where(good, without_model_error, 0.0), UNITS[name], valid=good,
+                description="standard error that noise alone would leave, without model error",
+            ),
+        }  # fmt: skip
 
-    whole = np.isfinite(found.stderr_melanin) & np.isfinite(found.stderr_hemoglobin)
-    melanin = chromophore("melanin", found.melanin, found.stderr_melanin, whole)
-    predicted = table.lookup(
-        np.where(usable, found.melanin, 0.0), np.where(usable, found.hemoglobin, 0.0)
-    )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shading = np.exp(np.mean(np.log(rgb / predicted), axis=-1))
-    lit = usable & np.isfinite(shading)
     return {
-        "melanin": melanin,
-        "hemoglobin": chromophore(
-            "hemoglobin", found.hemoglobin, found.stderr_hemoglobin, whole
+        **chromophore(
+            "melanin", found.melanin, found.stderr_melanin, noise_alone.stderr_melanin
         ),
-        "shading": SkinMap(np.where(lit, shading, 0.0), "1", valid=lit),
+        **chromophore(
+            "hemoglobin", found.hemoglobin, found.stderr_hemoglobin, noise_alone.stderr_hemoglobin
+        ),
+        "shading": SkinMap(np.where(usable, found.shading, 0.0), "1", valid=usable),
         "residual": SkinMap(np.where(usable, found.residual, 0.0), "1", valid=usable),
         "gamut_distance": SkinMap(
             np.nan_to_num(found.gamut_distance), "1",
@@ -301,14 +331,10 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     }  # fmt: skip
 
 
-SHADING_PRIOR = (0.7, 0.6)
-"""Light on a face over that on a white tile in its place: center and relative standard error.
-
-Weak on purpose: it decides between light skin in little light and dark skin in much, which have
-the same color, and tells where pixels in between leave off.
-"""
-SHADING_PRIOR_UNCALIBRATED = (0.7, 1.0)
-"""The same when no white tile was captured and the exposure is not known."""
+NOISE_STDERR = "_noise_stderr"
+"""Ending of the maps of the standard errors that noise alone would leave."""
+EXPOSURE_SPREAD = 1.0
+"""Spread of log exposure when no white tile was captured and the exposure is not known."""
 
 
 def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
+from reconstruction.flash_stages import NOISE_STDERR
+from skinrig.bounds import cramer_rao
 
 BANDS: tuple[tuple[float, float], ...] = (
     (0.0, 0.02), (0.02, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, 0.51),
@@ -37,7 +39,13 @@ class MapError:
     coverage
         Share of truths inside the 68 % interval of the estimate.
     median_stderr
-        Median of the relative standard error, estimate's.
+        Median of the relative standard error, estimate's: half the interval's width.
+    noise_coverage
+        Share of truths inside the interval that noise alone would leave, without model error;
+        NaN where no map says it.
+    median_bound
+        Median of the relative Cramer-Rao bound at the true chromophores, of noise, model error
+        and the light's prior; NaN where it cannot be told.
     """
 
     name: str
@@ -50,6 +58,8 @@ class MapError:
     bias: float
     coverage: metrics.Coverage
     median_stderr: float
+    noise_coverage: float = float("nan")
+    median_bound: float = float("nan")
 
     @property
     def band_name(self) -> str:
@@ -65,12 +75,16 @@ BOUND_FACTOR = 1.3
 def limit(row: MapError) -> float:
     """Return the largest median relative error that counts as kept.
 
-    15 % where the estimate's own standard error, which is the Cramer-Rao bound of noise and model
-    error, is below 10 %; elsewhere 1.3 times that bound.
+    15 % where the Cramer-Rao bound at the truth is below 10 %, elsewhere 1.3 times that bound. An
+    estimate's own standard error stands for the bound only where the truth cannot give it.
     """
-    if row.median_stderr < BOUND_LIMIT:
-        return MEDIAN_LIMIT
-    return BOUND_FACTOR * row.median_stderr
+    least = bound(row)
+    return MEDIAN_LIMIT if least < BOUND_LIMIT else BOUND_FACTOR * least
+
+
+def bound(row: MapError) -> float:
+    """Return the relative bound that a row is held to, see `limit`."""
+    return row.median_bound if np.isfinite(row.median_bound) else row.median_stderr
 
 
 def compare(
@@ -102,6 +116,7 @@ def compare(
     if "melanin" not in truth.maps:
         raise ValueError("truth: has no map 'melanin', which the bands are made from")
     melanin = truth.maps["melanin"].values
+    bounds = cramer_rao(appearance, truth)
     rows = []
     for name in names:
         if name not in appearance.maps:
@@ -118,9 +133,12 @@ def compare(
                 )
             skin = _skin(truth, true_map.values)
             rows += [
-                _row(name, against, band, estimate, true_map.values, melanin, skin, rng)
+                _row(
+                    name, against, band, estimate, true_map.values, melanin, skin, rng,
+                    noise=appearance.maps.get(name + NOISE_STDERR), bound=bounds.get(name),
+                )
                 for band in (None, *BANDS)
-            ]
+            ]  # fmt: skip
     return [row for row in rows if row.pixels >= 20]
 
 
@@ -140,6 +158,9 @@ def _row(
     melanin: NDArray[np.float32],
     skin: NDArray[np.bool_],
     rng: np.random.Generator,
+    *,
+    noise: SkinMap | None,
+    bound: NDArray[np.float64] | None,
 ) -> MapError:
     chosen = skin if band is None else skin & (melanin >= band[0]) & (melanin < band[1])
     valid = chosen if estimate.valid is None else chosen & estimate.valid
@@ -156,6 +177,10 @@ def _row(
         with np.errstate(divide="ignore", invalid="ignore"):
             ratios = stderr / np.abs(value)
         spread = float(np.median(ratios)) if ratios.size else float("nan")
+    noise_held = float("nan")
+    if noise is not None:
+        noise_held = metrics.coverage(value, noise.values[valid], true_value).share
+    told = np.empty(0) if bound is None else bound[valid & np.isfinite(bound)]
     return MapError(
         name=name,
         against=against,
@@ -167,4 +192,6 @@ def _row(
         bias=float(np.median(relative)) if relative.size else float("nan"),
         coverage=held,
         median_stderr=spread,
+        noise_coverage=noise_held,
+        median_bound=float(np.median(told)) if told.size else float("nan"),
     )

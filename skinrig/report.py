@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
+from reconstruction.flash_stages import NOISE_STDERR
 from skinrig import evaluation, figures, page, surface_section
 
 
@@ -138,6 +139,8 @@ def _appearance_section(
     for key, skin_map in sorted(appearance.maps.items()):
         if skin_map.values.ndim != 2 or key.startswith("_") or on_mesh:
             continue
+        if key.endswith(NOISE_STDERR):
+            continue
         true_map = truth.maps.get(key) if truth is not None else None
         body += page.map_panel(
             key,
@@ -229,18 +232,19 @@ def _errors(
                     100 * evaluation.limit(row),
                     "<=",
                     "%",
-                    f"bound {100 * row.median_stderr:.1f} %, {100 * row.masked:.0f} % masked",
+                    f"bound {100 * evaluation.bound(row):.1f} %, {100 * row.masked:.0f} % masked",
                 )
             )
     body = "<h3>Errors by melanin band</h3>" + page.table(
         ("map", "truth", "band", "pixels", "masked %", "median |error| %", "68 % interval",
-         "bias %", "68 % coverage %", "median standard error %"),
+         "bias %", "68 % coverage %", "by noise alone %", "median standard error %", "bound %"),
         [
             (
                 row.name, row.against, row.band_name, row.pixels, 100 * row.masked,
                 100 * row.median_relative,
                 f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}",
-                100 * row.bias, 100 * row.coverage.share, 100 * row.median_stderr,
+                100 * row.bias, 100 * row.coverage.share, 100 * row.noise_coverage,
+                100 * row.median_stderr, 100 * row.median_bound,
             )
             for row in rows
         ],

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from capture.calibration import store as calibration_store
+from capture.session import Session
 from model import store
 from reconstruction import pipeline
 from skinrig.calibrating import calibrate
@@ -99,6 +100,42 @@ def test_a_subject_is_reconstructed_only_as_far_as_wanted(tmp_path):
     valid = maps["melanin"].valid
     assert np.isfinite(maps["melanin"].stderr[valid]).all()
     assert (maps["melanin"].stderr[valid] > 0).all()
+
+
+def test_a_wrong_noise_profile_does_not_matter_where_the_sensor_is_calibrated(
+    tmp_path, monkeypatch
+):
+    simulate_session("flash", tmp_path / "session-flat", target="flat", seed=3, width_px=96)
+    calibrate("sensor", [tmp_path / "session-flat"], tmp_path / "store", created=TODAY)
+    done = simulate_session(
+        "flash", tmp_path / "session-flash", subject="II", seed=114, width_px=96
+    )
+
+    def stderr(name, calibration):
+        outcome = pipeline.reconstruct(
+            done.session, want=["diffuse"], out=tmp_path / name, calibration=calibration
+        )
+        diffuse = store.read(tmp_path / name).maps["diffuse"]
+        return outcome, diffuse.stderr[diffuse.valid].astype(float)
+
+    assumed, honest = stderr("honest", None)
+    known, measured = stderr("measured", tmp_path / "store")
+    assert any("noisy" in text for text in assumed.assumed)
+    assert not any("noisy" in text for text in known.assumed)
+    np.testing.assert_allclose(np.median(measured / honest), 1.0, atol=0.05)
+    read = Session.read
+
+    def exaggerate(session, record):
+        frame = read(session, record)
+        scale, offset = frame.noise_profile
+        return dataclasses.replace(frame, noise_profile=(100.0 * scale, 100.0 * offset))
+
+    monkeypatch.setattr(Session, "read", exaggerate)
+    # signals of few sigmas are masked, so that fewer pixels are left of what looks noisier
+    _, believed = stderr("believed", None)
+    assert np.median(believed) > 5.0 * np.median(honest)
+    _, unmoved = stderr("unmoved", tmp_path / "store")
+    np.testing.assert_array_equal(unmoved, measured)
 
 
 def test_reconstruction_needs_no_truth(tmp_path):

@@ -165,34 +165,6 @@ def test_a_shading_known_to_little_is_a_free_one(table):
     assert np.all(exact.stderr_melanin < 0.9 * free.stderr_melanin)
 
 
-@pytest.mark.parametrize("factor", [0.3, 1.0, 3.0])
-def test_a_shading_known_to_a_half_bears_large_factors(factor, table):
-    # Color decides, brightness only leans: the prior pulls by less than one standard error.
-    c_m, c_hd = np.array([0.01, 0.03]), np.array([0.05, 0.1])
-    color = factor * table.lookup(c_m, c_hd)
-    maps = invert(color, table, shading="known", variance=(0.003 * color) ** 2, model_error=half())
-    assert maps.valid.all()
-    assert np.all(np.abs(maps.melanin - c_m) < 0.5 * maps.stderr_melanin)
-    np.testing.assert_allclose(maps.shading, factor, rtol=0.02)
-    assert maps.gamut_distance.max() < 0.01
-    free = invert(color, table, variance=(0.003 * color) ** 2)
-    np.testing.assert_allclose(maps.stderr_melanin, free.stderr_melanin, rtol=0.15)
-
-
-def test_a_rough_shading_tells_dark_skin_from_light_skin_in_less_light(table):
-    c_m, c_hd = np.array([0.35, 0.45]), np.array([0.05, 0.05])
-    rough = np.full((3, 3), 0.2**2)
-    dark = invert(table.lookup(c_m, c_hd), table, shading=1.0, model_error=rough)
-    assert dark.melanin_identifiable.all()
-    np.testing.assert_allclose(dark.melanin, c_m, rtol=0.02)
-    between = invert(table.lookup([0.12], [0.01]), table, shading=1.0, model_error=half())
-    assert between.ambiguous.all()
-
-
-def half():
-    return np.full((3, 3), 0.25)
-
-
 def test_a_model_error_widens_the_errors_like_noise(table):
     color = table.lookup([0.02], [0.05])
     noise = invert(color, table, variance=(0.03 * color) ** 2)

@@ -1,0 +1,146 @@
+"""Melanin and hemoglobin of a pixel whose light is known only in distribution.
+
+Skin of more than a few percent melanin has the color of lighter skin in less light. A fit must
+decide for one of them, and its standard error then knows nothing of the other. Here all pairs of
+chromophores are weighed: by the color, with noise and model error, and by how probable the light
+is that they would need. The estimate is the median of what remains, its standard error reaches as
+far as 68 % of the probability, over both solutions where both are possible.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.color_table import ColorTable
+from reconstruction import chromophore_ridge as ridge
+from reconstruction.chromophore_start import LOWEST
+from reconstruction.chromophores import invert, model_covariance, without_brightness
+from reconstruction.shading_prior import ShadingPrior
+
+Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+FINEST = 2e-4
+"""Least relative error of a color that is told apart: smaller noise is taken for this much, with
+which melanin is known to some 0.3 percent."""
+_TASK_PIXELS = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class WeighedChromophores:
+    """Medians and 68 % reaches; every map has the pixels' shape."""
+
+    melanin: Map
+    """Volume fraction of melanin in the epidermis: the median; NaN where the input is unusable."""
+    hemoglobin: Map
+    """Volume fraction of blood in the dermis: the median; NaN where the input is unusable."""
+    shading: Map
+    """Light on the pixel over that on a white tile: the mean of its logarithm, as a factor."""
+    stderr_melanin: Map
+    """Distance from `melanin` within which 68.3 % of the probability lies; of a normal
+    distribution it is the standard deviation."""
+    stderr_hemoglobin: Map
+    """The same of `hemoglobin`."""
+    residual: Map
+    """Root of the weighted square sum of what the best color leaves, in standard errors."""
+    gamut_distance: Map
+    """How far the nearest color of the table is: root mean square relative difference."""
+    outside: Mask
+    """The color does not belong to the table, see `reconstruction.chromophores`."""
+    valid: Mask
+    """Usable input, and not `outside`."""
+
+
+def weigh(
+    rgb: ArrayLike,
+    table: ColorTable,
+    *,
+    prior: ShadingPrior,
+    variance: ArrayLike | None = None,
+    model_error: ArrayLike | None = None,
+    valid: ArrayLike | None = None,
+) -> WeighedChromophores:
+    """Estimate melanin and hemoglobin of every pixel from all solutions that are possible.
+
+    Parameters
+    ----------
+    rgb
+        Shape (..., 3): light of the pixel over that of a white tile, linear camera RGB.
+    table
+        Color table of the camera and the light that took the picture.
+    prior
+        How the pixels' shading is distributed.
+    variance
+        Noise variance of `rgb`, broadcast to its shape. None: 1 percent of each channel.
+    model_error
+        Relative error of the table's colors, see `reconstruction.chromophores.invert`.
+    valid
+        Shape (...): False where a pixel is masked otherwise. None: all may be used.
+
+    Returns
+    -------
+    WeighedChromophores
+        Estimates, 68 % reaches and masks of the pixels' shape.
+
+    Raises
+    ------
+    ChromophoreError
+        When shapes do not fit, or the model error is no covariance.
+
+    Notes
+    -----
+    Beforehand every ratio of melanin is as probable as any other (log-uniform), and so is every
+    cube root of blood. The prior of the shading must be wide against noise and model error: it is
+    taken as constant over the shadings that one pair of chromophores leaves open. Intervals cover
+    68 % over skin as it is distributed beforehand, not for each skin by itself; near the ends of
+    the table, where no skin is beyond, they cover more.
+
+    Examples
+    --------
+    >>> from model import color_table
+    >>> from reconstruction.shading_prior import lognormal
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
+    >>> color = 0.8 * table.lookup([[0.01, 0.02]], [[0.05, 0.05]])
+    >>> found = weigh(color, table, prior=lognormal(0.7, 0.6), variance=(1e-3 * color) ** 2)
+    >>> [f"{value:.3f}" for value in found.melanin[0]]
+    ['0.010', '0.020']
+    >>> [f"{value:.2f}" for value in found.shading[0]]
+    ['0.80', '0.80']
+    """
+    colors = np.asarray(rgb, dtype=np.float32)
+    fitted = invert(colors, table, variance=variance, model_error=model_error, valid=valid)
+    shape = fitted.melanin.shape
+    pixels = fitted.melanin.size
+    usable = np.isfinite(fitted.melanin) & np.isfinite(fitted.hemoglobin)
+    ends = np.array([table.c_m_max, table.c_hd_max])
+    fractions = np.stack([fitted.melanin, fitted.hemoglobin], axis=-1) / ends
+    begin = np.clip(np.cbrt(np.where(usable[..., None], fractions, 0.1)), LOWEST, 1.0)
+    noise = np.zeros(3) if variance is None else np.asarray(variance, dtype=np.float32)
+    lines = ridge.lines_of(table)
+    maps = np.empty((len(ridge.MAPS), pixels), dtype=np.float32)
+    ridge.weigh_pixels(
+        np.ascontiguousarray(colors).reshape(-1, 3),
+        np.ascontiguousarray(np.broadcast_to(noise, colors.shape), np.float32).reshape(-1, 3),
+        usable.reshape(-1),
+        np.ascontiguousarray(begin, dtype=np.float32).reshape(-1, 2),
+        without_brightness(model_covariance(model_error, variance is None) + FINEST**2 * np.eye(3)),
+        lines.log_rgb,
+        lines.by_a,
+        lines.by_b,
+        ends,
+        -2.0 * np.log(prior.density),
+        prior.low,
+        prior.step,
+        maps,
+        _TASK_PIXELS,
+    )
+    named = {name: maps[k].reshape(shape) for k, name in enumerate(ridge.MAPS)}
+    return WeighedChromophores(
+        **named,
+        gamut_distance=fitted.gamut_distance,
+        outside=fitted.outside,
+        valid=usable & ~fitted.outside,
+    )

@@ -1,0 +1,429 @@
+"""Weighs all pairs of chromophores that a color allows, one pixel after the other, in parallel.
+
+For every melanin of a grid the blood that fits best is followed along the ridge of the
+likelihood, over the fold where dark skin takes the colors of lighter skin; between the grid's
+lines the cost is interpolated by its values and slopes. `reconstruction.chromophore_posterior` is
+the door; `reconstruction.chromophore_reference` sums the same over a dense plane and is what this
+is tested against.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numba import boolean, float32, float64, int64, njit, prange, types, void
+from numpy.typing import NDArray
+
+from model.color_table import ColorTable
+from reconstruction.chromophore_start import LOWEST, evaluate
+
+LINES = 49
+"""Values of melanin at which the ridge is followed, evenly spaced in the cube root."""
+NODES = 65
+"""Values of blood that each line's colors are stored at."""
+NEWTON_STEPS = 4
+REACH = 0.12
+"""Longest step in blood, as a fraction of its axis."""
+CLOSE = 0.02
+"""Step, in standard errors of blood, after which the next one would not matter."""
+PROBES = 8
+"""Places between two lines where the cost is looked at first."""
+FINE = 160
+"""Places that the probability is summed at, along melanin, spread over where there is any."""
+FEWEST = 5
+"""Fewest of them between two lines."""
+ACROSS = 8
+"""Places in blood, across the ridge, at each of them."""
+WIDE = 0.25
+"""Extent across the ridge, as a fraction of the axis, from which on its shape is looked at."""
+COARSE = 24
+"""Places that it is looked at, over the whole axis."""
+FAR = 8.0
+"""Cost above the lowest where the ends are set."""
+NEGLIGIBLE = 18.0
+"""Cost above the lowest from which on probability is left out: 1e-4 of the greatest."""
+BINS = 128
+"""Bins of blood's probability."""
+STEPS_TO_REACH = 20
+"""Halvings of the distance that holds one sigma's probability."""
+WITHIN = 0.682689492137086
+"""Probability within one standard error of a normal distribution."""
+MAPS = (
+    "melanin",
+    "hemoglobin",
+    "shading",
+    "stderr_melanin",
+    "stderr_hemoglobin",
+    "residual",
+)
+
+_LOW = float(LOWEST)
+_STEP_A = (1.0 - _LOW) / (LINES - 1)
+_STEP_B = (1.0 - _LOW) / (NODES - 1)
+_ROOM = (LINES - 1) * FEWEST + FINE
+_FAST = {"contract"}
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lines:
+    """Log colors of skin along lines of equal melanin, each array (LINES, NODES, 3)."""
+
+    log_rgb: Floats
+    by_a: Floats
+    """Derivative by the fraction of the melanin axis."""
+    by_b: Floats
+    """Derivative by the fraction of the blood axis."""
+
+
+@lru_cache(maxsize=16)
+def lines_of(table: ColorTable) -> Lines:
+    """Return the lines of a table; kept for the tables used last."""
+    a, b = np.meshgrid(np.linspace(_LOW, 1.0, LINES), np.linspace(_LOW, 1.0, NODES), indexing="ij")
+    color, by_a, by_b = evaluate(table, a, b)
+    return Lines(np.log(color), by_a / color, by_b / color)
+
+
+@njit(inline="always", fastmath=_FAST)
+def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
+    """Return p' W q."""
+    return (
+        w[0] * p0 * q0
+        + w[3] * p1 * q1
+        + w[5] * p2 * q2
+        + w[1] * (p0 * q1 + p1 * q0)
+        + w[2] * (p0 * q2 + p2 * q0)
+        + w[4] * (p1 * q2 + p2 * q1)
+    )
+
+
+@njit(inline="always", fastmath=_FAST)
+def _hermite(v0, v1, d0, d1, x, step):  # type: ignore[no-untyped-def]
+    """Return the cubic with these values and derivatives at the ends, and its derivative."""
+    rise = v1 - v0
+    p, q = d0 * step - rise, rise - d1 * step
+    y = 1.0 - x
+    value = v0 + x * (rise + y * (p * y + q * x))
+    slope = (rise + (y - x) * (p * y + q * x) + x * y * (q - p)) / step
+    return value, slope
+
+
+@njit(inline="always", fastmath=_FAST)
+def _color(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
+    """Return the log color and its derivative by blood on line k, the node and the way past it."""
+    y = (b - _LOW) / _STEP_B
+    j = min(int(y), NODES - 2)
+    x = y - j
+    f0, g0 = _hermite(
+        log_rgb[k, j, 0], log_rgb[k, j + 1, 0], by_b[k, j, 0], by_b[k, j + 1, 0], x, _STEP_B
+    )
+    f1, g1 = _hermite(
+        log_rgb[k, j, 1], log_rgb[k, j + 1, 1], by_b[k, j, 1], by_b[k, j + 1, 1], x, _STEP_B
+    )
+    f2, g2 = _hermite(
+        log_rgb[k, j, 2], log_rgb[k, j + 1, 2], by_b[k, j, 2], by_b[k, j + 1, 2], x, _STEP_B
+    )
+    return f0, f1, f2, g0, g1, g2, j, x
+
+
+@njit(inline="always", fastmath=_FAST)
+def _prior_cost(prior, low, step, t):  # type: ignore[no-untyped-def]
+    """Return -2 log p of a log shading; beyond the table its ends go on straight."""
+    y = (t - low) / step
+    i = min(max(math.floor(y), 0), prior.shape[0] - 2)
+    return prior[i] + (y - i) * (prior[i + 1] - prior[i])
+
+
+@njit(inline="always", fastmath=_FAST)
+def _volume(k, x, end):  # type: ignore[no-untyped-def]
+    """Return the volume fraction of melanin a part x of the way past line k."""
+    a = _LOW + (k + x) * _STEP_A
+    return end * a * a * a
+
+
+@njit(fastmath=_FAST)
+def _place(values, at, count, wanted):  # type: ignore[no-untyped-def]
+    """Interpolate `at` where the ascending `values`, count + 1 of them, reach `wanted`."""
+    if wanted <= values[0]:
+        return at[0]
+    if wanted >= values[count]:
+        return at[count]
+    low, high = 0, count
+    while high - low > 1:
+        middle = (low + high) // 2
+        if values[middle] <= wanted:
+            low = middle
+        else:
+            high = middle
+    part = (wanted - values[low]) / max(values[high] - values[low], 1e-300)
+    return at[low] + part * (at[high] - at[low])
+
+
+@njit(fastmath=_FAST)
+def _center_and_reach(edges, total, count):  # type: ignore[no-untyped-def]
+    """Return the median, and the distance from it within which one sigma's probability lies.
+
+    `total` is the cumulative probability at each of the `edges`, 0 at the first one.
+    """
+    center = _place(total, edges, count, 0.5 * total[count])
+    low, high = 0.0, max(edges[count] - center, center - edges[0])
+    for _ in range(STEPS_TO_REACH):
+        middle = 0.5 * (low + high)
+        above = _place(edges, total, count, center + middle)
+        below = _place(edges, total, count, center - middle)
+        if above - below < WITHIN * total[count]:
+            low = middle
+        else:
+            high = middle
+    return center, 0.5 * (low + high)
+
+
+def _given(dtype: types.Type, axes: int) -> types.Array:
+    """Return the type of a contiguous argument that is only read, and may be read-only."""
+    return types.Array(dtype, axes, "C", readonly=True)
+
+
+@njit(
+    void(
+        _given(float32, 2),  # rgb (n, 3)
+        _given(float32, 2),  # variance (n, 3)
+        _given(boolean, 1),  # usable (n,)
+        _given(float32, 2),  # where to begin: fractions of the axes (n, 2)
+        _given(float64, 2),  # covariance of the model's relative error (3, 3)
+        _given(float64, 3),  # log color of the lines (LINES, NODES, 3)
+        _given(float64, 3),  # its derivative by melanin
+        _given(float64, 3),  # its derivative by blood
+        _given(float64, 1),  # ends of the axes as volume fractions (2,)
+        _given(float64, 1),  # -2 log probability of log shading
+        float64,  # log shading at the first node of it
+        float64,  # and its step
+        float32[:, ::1],  # maps (6, n): see MAPS
+        int64,  # pixels a task
+    ),
+    parallel=True,
+    fastmath=_FAST,
+    cache=True,
+    nogil=True,
+    boundscheck=False,
+    error_model="numpy",
+)
+def weigh_pixels(  # type: ignore[no-untyped-def]
+    rgb,
+    variance,
+    usable,
+    begin,
+    model,
+    log_rgb,
+    by_a,
+    by_b,
+    ends,
+    prior,
+    prior_low,
+    prior_step,
+    maps,
+    block,
+):
+    """Weigh the chromophores of every pixel; the shapes are in the signature above."""
+    pixels = rgb.shape[0]
+    for task in prange((pixels + block - 1) // block):
+        cost, slope = np.empty(LINES), np.empty(LINES)
+        blood, blood_slope = np.empty(LINES), np.empty(LINES)
+        spread, pull = np.empty(LINES), np.empty(LINES)
+        shade, shade_by_b = np.empty(LINES), np.empty(LINES)
+        between = np.empty(LINES - 1)
+        edges_a, total_a = np.empty(_ROOM + LINES), np.empty(_ROOM + LINES)
+        across, coarse = np.empty((LINES, ACROSS)), np.empty(COARSE)
+        wide = np.empty(LINES, dtype=np.bool_)
+        across_low, across_width = np.empty(LINES), np.empty(LINES)
+        edges_b, total_b = np.empty(BINS + 1), np.empty(BINS + 1)
+        bins = np.empty(BINS)
+        for n in range(task * block, min(pixels, (task + 1) * block)):
+            if not usable[n]:
+                for m in range(6):
+                    maps[m, n] = np.nan
+                continue
+            d0, d1, d2 = float64(rgb[n, 0]), float64(rgb[n, 1]), float64(rgb[n, 2])
+            l0, l1, l2 = math.log(d0), math.log(d1), math.log(d2)
+            # Weights of the relative errors, with the brightness projected out of them.
+            a00 = variance[n, 0] / (d0 * d0) + model[0, 0]
+            a11 = variance[n, 1] / (d1 * d1) + model[1, 1]
+            a22 = variance[n, 2] / (d2 * d2) + model[2, 2]
+            a01, a02, a12 = model[0, 1], model[0, 2], model[1, 2]
+            c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
+            scale = 1.0 / (a00 * c00 + a01 * c01 + a02 * c02)
+            w0, w1, w2 = c00 * scale, c01 * scale, c02 * scale
+            w3 = (a00 * a22 - a02 * a02) * scale
+            w4 = (a01 * a02 - a00 * a12) * scale
+            w5 = (a00 * a11 - a01 * a01) * scale
+            s0, s1, s2 = w0 + w1 + w2, w1 + w3 + w4, w2 + w4 + w5
+            whole = s0 + s1 + s2
+            s0, s1, s2 = s0 / whole, s1 / whole, s2 / whole
+            w = (
+                w0 - s0 * s0 * whole,
+                w1 - s0 * s1 * whole,
+                w2 - s0 * s2 * whole,
+                w3 - s1 * s1 * whole,
+                w4 - s1 * s2 * whole,
+                w5 - s2 * s2 * whole,
+            )
+            # Follow the ridge to both sides of where the fit ended.
+            first = min(max(int((begin[n, 0] - _LOW) / _STEP_A + 0.5), 0), LINES - 1)
+            for side in range(2):
+                b = float64(begin[n, 1])
+                if side == 1:
+                    b = blood[first]
+                count = LINES - first if side == 0 else first
+                for index in range(count):
+                    k = first + index if side == 0 else first - 1 - index
+                    f0, f1, f2, g0, g1, g2, j, x = _color(log_rgb, by_b, k, b)
+                    e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
+                    bb = _form(w, g0, g1, g2, g0, g1, g2) + 1e-9
+                    step = _form(w, g0, g1, g2, e0, e1, e2) / bb
+                    for _ in range(NEWTON_STEPS):
+                        moved = min(max(b + min(max(step, -REACH), REACH), _LOW), 1.0) - b
+                        if moved * moved * bb < CLOSE * CLOSE:
+                            break
+                        b += moved
+                        f0, f1, f2, g0, g1, g2, j, x = _color(log_rgb, by_b, k, b)
+                        e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
+                        bb = _form(w, g0, g1, g2, g0, g1, g2) + 1e-9
+                        step = _form(w, g0, g1, g2, e0, e1, e2) / bb
+                    held = (b <= _LOW and step < 0.0) or (b >= 1.0 and step > 0.0)
+                    h0 = by_a[k, j, 0] + x * (by_a[k, j + 1, 0] - by_a[k, j, 0])
+                    h1 = by_a[k, j, 1] + x * (by_a[k, j + 1, 1] - by_a[k, j, 1])
+                    h2 = by_a[k, j, 2] + x * (by_a[k, j + 1, 2] - by_a[k, j, 2])
+                    blood[k] = b
+                    blood_slope[k] = 0.0 if held else -_form(w, h0, h1, h2, g0, g1, g2) / bb
+                    spread[k] = 1.0 / math.sqrt(bb)
+                    pull[k] = step if held else 0.0
+                    gain = 0.0 if held else step * step * bb
+                    cost[k] = max(_form(w, e0, e1, e2, e0, e1, e2) - gain, 0.0)
+                    o0, o1, o2 = e0, e1, e2
+                    if not held:
+                        o0, o1, o2 = e0 - g0 * step, e1 - g1 * step, e2 - g2 * step
+                        blood[k] = min(max(b + step, _LOW), 1.0)
+                    slope[k] = -2.0 * _form(w, h0, h1, h2, o0, o1, o2)
+                    shade_by_b[k] = -(s0 * g0 + s1 * g1 + s2 * g2)
+                    shade[k] = s0 * e0 + s1 * e1 + s2 * e2 + shade_by_b[k] * (blood[k] - b)
+            # The lowest cost, and between which lines there is probability at all.
+            lowest, color_lowest = np.inf, np.inf
+            for k in range(LINES - 1):
+                least = np.inf
+                for i in range(PROBES + 1):
+                    x = float64(i) / PROBES
+                    value, _ = _hermite(cost[k], cost[k + 1], slope[k], slope[k + 1], x, _STEP_A)
+                    value = max(value, 0.0)
+                    color_lowest = min(color_lowest, value)
+                    t = shade[k] + x * (shade[k + 1] - shade[k])
+                    value += _prior_cost(prior, prior_low, prior_step, t)
+                    least = min(least, value)
+                between[k] = least
+                lowest = min(lowest, least)
+            live = 0
+            for k in range(LINES - 1):
+                live += between[k] < lowest + NEGLIGIBLE
+            # On each line that matters: how probability spreads over blood, across the ridge.
+            b_low, b_high = 1.0, _LOW
+            for k in range(LINES):
+                beside = min(between[max(k - 1, 0)], between[min(k, LINES - 2)])
+                if not beside < lowest + NEGLIGIBLE:
+                    continue
+                b = blood[k]
+                reach = 2.6 * spread[k]
+                if pull[k] != 0.0:
+                    reach = min(reach, 5.0 * spread[k] * spread[k] / abs(pull[k]))
+                low, high = max(b - reach, _LOW), min(b + reach, 1.0)
+                wide[k] = high - low > WIDE
+                if wide[k]:
+                    # The curvature says little of the far ends: look where probability ends.
+                    width = (1.0 - _LOW) / COARSE
+                    least = np.inf
+                    for i in range(COARSE):
+                        f0, f1, f2, g0, g1, g2, j, x = _color(
+                            log_rgb, by_b, k, _LOW + (i + 0.5) * width
+                        )
+                        e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
+                        t = s0 * e0 + s1 * e1 + s2 * e2
+                        value = _form(w, e0, e1, e2, e0, e1, e2)
+                        value += _prior_cost(prior, prior_low, prior_step, t)
+                        coarse[i] = value
+                        least = min(least, value)
+                    low, high = 1.0, _LOW
+                    for i in range(COARSE):
+                        if coarse[i] < least + FAR:
+                            low = min(low, _LOW + max(i - 0.5, 0.0) * width)
+                            high = max(high, _LOW + min(i + 1.5, COARSE + 0.0) * width)
+                width = (high - low) / ACROSS
+                across_low[k], across_width[k] = low, width
+                if beside < lowest + 10.0:
+                    b_low, b_high = min(b_low, low), max(b_high, high)
+                here = cost[k] + _prior_cost(prior, prior_low, prior_step, shade[k])
+                for i in range(ACROSS):
+                    f0, f1, f2, g0, g1, g2, j, x = _color(log_rgb, by_b, k, low + (i + 0.5) * width)
+                    e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
+                    t = s0 * e0 + s1 * e1 + s2 * e2
+                    more = _form(w, e0, e1, e2, e0, e1, e2) - here
+                    more += _prior_cost(prior, prior_low, prior_step, t)
+                    across[k, i] = width * math.exp(-0.5 * max(more, -NEGLIGIBLE))
+            per_b = BINS / max(b_high - b_low, 1e-9)
+            bins[:] = 0.0
+            # Sum over melanin along the ridge, and over blood across it.
+            each = max(FEWEST, FINE // live)
+            count = 0
+            total_a[0] = 0.0
+            mean_shade = 0.0
+            for k in range(LINES - 1):
+                if not between[k] < lowest + NEGLIGIBLE:
+                    continue
+                if count > 0 and not between[k - 1] < lowest + NEGLIGIBLE:
+                    # a gap without probability
+                    count += 1
+                    total_a[count] = total_a[count - 1]
+                edges_a[count] = _volume(k, 0.0, ends[0])
+                for f in range(each):
+                    x = (f + 0.5) / each
+                    value, _ = _hermite(cost[k], cost[k + 1], slope[k], slope[k + 1], x, _STEP_A)
+                    t = shade[k] + x * (shade[k + 1] - shade[k])
+                    value = max(value, 0.0) + _prior_cost(prior, prior_low, prior_step, t) - lowest
+                    mass = 0.0
+                    if value < NEGLIGIBLE:
+                        # every ratio of melanin is as likely as any other
+                        weight = math.exp(-0.5 * value) / (each * (_LOW + (k + x) * _STEP_A))
+                        b = (1.0 - x) * across_low[k] + x * across_low[k + 1]
+                        if not (wide[k] or wide[k + 1]):
+                            bent, _ = _hermite(
+                                blood[k], blood[k + 1], blood_slope[k], blood_slope[k + 1], x,
+                                _STEP_A,
+                            )  # fmt: skip
+                            b += bent - (1.0 - x) * blood[k] - x * blood[k + 1]
+                        width = across_width[k] + x * (across_width[k + 1] - across_width[k])
+                        place, size = (b - b_low) * per_b, width * per_b
+                        for i in range(ACROSS):
+                            part = weight * (across[k, i] + x * (across[k + 1, i] - across[k, i]))
+                            mass += part
+                            # one of the places fills as many bins as it is wide
+                            start = min(max(place + i * size, 0.0), BINS - 0.001)
+                            stop = min(max(place + (i + 1) * size, start + 0.001), float64(BINS))
+                            density = part / (stop - start)
+                            m = int(start)
+                            while m < stop:
+                                bins[m] += density * (min(stop, m + 1.0) - max(start, float64(m)))
+                                m += 1
+                        mean_shade += mass * t
+                    count += 1
+                    edges_a[count] = _volume(k, (f + 1.0) / each, ends[0])
+                    total_a[count] = total_a[count - 1] + mass
+            edges_b[0], total_b[0] = ends[1] * b_low**3, 0.0
+            for m in range(BINS):
+                edges_b[m + 1] = ends[1] * (b_low + (m + 1) / per_b) ** 3
+                total_b[m + 1] = total_b[m] + bins[m]
+            center, reach = _center_and_reach(edges_a, total_a, count)
+            maps[0, n], maps[3, n] = center, reach
+            center, reach = _center_and_reach(edges_b, total_b, BINS)
+            maps[1, n], maps[4, n] = center, reach
+            maps[2, n] = math.exp(mean_shade / total_a[count])
+            maps[5, n] = math.sqrt(color_lowest)

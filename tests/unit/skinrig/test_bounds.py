@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+
+from model import color_table
+from model.skin import UNITS, SkinAppearance, SkinMap
+from model.tissue_optics import ANISOTROPY_SKIN
+from reconstruction import model_error, shading_prior
+from reconstruction.chromophores import identifiability
+from skinrig.bounds import cramer_rao, relative_bounds
+
+CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
+
+
+@pytest.fixture(scope="module")
+def table():
+    return color_table.build(CAMERA, LIGHT, anisotropy=ANISOTROPY_SKIN)
+
+
+def test_a_shading_that_is_hardly_known_has_the_bound_of_a_free_one(table):
+    noise = 0.005
+    free = identifiability(
+        table, variance=lambda rgb: (noise * rgb) ** 2, model_error=model_error.load(), size=24
+    )
+    c_m, c_hd = np.meshgrid(free.c_m[6:16], free.c_hd[6:16], indexing="ij")
+    melanin, blood = relative_bounds(
+        table, c_m.ravel(), c_hd.ravel(), np.full((100, 3), noise**2), shading_spread=200.0
+    )
+    np.testing.assert_allclose(melanin.reshape(10, 10), free.stderr_melanin[6:16, 6:16], rtol=0.02)
+    np.testing.assert_allclose(blood.reshape(10, 10), free.stderr_hemoglobin[6:16, 6:16], rtol=0.02)
+
+
+def test_the_bound_scales_with_the_noise_and_shrinks_with_what_is_known(table):
+    c_m, c_hd = np.array([0.02]), np.array([0.05])
+    few, many = np.full((1, 3), 1e-2), np.full((1, 3), 4e-2)
+    loud = relative_bounds(table, c_m, c_hd, few, shading_spread=0.6)
+    louder = relative_bounds(table, c_m, c_hd, many, shading_spread=1.2)
+    np.testing.assert_allclose(np.array(louder), 2.0 * np.array(loud), rtol=1e-3)
+    known = relative_bounds(table, c_m, c_hd, few, shading_spread=0.01)
+    assert np.all(np.array(known) < np.array(loud))
+
+
+def scene(table, melanin, stderr):
+    """Return maps whose estimate states `stderr`, and their truth."""
+    shape = (4, 5)
+    color = np.broadcast_to(0.7 * table.lookup(melanin, 0.05), (*shape, 3))
+    diffuse = SkinMap(color, "1", 0.005 * color)
+    estimate = SkinMap(np.full(shape, melanin), UNITS["melanin"], np.full(shape, stderr))
+    truths = {
+        "melanin": melanin, "melanin_blurred": melanin, "hemoglobin": 0.05,
+        "hemoglobin_blurred": 0.05,
+    }  # fmt: skip
+    truth = SkinAppearance(
+        {k: SkinMap(np.full(shape, v), UNITS[k.split("_")[0]]) for k, v in truths.items()},
+        "simulated",
+    )
+    found = SkinAppearance(
+        {"diffuse": diffuse, "melanin": estimate}, "simulated",
+        parameters={"color_table": {"camera": CAMERA, "illuminant": LIGHT}},
+    )  # fmt: skip
+    return found, truth
+
+
+def test_the_bound_of_maps_is_that_at_the_truth(table, rng):
+    found, truth = scene(table, 0.02, 0.01)
+    bounds = cramer_rao(found, truth)
+    expected, _ = relative_bounds(
+        table, np.array([0.02]), np.array([0.05]), np.full((1, 3), 0.005**2),
+        shading_spread=shading_prior.of_faces().spread,
+    )  # fmt: skip
+    np.testing.assert_allclose(bounds["melanin"], expected[0], rtol=1e-3)
+    assert cramer_rao(SkinAppearance({}, "simulated"), truth) == {}
+
+
+def test_an_inflated_standard_error_does_not_widen_its_own_limit(table, rng):
+    from skinrig.evaluation import compare, limit
+
+    honest, inflated = (
+        next(
+            row
+            for row in compare(*scene(table, 0.02, stderr), rng=rng)
+            if row.against == "blurred" and row.band is None
+        )
+        for stderr in (0.001, 0.02)
+    )
+    assert inflated.median_stderr == pytest.approx(1.0)
+    assert limit(inflated) == pytest.approx(limit(honest))
+    assert limit(inflated) < 0.3
