@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Literal, Protocol, TypeAlias
 
 import cv2
 import numpy as np
@@ -44,6 +44,14 @@ MAX_STEPS = 100
 STOP = 1e-10  # relative decrease of the cost
 LEAST_SIGMA_PX = 1e-9
 LEAST_SHARED = 2  # places that a camera must share with others
+
+
+class Target(Protocol):
+    """A flat target with known points."""
+
+    @property
+    def points_mm(self) -> FloatArray:
+        """Points in the target's own axes, shape (N, 3), z = 0."""
 
 
 class BundleError(CalibrationError):
@@ -220,7 +228,7 @@ def adjust(
 
 
 def place_board(
-    sightings: Sightings, board: Board, cameras: Mapping[str, CameraPose], pose: int
+    sightings: Sightings, board: Target, cameras: Mapping[str, CameraPose], pose: int
 ) -> BoardPlace:
     """Return where the board stood, from all its images, with the cameras as given.
 
@@ -364,7 +372,7 @@ def _resection(
     return replace(camera, rotation=rotation, translation_mm=np.ravel(shift))
 
 
-def _gaps(camera: CameraPose, place: BoardPlace, board: Board, sighting: Sighting) -> FloatArray:
+def _gaps(camera: CameraPose, place: BoardPlace, board: Target, sighting: Sighting) -> FloatArray:
     found = camera.project(place.to_rig(board.points_mm[sighting.ids]))
     return np.asarray(np.linalg.norm(found - sighting.pixels, axis=-1))
 
@@ -407,7 +415,7 @@ class _Problem:
     def __init__(
         self,
         sightings: Sightings,
-        board: Board,
+        board: Target,
         start: Mapping[str, CameraPose],
         prior: LensPrior,
         gauge: Gauge,
