@@ -39,6 +39,8 @@ from rigsim.scenes import olat
 from rigsim.scenes.olat import Hits, Lamp
 from rigsim.scenes.olat_vector import VectorLight
 from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.skin_bleeding import SkinBleeding
+from rigsim.skin_bounce import SkinBounce
 from rigsim.subject import Subject
 from rigsim.surface_brdf import SkinSurface, skin_surface
 from rigsim.targets import Target
@@ -149,6 +151,9 @@ class DomeScene:
         self._surfaces: dict[str, SkinSurface] = {}
         self._textures: dict[str, Float32Array] = {}
         self._hits: OrderedDict[tuple[str, float], tuple[Hits, Caster]] = OrderedDict()
+        self._bounce: SkinBounce | None = None
+        self._bleeding: dict[str, SkinBleeding] = {}
+        self._glow: dict[tuple[str, int, float], Float32Array] = {}
         self._vector: dict[tuple[str, float], VectorLight] = {}
         self._frames: OrderedDict[tuple[str, int, float], Float32Array] = OrderedDict()
 
@@ -167,8 +172,14 @@ class DomeScene:
             ]
             if not self.interreflections:
                 out.append(("light from skin to skin", "interreflections=False asks for it"))
+            else:
+                out.append(("highlights of skin on skin", "only light from inside goes on"))
             if not self.subsurface:
                 out.append(("light spreading sideways in skin", "subsurface=False asks for it"))
+            else:
+                out.append(("kernels that vary over the face", "one profile, of its median skin"))
+            if self.motion is not None and (self.subsurface or self.interreflections):
+                out.append(("the twitch in light from inside", "it stays that of the still mouth"))
             if self.motion is None:
                 out.append(("movement of the head", "motion=None asks for it"))
             else:
@@ -445,15 +456,42 @@ class DomeScene:
             return np.zeros(shape, np.float32)
         hits, caster = self._seen(view, t_s)
         lamp = self._lamp(light, t_s)
+        glow = self._glow_of(view, light, t_s, hits)
+        diffuse = not (self.subsurface and glow is not None)
         if hits.kind == olat.SKIN and caster.scene is not None:
             if (view.name, t_s) not in self._vector:
                 self._vector[view.name, t_s] = VectorLight(hits, caster)
-            image = self._vector[view.name, t_s].light_up(lamp)
+            image = self._vector[view.name, t_s].light_up(lamp, glow, diffuse=diffuse)
         else:
-            image = olat.light_up(hits, lamp, olat.seen_from(hits, caster, lamp))
+            visible = olat.seen_from(hits, caster, lamp)
+            image = olat.light_up(hits, lamp, visible, glow, diffuse=diffuse)
         image *= self.intensity(light, view_name=view.name)
         image *= np.float32(self.dome.gain.get(view.name, 1.0))
         return image
+
+    def _glow_of(self, view: View, light: int, t_s: float, hits: Hits) -> Float32Array | None:
+        """Return what leaves the interior of the rows besides their own diffuse term."""
+        if not (self.subsurface or self.interreflections) or hits.kind != olat.SKIN:
+            return None
+        camera = view.spectral_sensitivity
+        if camera not in self._bleeding:
+            if self.interreflections and self._bounce is None:
+                self._bounce = SkinBounce(self._caster)
+            self._bleeding[camera] = SkinBleeding(
+                self._face(),
+                self.surface(view),
+                self._caster,
+                camera=camera,
+                light=self._illuminant,
+                subsurface=self.subsurface,
+                bounce=self._bounce,
+            )
+        key = (camera, light, t_s)
+        if key not in self._glow:
+            self._glow.clear()  # all cameras look at one light before the next
+            self._glow[key] = self._bleeding[camera].glow(self._lamp(light, t_s))
+        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
+        return sample(self._glow[key], uv, np.ones(len(uv), np.bool_))
 
     def _pose(self, t_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if self.motion is None or not isinstance(self.subject, Subject):

@@ -16,7 +16,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from capture.rig import Rig, View, load_rig
-from rigsim.atlas import spread
+from rigsim.atlas import BoolArray, spread
 from rigsim.mesh import Float32Array
 from rigsim.render import MovedLight, look_at, radiance
 from rigsim.scenes.dome import DomeScene
@@ -56,6 +56,15 @@ def plain_face(preset: str = "III", *, seed: int = 0, size: int = 512) -> Subjec
     """Return a face whose normals are those of its mesh: without pores and wrinkles."""
     face = make_subject(preset, seed=seed, size=size)
     return dataclasses.replace(face, normal=face.atlas.normal)
+
+
+class MattScene(DomeScene):
+    """A dome whose skin does not shine: the diffuse term behind the boundary alone."""
+
+    def surface(self, view: View) -> SkinSurface:
+        """Return how the face reflects for a camera."""
+        surface = super().surface(view)
+        return dataclasses.replace(surface, bare=np.zeros_like(surface.bare))
 
 
 class PlainScene(DomeScene):
@@ -170,12 +179,17 @@ _INTEGRATORS: dict[Integrator, dict[str, Any]] = {
 
 def describe(scene: PlainScene, view: View, integrator: Integrator) -> dict[str, Any]:
     """Return Mitsuba's scene of a face in the dome, lit by a point of intensity 1 per steradian."""
-    subject = scene.subject
-    if not isinstance(subject, Subject):
-        raise TypeError(f"subject: got the target {subject.name!r}, expected a face")
+    subject = _face(scene)
+    return _look(view) | {
+        "integrator": _INTEGRATORS[integrator],
+        "face": {"type": "mesh", "mesh": subject.mesh, "bsdf": _skin(scene.surface(view), subject)},
+    }
+
+
+def _look(view: View) -> dict[str, Any]:
+    """Return a scene with a camera and a point of intensity 1 per steradian."""
     return {
         "type": "scene",
-        "integrator": _INTEGRATORS[integrator],
         "sensor": {
             "type": "perspective",
             "fov": math.degrees(2.0 * math.atan(0.5 * view.width_px / view.focal_px)),
@@ -191,7 +205,6 @@ def describe(scene: PlainScene, view: View, integrator: Integrator) -> dict[str,
                 "rfilter": {"type": "box"},
             },
         },
-        "face": {"type": "mesh", "mesh": subject.mesh, "bsdf": _skin(scene.surface(view), subject)},
         "light": {
             "type": "point",
             "position": [0.0, 0.0, 700.0],
@@ -211,6 +224,39 @@ def _plastic_scale(eta: float) -> float:
     return eta * eta * (1.0 - inner)
 
 
+def matt_image(
+    scene: MattScene, view: View, light: int, *, depth: int, samples: int, seed: int
+) -> Float32Array:
+    """Return one image of matt skin by Mitsuba's path tracer with several bounces, (H, W, 3).
+
+    Parameters
+    ----------
+    scene
+        The dome.
+    view, light
+        Camera, and index of the light, a point of intensity 1 per steradian.
+    depth
+        Surfaces on a path and the light: 2 is direct light alone.
+    samples, seed
+        Of Mitsuba.
+    """
+    subject = _face(scene)
+    description = _look(view) | {
+        "integrator": {"type": "path", "max_depth": depth, "rr_depth": depth + 1},
+        "face": {"type": "mesh", "mesh": subject.mesh, "bsdf": _matt(scene.surface(view), subject)},
+    }
+    description["light"] = dict(
+        description["light"], position=list(scene.rig.lights[light].position_mm)
+    )
+    return radiance(description, kind="rgb", samples=samples, seed=seed)[..., :3]
+
+
+def _face(scene: DomeScene) -> Subject:
+    if not isinstance(scene.subject, Subject):
+        raise TypeError(f"subject: got the target {scene.subject.name!r}, expected a face")
+    return scene.subject
+
+
 def _skin(surface: SkinSurface, subject: Subject) -> dict[str, Any]:
     """Return our reflection as a blend of Mitsuba's materials, at half its strength.
 
@@ -219,22 +265,12 @@ def _skin(surface: SkinSurface, subject: Subject) -> dict[str, Any]:
     """
     covered = subject.atlas.covered
 
-    def texture(values: Float32Array) -> dict[str, Any]:
-        filled = np.flipud(spread(values, covered))  # Mitsuba's v runs down the rows
-        return {
-            "type": "bitmap",
-            "bitmap": filled if filled.ndim == 3 else filled[..., None],
-            "raw": True,
-            "filter_type": "bilinear",
-            "wrap_mode": "clamp",
-        }
-
     def metal(kind: str, eta: float, alpha: Float32Array) -> dict[str, Any]:
         # A conductor without absorption reflects as a dielectric does.
         return {
             "type": "roughconductor",
             "distribution": kind,
-            "alpha": texture(alpha),
+            "alpha": _texture(alpha, covered),
             "eta": eta,
             "k": 0.0,
         }
@@ -242,16 +278,34 @@ def _skin(surface: SkinSurface, subject: Subject) -> dict[str, Any]:
     return {
         "type": "blendbsdf",
         "weight": 0.5,
-        "inside": {
-            "type": "plastic",
-            "int_ior": ETA,
-            "ext_ior": 1.0,
-            "diffuse_reflectance": texture(surface.r_d * np.float32(_plastic_scale(ETA))),
-        },
+        "inside": _matt(surface, subject),
         "outside": {
             "type": "blendbsdf",
-            "weight": texture(surface.oil),
+            "weight": _texture(surface.oil, covered),
             "skin": metal("beckmann", ETA, surface.roughness),
             "oil": metal("ggx", ETA_OIL, np.float32(OIL_SMOOTHING) * surface.roughness),
         },
+    }
+
+
+def _matt(surface: SkinSurface, subject: Subject) -> dict[str, Any]:
+    """Return the diffuse term behind the boundary, without the mirror that stands on it."""
+    r_d = surface.r_d * np.float32(_plastic_scale(ETA))
+    return {
+        "type": "plastic",
+        "int_ior": ETA,
+        "ext_ior": 1.0,
+        "specular_reflectance": 0.0,
+        "diffuse_reflectance": _texture(r_d, subject.atlas.covered),
+    }
+
+
+def _texture(values: Float32Array, covered: BoolArray) -> dict[str, Any]:
+    filled = np.flipud(spread(values, covered))  # Mitsuba's v runs down the rows
+    return {
+        "type": "bitmap",
+        "bitmap": filled if filled.ndim == 3 else filled[..., None],
+        "raw": True,
+        "filter_type": "bilinear",
+        "wrap_mode": "clamp",
     }

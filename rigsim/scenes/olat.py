@@ -282,7 +282,12 @@ def sum_rows(
 
 
 def light_up(
-    hits: Hits, lamp: Lamp, visible: NDArray[np.bool_], glow: Float32Array | None = None
+    hits: Hits,
+    lamp: Lamp,
+    visible: NDArray[np.bool_],
+    glow: Float32Array | None = None,
+    *,
+    diffuse: bool = True,
 ) -> Float32Array:
     """Shade rows by one light and sum them into pixels.
 
@@ -295,8 +300,10 @@ def light_up(
     visible
         Rows that see it, see `seen_from`.
     glow
-        What else leaves the interior, before the boundary: radiance in the unit of the result,
-        shape (n, 3). Skin's own diffuse term is left out then, as the glow holds it.
+        What else leaves the interior of skin, before the boundary, in the unit of the result,
+        shape (n, 3).
+    diffuse
+        False leaves out skin's own diffuse term, for a glow that holds it.
 
     Returns
     -------
@@ -311,7 +318,8 @@ def light_up(
     axis = np.ascontiguousarray(lamp.axis, np.float64)
     _shade(
         hits.pixel, hits.first, hits.position_mm, hits.normal, hits.surface, hits.camera_mm,
-        hits.kind, center, axis, float(lamp.exponent), visible, extra, 1.0 / hits.subpixels**2, out,
+        hits.kind, center, axis, float(lamp.exponent), visible, extra, diffuse,
+        1.0 / hits.subpixels**2, out,
     )  # fmt: skip
     return out.reshape(*hits.shape, 3)
 
@@ -395,7 +403,7 @@ def _aim(  # type: ignore[no-untyped-def]
 @njit(parallel=True, cache=True)
 def _shade(  # type: ignore[no-untyped-def]
     pixel, first, position, normal, surface, camera, kind, center, axis, exponent,
-    visible, glow, share, out,
+    visible, glow, diffuse, share, out,
 ):  # fmt: skip
     has_glow = glow.shape[0] > 0
     for p in prange(pixel.shape[0]):
@@ -452,7 +460,7 @@ def _shade(  # type: ignore[no-untyped-def]
             oil, fuzz, bare = surface[i, 4] / FULL, surface[i, 5] / FULL, surface[i, 6] / FULL
             lobe = surface_terms(nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz)
             gloss = math.pi * strength * bare * lobe
-            inside = 0.0 if has_glow else strength * boundary(nl, nv)
+            inside = strength * boundary(nl, nv) if diffuse else 0.0
             red += gloss + inside * r0
             green += gloss + inside * r1
             blue += gloss + inside * r2

@@ -106,7 +106,7 @@ class VectorLight:
         surface += oil * _fresnel(dr, lh, ETA_OIL) * _ggx(dr, cl, cv, nh, OIL_SMOOTHING * roughness)
         through = 1.0 - dr.exp(-fuzz * (1.0 / cl + 1.0 / cv))
         surface += FUZZ_ALBEDO / (4.0 * math.pi) * through / (cl + cv)
-        # Where light and camera are not both above, the half vector may lie in the surface: 0 * inf.
+        # Where not both are above, the half vector may lie in the surface: 0 * inf.
         gloss = dr.select(active, math.pi * strength * bare * surface, 0.0)
         leaving = 1.0 - _fresnel(dr, cv, ETA)
         rows = [gloss] * 3
