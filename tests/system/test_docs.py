@@ -112,6 +112,22 @@ def test_the_manual_lists_every_command_with_its_arguments_and_what_it_needs():
     assert listed == expected
 
 
+def test_the_manual_lists_every_command_of_the_domes_box():
+    from capture.rig import load_rig
+    from rigsim.world import World
+
+    box = World(load_rig("dome")).box("dome")
+    expected = {}
+    for name, command in box.device.commands().items():
+        needs = "armed" if command.armed else "" if name.endswith("?") else "frame"
+        expected[name] = (command.arguments, needs)
+    listed = {
+        name.strip("`"): (arguments.strip("`"), needs)
+        for name, arguments, needs, _ in rows(WIRE, "Commands of the dome's box")
+    }
+    assert listed == expected
+
+
 def test_the_manual_lists_every_code():
     cells = [row[column] for row in rows(WIRE, "Codes") for column in (0, 2)]
     assert sorted(map(int, cells)) == sorted(int(code) for code in wire.Code)
