@@ -76,7 +76,7 @@ class DomeImage:
 
 
 class DomeImages:
-    """Merges the exposures of a dome session when an image is asked for; keeps none.
+    """Reads, and merges, the exposures of a dome session when an image is asked for; keeps none.
 
     Parameters
     ----------
@@ -87,11 +87,16 @@ class DomeImages:
         the word of its own frames.
     kind
         "olat" for the subject; "white", "mirror" for targets with one light at a time.
+    merge
+        Whether the exposures of a light make one image. Those of a subject that moves do not:
+        they were taken seconds apart.
 
     Attributes
     ----------
     views, lights
         Names, in the rig's order, of those that the session holds frames of.
+    captures
+        The images that each view has: light and exposure, -1 for all of them merged.
 
     Raises
     ------
@@ -105,6 +110,7 @@ class DomeImages:
         *,
         noise: dict[str, SensorNoise] | None = None,
         kind: str = "olat",
+        merge: bool = True,
     ) -> None:
         self._session = session
         self._noise = dict(noise or {})
@@ -118,25 +124,37 @@ class DomeImages:
         lights = {light for _, light in self._shots}
         self.views = tuple(v.name for v in session.rig.views if v.name in views)
         self.lights = tuple(x.name for x in session.rig.lights if x.name in lights)
+        exposures = sorted(
+            {int(r.index.get("exposure", 0)) for s in self._shots.values() for r in s}
+        )
+        kept = [-1] if merge else exposures
+        self.captures = tuple((light, exposure) for exposure in kept for light in self.lights)
         self._darks: dict[str, tuple[Float32, Float32] | None] = {}
 
-    def times_s(self, view: str, light: str) -> tuple[float, ...]:
+    def times_s(self, view: str, light: str, exposure: int = -1) -> tuple[float, ...]:
         """Return when the box lit the frames of an image, s on the box's clock.
 
         Frames that no box lit, as imported ones, have NaN.
         """
-        times = (record.line.t_box_s for record in self._of(view, light))
+        times = (record.line.t_box_s for record in self._of(view, light, exposure))
         return tuple(math.nan if time is None else time for time in times)
 
-    def image(self, view: str, light: str) -> DomeImage:
-        """Return what a camera sees by a light, all its exposures merged, the darks subtracted.
+    def image(self, view: str, light: str, exposure: int = -1) -> DomeImage:
+        """Return what a camera sees by a light, the darks subtracted.
+
+        Parameters
+        ----------
+        view, light
+            Names.
+        exposure
+            Which one; -1 merges all.
 
         Raises
         ------
         EvidenceError
             Where the session lacks that image.
         """
-        shots = self._of(view, light)
+        shots = self._of(view, light, exposure)
         frames = [self._session.read(record) for record in shots]
         levels = [float(record.settings.get("level", 1.0)) for record in shots]
         values, variance, good = self._merge(view, frames, levels)
@@ -147,8 +165,10 @@ class DomeImages:
         linear = raw.interpolate(values, variance, good, frames[0].pattern, demosaic="centered")
         return DomeImage(linear.rgb, linear.variance, linear.valid)
 
-    def _of(self, view: str, light: str) -> list[FrameRecord]:
-        shots = self._shots.get((view, light))
+    def _of(self, view: str, light: str, exposure: int) -> list[FrameRecord]:
+        shots = self._shots.get((view, light), [])
+        if exposure >= 0:
+            shots = [record for record in shots if record.index.get("exposure", 0) == exposure]
         if not shots:
             raise EvidenceError(f"session {self._session.id}: lacks camera {view}, light {light}")
         return shots

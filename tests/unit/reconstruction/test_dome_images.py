@@ -120,3 +120,12 @@ def test_the_middle_of_the_sensors_first_cell_is_the_first_pixel():
 
 def test_times_are_the_boxs(tmp_path, rng):
     assert DomeImages(make(tmp_path / "s", rng)).times_s("C00", "L000") == (1.5, 1.5)
+
+
+def test_exposures_of_a_moving_subject_stay_apart(tmp_path, rng):
+    images = DomeImages(make(tmp_path / "s", rng), merge=False)
+    assert images.captures == (("L000", 0), ("L000", 1))
+    long, short = (images.image("C00", "L000", k) for k in (0, 1))
+    assert not long.valid.any()  # green is saturated
+    assert short.valid.all()
+    assert short.rgb[..., 1].mean() == pytest.approx(RATE[1], rel=0.02)
