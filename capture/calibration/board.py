@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeAlias
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from capture.calibration.record import CalibrationError
 
@@ -37,6 +38,8 @@ MARKER_SHARE = 0.75  # side of a marker over that of a square, as most boards ar
 LEAST_CORNERS = 6  # of a board in an image: fewer fix its place badly
 LEAST_IMAGES = 3
 REFINE_SHARE = 0.35  # half window of corner refinement over the distance of neighbours
+SIDE_SAMPLES = 17  # across each side of a marker
+SIDE_REACH = 0.45  # of a marker's bit, on both sides of its border
 REFINE_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
 
 
@@ -264,23 +267,72 @@ def find_markers(image: NDArray, dictionary: str, ids: Iterable[int]) -> Sightin
         None where fewer than two of the markers are found.
     """
     wanted = {number: k for k, number in enumerate(ids)}
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    parameters.cornerRefinementMaxIterations = 60
-    parameters.cornerRefinementMinAccuracy = 1e-3
     detector = cv2.aruco.ArucoDetector(
-        cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}")), parameters
+        cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}")),
+        cv2.aruco.DetectorParameters(),
     )
-    corners, found, _ = detector.detectMarkers(gray8(image))
-    rows = [
-        (4 * wanted[int(number)] + k, place)
-        for number, square in zip([] if found is None else np.ravel(found), corners, strict=True)
-        if int(number) in wanted
-        for k, place in enumerate(np.asarray(square, np.float64).reshape(4, 2))
-    ]
+    gray = gray8(image)
+    corners, found, _ = detector.detectMarkers(gray)
+    smooth = gray.astype(np.float64)
+    rows: list[tuple[int, FloatArray]] = []
+    for number, square in zip([] if found is None else np.ravel(found), corners, strict=True):
+        if int(number) in wanted:
+            places = _square_corners(smooth, np.asarray(square, np.float64).reshape(4, 2))
+            if places is not None:
+                rows += [(4 * wanted[int(number)] + k, place) for k, place in enumerate(places)]
     if len(rows) < 8:
         return None
     return Sighting(np.array([row[0] for row in rows]), np.array([row[1] for row in rows]))
+
+
+def _square_corners(gray: FloatArray, corners: FloatArray) -> FloatArray | None:
+    """Return a dark square's corners as the crossings of lines fitted to its four sides.
+
+    None where a side shows no clear edge.
+    """
+    along = np.linspace(0.12, 0.88, SIDE_SAMPLES)[:, None]
+    places = corners.copy()
+    for _ in range(2):
+        lines = []
+        middle = places.mean(axis=0)
+        cell = np.linalg.norm(np.diff(places, axis=0, append=places[:1]), axis=1).min() / 6
+        reach = max(SIDE_REACH * cell, 1.5)
+        steps = np.arange(-reach, reach + 0.125, 0.25)
+        for k in range(4):
+            a, b = places[k], places[(k + 1) % 4]
+            outward = np.array([b[1] - a[1], a[0] - b[0]]) / np.linalg.norm(b - a)
+            outward *= np.sign(outward @ (0.5 * (a + b) - middle))
+            start = a + along * (b - a)
+            at = start[:, None] + steps[:, None] * outward
+            profile = map_coordinates(gray, [at[..., 1], at[..., 0]], order=1, mode="nearest")
+            slope = np.clip(np.gradient(profile, axis=1), 0.0, None)  # brighter outside
+            slope -= 0.2 * slope.max(axis=1, keepdims=True)
+            slope = np.clip(slope, 0.0, None)
+            if not (slope.sum(axis=1) > 0).all():
+                return None
+            edge = start + (slope @ steps / slope.sum(axis=1))[:, None] * outward
+            lines.append(_line(edge))
+        places = np.array([_crossing(lines[k - 1], lines[k]) for k in range(4)])
+        if not np.isfinite(places).all() or np.abs(places - corners).max() > 2 * reach:
+            return None
+    return places
+
+
+def _line(points: FloatArray) -> FloatArray:
+    """Return a, b, c of the line a x + b y = c through points; the two farthest are dropped."""
+    for _ in range(2):
+        middle = points.mean(axis=0)
+        normal = np.linalg.svd(points - middle)[2][1]
+        off = np.abs((points - middle) @ normal)
+        points = points[np.argsort(off)[: max(len(points) - 2, 4)]]
+    return np.array([*normal, normal @ middle])
+
+
+def _crossing(a: FloatArray, b: FloatArray) -> FloatArray:
+    lines = np.array([a[:2], b[:2]])
+    if abs(np.linalg.det(lines)) < 1e-6:
+        return np.full(2, np.nan)
+    return np.asarray(np.linalg.solve(lines, [a[2], b[2]]))
 
 
 def calibrate_intrinsics(

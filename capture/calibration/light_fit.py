@@ -34,7 +34,7 @@ EXPONENT_PRIOR = 1.0
 NORMAL_PRIOR_RAD = 2e-3  # of the plate's normal as its markers show it
 GAIN_PRIOR = 0.2  # relative, of a camera's response
 VIGNETTING_PRIOR = 0.4
-FRAME_STDERR = 2e-3  # relative, of all parts of a frame: the LED's pulses, the plate's place
+FRAME_STDERR = 3e-3  # relative, of all parts of a frame: the LED's pulses, the plate's place
 PART_STDERR = (
     3e-3  # relative, of a part's mean: responses of pixels, form of the vignetting, cleanness
 )

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 
 from capture.calibration.board import Sighting, find_markers
 from capture.calibration.bundle import BoardPlace
@@ -169,6 +170,8 @@ class PlateWindow:
         share = (hit - low) / (high - low)
         cell = np.floor(share * CELLS).astype(np.int64)
         inside = (share >= 0).all(axis=-1) & (share < 1).all(axis=-1)
+        # a pixel is made of its neighbours, too: none of them may show a marker
+        inside = binary_erosion(inside, iterations=2)
         part = np.where(inside, cell[..., 1] * CELLS[0] + cell[..., 0], -1)
         number = part[inside]
         count = np.bincount(number, minlength=CELLS[0] * CELLS[1])
