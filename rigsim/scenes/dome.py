@@ -232,9 +232,11 @@ class DomeScene:
         """
         view = self._view(view_name)
         chosen = range(len(self.rig.lights)) if lights is None else lights
+        if len(chosen) == 1:  # the usual stream, one light after the other, is not copied
+            return self._render(view, chosen[0], self._instant(t_s))[None]
         out = np.empty((len(chosen), view.height_px, view.width_px, 3), np.float32)
         for k, light in enumerate(chosen):
-            out[k] = self._frame(view, light, t_s)
+            out[k] = self._render(view, light, self._instant(t_s))
         return out
 
     def exposure(
@@ -432,8 +434,6 @@ class DomeScene:
         return self._textures[camera]
 
     def _frame(self, view: View, light: int, t_s: float) -> Float32Array:
-        if not 0 <= light < len(self.rig.lights):
-            raise SceneError(f"light: got {light}, expected 0 to {len(self.rig.lights) - 1}")
         key = (view.name, light, self._instant(t_s))
         if key not in self._frames:
             # a capture comes back to each light in its next pass
@@ -451,22 +451,24 @@ class DomeScene:
         return round(t_s, 4)
 
     def _render(self, view: View, light: int, t_s: float) -> Float32Array:
+        if not 0 <= light < len(self.rig.lights):
+            raise SceneError(f"light: got {light}, expected 0 to {len(self.rig.lights) - 1}")
         shape = (view.height_px, view.width_px, 3)
         if isinstance(self.subject, Target) and self.subject.kind == "cap":
             return np.zeros(shape, np.float32)
         hits, caster = self._seen(view, t_s)
         lamp = self._lamp(light, t_s)
+        gain = np.float32(self.dome.gain.get(view.name, 1.0))
+        color = gain * self.intensity(light, view_name=view.name)
         glow = self._glow_of(view, light, t_s, hits)
         diffuse = not (self.subsurface and glow is not None)
         if hits.kind == olat.SKIN and caster.scene is not None:
             if (view.name, t_s) not in self._vector:
                 self._vector[view.name, t_s] = VectorLight(hits, caster)
-            image = self._vector[view.name, t_s].light_up(lamp, glow, diffuse=diffuse)
+            image = self._vector[view.name, t_s].light_up(lamp, color, glow, diffuse=diffuse)
         else:
             visible = olat.seen_from(hits, caster, lamp)
-            image = olat.light_up(hits, lamp, visible, glow, diffuse=diffuse)
-        image *= self.intensity(light, view_name=view.name)
-        image *= np.float32(self.dome.gain.get(view.name, 1.0))
+            image = olat.light_up(hits, lamp, visible, color, glow, diffuse=diffuse)
         return image
 
     def _glow_of(self, view: View, light: int, t_s: float, hits: Hits) -> Float32Array | None:

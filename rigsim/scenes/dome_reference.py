@@ -177,16 +177,18 @@ _INTEGRATORS: dict[Integrator, dict[str, Any]] = {
 }
 
 
-def describe(scene: PlainScene, view: View, integrator: Integrator) -> dict[str, Any]:
+def describe(
+    scene: PlainScene, view: View, integrator: Integrator, *, sampler: str = "independent"
+) -> dict[str, Any]:
     """Return Mitsuba's scene of a face in the dome, lit by a point of intensity 1 per steradian."""
     subject = _face(scene)
-    return _look(view) | {
+    return _look(view, sampler) | {
         "integrator": _INTEGRATORS[integrator],
         "face": {"type": "mesh", "mesh": subject.mesh, "bsdf": _skin(scene.surface(view), subject)},
     }
 
 
-def _look(view: View) -> dict[str, Any]:
+def _look(view: View, sampler: str = "independent") -> dict[str, Any]:
     """Return a scene with a camera and a point of intensity 1 per steradian."""
     return {
         "type": "scene",
@@ -197,6 +199,7 @@ def _look(view: View) -> dict[str, Any]:
             "near_clip": 1.0,
             "far_clip": 1e4,
             "to_world": look_at(view.position_mm, view.target_mm, view.up),
+            "sampler": {"type": sampler, "sample_count": 4},
             "film": {
                 "type": "hdrfilm",
                 "width": view.width_px,

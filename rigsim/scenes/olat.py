@@ -272,11 +272,11 @@ def lift(hits: Hits, caster: Caster) -> Float32Array:
 
 
 def sum_rows(
-    hits: Hits, red: Float32Array, green: Float32Array, blue: Float32Array
+    hits: Hits, red: Float32Array, green: Float32Array, blue: Float32Array, color: Float32Array
 ) -> Float32Array:
-    """Sum what rows send, shape (n,) each, into whole pixels, shape (H, W, 3)."""
+    """Sum what rows send, shape (n,) each, times a color, into whole pixels, shape (H, W, 3)."""
     out = np.zeros((hits.shape[0] * hits.shape[1], 3), np.float32)
-    share = np.float32(1.0 / hits.subpixels**2)
+    share = np.asarray(color, np.float32) / np.float32(hits.subpixels**2)
     _sum_rows(hits.pixel, hits.first, red, green, blue, share, out)
     return out.reshape(*hits.shape, 3)
 
@@ -285,6 +285,7 @@ def light_up(
     hits: Hits,
     lamp: Lamp,
     visible: NDArray[np.bool_],
+    color: Float32Array,
     glow: Float32Array | None = None,
     *,
     diffuse: bool = True,
@@ -299,18 +300,18 @@ def light_up(
         The light.
     visible
         Rows that see it, see `seen_from`.
+    color
+        Intensity on the light's axis, shape (3,), see `rigsim.led_light`.
     glow
-        What else leaves the interior of skin, before the boundary, in the unit of the result,
-        shape (n, 3).
+        What else leaves the interior of skin, before the boundary: pi times radiance for an
+        intensity of 1 mm^2, shape (n, 3).
     diffuse
         False leaves out skin's own diffuse term, for a glow that holds it.
 
     Returns
     -------
     ndarray of float32
-        Shape (H, W, 3): pi times radiance for an intensity of 1 mm^2 on the light's axis, averaged
-        over whole pixels; multiplied by the intensity it is what a white of reflectance 1 is
-        compared with.
+        Shape (H, W, 3), in full scales per second, averaged over whole pixels.
     """
     out = np.zeros((hits.shape[0] * hits.shape[1], 3), np.float32)
     extra = np.zeros((0, 3), np.float32) if glow is None else glow
@@ -319,7 +320,7 @@ def light_up(
     _shade(
         hits.pixel, hits.first, hits.position_mm, hits.normal, hits.surface, hits.camera_mm,
         hits.kind, center, axis, float(lamp.exponent), visible, extra, diffuse,
-        1.0 / hits.subpixels**2, out,
+        np.asarray(color, np.float64) / hits.subpixels**2, out,
     )  # fmt: skip
     return out.reshape(*hits.shape, 3)
 
@@ -343,9 +344,9 @@ def _sum_rows(pixel, first, red, green, blue, share, out):  # type: ignore[no-un
             r += red[i]
             g += green[i]
             b += blue[i]
-        out[pixel[p], 0] = share * r
-        out[pixel[p], 1] = share * g
-        out[pixel[p], 2] = share * b
+        out[pixel[p], 0] = share[0] * r
+        out[pixel[p], 1] = share[1] * g
+        out[pixel[p], 2] = share[2] * b
 
 
 @njit(cache=True, inline="always")
@@ -464,6 +465,6 @@ def _shade(  # type: ignore[no-untyped-def]
             red += gloss + inside * r0
             green += gloss + inside * r1
             blue += gloss + inside * r2
-        out[pixel[p], 0] = share * red
-        out[pixel[p], 1] = share * green
-        out[pixel[p], 2] = share * blue
+        out[pixel[p], 0] = share[0] * red
+        out[pixel[p], 1] = share[1] * green
+        out[pixel[p], 2] = share[2] * blue

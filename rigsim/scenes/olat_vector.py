@@ -53,13 +53,18 @@ class VectorLight:
         self._across, self._along = mi.Float(across), mi.Float(along)
 
     def light_up(
-        self, lamp: Lamp, glow: Float32Array | None = None, *, diffuse: bool = True
+        self,
+        lamp: Lamp,
+        color: Float32Array,
+        glow: Float32Array | None = None,
+        *,
+        diffuse: bool = True,
     ) -> Float32Array:
         """Trace shadow rays, shade and sum into pixels; see `rigsim.scenes.olat.light_up`.
 
         Parameters
         ----------
-        lamp, glow, diffuse
+        lamp, color, glow, diffuse
             As there.
 
         Returns
@@ -119,7 +124,7 @@ class VectorLight:
             rows = [row + leaving * light for row, light in zip(rows, columns, strict=True)]
         dr.eval(rows)
         r, g, b = (np.asarray(row.numpy(), np.float32) for row in rows)
-        return sum_rows(self.hits, r, g, b)
+        return sum_rows(self.hits, r, g, b, color)
 
 
 def _columns(rows: Float32Array) -> list[Float32Array]:
