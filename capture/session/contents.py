@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from capture.documents import Fault
-from capture.plan import PlanError
 from capture.session.disk import read_file
 from capture.session.errors import NotASession, SessionDamage, SessionError
 from capture.session.journal import AttachmentLine, CloseLine, FrameLine, Walk, walk
@@ -87,6 +86,7 @@ def read_contents(path: Path) -> Contents:
 def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
     """Note the first line that the plan does not allow: an unknown step, a frame twice."""
     seen: set[str] = set()
+    steps = {step.id: step for step in manifest.plan.steps}
     frames = 0
     for byte, line in walked.lines:
         if isinstance(line, CloseLine):
@@ -98,12 +98,11 @@ def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
             got, good, expected = line.file, line.file not in seen, "each frame once"
             seen.add(line.file)
             frames += 1
-            try:
-                step = manifest.plan.step(line.step)
-                if line.camera not in step.cameras:
-                    got, good, expected = line.camera, False, f"one of {', '.join(step.cameras)}"
-            except PlanError:
+            step = steps.get(line.step)
+            if step is None:
                 got, good, expected = line.step, False, "a step of the plan"
+            elif line.camera not in step.cameras:
+                got, good, expected = line.camera, False, f"one of {', '.join(step.cameras)}"
         if not good:
             damage = SessionDamage(
                 "does not fit the plan",
