@@ -360,7 +360,8 @@ class Port:
                 self.url,
                 baudrate=self._baudrate,
                 timeout=READ_SLICE_S,
-                write_timeout=self._timeout_s,
+                # pyserial's RFC 2217 client refuses one; its socket's own time limits then hold
+                write_timeout=None if self.url.startswith("rfc2217://") else self._timeout_s,
                 exclusive=True,
             )
         except ValueError as exc:

@@ -1,11 +1,16 @@
 """Worlds, and the same box and camera behind every transport."""
 
+import contextlib
 import dataclasses
 import itertools
+import socket
+import threading
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import serial
+from serial import rfc2217
 
 from capture.devices.camera import open_camera
 from capture.devices.flash import FlashBox
@@ -50,7 +55,64 @@ def rig():
     return quick_rig()
 
 
-@pytest.fixture(params=["sim", "pty", "tcp"])
+class Gateway:
+    """A serial port handed on over RFC 2217, as terminal servers do, by pyserial's server half."""
+
+    def __init__(self, url):
+        self.port = serial.serial_for_url(url, timeout=0.005)
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.address = f"rfc2217://127.0.0.1:{self.listener.getsockname()[1]}"
+        self.closing = threading.Event()
+        self.thread = threading.Thread(target=self.run, daemon=True)
+        self.thread.start()
+
+    def run(self):
+        while not self.closing.is_set():
+            with contextlib.suppress(OSError):
+                client, _ = self.listener.accept()
+                with client:
+                    self.serve(client)
+
+    def serve(self, client):
+        client.settimeout(0.002)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        lock = threading.Lock()
+
+        def write(data):
+            with lock:
+                client.sendall(data)
+
+        telnet = rfc2217.PortManager(self.port, SimpleNamespace(write=write))
+        while not self.closing.is_set():
+            with contextlib.suppress(TimeoutError):
+                data = client.recv(4096)
+                if not data:
+                    return
+                self.port.write(b"".join(telnet.filter(data)))
+            waiting = self.port.read(4096)
+            if waiting:
+                write(b"".join(telnet.escape(waiting)))
+
+    def close(self):
+        self.closing.set()
+        with contextlib.suppress(OSError):
+            socket.create_connection(self.listener.getsockname()).close()
+        self.thread.join(5.0)
+        self.listener.close()
+        self.port.close()
+
+
+RFC2217 = pytest.param(
+    "rfc2217",
+    marks=[
+        pytest.mark.long,
+        # pyserial's own client
+        pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning"),
+    ],
+)
+
+
+@pytest.fixture(params=["sim", "pty", "tcp", RFC2217])
 def bench(request, rig):
     """A world with a box and a camera behind one transport; closes what it opened."""
     if request.param == "sim":
@@ -62,6 +124,11 @@ def bench(request, rig):
         return
     world = World(rig, seed=5, clock="real", scene=Photometer(rig), faults=Faults(baud=0.0))
     with serve(rig, world=world, pty=request.param == "pty") as served:
+        if request.param == "rfc2217":
+            with contextlib.closing(Gateway(served.addresses["flash"])) as gateway:
+                addresses = {**served.addresses, "flash": gateway.address}
+                yield from _bench(world, addresses, request.param)
+            return
         yield from _bench(world, served.addresses, request.param)
 
 

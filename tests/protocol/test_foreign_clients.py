@@ -1,10 +1,13 @@
-"""Programs that know nothing of us talk to what is served: bash, and PyVISA."""
+"""Programs that know nothing of us talk to what is served: bash, PyVISA and serialx."""
 
 import shutil
 import subprocess
 
 import pytest
+import serial
 
+from capture.devices.flash import FlashBox
+from capture.devices.port import Port
 from rigsim.serve import ServeError, serve
 from rigsim.world import World
 
@@ -55,6 +58,39 @@ def test_pyvisa_asks_and_is_refused_a_bare_command(served):
     assert box.query("SYST:CAP?").startswith('{"kind":"flash"')
     box.close()
     manager.close()
+
+
+def test_serialx_asks_and_is_refused_a_bare_command(served):
+    serialx = pytest.importorskip("serialx")
+    with serialx.serial_for_url(served.addresses["flash"], baudrate=115_200, timeout=5.0) as box:
+
+        def query(text):
+            box.write(text + b"\r\n")
+            return box.readline().decode().rstrip()
+
+        assert query(b"*IDN?") == IDN
+        box.write(b"FLAS:FIRE a\n")
+        assert [query(b"SYST:ERR?"), query(b"FLAS:COUN?")] == ANSWERS[1:]
+    assert served.world.pops == []
+
+
+def test_the_driver_works_on_serialx_in_place_of_pyserial(served, monkeypatch):
+    """The six methods that a port uses are the same there, so that a change is one file's."""
+    serialx = pytest.importorskip("serialx")
+
+    def serial_for_url(url, **settings):
+        port = serialx.serial_for_url(url, **settings)
+        port.open()  # pyserial's has done so
+        return port
+
+    monkeypatch.setattr(serial, "serial_for_url", serial_for_url)
+    with FlashBox(Port(served.addresses["flash"])) as box:
+        assert box.identify() == IDN
+        box.wait_charged(5.0)
+        box.arm()
+        assert box.fire("serialx").count == 1
+        assert box.port.statistics.retries == 0
+    assert [pop.token for pop in served.world.pops] == ["serialx"]
 
 
 def test_served_addresses_name_boxes_first(rig):

@@ -1,6 +1,11 @@
 """Whatever bytes arrive, a box lights nothing by them and a driver raises only its own errors."""
 
+import importlib.util
+import re
 import string
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -100,6 +105,29 @@ def test_framed_nonsense_is_answered_once_and_lights_only_an_armed_box(box, rng)
     chance = 0.25 * len(IN_ANY_STATE) / len(COMMANDS)
     deviation = np.sqrt(rounds * chance * (1.0 - chance))
     assert accepted > rounds * chance - 5.0 * deviation
+
+
+@pytest.mark.long
+@pytest.mark.timeout(240)
+@pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="atheris is not installed")
+def test_a_minute_of_fuzzing_guided_by_coverage_breaks_nothing(tmp_path):
+    """60 s of atheris on the box, beginning from its own commands."""
+    for number, command in enumerate(COMMANDS):
+        text = bytes((ord(letter) - 0x20) % 0x5F for letter in command)
+        (tmp_path / f"{number:02d}").write_bytes(b"\x01" + text)
+    arm = b"\x01" + bytes(ord(letter) - 0x20 for letter in "SYST:ARM")
+    fire = b"\x01" + bytes(ord(letter) - 0x20 for letter in "FLAS:FIRE a")
+    (tmp_path / "armed").write_bytes(arm + b"\n" + fire)
+    harness = Path(__file__).with_name("box_harness.py")
+    run = subprocess.run(
+        [sys.executable, str(harness), "-max_total_time=60", "-timeout=10", "-seed=1",
+         f"-artifact_prefix={tmp_path}/crash-", str(tmp_path)],
+        capture_output=True, text=True, timeout=200, check=False, cwd=tmp_path,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr[-3000:]
+    runs = int(re.findall(r"Done (\d+) runs", run.stderr)[-1])
+    print(f"{runs} inputs in 60 s")
+    assert runs > 1000
 
 
 class Babbler:
