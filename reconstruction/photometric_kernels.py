@@ -19,7 +19,8 @@ SHARED, PER_POINT, NEAR = 0, 1, 2
 """How light vectors are given: one a light, one a light and point, or positions."""
 
 # Row of the table of settings, which carries them in the type of the data.
-SHADOW, GRAZING, TUKEY, TOLERANCE, FLOOR, L1_SOFT, MIN_SPREAD, BRIGHT_PART = range(8)
+SHADOW, GRAZING, TUKEY, TOLERANCE, FLOOR, L1_SOFT = 0, 1, 2, 3, 4, 5
+MIN_SPREAD, BRIGHT_PART, DARK_SIGMAS, DARK_FIT, LEAST_SHARE = 6, 7, 8, 9, 10
 # Rows of the table of results.
 NX, NY, NZ, ALBEDO, RESIDUAL, STDERR, STDERR_ALBEDO, USED, SCALE = range(9)
 ROWS = 9
@@ -28,6 +29,8 @@ ROWS = 9
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 _FASTER = _FAST | {"nnan", "ninf"}  # where nothing but finite numbers can come
 TUKEY_EFFICIENCY = 0.95  # of the biweight with c = 4.685 at the normal distribution
+VAGUE_RAD = 0.5
+"""Standard error from which a signal drowns in its noise."""
 _MAD = 0.6744897501960817  # median of |x| of the unit normal distribution
 _BISECTIONS = 10
 
@@ -173,13 +176,14 @@ def _noise(q, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _moments(x, y, z, v, s, e, b0, b1, b2, per_reach2, least, sums):  # type: ignore[no-untyped-def]
+def _moments(x, y, z, v, s, e, m, b0, b1, b2, per_reach2, least, sums):  # type: ignore[no-untyped-def]
     """Sum what the standard errors need over the samples with weight; return their number."""
     zero, one, five = x.dtype.type(0.0), x.dtype.type(1.0), x.dtype.type(5.0)
     xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero
     dxx, dxy, dxz, dyy, dyz, dzz = zero, zero, zero, zero, zero, zero
     txx, txy, txz, tyy, tyz, tzz = zero, zero, zero, zero, zero, zero
-    used, psi2, slope, slope2, raw2, e2 = zero, zero, zero, zero, zero, zero
+    used, bright, agrees = zero, zero, zero
+    psi2, slope, slope2, raw2, e2 = zero, zero, zero, zero, zero
     for k in range(x.size):
         xk, yk, zk, sk = x[k], y[k], z[k], s[k]
         fit = xk * b0 + yk * b1 + zk * b2
@@ -187,6 +191,8 @@ def _moments(x, y, z, v, s, e, b0, b1, b2, per_reach2, least, sums):  # type: ig
         t = one - r * r * per_reach2
         lit = (sk > zero) & (fit > least * sk) & (t > zero)
         w = one if lit else zero
+        bright += m[k]
+        agrees += m[k] * w
         # directions without strength: of unit length
         per = w / (sk * sk if lit else one)
         wx, wy, wz = w * xk, w * yk, w * zk
@@ -221,24 +227,25 @@ def _moments(x, y, z, v, s, e, b0, b1, b2, per_reach2, least, sums):  # type: ig
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = xx, xy, xz, yy, yz, zz
     sums[6], sums[7], sums[8], sums[9], sums[10], sums[11] = dxx, dxy, dxz, dyy, dyz, dzz
     sums[12], sums[13], sums[14], sums[15], sums[16] = psi2, slope, slope2, raw2, e2
+    sums[23], sums[24] = bright, agrees
     sums[17], sums[18], sums[19], sums[20], sums[21], sums[22] = txx, txy, txz, tyy, tyz, tzz
     return int(used)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _finish(  # type: ignore[no-untyped-def]
-    x, y, z, v, s, e, b0, b1, b2, scale, known, robust, settings, sums, out,
+    x, y, z, v, s, e, m, b0, b1, b2, scale, above, known, robust, settings, sums, out,
 ):  # fmt: skip
     """Write normal, albedo, residual and standard errors of one point; False where it has none."""
     kind = x.dtype.type
     length = math.sqrt(float(b0) * b0 + float(b1) * b1 + float(b2) * b2)
     if not (length > 0.0 and length < math.inf):
         return False
-    least = settings[GRAZING] * kind(length) if robust else -kind(math.inf)
+    least = max(settings[GRAZING] * kind(length), above) if robust else -kind(math.inf)
     reach = settings[TUKEY] * scale
     per_reach2 = kind(1.0) / (reach * reach) if robust and reach > kind(0.0) else kind(0.0)
-    used = _moments(x, y, z, v, s, e, b0, b1, b2, per_reach2, least, sums)
-    if used < 3:
+    used = _moments(x, y, z, v, s, e, m, b0, b1, b2, per_reach2, least, sums)
+    if used < 3 or (robust and sums[24] < float(settings[LEAST_SHARE]) * sums[23]):
         return False
     xx, xy, xz, yy, yz, zz = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     dxx, dxy, dxz, dyy, dyz, dzz = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11]
@@ -305,8 +312,10 @@ def _finish(  # type: ignore[no-untyped-def]
     if variance < math.inf:
         angle = math.sqrt(variance * across) / length
         error = math.sqrt(variance * max(along, 0.0))
-        if angle > 1.0:  # the signal drowns in its noise
+        if angle > VAGUE_RAD:
             return False
+    elif free > 0:
+        return False
     out[NX], out[NY], out[NZ] = nx, ny, nz
     out[ALBEDO] = length
     out[RESIDUAL] = math.sqrt(raw2 / used)
@@ -351,8 +360,18 @@ def _fit_point(  # type: ignore[no-untyped-def]
         for _ in range(2):  # the second step refines the digits of the first
             d0, d1, d2 = _step_squares(x, y, z, v, m, b0, b1, b2)
             b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
-        return _finish(x, y, z, v, s, e, b0, b1, b2, one, known, False, settings, sums, out)
+        return _finish(
+            x, y, z, v, s, e, m, b0, b1, b2, one, zero, known, False, settings, sums, out
+        )
     dark = settings[SHADOW] * bright
+    # samples below zero are noise around a shadow, and as much of it lies above
+    below, negative = 0, zero
+    for k in range(x.size):
+        if m[k] > zero and q[k] < zero:
+            below += 1
+            negative += q[k] * q[k]
+    if below > 0:
+        dark = max(dark, settings[DARK_SIGMAS] * kind(math.sqrt(negative / kind(below))))
     lit = 0
     for k in range(x.size):
         m[k] = one if q[k] > dark else zero
@@ -374,10 +393,12 @@ def _fit_point(  # type: ignore[no-untyped-def]
     floor = settings[FLOOR] * bright * total / kind(lit)
     if known:
         floor = max(floor, one)
+    # what the fit itself sees near the dark may be a shadow as well
+    above = settings[DARK_FIT] * dark
     scale = one
     for step in range(steps):
         length = kind(math.sqrt(b0 * b0 + b1 * b1 + b2 * b2))
-        least = settings[GRAZING] * length
+        least = max(settings[GRAZING] * length, above)
         if step % 2 == 0 and step < 4:
             count = _residuals(x, y, z, v, s, m, b0, b1, b2, least, q)
             scale = max(_noise(q, count), floor)
@@ -386,7 +407,7 @@ def _fit_point(  # type: ignore[no-untyped-def]
         b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
         if step > 2 and d0 * d0 + d1 * d1 + d2 * d2 < near * (b0 * b0 + b1 * b1 + b2 * b2):
             break
-    return _finish(x, y, z, v, s, e, b0, b1, b2, scale, known, True, settings, sums, out)
+    return _finish(x, y, z, v, s, e, m, b0, b1, b2, scale, above, known, True, settings, sums, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -419,7 +440,7 @@ def fit_points(  # type: ignore[no-untyped-def]
     s = np.zeros((BLOCK, lanes), out.dtype)
     x, y, z = np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype)
     q, m, e = np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype), np.zeros(lanes, out.dtype)
-    sums = np.empty(23, np.float64)
+    sums = np.empty(25, np.float64)
     for start in range(0, count, BLOCK):
         size = min(BLOCK, count - start)
         for k in range(lights):

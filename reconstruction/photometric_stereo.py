@@ -30,6 +30,8 @@ __all__ = [
 Floating = NDArray[np.floating]
 
 TILE_POINTS = 8192
+LEAST_SHARE = 0.5
+"""Of the samples that are not dark, how many must agree with a robust fit."""
 FLATTEST = 3e-3
 """Least over largest singular value of the light directions, below which they lie in a plane."""
 
@@ -163,7 +165,7 @@ def estimate_normals(
     settings = np.array(
         [
             chosen.shadow, chosen.grazing, chosen.tuning, 1e-3,
-            1e-6 if kind is np.float32 else 1e-13, 0.01, 1e-5, 1 / 8,
+            1e-6 if kind is np.float32 else 1e-13, 0.01, 1e-5, 1 / 8, 3.0, 1.5, LEAST_SHARE,
         ],
         kind,
     )  # fmt: skip

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from skinrig import bench_chromophores, bench_flash, bench_tissue
+from skinrig import bench_chromophores, bench_flash, bench_photometric, bench_tissue
 from skinrig.benchmark import StageBenchmark, to_document
 from skinrig.console import Console, plain
 
@@ -17,6 +17,7 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "render-flash": bench_flash.render,
     "layered-reflectance": bench_tissue.layered_reflectance,
     "color-table": bench_tissue.table,
+    "normals": bench_photometric.normals,
 }
 
 

@@ -109,10 +109,11 @@ def test_directions_a_point_and_near_lights_equal_each_other(rng):
 
 def reference_irls(lights, samples, *, shadow=0.1, steps=16, ends=8, tuning=4.685, grazing=0.05):
     """Fit one point as the kernel does, in plain NumPy."""
-    lit = (
-        samples > shadow * np.sort(samples)[::-1][min(len(samples), max(4, len(samples) // 8)) - 1]
-    )
-    soft = 0.01 * np.sort(samples)[::-1][min(len(samples), max(4, len(samples) // 8)) - 1]
+    bright = np.sort(samples)[::-1][min(len(samples), max(4, len(samples) // 8)) - 1]
+    dark = shadow * bright
+    if (samples < 0).any():
+        dark = max(dark, 3.0 * np.sqrt(np.mean(samples[samples < 0] ** 2)))
+    lit, soft = samples > dark, 0.01 * bright
     b = np.linalg.lstsq(lights[lit], samples[lit])[0]
     for _ in range(steps):
         w = 1.0 / np.maximum(np.abs(samples[lit] - lights[lit] @ b), soft)
@@ -121,7 +122,7 @@ def reference_irls(lights, samples, *, shadow=0.1, steps=16, ends=8, tuning=4.68
         )
     for step in range(ends):
         fit = lights @ b
-        seen = fit > grazing * np.linalg.norm(b)
+        seen = fit > max(grazing * np.linalg.norm(b), 1.5 * dark)
         r = samples - fit
         if step in (0, 2):
             free = np.sort(np.abs(r[seen & lit]))[3:]
