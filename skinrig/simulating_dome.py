@@ -34,7 +34,7 @@ def simulate_dome(order: Order) -> Simulated:
         views=order.views or VIEWS[order.size],
         width_px=order.width_px or WIDTHS_PX[order.size],
     )
-    plan = _plan(rig, order.target)
+    plan = _plan(rig, order.target, order.size)
     figures = light_figures(plan, rig)
     if order.progress is not None:
         for line in light_lines(plan, rig):
@@ -138,14 +138,15 @@ def spread(places: np.ndarray[Any, Any], count: int) -> list[int]:
     return chosen
 
 
-def _plan(rig: Rig, target: str | None) -> Plan:
+def _plan(rig: Rig, target: str | None, size: str) -> Plan:
     if target is None:
         return dome_plan(rig, tracking_every=TRACKING_EVERY)
-    from rigsim.scenes.dome_targets import PLACES
+    from rigsim.scenes.dome_targets import PLACES, plate_normals
 
+    few = {"charuco": 10, "mirror": 3, "white": 3} if size == "small" else PLACES
     return dome_calibration_plan(
-        rig, cast(DomeTarget, target), poses=PLACES["charuco"], spheres=PLACES["mirror"],
-        plates=PLACES["white"],
+        rig, cast(DomeTarget, target), poses=few["charuco"], spheres=few["mirror"],
+        plates=few["white"], plate_normals=plate_normals(),
     )  # fmt: skip
 
 

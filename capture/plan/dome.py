@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal, get_args
 
@@ -23,6 +24,13 @@ TRACKING_EVERY = 25
 TRACKING_LIGHTS = 6
 TRACKING_FLOOR = 0.25
 """Least light of a tracking frame at the eyes, of the brightest single light."""
+LEAST_COSINE = 0.15
+"""Lights that meet a plate flatter than this tell nothing of it."""
+OUTLINE_LIGHTS = 24
+MIRROR_GROUP = 8
+"""Lights that are on together to show a sphere's outline, and in a sphere."""
+MIRROR_LEVEL = 0.002
+"""Of these: a sphere shows the radiance of an LED, thousands of times that of a lit white."""
 LEVEL_STEPS = 1000
 """The box sets an LED's level in so many steps."""
 
@@ -106,6 +114,7 @@ def dome_calibration_plan(
     poses: int = 14,
     spheres: int = 4,
     plates: int = 7,
+    plate_normals: Sequence[Sequence[float]] | None = None,
     darks: int = 2,
     level: float = 1.0,
     iso: int = 100,
@@ -118,17 +127,21 @@ def dome_calibration_plan(
         A dome.
     target : {"charuco", "mirror", "white", "dark"}
         "charuco": a board in ``poses`` poses, each lit by several lights at the first exposure;
-        "mirror": a mirror sphere at ``spheres`` places, each lit by every light at the last
-        exposure; "white": a white plate in ``plates`` poses (no pose faces all lights), each lit by
-        every light at the first exposure; "dark": ``8 * darks`` frames with the caps on, at every
+        "mirror": a mirror sphere at ``spheres`` places, each once before the lit dome, for its
+        outline, and then lit by groups of lights, faintly, at the last exposure: what it shows are
+        the lights themselves; "white": a white plate in ``plates`` poses (no pose faces all
+        lights), each once lit by several lights, for its markers, and then by every light at the
+        first exposure; "dark": ``8 * darks`` frames with the caps on, at every
         exposure.
     exposures_s : sequence of float
         As for `dome_plan`.
     poses, spheres, plates : int
         Poses of the board, places of the sphere and poses of the plate, >= 1; a person moves them
         in between.
+    plate_normals : sequence of (3,), optional
+        About where the plate's front looks in each pose: lights behind it are left out.
     darks : int
-        Frames with no light at the exposure in use, >= 0.
+        Frames with no light at the exposure in use, >= 0; none for the mirror.
     level, iso
         As for `dome_plan`.
 
@@ -137,7 +150,7 @@ def dome_calibration_plan(
     >>> from capture.rig import load_rig
     >>> plan = dome_calibration_plan(load_rig("dome"), "mirror", spheres=2)
     >>> plan.steps[-1].kind, dict(plan.steps[-1].index)["sphere"], len(plan.steps)
-    ('mirror', 1, 302)
+    ('mirror', 1, 40)
     """
     targets = get_args(DomeTarget)
     require(target in targets, "target", target, f"one of {', '.join(targets)}")
@@ -154,19 +167,27 @@ def dome_calibration_plan(
         for pose in range(poses):
             series.several(f"P{pose:02d}", "charuco", {"pose": pose}, exposures_s[0], level)
         return series.plan()
-    # a mirror shows the lights themselves, a white plate shows less than full scale
-    exposure = len(exposures_s) - 1 if target == "mirror" else 0
-    series.darks(darks, exposures_s[exposure], exposure)
     order = best_order(rig, dwell_s=series.dwell_s)
-    places, word = (spheres, "sphere") if target == "mirror" else (plates, "pose")
-    for place in range(places):
+    if target == "mirror":
+        series.mirrors(spheres, order, exposures_s)
+        return series.plan()
+    series.darks(darks, exposures_s[0], 0)
+    for pose in range(plates):
+        series.several(f"W{pose}-markers", "white", {"pose": pose, "light": "several"},
+                       exposures_s[0], level)  # fmt: skip
+        normal = None if plate_normals is None else plate_normals[pose]
         for light in order:
             name = rig.lights[light].name
-            series.add(
-                f"{target[0].upper()}{place}-{name}", target, {word: place, "light": name},
-                exposures_s[exposure], light=name, level=level,
-            )  # fmt: skip
+            if normal is None or _cosine(rig.lights[light].position_mm, normal) > LEAST_COSINE:
+                series.add(
+                    f"W{pose}-{name}", "white", {"pose": pose, "light": name}, exposures_s[0],
+                    light=name, level=level,
+                )  # fmt: skip
     return series.plan()
+
+
+def _cosine(a: Sequence[float], b: Sequence[float]) -> float:
+    return float(np.dot(a, b) / (np.linalg.norm(a) * np.linalg.norm(b)))
 
 
 def tracking_lights(rig: Rig) -> list[int]:
@@ -262,12 +283,37 @@ class _Series:
         """Add a step lit by the tracking lights together; ``level`` is cut to what one may give."""
         limits = self._limits
         most = min(1.0, limits.max_duty * limits.duty_window_s / self.dwell_s)
-        if kind == "charuco":  # together as bright as one light alone
+        if kind != "tracking":  # together as bright as one light alone
             level = level / len(self._tracking)
         level = min(most, max(1.0, np.ceil(LEVEL_STEPS * level)) / LEVEL_STEPS)
         names = "+".join(self._rig.lights[k].name for k in self._tracking)
         index = index if number is None else {**index, "pass": number}
         self.add(identity, kind, index, exposure_s, leds=names, level=float(level))
+
+    def mirrors(self, count: int, order: Sequence[int], exposures_s: Sequence[float]) -> None:
+        """Add the steps of mirror spheres: outlines by the lit dome, then lights by groups.
+
+        The lights of a group are far apart in the order, and so on the dome and in the sphere.
+        """
+        some = max(1, math.ceil(len(order) / min(OUTLINE_LIGHTS, self._limits.max_at_once)))
+        groups = math.ceil(len(order) / min(MIRROR_GROUP, self._limits.max_at_once))
+        for sphere in range(count):
+            self._lit(f"M{sphere}-outline", {"sphere": sphere, "light": "outline"},
+                      order[::some], exposures_s[0], 1.0)  # fmt: skip
+            for group in range(groups):
+                self._lit(f"M{sphere}-{group:02d}", {"sphere": sphere, "light": f"group {group}"},
+                          order[group::groups], exposures_s[-1], MIRROR_LEVEL)  # fmt: skip
+
+    def _lit(
+        self,
+        identity: str,
+        index: dict[str, str | int | float],
+        lights: Sequence[int],
+        exposure_s: float,
+        level: float,
+    ) -> None:
+        names = "+".join(self._rig.lights[k].name for k in lights)
+        self.add(identity, "mirror", index, exposure_s, leds=names, level=level)
 
     def plan(self) -> Plan:
         limits = self._limits

@@ -49,14 +49,15 @@ BOARD_PLACES: Final = (
 """Azimuth and elevation of the front's normal, turn in its plane (degrees), middle (mm)."""
 
 PLATE_PLACES: Final = (
-    (0, 15, 0, 0, 0, 0),
-    (60, 25, 0, 0, 0, 0),
-    (-60, 25, 0, 0, 0, 0),
-    (25, -35, 90, 0, 0, 0),
+    (0, 20, 0, 0, 0, 0),
+    (70, 20, 0, 0, 0, 0),
+    (-70, 20, 0, 0, 0, 0),
+    (20, -35, 90, 0, 0, 0),
     (-30, 55, 90, 0, 0, 0),
-    (110, 10, 0, 0, 0, 0),
-    (-110, 10, 0, 0, 0, 0),
+    (105, 5, 0, 0, 0, 0),
+    (-105, 5, 0, 0, 0, 0),
 )
+"""The same of the white plate; the first three face most lights."""
 
 BALL_PLACES: Final = (
     (-85.0, 45.0, 30.0),
@@ -374,6 +375,15 @@ def target_scene(kind: Kind, rig: Rig, *, seed: int, dome: BuiltDome | None = No
     TargetScene
     """
     return TargetScene(kind, dome or build(rig, seed=seed), seed=seed)
+
+
+def plate_normals() -> list[tuple[float, float, float]]:
+    """Return where the white plate's front looks in each place, before the operator's hand."""
+    out = []
+    for azimuth, elevation in np.radians([place[:2] for place in PLATE_PLACES]):
+        x, z = math.cos(elevation) * math.sin(azimuth), math.cos(elevation) * math.cos(azimuth)
+        out.append((x, math.sin(elevation), z))
+    return out
 
 
 def board(kind: Literal["charuco", "white"]) -> Plate:
