@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, ClassVar, Self
 
@@ -13,7 +14,45 @@ from .port import BadAnswer, DeviceError, Hello, Port, WrongDevice
 
 log = logging.getLogger(__name__)
 
-__all__ = ["Box"]
+__all__ = ["Box", "BoxStatus"]
+
+
+@dataclass(frozen=True, slots=True)
+class BoxStatus:
+    """The bits of ``STAT?`` that all boxes share."""
+
+    bits: int
+    """Their sum."""
+
+    @property
+    def armed(self) -> bool:
+        """Whether light is allowed."""
+        return bool(self.bits & 1)
+
+    @property
+    def tripped(self) -> bool:
+        """Whether the lease ran out since the box was last armed."""
+        return bool(self.bits & 2)
+
+    @property
+    def errors_waiting(self) -> bool:
+        """Whether `Box.errors` would find something."""
+        return bool(self.bits & 4)
+
+    @property
+    def lit(self) -> bool:
+        """Whether a lamp is on."""
+        return bool(self.bits & 64)
+
+    @property
+    def too_hot(self) -> bool:
+        """Whether a lamp's driver has tripped."""
+        return bool(self.bits & 128)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the emergency stop is open."""
+        return bool(self.bits & 256)
 
 
 class Box:

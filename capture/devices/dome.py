@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from . import wire
-from .box import Box
+from .box import Box, BoxStatus
 from .port import Port
 
 __all__ = ["DomeBox", "DomeStatus", "Eyes", "Judgment", "Position", "TableRow"]
@@ -82,42 +82,15 @@ class Position:
     """Name of the run; empty when there is none."""
 
 
-@dataclass(frozen=True, slots=True)
-class DomeStatus:
-    """The bits of ``STAT?``."""
+class DomeStatus(BoxStatus):
+    """The bits of ``STAT?``; what is lit or too hot is an LED."""
 
-    bits: int
-    """Their sum."""
-
-    @property
-    def armed(self) -> bool:
-        """Whether light is allowed."""
-        return bool(self.bits & 1)
-
-    @property
-    def tripped(self) -> bool:
-        """Whether the lease ran out since the box was last armed."""
-        return bool(self.bits & 2)
+    __slots__ = ()
 
     @property
     def running(self) -> bool:
         """Whether a sequence is stepping."""
         return bool(self.bits & 16)
-
-    @property
-    def lit(self) -> bool:
-        """Whether an LED is on."""
-        return bool(self.bits & 64)
-
-    @property
-    def too_hot(self) -> bool:
-        """Whether an LED's driver has tripped."""
-        return bool(self.bits & 128)
-
-    @property
-    def stopped(self) -> bool:
-        """Whether the emergency stop is open."""
-        return bool(self.bits & 256)
 
     @property
     def eyes_safe(self) -> bool:
