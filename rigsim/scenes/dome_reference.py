@@ -11,7 +11,7 @@ import dataclasses
 import math
 import time
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -26,30 +26,32 @@ from rigsim.surface_brdf import ETA_OIL, OIL_SMOOTHING, SkinSurface
 
 Integrator = Literal["path", "direct"]
 
-SAMPLES: Final = 4
-"""Rays in a pixel of all three ways that are timed."""
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One way to render the dome's lights one by one."""
+
+    seconds: float
+    """A light, s; of ours with its share of the first look, which serves all lights of the rig."""
+    error: float
+    """Root mean square error over all images, relative to their mean."""
+    mean_ratio: float
+    """Mean of its images over that of the reference."""
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Seconds and errors of three ways to render one view of the dome."""
+    """Three ways to render one view of the dome, with as many rays in a pixel."""
 
-    lights: int
-    """Lights that Mitsuba rendered; ours rendered all."""
-    ours_s: float
-    """Seconds a light, the first look at the geometry shared out among them."""
-    path_s: float
-    """Seconds a light of Mitsuba's path tracer."""
-    direct_s: float
-    """Seconds a light of Mitsuba's direct integrator."""
-    ours_error: float
-    """Relative root mean square error over all images."""
-    path_error: float
-    """The same for the path tracer."""
-    direct_error: float
-    """The same for the direct integrator."""
-    mean_ratio: float
-    """Mean of the path tracer's images over that of the reference: 1 but for noise."""
+    ours: Way
+    path: Way
+    """Mitsuba's path tracer, direct light alone."""
+    direct: Way
+    """Mitsuba's direct integrator, which samples the light alone."""
+
+    def speed_up(self, way: Way) -> float:
+        """How many times faster ours is for no more noise; noisier is counted by its square."""
+        return way.seconds / self.ours.seconds * min(1.0, (way.error / self.ours.error) ** 2)
 
 
 def plain_face(preset: str = "III", *, seed: int = 0, size: int = 512) -> Subject:
@@ -78,75 +80,82 @@ class PlainScene(DomeScene):
 
 
 def compare(
-    *, width_px: int, lights: int, subpixels: int = 2, fine: int = 8, seed: int = 0
+    *,
+    width_px: int,
+    lights: int,
+    subpixels: int = 2,
+    fine: int = 6,
+    rounds: int = 2,
+    sampler: str = "stratified",
 ) -> Comparison:
-    """Render one view of the dome in three ways.
+    """Render one view of the dome in three ways, light after light.
 
     Parameters
     ----------
     width_px
         Width of the images.
     lights
-        How many of the dome's lights Mitsuba renders, spread over the dome; ours renders all 150,
-        and is judged on the same.
+        How many of the dome's lights are rendered, spread over the dome.
     subpixels
         Rays along each side of our pixels; Mitsuba gets as many samples.
     fine
         Rays along each side of the reference's pixels.
-    seed
-        Of Mitsuba's sampler.
+    rounds
+        Times that everything is rendered; the fastest counts.
+    sampler
+        Mitsuba's; "stratified" is its least noisy one here, "independent" its default.
 
     Returns
     -------
     Comparison
-        Best of two alternating runs; compiling and building of meshes are done before.
+        All three take turns at each light. Compiling, parsing and building of meshes are done
+        before and not counted; tracing our camera rays is.
     """
     rig = point_rig(load_rig("dome").resized(width_px).subset(views=["C02"]))
-    view = rig.views[0]
-    face = plain_face()
+    view, face = rig.views[0], plain_face()
     chosen = [int(k) for k in np.linspace(0, len(rig.lights) - 1, lights).round()]
-    truth = PlainScene(rig, face, subpixels=fine)
-    reference = np.stack([_per_steradian(truth, k) for k in chosen])
-    scene = PlainScene(rig, face, subpixels=subpixels)
-    scene.radiance(view.name, [0])
-    theirs = {name: MovedLight(describe(truth, view, name), kind="rgb") for name in _INTEGRATORS}
+    fine_scene = PlainScene(rig, face, subpixels=fine)
+    reference = np.stack([_per_steradian(fine_scene, k) for k in chosen])
+    theirs = {
+        name: MovedLight(describe(fine_scene, view, name, sampler=sampler), kind="rgb")
+        for name in _INTEGRATORS
+    }
+    del fine_scene
+    samples = subpixels**2
     for renderer in theirs.values():
-        renderer.radiance((0.0, 0.0, 700.0), samples=subpixels**2)
-    seconds = {"ours": math.inf, "path": math.inf, "direct": math.inf}
+        renderer.radiance((0.0, 0.0, 700.0), samples=samples)
+    _per_steradian(PlainScene(rig, face, subpixels=subpixels), 0)
+    best = {"ours": math.inf, "path": math.inf, "direct": math.inf}
     images: dict[str, list[Float32Array]] = {}
-    for _ in range(2):
+    for _ in range(rounds):
+        spent = dict.fromkeys(best, 0.0)
+        images = {name: [] for name in best}
         scene = PlainScene(rig, face, subpixels=subpixels)
-        scene.brdf([[0.5, 0.5]], (0.0, 0.0, 1.0), (0.0, 0.0, 1.0))  # textures are ready
+        scene.surface(view)
         start = time.perf_counter()
-        for k in range(len(rig.lights)):
-            scene.radiance(view.name, [k])
-        seconds["ours"] = min(seconds["ours"], (time.perf_counter() - start) / len(rig.lights))
-        images["ours"] = [_per_steradian(scene, k) for k in chosen]
-        for name, renderer in theirs.items():
+        scene.radiance(view.name, [chosen[0]])
+        first = time.perf_counter() - start
+        for n, k in enumerate(chosen):
             start = time.perf_counter()
-            images[name] = [
-                2.0
-                * renderer.radiance(rig.lights[k].position_mm, samples=subpixels**2, seed=seed + n)[
-                    ..., :3
-                ]
-                for n, k in enumerate(chosen)
-            ]
-            seconds[name] = min(seconds[name], (time.perf_counter() - start) / lights)
+            scene.radiance(view.name, [k])
+            spent["ours"] += time.perf_counter() - start
+            images["ours"].append(_per_steradian(scene, k))
+            for name, renderer in theirs.items():
+                start = time.perf_counter()
+                image = renderer.radiance(rig.lights[k].position_mm, samples=samples, seed=n)
+                spent[name] += time.perf_counter() - start
+                images[name].append(2.0 * image[..., :3])
+        look = max(first - spent["ours"] / lights, 0.0)
+        spent["ours"] += look * lights / len(rig.lights)
+        best = {name: min(best[name], spent[name] / lights) for name in best}
 
-    def error(name: str) -> float:
-        difference = (np.stack(images[name]) - reference).astype(np.float64)
-        return float(np.sqrt(np.mean(difference**2)) / reference.mean())
+    def way(name: str) -> Way:
+        found = np.stack(images[name])
+        difference = (found - reference).astype(np.float64)
+        error = float(np.sqrt(np.mean(difference**2)) / reference.mean())
+        return Way(best[name], error, float(found.mean() / reference.mean()))
 
-    return Comparison(
-        lights=lights,
-        ours_s=seconds["ours"],
-        path_s=seconds["path"],
-        direct_s=seconds["direct"],
-        ours_error=error("ours"),
-        path_error=error("path"),
-        direct_error=error("direct"),
-        mean_ratio=float(np.stack(images["path"]).mean() / reference.mean()),
-    )
+    return Comparison(way("ours"), way("path"), way("direct"))
 
 
 def _per_steradian(scene: PlainScene, light: int) -> Float32Array:
