@@ -6,66 +6,26 @@ import contextlib
 import json
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 from capture.devices.dome import Eyes
 from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
 from capture.rig import Rig, load_rig
 from capture.session import Session, Subject
+from skinrig.addresses import addresses, patiently, require_addresses
 from skinrig.console import Console
 from skinrig.errors import UsageError
 from skinrig.light_safety import light_figures, light_lines
 
 CALIBRATION_TARGETS = ("dark", "flat", "chart", "malus")
-RETRY_S = 10.0
-"""How long a device that is held, or reads out a frame of before, is asked for again."""
-RETRY_PAUSE_S = 0.5
-
-_T = TypeVar("_T")
 
 
 class CaptureError(ValueError):
     """A capture that cannot start as asked."""
-
-
-def addresses(given: Sequence[str], option: str) -> dict[str, str]:
-    """Return NAME=URL pairs as a mapping.
-
-    Examples
-    --------
-    >>> addresses(["flash=/dev/ttyUSB0"], "--port")
-    {'flash': '/dev/ttyUSB0'}
-    """
-    found: dict[str, str] = {}
-    for text in given:
-        name, equals, url = text.partition("=")
-        if not (equals and name and url):
-            raise UsageError(f"{option}: got {text!r}, expected NAME=URL")
-        if name in found:
-            raise UsageError(f"{option}: {name!r} is given twice")
-        found[name] = url
-    return found
-
-
-def require_addresses(rig: Rig, boxes: Mapping[str, str], cameras: Mapping[str, str]) -> None:
-    """Raise, naming all that is missing, unless each box and each camera has an address.
-
-    Raises
-    ------
-    UsageError
-    """
-    missing = [f"--port {name}=URL" for name in rig.boxes if name not in boxes]
-    missing += [f"--camera {v.name}=URL" for v in rig.views if v.name not in cameras]
-    if missing:
-        raise UsageError(
-            f"the rig {rig.name!r} needs {' '.join(missing)}; --dry-run needs none, and "
-            "skinrig serve prints those of a simulation"
-        )
 
 
 def eyes_of(text: str) -> Eyes:
@@ -250,35 +210,6 @@ def ask(progress: Callable[[str], None], what: str) -> None:
         return
     progress(f"{what}; then press Enter")
     sys.stdin.readline()
-
-
-def patiently(
-    open_device: Callable[[], _T],
-    progress: Callable[[str], None],
-    *,
-    retry_s: float = RETRY_S,
-    clock: Callable[[], float] = time.monotonic,
-    sleep: Callable[[float], None] = time.sleep,
-) -> _T:
-    """Open a device, asking again for a few seconds while another program holds it.
-
-    What was killed a moment ago may still hold its ports.
-    """
-    from capture.devices.camera import CameraBusy
-    from capture.devices.port import PortBusy
-
-    until_s = clock() + retry_s
-    told = False
-    while True:
-        try:
-            return open_device()
-        except (CameraBusy, PortBusy) as error:
-            if clock() >= until_s:
-                raise
-            if not told:
-                progress(f"{error}; trying again for {retry_s:g} s")
-            told = True
-        sleep(RETRY_PAUSE_S)
 
 
 @contextlib.contextmanager

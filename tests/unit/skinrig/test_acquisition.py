@@ -11,7 +11,7 @@ from capture.rig import load_rig
 from capture.session import Session
 from rigsim.faults import Faults
 from rigsim.world import World
-from skinrig import acquisition
+from skinrig import acquisition, addresses
 from skinrig.cli import main
 from skinrig.errors import UsageError
 
@@ -127,11 +127,11 @@ def test_a_device_that_is_held_is_asked_for_again_and_said_so_once(error):
     def sleep(seconds):
         now[0] += seconds
 
-    found = acquisition.patiently(open_device, said.append, clock=lambda: now[0], sleep=sleep)
+    found = addresses.patiently(open_device, said.append, clock=lambda: now[0], sleep=sleep)
     assert (found, len(said)) == ("camera", 1)
     failures[:] = [error] * 99
     with pytest.raises(type(error)):
-        acquisition.patiently(open_device, said.append, clock=lambda: now[0], sleep=sleep)
+        addresses.patiently(open_device, said.append, clock=lambda: now[0], sleep=sleep)
     assert now[0] == pytest.approx(3 * 0.5 + 10.0)
 
 
@@ -140,13 +140,13 @@ def test_a_device_that_is_broken_is_not_asked_for_again():
         raise CameraError("broken")
 
     with pytest.raises(CameraError, match="broken"):
-        acquisition.patiently(open_device, print, sleep=lambda seconds: pytest.fail("waited"))
+        addresses.patiently(open_device, print, sleep=lambda seconds: pytest.fail("waited"))
 
 
 def test_addresses_of_the_wrong_form_are_usage_errors():
     for given in (["flash"], ["=x"], ["flash="], ["flash=a", "flash=b"]):
         with pytest.raises(UsageError, match="--port"):
-            acquisition.addresses(given, "--port")
+            addresses.addresses(given, "--port")
 
 
 def test_an_import_knows_whose_photographs_they_are_and_by_which_rig(tmp_path, sim, capsys):

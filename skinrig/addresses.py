@@ -1,0 +1,80 @@
+"""Where the boxes and cameras of a capture are: NAME=URL pairs, and devices that are still held."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
+
+from capture.rig import Rig
+from skinrig.errors import UsageError
+
+RETRY_S = 10.0
+"""How long a device that is held, or reads out a frame of before, is asked for again."""
+RETRY_PAUSE_S = 0.5
+
+_T = TypeVar("_T")
+
+
+def addresses(given: Sequence[str], option: str) -> dict[str, str]:
+    """Return NAME=URL pairs as a mapping.
+
+    Examples
+    --------
+    >>> addresses(["flash=/dev/ttyUSB0"], "--port")
+    {'flash': '/dev/ttyUSB0'}
+    """
+    found: dict[str, str] = {}
+    for text in given:
+        name, equals, url = text.partition("=")
+        if not (equals and name and url):
+            raise UsageError(f"{option}: got {text!r}, expected NAME=URL")
+        if name in found:
+            raise UsageError(f"{option}: {name!r} is given twice")
+        found[name] = url
+    return found
+
+
+def require_addresses(rig: Rig, boxes: Mapping[str, str], cameras: Mapping[str, str]) -> None:
+    """Raise, naming all that is missing, unless each box and each camera has an address.
+
+    Raises
+    ------
+    UsageError
+    """
+    missing = [f"--port {name}=URL" for name in rig.boxes if name not in boxes]
+    missing += [f"--camera {v.name}=URL" for v in rig.views if v.name not in cameras]
+    if missing:
+        raise UsageError(
+            f"the rig {rig.name!r} needs {' '.join(missing)}; --dry-run needs none, and "
+            "skinrig serve prints those of a simulation"
+        )
+
+
+def patiently(
+    open_device: Callable[[], _T],
+    progress: Callable[[str], None],
+    *,
+    retry_s: float = RETRY_S,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> _T:
+    """Open a device, asking again for a few seconds while another program holds it.
+
+    What was killed a moment ago may still hold its ports.
+    """
+    from capture.devices.camera import CameraBusy
+    from capture.devices.port import PortBusy
+
+    until_s = clock() + retry_s
+    told = False
+    while True:
+        try:
+            return open_device()
+        except (CameraBusy, PortBusy) as error:
+            if clock() >= until_s:
+                raise
+            if not told:
+                progress(f"{error}; trying again for {retry_s:g} s")
+            told = True
+        sleep(RETRY_PAUSE_S)
