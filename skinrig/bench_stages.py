@@ -8,15 +8,25 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from skinrig import bench_chromophores, bench_flash, bench_photometric, bench_tissue
+from skinrig import (
+    bench_brdf,
+    bench_chromophores,
+    bench_dome_render,
+    bench_flash,
+    bench_photometric,
+    bench_tissue,
+)
 from skinrig.benchmark import StageBenchmark, to_document
 from skinrig.console import Console, plain
 
 STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "chromophores": bench_chromophores.inversion,
     "render-flash": bench_flash.render,
+    "render-dome": bench_dome_render.render,
     "layered-reflectance": bench_tissue.layered_reflectance,
     "color-table": bench_tissue.table,
+    "diffuse-albedo": bench_brdf.albedo,
+    "brdf": bench_brdf.surface,
     "normals": bench_photometric.normals,
 }
 

@@ -1,0 +1,270 @@
+"""Bases of tabulated isotropic BRDFs: the grid, lookups, and where the tables come from.
+
+A table holds BRDFs in 1/sr over MERL's half/difference angles, coarser than MERL's files and
+interpolated, each convolved with the solid angle of a light. Fresnel reflection is inside a table
+(as it is in measured ones): whoever evaluates it multiplies by nothing but the cosine of the light.
+
+References
+----------
+Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 7.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt
+
+from model import merl
+from reconstruction import brdf_recipe
+
+FloatArray = NDArray[np.float64]
+Brdf = Callable[[FloatArray, FloatArray], FloatArray]
+"""Takes light and view, unit vectors (..., 3) where +z is the normal; gives 1/sr, NaN: unknown."""
+
+NODES_D, NODES_PHI, NODES_H = 32, 9, 90
+LANES = 16  # materials are padded to full vectors of float32
+LEAST = 1e-20
+"""Values below this are stored as 0: a sum of denormal numbers is nine times as slow."""
+LED_RADIUS_RAD = 10.0 / 700.0
+"""Angular radius of the dome's lights (10 mm at 700 mm) seen from its centre."""
+_HALF_PI = 0.5 * np.pi
+
+
+class BasisError(ValueError):
+    """A folder or a set of tables that makes no basis."""
+
+
+@dataclass(frozen=True, slots=True)
+class BrdfBasis:
+    """BRDFs of K materials on one grid.
+
+    Attributes
+    ----------
+    table : ndarray of float32, shape (32, 9, 90, L)
+        1/sr at nodes of theta_d (even over [0, pi/2]), phi_d (even over [0, pi/2], folded by
+        reciprocity and mirror symmetry) and theta_h (even in its square root over [0, pi/2]).
+        L is K rounded up to a multiple of 16; columns from K on are 0.
+    names : tuple of str
+        The K materials.
+    light_radius_rad : float
+        Angular radius of the light the tables are convolved with; 0: a point.
+    """
+
+    table: NDArray[np.float32]
+    names: tuple[str, ...]
+    light_radius_rad: float
+
+    def __post_init__(self) -> None:
+        """Check shapes and values."""
+        lanes = -(-len(self.names) // LANES) * LANES
+        expected = (NODES_D, NODES_PHI, NODES_H, lanes)
+        if not self.names or self.table.shape != expected or self.table.dtype != np.float32:
+            raise BasisError(
+                f"BrdfBasis.table: got {self.table.dtype} {self.table.shape} for "
+                f"{len(self.names)} names, expected float32 {expected} and at least one name"
+            )
+        if not np.all((self.table >= 0.0) & (self.table < np.inf)):
+            raise BasisError("BrdfBasis.table: got negative or non-finite values")
+
+    @property
+    def size(self) -> int:
+        """Number of materials."""
+        return len(self.names)
+
+    def evaluate(self, light_dir: ArrayLike, view_dir: ArrayLike, normal: ArrayLike) -> FloatArray:
+        """Return each material's BRDF, trilinear between the nodes.
+
+        Parameters
+        ----------
+        light_dir, view_dir, normal
+            Unit vectors (..., 3) in one frame, away from the surface; broadcast together.
+
+        Returns
+        -------
+        ndarray, shape (..., K)
+            1/sr; 0 where light or view are below the horizon.
+        """
+        light, view, n = (np.asarray(v, dtype=np.float64) for v in (light_dir, view_dir, normal))
+        mu_l, mu_v = np.sum(light * n, axis=-1), np.sum(view * n, axis=-1)
+        cell, part = _place(mu_l, mu_v, np.sum(light * view, axis=-1))
+        shape = np.broadcast_shapes(*(c.shape for c in cell))
+        found = np.zeros((*shape, self.table.shape[-1]))
+        for corner in range(8):
+            bits = [(corner >> axis) & 1 for axis in range(3)]
+            weight = np.ones(())
+            for p, b in zip(part, bits, strict=True):
+                weight = weight * (p if b else 1.0 - p)
+            index = tuple(c + b for c, b in zip(cell, bits, strict=True))
+            found += weight[..., None] * self.table[index]
+        above = (mu_l > 0.0) & (mu_v > 0.0)
+        return np.asarray(np.where(above[..., None], found, 0.0)[..., : self.size])
+
+    def strength(self) -> FloatArray:
+        """Return each material's RMS over the grid, (K,), 1/sr; nodes count by solid angle."""
+        return np.asarray(np.sqrt(np.diag(self._gram())))
+
+    def kinship(self) -> FloatArray:
+        """Return the cosines between the materials, (K, K): 1 for one of the same shape."""
+        gram = self._gram()
+        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        return np.ascontiguousarray(gram / size / size[:, None])
+
+    def _gram(self) -> FloatArray:
+        d, _, h = nodes()
+        solid = np.sin(2.0 * d)[:, None] * (np.sin(h) * np.gradient(h))
+        weight = np.sqrt(np.broadcast_to((solid / solid.sum())[:, None], self.table.shape[:3]))
+        scaled = self.table[..., : self.size] * weight[..., None].astype(np.float32)
+        flat = scaled.reshape(-1, self.size)
+        return np.asarray(flat.T @ flat, dtype=np.float64) / NODES_PHI
+
+    def mixed(self, mix: ArrayLike) -> BrdfBasis:
+        """Return the basis whose R materials are the rows of `mix`, (R, K), at least 0."""
+        rows = np.asarray(mix, dtype=np.float64)
+        if rows.ndim != 2 or rows.shape[1] != self.size or not np.all(rows >= 0.0):
+            raise BasisError(
+                f"mix: got shape {rows.shape}, expected (R, {self.size}) of values at least 0"
+            )
+        table = self.table[..., : self.size].astype(np.float64) @ rows.T
+        return _padded(table, [f"mix {i}" for i in range(len(rows))], self.light_radius_rad)
+
+
+@lru_cache(maxsize=4)
+def default(light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
+    """Return the 59 dielectrics of :mod:`reconstruction.brdf_recipe`, made on first use (2 s).
+
+    Parameters
+    ----------
+    light_radius_rad
+        Angular radius of the light to convolve with, rad, in [0, 0.5].
+    """
+    return tabulate(dict(brdf_recipe.materials()), light_radius_rad=light_radius_rad)
+
+
+def tabulate(materials: dict[str, Brdf], *, light_radius_rad: float = 0.0) -> BrdfBasis:
+    """Return a basis of BRDFs given as functions.
+
+    Parameters
+    ----------
+    materials
+        Name to function; see :data:`Brdf`. Where a function gives NaN, the nearest known node
+        stands in; values below 0 count as 0.
+    light_radius_rad
+        Angular radius of the light to convolve with, rad, in [0, 0.5].
+    """
+    columns = [_convolved(brdf, light_radius_rad) for brdf in materials.values()]
+    if not columns:
+        raise BasisError("materials: got none, expected at least one")
+    return _padded(np.stack(columns, axis=-1), list(materials), light_radius_rad)
+
+
+def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
+    """Return a basis of the MERL files in a folder, their channels averaged to one.
+
+    Raises
+    ------
+    BasisError
+        When the folder holds no .binary file.
+    model.merl.MerlFileError
+        When one of them is no MERL table.
+    """
+    paths = sorted(Path(folder).glob("*.binary"))
+    if not paths:
+        raise BasisError(f"{folder}: got no .binary files, expected MERL tables")
+    columns = [_convolved(of_merl(merl.read(path)), light_radius_rad) for path in paths]
+    return _padded(np.stack(columns, -1), [path.stem for path in paths], light_radius_rad)
+
+
+def of_merl(table: merl.MerlTable) -> Brdf:
+    """Return a MERL table as a function, the mean of its channels, NaN where not measured."""
+    mean = np.where(table.measured, np.tensordot(merl.SCALE, table.stored, 1) / 3.0, np.nan)
+
+    def brdf(light: FloatArray, view: FloatArray) -> FloatArray:
+        h, d, phi = merl.to_angles(light, view, [0.0, 0.0, 1.0])
+        return np.asarray(mean[merl.bins(np.minimum(h, _HALF_PI), d, phi)])
+
+    return brdf
+
+
+def nodes() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return theta_d, phi_d and theta_h of the grid's nodes, rad."""
+    return (
+        np.linspace(0.0, _HALF_PI, NODES_D),
+        np.linspace(0.0, _HALF_PI, NODES_PHI),
+        np.linspace(0.0, 1.0, NODES_H) ** 2 * _HALF_PI,
+    )
+
+
+def _convolved(brdf: Brdf, radius_rad: float) -> FloatArray:
+    """Return a BRDF at the nodes, averaged with the cosine over a disc of light directions."""
+    if not 0.0 <= radius_rad <= 0.5:
+        raise BasisError(f"light_radius_rad: got {radius_rad}, expected 0 to 0.5 rad")
+    d, phi, h = np.meshgrid(*nodes(), indexing="ij")
+    light, view = merl.to_directions(h, d, phi)
+    if radius_rad == 0.0:
+        return _filled(np.asarray(brdf(light, view)))
+    # Seven points: exact on a disc for polynomials of degree 5 (Stroud 1971, S2 5-1).
+    helper = np.where(np.abs(light[..., 1:2]) < 0.9, [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
+    u = np.cross(helper, light)
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    v = np.cross(light, u)
+    total = np.zeros(d.shape)
+    weight = np.zeros(d.shape)
+    for point in range(7):
+        turn = point * np.pi / 3.0
+        reach = 0.0 if point == 6 else np.tan(radius_rad) * np.sqrt(2.0 / 3.0)
+        to = light + reach * (np.cos(turn) * u + np.sin(turn) * v)
+        to /= np.linalg.norm(to, axis=-1, keepdims=True)
+        value = np.asarray(brdf(to, view))
+        share = (0.25 if point == 6 else 0.125) * np.maximum(to[..., 2], 1e-3)
+        known = np.isfinite(value)
+        total += np.where(known, share * np.where(known, value, 0.0), 0.0)
+        weight += np.where(known, share, 0.0)
+    with np.errstate(invalid="ignore"):
+        return _filled(total / weight)
+
+
+def _filled(values: FloatArray) -> FloatArray:
+    """Put the nearest known node where a value is unknown, and 0 where it is below 0."""
+    unknown = ~np.isfinite(values)
+    if np.all(unknown):
+        raise BasisError("table: got no known value")
+    if np.any(unknown):
+        nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+        values = values[tuple(nearest)]
+    return np.maximum(values, 0.0)
+
+
+def _padded(columns: FloatArray, names: Sequence[str], light_radius_rad: float) -> BrdfBasis:
+    lanes = -(-len(names) // LANES) * LANES
+    table = np.zeros((*columns.shape[:3], lanes), dtype=np.float32)
+    table[..., : len(names)] = np.where(columns < LEAST, 0.0, columns)
+    return BrdfBasis(table, tuple(names), light_radius_rad)
+
+
+def _place(
+    mu_l: FloatArray, mu_v: FloatArray, between: FloatArray
+) -> tuple[list[NDArray[np.intp]], list[FloatArray]]:
+    """Return cell and place in it along theta_d, phi_d, theta_h, from cosines alone."""
+    cos_d = np.sqrt(np.clip(0.5 * (1.0 + between), 0.0, 1.0))
+    sin_d = np.sqrt(np.clip(0.5 * (1.0 - between), 0.0, 1.0))
+    cos_h = np.clip((mu_l + mu_v) / np.maximum(2.0 * cos_d, 1e-9), 0.0, 1.0)
+    sin_h = np.sqrt(1.0 - cos_h**2)
+    # mu_v - mu_l = 2 sin_d sin_h cos(phi_d); the sign falls with the folding
+    cos_phi = np.minimum(np.abs(mu_v - mu_l) / np.maximum(2.0 * sin_d * sin_h, 1e-9), 1.0)
+    place = (
+        np.arctan2(sin_d, cos_d) / _HALF_PI * (NODES_D - 1),
+        np.arccos(cos_phi) / _HALF_PI * (NODES_PHI - 1),
+        np.sqrt(np.arccos(cos_h) / _HALF_PI) * (NODES_H - 1),
+    )
+    cells = [
+        np.clip(p.astype(np.intp), 0, size - 2)
+        for p, size in zip(place, (NODES_D, NODES_PHI, NODES_H), strict=True)
+    ]
+    return cells, [p - c for p, c in zip(place, cells, strict=True)]

@@ -1,0 +1,129 @@
+"""Tables of materials: the grid, MERL files, and that Fresnel reflection is inside, once."""
+
+import numpy as np
+import pytest
+
+from model import fresnel, merl
+from reconstruction import brdf_recipe, brdf_tables, nnls_kernels
+
+
+@pytest.fixture(scope="module")
+def point_basis():
+    return brdf_tables.default(0.0)
+
+
+def directions(rng, n, least=0.3):
+    v = rng.standard_normal((20 * n, 3))
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    return v[v[:, 2] > least][:n]
+
+
+def test_the_basis_has_59_materials_on_the_grid_that_the_kernels_know(point_basis):
+    assert point_basis.size == len(set(point_basis.names)) == 59
+    assert point_basis.table.shape[:3] == (
+        nnls_kernels.NODES_D, nnls_kernels.NODES_PHI, nnls_kernels.NODES_H,
+    )  # fmt: skip
+    assert np.all(point_basis.table[..., 59:] == 0.0)
+    tiny = point_basis.table[(point_basis.table > 0.0)].min()
+    assert tiny >= np.float32(brdf_tables.LEAST)
+
+
+def test_tables_follow_their_functions_away_from_the_horizon(point_basis, rng):
+    light, view = directions(rng, 400), directions(rng, 400)
+    found = point_basis.evaluate(light, view, [0.0, 0.0, 1.0])
+    for material, (_, brdf) in enumerate(brdf_recipe.materials()):
+        true = brdf(light, view)
+        gap = np.sqrt(np.mean((found[:, material] - true) ** 2) / np.mean(true**2))
+        assert gap < 0.03, point_basis.names[material]
+
+
+def test_a_table_does_not_know_light_from_view(point_basis, rng):
+    light, view = directions(rng, 50), directions(rng, 50)
+    np.testing.assert_allclose(
+        point_basis.evaluate(light, view, [0, 0, 1.0]),
+        point_basis.evaluate(view, light, [0, 0, 1.0]),
+        rtol=1e-9,
+    )
+
+
+def uniform_sky(basis, name, mu_view):
+    """Return what one material sends to a view under light of radiance 1 from all sides."""
+    mu = (np.arange(400) + 0.5) / 400
+    phi = (np.arange(200) + 0.5) / 200 * np.pi
+    mu_l, azimuth = np.meshgrid(mu, phi, indexing="ij")
+    s = np.sqrt(1.0 - mu_l**2)
+    light = np.stack([s * np.cos(azimuth), s * np.sin(azimuth), mu_l], axis=-1)
+    view = np.array([np.sqrt(1.0 - mu_view**2), 0.0, mu_view])
+    one = brdf_tables.tabulate({name: dict(brdf_recipe.materials())[name]})
+    f = one.evaluate(light, view, [0.0, 0.0, 1.0])[..., 0]
+    return float(np.mean(f * mu_l) * 2.0 * np.pi)
+
+
+@pytest.mark.parametrize("mu_view", [1.0, 0.8, 0.6])
+def test_a_white_furnace_stays_white_with_fresnel_counted_once(point_basis, mu_view):
+    # A smooth lossless surface over a white inside: F_r from the table, and what enters comes
+    # back, F_t(view) F_t(light) R_d / pi integrated with R_d = 1 / (1 - mean F_r).
+    specular = uniform_sky(point_basis, "ggx 0.14 eta 1.4", mu_view)
+    f_r = float(fresnel.reflectance(mu_view, 1.4))
+    r_d = 1.0 / (1.0 - fresnel.diffuse_external(1.4))
+    mu = (np.arange(2000) + 0.5) / 2000
+    entering = np.mean(2.0 * mu * (1.0 - fresnel.reflectance(mu, 1.4)))
+    total = specular + (1.0 - f_r) * entering * r_d
+    assert total == pytest.approx(1.0, abs=0.003)
+    assert specular == pytest.approx(f_r, rel=0.06)
+    assert (1.0 - f_r) * entering * r_d + f_r * specular < 0.98  # F_r twice: not white
+
+
+@pytest.mark.parametrize("mu_view", [1.0, 0.7, 0.3])
+def test_no_material_sends_back_more_than_it_got(point_basis, mu_view):
+    for name in ("ggx 0.7 eta 1.55", "beckmann 0.3", "blinn 0.45", "sheen 0.25", "rough diffuse"):
+        assert uniform_sky(point_basis, name, mu_view) < 1.02
+
+
+def test_the_light_s_disc_widens_a_narrow_lobe_and_keeps_its_energy():
+    sharp = {"ggx 0.05 eta 1.4": dict(brdf_recipe.materials())["ggx 0.05 eta 1.4"]}
+    point, disc = (brdf_tables.tabulate(sharp, light_radius_rad=radius) for radius in (0.0, 0.08))
+    z = np.array([0.0, 0.0, 1.0])
+    angle = np.linspace(0.0, 0.6, 4000)
+    light = np.stack([np.sin(angle), np.zeros(4000), np.cos(angle)], axis=-1)
+    lobes = [basis.evaluate(light, z, z)[:, 0] for basis in (point, disc)]
+    assert lobes[1][0] < 0.8 * lobes[0][0]
+    energy = [np.sum(lobe * np.sin(angle) * np.cos(angle)) for lobe in lobes]
+    assert energy[1] == pytest.approx(energy[0], rel=0.03)
+
+
+def test_a_folder_of_merl_files_becomes_a_basis(tmp_path, rng):
+    brdf = dict(brdf_recipe.materials())["ggx 0.22 eta 1.3"]
+    h, d, phi = np.meshgrid(*merl.bin_centers(), indexing="ij")
+    light, view = merl.to_directions(h, d, phi)
+    above = (light[..., 2] > 0.0) & (view[..., 2] > 0.0)
+    values = np.where(above, brdf(light, view), -1.0)
+    merl.write(tmp_path / "a.binary", merl.MerlTable.of_values(values[..., None]))
+    basis = brdf_tables.load(tmp_path, light_radius_rad=0.0)
+    assert basis.names == ("a",)
+    to, at = directions(rng, 300), directions(rng, 300)
+    found, true = basis.evaluate(to, at, [0.0, 0.0, 1.0])[:, 0], brdf(to, at)
+    assert np.sqrt(np.mean((found - true) ** 2) / np.mean(true**2)) < 0.05
+    with pytest.raises(brdf_tables.BasisError, match=r"no \.binary"):
+        brdf_tables.load(tmp_path / "nothing")
+    (tmp_path / "b.binary").write_bytes(b"foreign")
+    with pytest.raises(merl.MerlFileError, match=r"b\.binary"):
+        brdf_tables.load(tmp_path)
+
+
+def test_a_mixed_basis_is_the_mixture(point_basis, rng):
+    mix = rng.random((3, 59))
+    light, view = directions(rng, 20), directions(rng, 20)
+    whole = point_basis.evaluate(light, view, [0.0, 0.0, 1.0])
+    mixed = point_basis.mixed(mix).evaluate(light, view, [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(mixed, whole @ mix.T, rtol=1e-5)
+    with pytest.raises(brdf_tables.BasisError, match="mix"):
+        point_basis.mixed(-mix)
+
+
+def test_directions_below_the_horizon_reflect_nothing_and_degenerate_ones_are_finite(point_basis):
+    z = np.array([0.0, 0.0, 1.0])
+    assert np.all(point_basis.evaluate(-z, z, z) == 0.0)
+    side = np.array([1.0, 0.0, 0.0])
+    for light, view in ((z, z), (side, -side), (side, side), (z, side)):
+        assert np.all(np.isfinite(point_basis.evaluate(light, view, z)))
