@@ -3,19 +3,149 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
+from numba import carray, njit, prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
 
 from capture.documents import Checks, InputError
 
-__all__ = ["BracketError", "merge"]
+__all__ = ["BracketError", "Response", "merge", "merge_reference", "recover_response"]
 
-_STEPS = 4  # the weights change by less than 1e-3 after two
+STEPS: Final = 1
+"""Rounds of weighing; a second changes the estimate by less than 1 % of its standard error."""
+_TILE: Final = 512
+_FAST: Final = {"nsz", "arcp", "contract", "reassoc"}
+
+_LEVELS: Final = 256
+_GROUPS: Final = 8
+
+Merged = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
 
 
 class BracketError(InputError):
     """Frames that cannot be merged."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Response:
+    """How an encoded picture's values follow from exposure, up to one factor a channel."""
+
+    exposure: NDArray[np.float64]
+    """Relative exposure (radiance times seconds) of each value, shape (256, C), 1 at value 128."""
+    stderr: NDArray[np.float64]
+    """Of `exposure`, shape (256, C), from groups of pixels fitted apart."""
+    valid: NDArray[np.bool_]
+    """Values that were seen often enough and rise, shape (256, C)."""
+
+    def linearize(
+        self, image: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+        """Return relative exposure, its variance and where it is valid, each of the image's shape.
+
+        The variance is that of the response and of the rounding to whole values.
+        """
+        picture = np.asarray(image)
+        if picture.dtype != np.uint8 or picture.shape[-1:] != self.exposure.shape[1:]:
+            checks = Checks("Picture", BracketError)
+            expected = f"uint8, (..., {self.exposure.shape[1]})"
+            checks.that("image", (str(picture.dtype), picture.shape), False, expected)
+            checks.close()
+        step = np.gradient(self.exposure, axis=0)
+        variance = self.stderr**2 + step**2 / 12.0
+        channel = np.arange(self.exposure.shape[1])
+        return (
+            self.exposure[picture, channel].astype(np.float32),
+            variance[picture, channel].astype(np.float32),
+            self.valid[picture, channel],
+        )
+
+
+def recover_response(
+    images: Sequence[NDArray[np.uint8]],
+    exposures_s: ArrayLike,
+    *,
+    rng: np.random.Generator,
+    pixels: int = 150,
+    smoothness: float = 10.0,
+) -> Response:
+    """Recover the response of a camera from a bracket of JPEG pictures (OpenCV's Debevec).
+
+    Raw frames need no such thing: they are linear, see `merge`.
+
+    Parameters
+    ----------
+    images : sequence of N arrays of uint8, shape (H, W, 3)
+        One scene from one place, N >= 2.
+    exposures_s : array_like, shape (N,)
+        Exposure times, s, not all the same.
+    rng : numpy.random.Generator
+        Draws the pixels.
+    pixels : int
+        Of each of 8 groups that are fitted apart, at least 50.
+    smoothness : float
+        Weight of smoothness against the data, > 0.
+
+    Returns
+    -------
+    Response
+
+    Raises
+    ------
+    BracketError
+        Where shapes, kinds or times do not fit.
+
+    References
+    ----------
+    Debevec and Malik 1997, Recovering high dynamic range radiance maps from photographs, doi
+    10.1145/258734.258884.
+    """
+    import cv2
+
+    stack = [np.asarray(image) for image in images]
+    times = np.asarray(exposures_s, np.float64)
+    checks = Checks("Bracket", BracketError)
+    checks.that("images", len(stack), len(stack) >= 2, "at least two")
+    kinds = sorted({(str(image.dtype), image.shape) for image in stack})
+    fits = len(kinds) == 1 and stack[0].dtype == np.uint8 and stack[0].shape[2:] == (3,)
+    checks.that("images", kinds, fits, "uint8 of one shape (H, W, 3)")
+    positive = bool(np.isfinite(times).all() and (times > 0).all())
+    checks.that("exposures_s", times.tolist(), positive, "finite seconds > 0")
+    one_each = times.shape == (len(stack),) and len(np.unique(times)) >= 2
+    checks.that("exposures_s", times.tolist(), one_each, f"{len(stack)} times, two that differ")
+    checks.that("pixels", pixels, pixels >= 50, ">= 50")
+    checks.positive(smoothness=smoothness)
+    checks.close()
+    values = np.stack([image.reshape(-1, 3) for image in stack])  # (N, H W, 3)
+    # pixels spread over the values of the middle exposure, each group with its own
+    middle = values[len(stack) // 2].mean(axis=-1)
+    order = np.argsort(middle + rng.uniform(0, 1e-3, len(middle)), kind="stable")
+    strata = np.array_split(order, pixels)
+    curves = []
+    for _ in range(_GROUPS):
+        chosen = np.array([rng.choice(part) for part in strata if len(part)])
+        # each pixel is a patch of its own, of which the library samples the middle
+        side = int(np.ceil(np.sqrt(len(chosen))))
+        padded = np.concatenate([chosen, rng.choice(order, side * side - len(chosen))])
+        patches = [np.ascontiguousarray(v[padded].reshape(side, side, 3)) for v in values]
+        solver = cv2.createCalibrateDebevec(side * side, float(smoothness), False)
+        curve = solver.process(patches, times.astype(np.float32)).reshape(_LEVELS, 3)
+        curves.append(curve / curve[_LEVELS // 2])
+    exposure = np.array(curves, np.float64)
+    seen = np.stack(
+        [np.bincount(values[..., c].ravel(), minlength=_LEVELS) for c in range(3)], axis=-1
+    )
+    mean = exposure.mean(axis=0)
+    rising = np.gradient(mean, axis=0) > 0
+    inner = np.zeros((_LEVELS, 1), np.bool_)
+    inner[3:-3] = True  # the ends are clipped
+    valid = (seen >= 20) & rising & inner
+    stderr = exposure.std(axis=0, ddof=1) / np.sqrt(_GROUPS)
+    return Response(mean, stderr, np.asarray(valid, np.bool_))
 
 
 def merge(
@@ -26,7 +156,7 @@ def merge(
     read_noise: float,
     black: float,
     white: float,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+) -> Merged:
     """Merge raw frames of one scene at several exposure times with noise-optimal weights.
 
     Parameters
@@ -61,7 +191,8 @@ def merge(
     The estimate of largest likelihood for shot and read noise: each frame weighs by
     ``t^2 / (radiance t / gain + (read_noise / gain)^2 + 1/12)``, the radiance in it being the
     estimate itself, not the noisy value of the frame, which would favor low readings
-    (Granados et al. 2010, doi 10.1109/CVPR.2010.5540208).
+    (Granados et al. 2010, doi 10.1109/CVPR.2010.5540208). Frames of uint16 are read once, tile by
+    tile, on all cores; others go through `merge_reference`.
 
     Examples
     --------
@@ -74,24 +205,59 @@ def merge(
     stack = [np.asarray(frame) for frame in frames]
     times = np.asarray(exposures_s, np.float64)
     _check(stack, times, gain=gain, read_noise=read_noise, black=black, white=white)
+    if any(frame.dtype != np.uint16 for frame in stack):
+        return merge_reference(
+            stack, times, gain=gain, read_noise=read_noise, black=black, white=white
+        )
+    rows = [np.ascontiguousarray(frame) for frame in stack]
+    shape = rows[0].shape
+    radiance, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    valid = np.empty(shape, np.bool_)
+    # times are scaled to 1 so that float32 holds any of them
+    longest = float(times.max())
+    _merge_tiles(
+        np.array([row.ctypes.data for row in rows], np.int64),
+        (times / longest).astype(np.float32),
+        np.float32(1.0 / gain),
+        np.float32((read_noise / gain) ** 2 + 1.0 / 12.0),
+        np.float32(black),
+        np.float32(white),
+        np.float32(1.0 / longest),
+        radiance.reshape(-1),
+        variance.reshape(-1),
+        valid.reshape(-1),
+    )
+    return radiance, variance, valid
+
+
+def merge_reference(
+    frames: Sequence[NDArray[np.integer]],
+    exposures_s: ArrayLike,
+    *,
+    gain: float,
+    read_noise: float,
+    black: float,
+    white: float,
+) -> Merged:
+    """Return what `merge` does, written plainly in float64 for whole numbers of any kind."""
+    times = np.asarray(exposures_s, np.float64)
     floor = (read_noise / gain) ** 2 + 1.0 / 12.0  # DN^2, with the rounding to whole DN
-    signal = np.zeros(stack[0].shape)
-    time = np.zeros(stack[0].shape)
-    for frame, t in zip(stack, times, strict=True):
+    shape = frames[0].shape
+    signal, time = np.zeros(shape), np.zeros(shape)
+    for frame, t in zip(frames, times, strict=True):
         usable = frame < white
-        signal += np.where(usable, frame.astype(np.float64) - black, 0.0)
-        time += np.where(usable, t, 0.0)
+        # first by read noise alone, where the longest exposure counts most
+        signal += np.where(usable, (frame.astype(np.float64) - black) * t, 0.0)
+        time += np.where(usable, t * t, 0.0)
     valid = time > 0
     radiance = signal / np.where(valid, time, 1.0)
-    total = np.ones(stack[0].shape)
-    for _ in range(_STEPS if len(stack) > 1 else 1):
-        weighted = np.zeros(stack[0].shape)
-        total = np.zeros(stack[0].shape)
-        for frame, t in zip(stack, times, strict=True):
+    total = np.ones(shape)
+    for _ in range(STEPS):
+        weighted, total = np.zeros(shape), np.zeros(shape)
+        for frame, t in zip(frames, times, strict=True):
             # one frame's weight for its own DN / t is t^2 / variance
-            weight = np.where(
-                frame < white, t / (np.maximum(radiance, 0.0) * t / gain + floor), 0.0
-            )
+            spread = np.maximum(radiance, 0.0) * t / gain + floor
+            weight = np.where(frame < white, t / spread, 0.0)
             weighted += weight * (frame.astype(np.float64) - black)
             total += weight * t
         radiance = weighted / np.where(valid, total, 1.0)
@@ -126,3 +292,69 @@ def _check(
     checks.that("read_noise", read_noise, 0 <= read_noise < np.inf, ">= 0")
     checks.that("white", white, white > black, f"> black {black}")
     checks.close()
+
+
+@intrinsic
+def _as_pointer(typing_context: Any, address: Any) -> Any:
+    """Return the frame at an address: the kernel takes any number of separate frames."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
+
+    return types.voidptr(address), build
+
+
+@njit(
+    cache=True,
+    parallel=True,
+    error_model="numpy",
+    fastmath=_FAST,
+)
+def _merge_tiles(  # type: ignore[no-untyped-def]
+    addresses, times, per_gain, floor, black, white, per_time, radiance, variance, valid
+):
+    """Merge tile by tile: the frames' tiles stay in cache over the rounds of weighing."""
+    size = radiance.shape[0]
+    for tile in prange((size + _TILE - 1) // _TILE):
+        start = tile * _TILE
+        count = min(_TILE, size - start)
+        first = np.empty(count, np.float32)  # electrons per DN's worth: radiance over gain
+        s = np.zeros(count, np.float32)  # weighted sum of DN
+        w = np.zeros(count, np.float32)  # sum of weights times time
+        for k in range(len(addresses)):
+            frame = carray(_as_pointer(addresses[k]), size, np.uint16)[start : start + count]
+            _add(frame, times[k], black, white, s, w)
+        for _ in range(STEPS):
+            for i in range(count):
+                r = s[i] / w[i] if w[i] > 0.0 else np.float32(0.0)
+                first[i] = max(r, np.float32(0.0)) * per_gain
+                s[i] = 0.0
+                w[i] = 0.0
+            for k in range(len(addresses)):
+                frame = carray(_as_pointer(addresses[k]), size, np.uint16)[start : start + count]
+                _add_weighed(frame, times[k], first, floor, black, white, s, w)
+        for i in range(count):
+            good = w[i] > 0.0
+            valid[start + i] = good
+            radiance[start + i] = s[i] / w[i] * per_time if good else np.float32(np.nan)
+            variance[start + i] = per_time * per_time / w[i] if good else np.float32(np.nan)
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
+def _add(frame, t, black, white, s, w):  # type: ignore[no-untyped-def]
+    """Add the tile of one frame, weighed as read noise alone would have it."""
+    for i in range(len(s)):
+        v = np.float32(frame[i])
+        usable = np.float32(v < white) * t
+        s[i] += usable * (v - black)
+        w[i] += usable * t
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
+def _add_weighed(frame, t, first, floor, black, white, s, w):  # type: ignore[no-untyped-def]
+    """Add the tile of one frame, weighed by its time over its variance."""
+    for i in range(len(s)):
+        v = np.float32(frame[i])
+        weight = np.float32(v < white) * t / (first[i] * t + floor)
+        s[i] += weight * (v - black)
+        w[i] += weight * t
