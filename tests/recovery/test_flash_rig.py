@@ -1,6 +1,7 @@
 """Flash rig: simulate, capture through the drivers, calibrate, reconstruct, compare with the truth.
 
-Subjects of seeds from 100 on; the model-error term was fitted on seeds 0 to 19.
+Subjects of seeds from 100 on; model error and the light's prior were fitted on seeds 0 to 19, and
+tools/judge_flash_rig.py judges 100 to 119.
 """
 
 import dataclasses
@@ -21,6 +22,7 @@ pytestmark = pytest.mark.render
 
 WIDTH_PX = 768  # the demo's
 TODAY = date.today()
+WANT = ["melanin", "hemoglobin", "diffuse"]  # the last states the noise, for the bounds
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +40,12 @@ def reconstructed(folder, calibration, *, subject, seed, **more):
     done = simulate_session(
         "flash", folder / "session-flash", subject=subject, seed=seed, width_px=WIDTH_PX, **more
     )
-    pipeline.reconstruct(
-        done.session, want=["melanin", "hemoglobin"], out=folder / "maps", calibration=calibration
-    )
+    pipeline.reconstruct(done.session, want=WANT, out=folder / "maps", calibration=calibration)
     return store.read(folder / "maps"), store.read(done.truth)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("subject", "seed"), [("I", 100), ("III", 102), ("IV", 103), ("VI", 105)])
+@pytest.mark.parametrize(("subject", "seed"), [("I", 300), ("III", 302), ("IV", 303), ("VI", 305)])
 def test_chromophores_are_recovered_within_their_bounds(tmp_path, calibration, subject, seed, rng):
     """Median relative error over the skin, against the truth with lateral transport in it."""
     maps, truth = reconstructed(tmp_path, calibration, subject=subject, seed=seed)
@@ -56,6 +56,7 @@ def test_chromophores_are_recovered_within_their_bounds(tmp_path, calibration, s
             # blood under so much melanin cannot be seen: masked, not guessed
             assert row.masked > 0.95
             continue
+        assert np.isfinite(row.median_bound)
         assert row.median_relative <= limit(row), row
     melanin = next(row for row in rows if row.name == "melanin")
     assert melanin.masked <= 0.15
@@ -70,11 +71,10 @@ def test_a_white_balance_5_percent_off_breaks_the_bounds(tmp_path, calibration, 
     )
     calibration_store.save(tinted, tmp_path / "tinted")
     done = simulate_session(
-        "flash", tmp_path / "session-flash", subject="III", seed=102, width_px=WIDTH_PX
+        "flash", tmp_path / "session-flash", subject="III", seed=302, width_px=WIDTH_PX
     )
     pipeline.reconstruct(
-        done.session, want=["melanin", "hemoglobin"], out=tmp_path / "maps",
-        calibration=tmp_path / "tinted",
+        done.session, want=WANT, out=tmp_path / "maps", calibration=tmp_path / "tinted",
     )  # fmt: skip
     rows = compare(store.read(tmp_path / "maps"), store.read(done.truth), rng=rng)
     broken = [r for r in rows if r.band is None and not r.median_relative <= limit(r)]
