@@ -7,9 +7,11 @@ of points are mapped over threads. All reals have the type of the data (float32 
 from __future__ import annotations
 
 import math
+from functools import cache
+from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import boolean, float32, float64, int64, njit, types, void
 
 BLOCK = 32
 """Points gathered at once: rows of a stack are read in whole cache lines."""
@@ -410,8 +412,7 @@ def _fit_point(  # type: ignore[no-untyped-def]
     return _finish(x, y, z, v, s, e, m, b0, b1, b2, scale, above, known, True, settings, sums, out)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def fit_points(  # type: ignore[no-untyped-def]
+def _fit_points(  # type: ignore[no-untyped-def]
     intensity, variance, usable, strength, directions, per_point, positions, points, way,
     robust, known, l1_steps, steps, settings, out, valid,
 ):  # fmt: skip
@@ -506,3 +507,19 @@ def fit_points(  # type: ignore[no-untyped-def]
                 sums,
                 out[place],
             )
+
+
+@cache
+def fit_points(kind: type[np.floating]) -> Any:
+    """Return the kernel for float32 or float64: compiled once, whatever the arrays' layouts."""
+    real = float32 if kind is np.float32 else float64
+
+    def given(dtype: Any, axes: int) -> Any:
+        return types.Array(dtype, axes, "A", readonly=True)
+
+    signature = void(
+        given(real, 2), given(real, 2), given(boolean, 2), given(real, 2), real[:, ::1],
+        given(real, 3), real[:, ::1], given(real, 2), int64, boolean, boolean, int64, int64,
+        real[::1], real[:, ::1], boolean[::1],
+    )  # fmt: skip
+    return njit(signature, cache=True, nogil=True, error_model="numpy")(_fit_points)

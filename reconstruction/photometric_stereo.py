@@ -177,10 +177,13 @@ def estimate_normals(
     mask = _usable(valid, lights, shape)
     shared, per_point, positions, points = _light_arrays(way, geometry, kind)
 
+    fit_points = kernels.fit_points(kind)
+
     def solve(span: slice) -> None:
-        kernels.fit_points(
-            flat[:, span], noise[:, span], mask[:, span], strength[:, span], shared,
-            per_point[:, span] if way == kernels.PER_POINT else per_point, positions,
+        each = per_point[:, span] if way == kernels.PER_POINT else per_point
+        fit_points(
+            *(_of_kind(array[:, span], kind) for array in (flat, noise)), mask[:, span],
+            _of_kind(strength[:, span], kind), shared, _of_kind(each, kind), positions,
             points[span] if way == kernels.NEAR else points, way, robust, variance is not None,
             chosen.l1_iterations, chosen.iterations, settings, out[span], good[span],
         )  # fmt: skip
@@ -200,6 +203,14 @@ def estimate_normals(
         stderr_albedo=maps[..., kernels.STDERR_ALBEDO].copy(),
         used=maps[..., kernels.USED].astype(np.int32),
     )
+
+
+def _of_kind(array: NDArray[Any], kind: Any) -> Floating:
+    """Return an array of a type; one that repeats itself still does."""
+    if array.dtype == kind:
+        return array
+    whole = tuple(slice(0, 1) if step == 0 else slice(None) for step in array.strides)
+    return np.broadcast_to(array[whole].astype(kind), array.shape)
 
 
 def _mapped(solve: Any, count: int, executor: Executor | None) -> Iterator[None]:
