@@ -252,7 +252,7 @@ def fixed_pattern(sensor: Sensor, shape: tuple[int, ...]) -> FixedPattern:
     return _fixed_pattern(sensor, int(shape[0]), int(shape[1]))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)  # one for each camera of a dome
 def _fixed_pattern(sensor: Sensor, rows: int, columns: int) -> FixedPattern:
     digest = hashlib.sha256(sensor.serial.encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))

@@ -17,15 +17,16 @@ from rigsim.mesh import Float32Array
 from rigsim.render import Caster, load
 from rigsim.scenes.olat import (
     DISC_POINTS,
+    FULL,
+    FUZZ_LIMIT,
     Hits,
     Lamp,
     disc_points,
     lift,
     sum_rows,
-    unpack_surface,
 )
 from rigsim.skin_layers import ETA
-from rigsim.surface_brdf import ETA_OIL, FUZZ_ALBEDO, OIL_SMOOTHING
+from rigsim.surface_brdf import ETA_OIL, FUZZ_ALBEDO, OIL_SMOOTHING, R_D_LIMIT
 
 
 class VectorLight:
@@ -44,13 +45,12 @@ class VectorLight:
         self._scene = caster.scene
         self.hits = hits
         mi = load(self._choice)
-        start, normal = lift(hits, caster), hits.normals()
-        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-        self._start = mi.Point3f(*_columns(start))
-        self._normal = mi.Vector3f(*_columns(normal))
-        self._surface = [mi.Float(column) for column in _columns(unpack_surface(hits.surface))]
-        across, along = (np.resize(p, len(start)) for p in disc_points(DISC_POINTS))
-        self._across, self._along = mi.Float(across), mi.Float(along)
+        self._start = mi.Point3f(*_columns(lift(hits, caster)))
+        # Normal, r_d, roughness, oil, fuzz, bare as ten half words: a dome holds sixteen views.
+        halves = np.concatenate([hits.normal.view(np.uint16), hits.surface], axis=1)
+        words = np.ascontiguousarray(halves).view(np.uint32)
+        self._words = [mi.UInt32(np.ascontiguousarray(words[:, k])) for k in range(5)]
+        self._across, self._along = (mi.Float(points) for points in disc_points(DISC_POINTS))
 
     def light_up(
         self,
@@ -86,22 +86,25 @@ class VectorLight:
 
         side, other = lamp.radii()
         center, axis = vector(lamp.position_mm), vector(lamp.axis)
+        normal, (red, green, blue, roughness, oil, fuzz, bare) = self._unpacked(dr, mi)
+        slot = dr.arange(mi.UInt32, len(self.hits.position_mm)) % DISC_POINTS
+        across = dr.gather(mi.Float, self._across, slot)
+        along = dr.gather(mi.Float, self._along, slot)
         way = center - self._start
         squared = dr.squared_norm(way)
         to_light = way * dr.rsqrt(squared)
         to_camera = dr.normalize(vector(self.hits.camera_mm) - self._start)
-        nl = dr.minimum(dr.dot(self._normal, to_light), 1.0)
-        nv = dr.minimum(dr.dot(self._normal, to_camera), 1.0)
+        nl = dr.minimum(dr.dot(normal, to_light), 1.0)
+        nv = dr.minimum(dr.dot(normal, to_camera), 1.0)
         off = -dr.dot(axis, to_light)
         active = (nl > 0.0) & (nv > 0.0) & (off > 0.0)
-        target = way + self._across * vector(side) + self._along * vector(other)
+        target = way + across * vector(side) + along * vector(other)
         far = dr.norm(target)
         ray = mi.Ray3f(self._start, target / far)
         ray.maxt = 0.999 * far
         active &= ~self._scene.ray_test(ray, True, active)
         lobe = dr.power(dr.maximum(off, 1e-9), number(lamp.exponent))
         strength = dr.select(active, nl / squared * lobe, 0.0)
-        red, green, blue, roughness, oil, fuzz, bare = self._surface
         half = to_light + to_camera
         length = dr.norm(half)
         nh, lh = dr.minimum((nl + nv) / length, 1.0), 0.5 * length
@@ -125,6 +128,18 @@ class VectorLight:
         dr.eval(rows)
         r, g, b = (np.asarray(row.numpy(), np.float32) for row in rows)
         return sum_rows(self.hits, r, g, b, color)
+
+    def _unpacked(self, dr: Any, mi: Any) -> tuple[Any, list[Any]]:
+        """Return unit normals, and r_d (3), roughness, oil, fuzz, bare."""
+        low = [word & 0xFFFF for word in self._words]
+        high = [word >> 16 for word in self._words]
+        halves = [half for pair in zip(low, high, strict=True) for half in pair]
+        # Signed halves: the top bit is the sign.
+        signed = [mi.Int32(half << 16) >> 16 for half in halves[:3]]
+        normal = dr.normalize(mi.Vector3f(*(mi.Float(half) for half in signed)))
+        unit = [mi.Float(half) * (1.0 / FULL) for half in halves[3:]]
+        colors = [R_D_LIMIT * root * root for root in unit[:3]]
+        return normal, [*colors, unit[3], unit[4], FUZZ_LIMIT * unit[5], unit[6]]
 
 
 def _columns(rows: Float32Array) -> list[Float32Array]:
