@@ -15,8 +15,9 @@ from capture import raw
 from capture.calibration import chart, color, colorimetry, polarization, sensor, store, white
 from capture.calibration.photon_transfer import FlatPair
 from capture.session import FrameRecord, Session
+from skinrig import calibrating_dome
 
-KINDS = ("sensor", "color", "polarization", "white")
+KINDS = ("sensor", "color", "polarization", "white", *calibrating_dome.KINDS)
 
 
 class CalibratingError(ValueError):
@@ -32,34 +33,52 @@ class Outcome:
     drift: tuple[store.Drift, ...]
     summary: tuple[tuple[str, str], ...]
     """What to tell the user: quantity and value with standard error."""
+    findings: tuple[str, ...] = ()
+    """What is wrong with the rig."""
 
 
 def calibrate(
-    kind: str, sessions: Sequence[str | Path], out: str | Path, *, created: date | None = None
+    kind: str,
+    sessions: Sequence[str | Path],
+    out: str | Path,
+    *,
+    created: date | None = None,
+    targets: calibrating_dome.DomeTargets | None = None,
 ) -> Outcome:
     """Make one kind of calibration from target sessions and save it.
 
     Parameters
     ----------
     kind
-        "sensor", "color", "polarization" or "white".
+        One of :data:`KINDS`.
     sessions
-        Folders; frames of all of them are pooled. They must come from one camera.
+        Folders; frames of all of them are pooled. They must come from one camera, those of a
+        dome's "geometry" and "lights" from one rig.
     out
         The CALIBRATION/ folder; an older calibration of the kind is compared, then replaced.
     created
         Date of the calibration; None: that of the latest session.
+    targets
+        What stood in the dome.
 
     Raises
     ------
     CalibratingError
         When a needed kind of frame is missing, or the sessions come from several cameras.
     """
-    if kind not in _MAKERS:
+    if kind not in KINDS:
         raise CalibratingError(f"kind: got {kind!r}, expected one of {', '.join(KINDS)}")
-    frames = _Frames([Session.open(path) for path in sessions])
-    made_on = created or max(s.manifest.created_at.date() for s in frames.sessions)
-    calibration = _MAKERS[kind](frames, made_on)
+    opened = [Session.open(path) for path in sessions]
+    if not opened:
+        raise CalibratingError("sessions: got none, expected at least one folder")
+    made_on = created or max(s.manifest.created_at.date() for s in opened)
+    findings: tuple[str, ...] = ()
+    if kind in calibrating_dome.KINDS:
+        made = calibrating_dome.calibrate_dome(kind, opened, out, made_on, targets=targets)
+        calibration, summary, findings = made.calibration, made.summary, made.findings
+    else:
+        calibration = _MAKERS[kind](_Frames(opened), made_on)
+        summary = tuple(_summary(calibration))
     drift: tuple[store.Drift, ...] = ()
     try:
         drift = store.drift(store.load(out, kind), calibration)
@@ -67,15 +86,13 @@ def calibrate(
         pass
     Path(out).mkdir(parents=True, exist_ok=True)
     path = store.save(calibration, out)
-    return Outcome(calibration, path, drift, tuple(_summary(calibration)))
+    return Outcome(calibration, path, drift, summary, findings)
 
 
 class _Frames:
     """The frames of one camera in several sessions."""
 
     def __init__(self, sessions: Sequence[Session]) -> None:
-        if not sessions:
-            raise CalibratingError("sessions: got none, expected at least one folder")
         self.sessions = sessions
         self.rig = sessions[0].rig
         serials = {view.serial for session in sessions for view in session.rig.views}

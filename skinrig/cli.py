@@ -191,9 +191,13 @@ def serve(
 
 @app.command()
 def calibrate(
-    kind: Annotated[str, typer.Argument(help="sensor, color, polarization or white.")],
+    kind: Annotated[
+        str, typer.Argument(help="sensor, color, polarization, white, geometry or lights.")
+    ],
     sessions: Annotated[list[Path], typer.Argument(help="Sessions of the target.")],
     out: Out = Path("calibration"),
+    square_mm: Annotated[float, typer.Option(help="Side of the board's squares.")] = 36.0,
+    sphere_mm: Annotated[float, typer.Option(help="Radius of the mirror sphere.")] = 50.0,
     json: Json = False,
 ) -> None:
     """Make a calibration from sessions of a target and say how it drifted.
@@ -201,18 +205,22 @@ def calibrate(
     Example: skinrig calibrate sensor session-flat --out calibration
     """
     from skinrig.calibrating import calibrate as make
+    from skinrig.calibrating_dome import dome_targets
 
     console = Console(json)
-    done = make(kind, sessions, out)
+    done = make(kind, sessions, out, targets=dome_targets(square_mm, sphere_mm))
     console.rows(("quantity", "value"), done.summary)
+    for text in done.findings:
+        console.say(f"found: {text}")
     for change in done.drift:
         if change.sigmas is None or abs(change.sigmas) > 2:
             console.say(f"drift: {change}")
     console.say(f"{done.path}: valid until {done.calibration.valid_until}")
     console.document(
         "skinrig.calibrate/1",
-        {"path": done.path, "values": dict(done.summary), "drift": [str(d) for d in done.drift]},
-    )
+        {"path": done.path, "values": dict(done.summary), "findings": done.findings,
+         "drift": [str(d) for d in done.drift]},
+    )  # fmt: skip
 
 
 import_app = typer.Typer(help="Bring in what other devices made.", no_args_is_help=True)

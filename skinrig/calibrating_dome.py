@@ -1,0 +1,331 @@
+"""Sessions of the dome's targets to its calibrations: geometry, and lights."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture import raw
+from capture.calibration import bundle, geometry, light_fit, mirror_lights, mirror_sphere, store
+from capture.calibration.board import Board, Sighting, find_board
+from capture.calibration.lights import LightTable
+from capture.calibration.mosaic import channel_levels, neutral_mosaic
+from capture.calibration.white_plate import PlateSamples, PlateWindow, WhitePlate
+from capture.rig import Rig
+from capture.session import FrameRecord, Session
+
+KINDS = ("geometry", "lights")
+SESSION_STEP = 1000  # poses of the k-th session are numbered from k times this
+Vector = NDArray[np.float64]
+
+
+class DomeCalibratingError(ValueError):
+    """Sessions that do not hold what a calibration of the dome needs."""
+
+
+@dataclass(frozen=True, slots=True)
+class DomeTargets:
+    """What stood in the dome; the values are those of the simulated targets."""
+
+    board: Board = field(
+        default_factory=lambda: Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0)
+    )
+    sphere_radius_mm: float = 50.0
+    plate: WhitePlate = field(default_factory=WhitePlate)
+    light_tolerance_mm: float = 5.0
+    """Standard deviation of the lights about the drawing, mm, > 0: it matters only where few
+    highlights were seen."""
+
+
+def dome_targets(square_mm: float, sphere_radius_mm: float) -> DomeTargets:
+    """Return targets of other sizes: side of the board's squares, radius of the sphere, mm."""
+    board = Board.of(("charuco", 7, 5, "4X4_50"), square_mm=square_mm)
+    return DomeTargets(board, sphere_radius_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class DomeCalibration:
+    """A calibration of the dome and what to say of it."""
+
+    calibration: store.Calibration
+    summary: tuple[tuple[str, str], ...]
+    findings: tuple[str, ...]
+    """What is wrong with the rig: a moved camera, a dead light, lights in the wrong order."""
+
+
+def calibrate_dome(
+    kind: str,
+    sessions: Sequence[Session],
+    folder: str | Path,
+    created: date,
+    *,
+    targets: DomeTargets | None = None,
+) -> DomeCalibration:
+    """Make the calibration "geometry" or "lights" of a dome.
+
+    Parameters
+    ----------
+    kind
+        One of :data:`KINDS`.
+    sessions
+        For "geometry" of the board; for "lights" of the mirror sphere, the white plate, or both.
+    folder
+        The CALIBRATION/ folder: lights need its geometry, and what moved is told from its last
+        geometry.
+    created
+        Date of the calibration.
+    targets
+        Sizes of the targets.
+
+    Raises
+    ------
+    DomeCalibratingError
+        When the frames that are needed are missing.
+    """
+    rigs = {session.rig.name for session in sessions}
+    if len(rigs) != 1:
+        raise DomeCalibratingError(f"sessions: got rigs {sorted(rigs)}, expected one")
+    what = targets or DomeTargets()
+    if kind == "geometry":
+        return _geometry(sessions, Path(folder), created, what)
+    return _lights(sessions, Path(folder), created, what)
+
+
+def _frames(sessions: Sequence[Session], kind: str) -> Iterator[tuple[int, Session, FrameRecord]]:
+    for number, session in enumerate(sessions):
+        for record in session.frames(kind):
+            yield number, session, record
+
+
+def _geometry(
+    sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets
+) -> DomeCalibration:
+    rig = sessions[0].rig
+    sightings: dict[tuple[str, int], Sighting] = {}
+    without = 0
+    for number, session, record in _frames(sessions, "charuco"):
+        image = raw.linear_rgb(session.read(record), demosaic="bilinear").rgb
+        sighting = find_board(image, what.board)
+        if sighting is None:
+            without += 1
+        else:
+            pose = SESSION_STEP * number + int(record.index["pose"])
+            sightings[record.camera, pose] = sighting
+    if not sightings:
+        raise DomeCalibratingError(
+            f"sessions: the board was found in none of {without} frames of kind 'charuco'; capture"
+            " it (`skinrig simulate dome --target charuco`), or say its squares"
+        )
+    start = geometry.nominal_cameras(rig)
+    findings = _moved(sightings, what.board, folder, rig)
+    in_jig = any(pose == 0 for _, pose in sightings)
+    found = bundle.adjust(sightings, what.board, start, gauge="board" if in_jig else "cameras")
+    summary = [
+        ("frames with the board", f"{len(sightings)} of {len(sightings) + without}"),
+        ("rig frame", "the board in its jig" if in_jig else "the nominal cameras"),
+        ("noise of a corner", f"{found.sigma_px:.3f} px"),
+    ]
+    for name, camera in found.cameras.items():
+        center, error = camera.center_mm, np.sqrt(np.diag(found.center_covariance_mm2[name]))
+        place = ", ".join(f"{c:.2f} ± {e:.2f}" for c, e in zip(center, error, strict=True))
+        focal, focal_error = camera.matrix[0, 0], camera.matrix_stderr[0, 0]
+        summary.append((
+            f"{name} ({camera.serial})",
+            f"{found.rms_px[name]:.3f} px; centre {place} mm; f {focal:.1f} ± {focal_error:.1f} px",
+        ))  # fmt: skip
+    calibration = geometry.to_calibration(
+        found.cameras,
+        rig=rig.name,
+        source=sessions[0].source,
+        created=created,
+        reprojection_px=found.rms_px,
+        inputs={session.id: session.content_hash for session in sessions},
+    )
+    return DomeCalibration(calibration, tuple(summary), findings)
+
+
+def _moved(
+    sightings: Mapping[tuple[str, int], Sighting], board: Board, folder: Path, rig: Rig
+) -> tuple[str, ...]:
+    """Return what moved since the geometry in a folder; nothing without one."""
+    try:
+        previous = geometry.poses_from(store.load(folder, "geometry"), rig)
+        return tuple(str(moved) for moved in bundle.find_moved(sightings, board, previous))
+    except (store.CalibrationMissing, store.CalibrationMismatch, bundle.BundleError):
+        return ()
+
+
+def _lights(
+    sessions: Sequence[Session], folder: Path, created: date, what: DomeTargets
+) -> DomeCalibration:
+    rig = sessions[0].rig
+    cameras = geometry.poses_from(store.load(folder, "geometry"), rig)
+    table = LightTable.nominal(rig)
+    findings: list[str] = []
+    summary: list[tuple[str, str]] = []
+    notes = {}
+    kinds = {record.kind for session in sessions for record in session.frames()}
+    if not kinds & {"mirror", "white"}:
+        raise DomeCalibratingError(
+            "sessions: hold no frames of kind 'mirror' or 'white'; capture a target (`skinrig"
+            " simulate dome --target mirror`, `--target white`)"
+        )
+    if "mirror" in kinds:
+        places = _mirror(sessions, rig, cameras, what)
+        table = replace(
+            table,
+            position_mm=places.position_mm,
+            position_stderr_mm=places.stderr_mm,
+            axis=-places.position_mm,
+            valid=places.valid,
+        )
+        error = np.linalg.norm(places.stderr_mm[places.valid], axis=1)
+        summary += [
+            ("lights placed", f"{int(places.valid.sum())} of {len(rig.lights)}"),
+            ("standard error of a place", f"{np.median(error):.2f} mm, worst {error.max():.2f} mm"),
+            ("noise of a highlight", f"{places.sigma_px:.3f} px"),
+        ]
+        few = [n for n, ok in zip(places.names, places.valid, strict=True) if not ok]
+        if few:
+            findings.append(f"seen by too few cameras to be placed, left out: {', '.join(few)}")
+        findings += [f"light {a} shone at the place of {b}" for a, b in places.answers.items()]
+        findings += [f"light {name} was never seen in a sphere" for name in places.unseen]
+    else:
+        notes["positions"] = "nominal: no session of the mirror sphere was given"
+    if "white" in kinds:
+        samples = _white(sessions, cameras, what)
+        fit = light_fit.fit_lights(samples, table, cameras, plate=what.plate)
+        table = fit.table
+        lit = table.intensity[table.valid]
+        relative = table.intensity_stderr[table.valid] / np.where(lit > 0, lit, 1.0)
+        summary += [
+            ("lights measured", f"{int((table.intensity > 0).all(axis=1).sum())} of"
+             f" {len(rig.lights)}, in {fit.frames} frames"),
+            ("standard error of an intensity", f"{100 * np.median(relative):.2f} % (and"
+             f" {100 * what.plate.reflectance_stderr:.1f} % in common: the plate's reflectance)"),
+            ("residual of the plate's parts", f"{100 * fit.residual:.2f} %"),
+        ]  # fmt: skip
+        for serial, response in table.cameras.items():
+            gain = ", ".join(f"{g:.4f}" for g in response.gain)
+            corner = 1 + float(response.vignetting.sum())
+            summary.append((f"{serial} gain R, G, B", f"{gain}; corner {100 * corner:.0f} %"))
+        findings += [f"light {name} is dead" for name in fit.dead]
+        findings += [f"light order: {a} shows the shading of {b}" for a, b in fit.answers.items()]
+        if fit.unseen:
+            findings.append(f"the plate never faced {', '.join(fit.unseen)}: left out")
+    else:
+        notes["intensities"] = "nominal and relative: no session of the white plate was given"
+    calibration = table.to_calibration(
+        rig=rig.name,
+        source=sessions[0].source,
+        created=created,
+        notes={**notes, **{f"finding {k}": text for k, text in enumerate(findings)}},
+        inputs={session.id: session.content_hash for session in sessions},
+    )
+    return DomeCalibration(calibration, tuple(summary), tuple(findings))
+
+
+def _mirror(
+    sessions: Sequence[Session],
+    rig: Rig,
+    cameras: Mapping[str, geometry.CameraPose],
+    what: DomeTargets,
+) -> mirror_lights.LightPlaces:
+    """Return the lights' places from the frames of mirror spheres."""
+    outlines: dict[int, dict[str, Vector]] = {}
+    colors: dict[str, Vector] = {}
+    for number, session, record in _frames(sessions, "mirror"):
+        if record.index.get("light") != "outline":
+            continue
+        frame = session.read(record)
+        colors[record.camera] = channel_levels(frame)
+        image = neutral_mosaic(frame, colors[record.camera])
+        edges = mirror_sphere.find_outline(image, cameras[record.camera], what.sphere_radius_mm)
+        if edges is not None:
+            sphere = SESSION_STEP * number + int(record.index["sphere"])
+            outlines.setdefault(sphere, {})[record.camera] = edges
+    if not outlines:
+        raise DomeCalibratingError(
+            "sessions: no outline of a mirror sphere was found; its frames of the lit dome (index"
+            " light = 'outline') must show it darker than what is behind it"
+        )
+    spheres = {
+        number: mirror_sphere.locate_sphere(edges, cameras, what.sphere_radius_mm)
+        for number, edges in outlines.items()
+    }
+    windows: dict[tuple[str, int], mirror_lights.SphereWindow] = {}
+    seen = []
+    for number, session, record in _frames(sessions, "mirror"):
+        sphere = SESSION_STEP * number + int(record.index["sphere"])
+        if record.index.get("light") == "outline" or sphere not in spheres:
+            continue
+        if record.camera not in colors:
+            continue
+        key = (record.camera, sphere)
+        if key not in windows:
+            windows[key] = mirror_lights.SphereWindow.of(cameras[record.camera], spheres[sphere])
+        image = neutral_mosaic(session.read(record), colors[record.camera])
+        pixels, flux = mirror_lights.find_highlights(image, windows[key])
+        seen.append(mirror_lights.Highlights(record.camera, sphere, _lit(record), pixels, flux))
+    return mirror_lights.locate_lights(
+        seen,
+        cameras,
+        spheres,
+        {light.name: np.array(light.position_mm) for light in rig.lights},
+        light_radius_mm=rig.lights[0].radius_mm,
+        nominal_stderr_mm=what.light_tolerance_mm,
+    )
+
+
+def _lit(record: FrameRecord) -> tuple[str, ...]:
+    """Return the names of the lights that were on."""
+    several = str(record.settings.get("leds", ""))
+    return tuple(several.split("+")) if several else (str(record.settings["light"]),)
+
+
+def _white(
+    sessions: Sequence[Session],
+    cameras: Mapping[str, geometry.CameraPose],
+    what: DomeTargets,
+) -> list[PlateSamples]:
+    """Return the parts of the white plate in all frames lit by one light."""
+    markers: dict[tuple[str, int], Sighting] = {}
+    for number, session, record in _frames(sessions, "white"):
+        if record.index.get("light") == "several":
+            image = raw.linear_rgb(session.read(record), demosaic="bilinear").rgb
+            sighting = what.plate.find(image)
+            if sighting is not None:
+                markers[record.camera, SESSION_STEP * number + int(record.index["pose"])] = sighting
+    if not markers:
+        raise DomeCalibratingError(
+            "sessions: the white plate's markers were found in no frame lit by several lights"
+            " (index light = 'several')"
+        )
+    places = {
+        pose: bundle.place_board(markers, what.plate, cameras, pose)
+        for pose in {pose for _, pose in markers}
+    }
+    windows: dict[tuple[str, int], PlateWindow | None] = {}
+    samples = []
+    for number, session, record in _frames(sessions, "white"):
+        pose = SESSION_STEP * number + int(record.index["pose"])
+        if record.index.get("light") == "several" or pose not in places:
+            continue
+        key = (record.camera, pose)
+        if key not in windows:
+            windows[key] = PlateWindow.of(cameras[record.camera], places[pose], what.plate)
+        window = windows[key]
+        if window is None:
+            continue
+        shot = raw.linear_rgb(session.read(record), demosaic="centered")
+        on_s = float(record.settings["exposure_s"]) * float(record.settings["level"])
+        samples.append(
+            window.sample(shot.rgb, shot.variance, shot.valid, view=record.camera,
+                          light=str(record.settings["light"]), on_s=on_s)
+        )  # fmt: skip
+    return samples
