@@ -248,9 +248,12 @@ class Controller:
             refused = Refused(Code.BOOT_CHANGED)
             return wire.encode(Reply(frame.seq, self.boot, refused.code, refused.reason))
         self._renew_lease(now)
-        if self._under_way is not None and self._under_way[0] == frame:
-            return b""  # a retry: the answer comes when the act is over
-        for seq, text, answer in self._replies:
+        answers = list(self._replies)
+        if self._under_way is not None:
+            request = self._under_way[0]
+            # a retry gets nothing yet: the answer comes when the act is over
+            answers.append((request.seq, request.text, b""))
+        for seq, text, answer in answers:
             if self._same_request(seq, text, frame):
                 return answer
             if seq == frame.seq:

@@ -116,6 +116,11 @@ class NoisyFlash(RuleBasedStateMachine):
     def set_lease(self, lease_ms):
         self.ask(f"SYST:WDOG {lease_ms}")
 
+    @rule(sync_us=st.sampled_from([0, 5000, 50_000]))
+    def set_sync(self, sync_us):
+        if self.ask(f"FLAS:SYNC {sync_us}") == Code.OK:
+            assert self.unit.sync_s == sync_us / 1e6
+
     @rule(length_ms=st.integers(1, 500))
     def light_lamp(self, length_ms):
         self.ask(f"FLAS:LAMP ON,{length_ms}")
@@ -174,6 +179,7 @@ class NoisyFlash(RuleBasedStateMachine):
     def a_box_that_started_again_waits_to_be_greeted(self):
         if self.fresh_boot == self.controller.boot:
             assert (self.unit.power, self.unit.polarizer) == (1.0, "parallel")
+            assert self.unit.sync_s == 0.0
             assert not self.controller.armed
             assert not self.unit.lit
 

@@ -476,6 +476,7 @@ def test_a_retry_before_a_delayed_pop_is_answered_once_after_it(bench, edges):
     bench.ask("SYST:ARM")
     frame = bench.frame("FLAS:FIRE a")
     assert bench.raw(frame) == bench.raw(b"\n" + frame) == b""
+    assert bench.reply("FLAS:POW 0.5", seq=bench.seq).code == Code.SEQ_REUSED
     bench.now = 1.05
     (answer,) = bench.box.advance(bench.now).splitlines()
     assert bench.raw(frame).rstrip() == answer
