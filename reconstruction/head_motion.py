@@ -28,6 +28,9 @@ OUTLIER_SIGMAS, OUTLIER_PX = 4.0, 0.3
 NONRIGID_SHARE = 0.05
 """Share of such tracks, beyond the capture's usual one, from which a frame is not usable."""
 NONRIGID_AT_ALL = 0.3
+PART_MM = 15.0
+PART_TIMES = 2.5
+"""Residual of the worst part of a face, over the capture's usual one, that is an expression."""
 BLOCK_PX = 32
 """Side of the parts of an image whose tracks err alike."""
 _STEP_MM = 0.01
@@ -69,6 +72,8 @@ class HeadMotion:
         Scale of what the rigid motion leaves of the tracks.
     nonrigid : ndarray, shape (T,)
         Share of the tracks that do not move with the head.
+    worst_part_px : ndarray, shape (T,)
+        Largest median residual of a part of the face, 15 mm across, seen by three tracks or more.
     tracks : ndarray of int, shape (T,)
     """
 
@@ -79,6 +84,7 @@ class HeadMotion:
     usable: NDArray[np.bool_]
     residual_px: Floats
     nonrigid: Floats
+    worst_part_px: Floats
     tracks: NDArray[np.intp]
 
     def at(self, times_s: ArrayLike) -> tuple[Floats, Floats]:
@@ -212,7 +218,7 @@ def estimate(
     found = []
     for time, pictures in enumerate(frames):
         if time == reference:
-            found.append(_Pose(np.zeros(6), np.zeros(6), np.zeros(0), total, total))
+            found.append(_Pose(np.zeros(6), np.zeros(6), np.zeros(0), 0.0, total, total))
             continue
         found.append(_pose(pictures, cameras, points, chosen, evened, iterations))
     return _judged(found, times, reference)
@@ -225,6 +231,7 @@ class _Pose:
     motion: Floats
     stderr: Floats
     residual_px: Floats
+    worst_part_px: float
     tracks: int
     started: int
 
@@ -281,7 +288,7 @@ def _pose(
             seen.append((camera, points[rows][tracks.valid], tracks.points_px[tracks.valid]))
     count = sum(len(p) for _, p, _ in seen)
     if count < LEAST_TRACKS:
-        return _Pose(np.zeros(6), np.full(6, np.inf), np.zeros(0), count, started)
+        return _Pose(np.zeros(6), np.full(6, np.inf), np.zeros(0), 0.0, count, started)
     motion = np.zeros(6)
     for _ in range(iterations):
         r, J = _residuals(seen, motion)
@@ -302,7 +309,23 @@ def _pose(
     stderr = _stderr(r, J, u2, _blocks(seen))
     if not np.isfinite(stderr).all():
         motion = np.zeros(6)
-    return _Pose(motion, stderr, length, count, started)
+    worst = _worst_part(np.concatenate([p for _, p, _ in seen]), length)
+    return _Pose(motion, stderr, length, worst, count, started)
+
+
+def _worst_part(points: Floats, length: Floats) -> float:
+    """Return the largest median residual of the parts of a face, 0 where none has three tracks.
+
+    Parts overlap by half, so that an expression lies in one of them as a whole.
+    """
+    worst = 0.0
+    for shift in (0.0, 0.5):
+        cell = np.floor(points / PART_MM + shift).astype(np.intp)
+        _, part, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+        part = part.reshape(-1)
+        for number in np.flatnonzero(count >= 3):
+            worst = max(worst, float(np.median(length[part == number])))
+    return worst
 
 
 def _blocks(seen: Sequence[tuple[Camera, Floats, Floats]]) -> NDArray[np.intp]:
@@ -388,6 +411,9 @@ def _judged(found: Sequence[_Pose], times: Floats, reference: int) -> HeadMotion
             share[number] = (far + lost) / pose.started
     base = float(np.median(share[others])) if others.any() else 0.0
     usable = told & (share <= min(base + NONRIGID_SHARE, NONRIGID_AT_ALL))
+    worst = np.array([f.worst_part_px for f in found])
+    usual_part = float(np.median(worst[others])) if others.any() else 0.0
+    usable &= worst <= max(PART_TIMES * usual_part, OUTLIER_PX)
     usable[reference] = True
     motion = np.array([f.motion for f in found])
     return HeadMotion(
@@ -398,5 +424,6 @@ def _judged(found: Sequence[_Pose], times: Floats, reference: int) -> HeadMotion
         usable=usable,
         residual_px=scales,
         nonrigid=share,
+        worst_part_px=worst,
         tracks=np.array([f.tracks for f in found], np.intp),
     )

@@ -172,6 +172,7 @@ def test_matrices_take_points_to_where_they_were():
         usable=np.ones(2, bool),
         residual_px=np.zeros(2),
         nonrigid=np.zeros(2),
+        worst_part_px=np.zeros(2),
         tracks=np.zeros(2, np.intp),
     )
     half = motion.matrices([0.5])[0]
