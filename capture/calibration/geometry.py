@@ -10,10 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capture.calibration.board import Intrinsics, calibrate_intrinsics
 from capture.calibration.record import Calibration, Quantity, Source, default_validity
 from capture.rig import Rig, View
 
-__all__ = ["CameraPose", "distort", "nominal_cameras", "poses_from", "to_calibration"]
+__all__ = [
+    "CameraPose",
+    "Intrinsics",
+    "calibrate_intrinsics",
+    "distort",
+    "nominal_cameras",
+    "poses_from",
+    "to_calibration",
+]
 
 FloatArray = NDArray[np.float64]
 

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from capture.calibration.chrome_ball import directions_from_chrome_ball
 from capture.calibration.record import Calibration, Quantity, Source, default_validity
 from capture.rig import Rig
 
-__all__ = ["CameraResponse", "LightTable"]
+__all__ = ["CameraResponse", "LightTable", "directions_from_chrome_ball"]
 
 FloatArray = NDArray[np.float64]
 
