@@ -13,6 +13,7 @@ from skinrig import (
     bench_chromophores,
     bench_dome_render,
     bench_flash,
+    bench_light_order,
     bench_photometric,
     bench_tissue,
 )
@@ -28,6 +29,7 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "diffuse-albedo": bench_brdf.albedo,
     "brdf": bench_brdf.surface,
     "normals": bench_photometric.normals,
+    "light-order": bench_light_order.light_order,
 }
 
 
