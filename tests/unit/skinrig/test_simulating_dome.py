@@ -1,0 +1,143 @@
+"""Domes that are simulated small, and their targets through the real drivers."""
+
+import numpy as np
+import pytest
+
+from capture.rig import load_rig
+from capture.session import Session, verify
+from skinrig.cli import main
+from skinrig.light_safety import light_figures, light_lines
+from skinrig.simulating_dome import small_dome, spread
+from skinrig.simulation import SimulationError, simulate_session
+
+DOME = load_rig("dome")
+SMALL_POSES = 10
+
+
+def test_what_is_kept_of_a_dome_is_spread_evenly():
+    places = np.array([light.position_mm for light in DOME.lights])
+    way = places / np.linalg.norm(places, axis=1)[:, None]
+    chosen = spread(places, 24)
+    assert len(set(chosen)) == 24
+    cosines = way[chosen] @ way[chosen].T
+    np.fill_diagonal(cosines, -1.0)
+    gap_deg = np.degrees(np.arccos(cosines.max(axis=1)))
+    assert gap_deg.min() > 25.0
+    first = np.degrees(np.arccos(np.sort((way[:24] @ way[:24].T)[0])[-2]))
+    assert first < 20.0  # the first 24 as they come lie together: the test can fail
+
+
+def test_a_small_dome_keeps_its_names_and_fields_of_view():
+    small = small_dome(DOME, lights=12, views=3, width_px=130)
+    assert {light.name for light in small.lights} <= {light.name for light in DOME.lights}
+    for view in small.views:
+        assert view.field_mm[0] == pytest.approx(DOME.view(view.name).field_mm[0], rel=1e-6)
+    assert small_dome(DOME) == DOME
+
+
+@pytest.mark.parametrize(("field", "count"), [("lights", 0), ("lights", 151), ("views", 17)])
+def test_more_than_the_dome_has_is_refused(field, count):
+    with pytest.raises(SimulationError, match=field):
+        small_dome(DOME, **{field: count})
+
+
+def test_a_targets_session_is_complete_and_sound(tmp_path):
+    done = simulate_session(
+        "dome", tmp_path / "session-charuco", target="charuco", lights=8, views=2, width_px=64
+    )
+    session = Session.open(done.session)
+    assert session.closed
+    poses = {record.index["pose"] for record in session.frames("charuco")}
+    assert poses == set(range(SMALL_POSES))
+    assert verify(done.session).ok
+    assert done.truth is None
+    # the board moved between the poses: no two pictures of a camera are alike
+    pictures = [session.read(r).cfa for r in session.frames("charuco") if r.camera == "C00"]
+    pictures += [session.read(r).cfa for r in session.frames("charuco") if r.camera != "C00"][:1]
+    differences = [np.abs(a.astype(int) - pictures[0]).mean() for a in pictures[1:]]
+    noise = np.abs(session.read(session.frames("dark")[0]).cfa.astype(int) - 64).mean()
+    assert min(differences) > 2.0 * noise
+
+
+def test_a_simulation_goes_on_where_it_was_stopped_with_the_same_settings_only(tmp_path):
+    class Enough(Exception):
+        pass
+
+    def stop(line):
+        if "rows of 2 cameras kept" in line:
+            raise Enough
+
+    asked = {"target": "charuco", "lights": 8, "views": 2, "width_px": 64}
+    with pytest.raises(Enough):
+        simulate_session("dome", tmp_path / "s", **asked, progress=stop)
+    assert Session.open(tmp_path / "s").todo()
+    with pytest.raises(SimulationError, match="same settings"):
+        simulate_session("dome", tmp_path / "s", **{**asked, "lights": 9}, resume=True)
+    done = simulate_session("dome", tmp_path / "s", **asked, resume=True)
+    assert done.frames == 2 * (2 + SMALL_POSES)
+
+
+@pytest.mark.parametrize(
+    ("more", "match"),
+    [({"target": "chart"}, "charuco, mirror, white, dark"), ({"states": ("anger",)}, "states"),
+     ({"repeats": 2}, "repeats"), ({"size": "huge"}, "size"), ({"seed": -1}, "seed")],
+)  # fmt: skip
+def test_what_the_dome_cannot_do_is_refused_before_a_folder_is_made(tmp_path, more, match):
+    with pytest.raises(SimulationError, match=match):
+        simulate_session("dome", tmp_path / "s", **more)
+    assert not (tmp_path / "s").exists()
+
+
+def test_the_flash_rig_knows_no_lights_to_choose(tmp_path):
+    with pytest.raises(SimulationError, match="lights: the flash rig knows nothing of it"):
+        simulate_session("flash", tmp_path / "s", lights=12)
+
+
+def test_flicker_and_dose_are_said_before_anything_is_captured(tmp_path, capsys):
+    assert main(["capture", "dome", "--dry-run"]) == 0
+    said = capsys.readouterr()
+    text = said.out + said.err
+    assert "flicker at the eyes: 1.0 flashes in the worst second" in text
+    assert "light dose: at most 0.439 Ws from one LED" in text
+    lines = []
+    simulate_session(
+        "dome", tmp_path / "s", target="dark", lights=8, views=1, width_px=32,
+        progress=lines.append,
+    )  # fmt: skip
+    assert lines[0].startswith("flicker at the eyes: 0.0 flashes")
+    assert lines[1].startswith("light dose: at most 0 Ws")
+
+
+def test_a_plan_for_closed_eyes_says_so():
+    from capture.plan.dome import dome_plan
+
+    plan = dome_plan(DOME, order=list(range(150)), tracking_every=0)
+    assert light_figures(plan, DOME)["open_eyes"] == "refused"
+    assert "must be closed or shielded" in light_lines(plan, DOME)[0]
+
+
+def test_nonsense_about_the_eyes_is_a_usage_error(capsys):
+    assert main(["capture", "dome", "--dry-run", "--eyes", "shut"]) == 2
+    assert "open, closed, shielded" in capsys.readouterr().err
+
+
+@pytest.mark.render
+@pytest.mark.long
+@pytest.mark.timeout(300)
+def test_a_faces_session_holds_a_scan_and_its_truth_lies_beside(tmp_path):
+    from model import store
+
+    done = simulate_session(
+        "dome", tmp_path / "session-face", lights=12, views=2, width_px=64, seed=1
+    )
+    session = Session.open(done.session)
+    assert session.attachments() == ("scan.ply",)
+    assert session.attachment("scan.ply").startswith(b"ply")
+    truth = store.read(done.truth)
+    assert truth.inputs["session"] == session.content_hash
+    assert {"normals", "r_d", "position"} <= set(truth.maps)
+    assert np.shape(truth.parameters["scan_to_dome"]) == (4, 4)
+    assert len(session.frames("olat")) == 2 * 2 * 12
+    bright = session.read(session.frames("olat", exposure=0)[0]).cfa
+    dark = session.read(session.frames("dark", exposure=0)[0]).cfa
+    assert bright.mean() > dark.mean()
