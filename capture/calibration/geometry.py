@@ -29,6 +29,7 @@ FloatArray = NDArray[np.float64]
 _LEFT_OUT: Any = None  # __post_init__ puts an array in its place
 
 UNDISTORT_STEPS = 50
+UNDISTORT_LIMIT = 10.0  # a step beyond it diverges
 UNDISTORT_TOLERANCE = 1e-12  # of normalized coordinates; a pixel is about 1e-4
 
 
@@ -183,13 +184,14 @@ class CameraPose:
         px = np.asarray(pixels, dtype=np.float64)
         seen = (px - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T
         xy = seen.copy()
-        for _ in range(UNDISTORT_STEPS if self.distortion.any() else 0):
-            step = seen - distort(xy, self.distortion)
-            xy += step
-            if not step.size or np.nanmax(np.abs(step)) < UNDISTORT_TOLERANCE:
-                break
-        else:
-            if self.distortion.any():
+        if self.distortion.any() and xy.size:
+            for _ in range(UNDISTORT_STEPS):
+                step = seen - distort(xy, self.distortion)
+                xy = xy + step
+                size = float(np.nanmax(np.abs(step)))
+                if not UNDISTORT_TOLERANCE < size < UNDISTORT_LIMIT:
+                    break
+            if not size <= UNDISTORT_TOLERANCE:
                 raise ValueError(
                     f"pixels: got some where the distortion {self.distortion.tolist()} of camera"
                     f" {self.serial!r} has no inverse, expected pixels within the image"
