@@ -1,0 +1,380 @@
+"""Values at surface points made into dense texture maps, each texel with its confidence.
+
+Texels that a triangle covers take the values of its corners; what is left is filled by push-pull:
+means over ever coarser pixels, weighed by confidence, then taken back where finer ones know less,
+and relaxed on the way towards a membrane: a constant stays constant, a gap in a ramp becomes ramp.
+
+References
+----------
+Gortler, Grzeszczuk, Szeliski, Cohen 1996, The Lumigraph, doi 10.1145/237170.237200 (push-pull).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.floating]
+Bools = NDArray[np.bool_]
+
+SIZE_RANGE: Final = (8, 8192)
+SWEEPS: Final = 5
+"""Of relaxation on each level, which bend the filled texels into a membrane (no kinks)."""
+_HASTE: Final = np.float32(1.5)
+"""Over-relaxation; below 2 it converges."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TexelMap:
+    """Which triangle lies under each texel of a square texture, and where in it."""
+
+    face: NDArray[np.int32]
+    """Triangle under the texel's centre, shape (N, N), row 0 at the top; -1 for none."""
+    weight: NDArray[np.float32]
+    """Shares of the triangle's second and third corner, shape (N, N, 2)."""
+
+    @property
+    def covered(self) -> Bools:
+        """Texels with a surface under their centre, shape (N, N)."""
+        return self.face >= 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilledTexture:
+    """A dense texture."""
+
+    values: NDArray[np.float32]
+    """Shape (N, N, C); 0 where `valid` is False."""
+    confidence: NDArray[np.float32]
+    """1 for measured texels of full weight, falling with the distance to them, shape (N, N)."""
+    valid: Bools
+    """Texels that hold a value, shape (N, N)."""
+
+
+def rasterize(corner_uv: ArrayLike, size: int) -> TexelMap:
+    """Lay triangles out in a texture.
+
+    Parameters
+    ----------
+    corner_uv : array_like, shape (F, 3, 2)
+        Texture coordinates of each triangle's corners, (0, 0) bottom left.
+    size : int
+        Texels along one side, 8 to 8192.
+
+    Returns
+    -------
+    TexelMap
+        Where triangles overlap in the texture, the one of the lowest index counts.
+    """
+    uv = np.ascontiguousarray(corner_uv, np.float64)
+    if uv.ndim != 3 or uv.shape[1:] != (3, 2) or not np.isfinite(uv).all():
+        raise ValueError(f"corner_uv: got shape {uv.shape}, expected (F, 3, 2) finite numbers")
+    if not SIZE_RANGE[0] <= size <= SIZE_RANGE[1]:
+        raise ValueError(f"size: got {size}, expected {SIZE_RANGE[0]} to {SIZE_RANGE[1]} texels")
+    face, weight = _rasterize(uv, size)
+    return TexelMap(face, weight)
+
+
+def texels_from_points(
+    texels: TexelMap, faces: ArrayLike, values: ArrayLike, weight: ArrayLike | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Interpolate values at points over the triangles, leaving out points without weight.
+
+    Parameters
+    ----------
+    texels : TexelMap
+    faces : array_like of int, shape (F, 3)
+        Points at the corners of the triangles that were rasterized.
+    values : array_like, shape (P,) or (P, C)
+    weight : array_like, shape (P,), optional
+        Confidence of each point, 0 to 1; 1 by default. What is not finite has none.
+
+    Returns
+    -------
+    values : ndarray of float32, shape (N, N, C)
+        0 where nothing is known.
+    weight : ndarray of float32, shape (N, N)
+        Confidence, 0 for none.
+    """
+    at = np.asarray(values, np.float32)
+    at = np.ascontiguousarray(at[:, None] if at.ndim == 1 else at)
+    corners = np.ascontiguousarray(faces, np.int32)
+    trust = np.ones(len(at), np.float32) if weight is None else np.asarray(weight, np.float32)
+    if at.ndim != 2 or trust.shape != (len(at),):
+        raise ValueError(
+            f"values: got shapes {at.shape} and {trust.shape}, expected (P, C) and (P,)"
+        )
+    if corners.ndim != 2 or corners.shape[1] != 3 or int(texels.face.max()) >= len(corners):
+        raise ValueError(f"faces: got shape {corners.shape}, expected those that were rasterized")
+    if corners.size and (corners.min() < 0 or corners.max() >= len(at)):
+        raise ValueError(f"faces: got points {corners.min()} to {corners.max()} of {len(at)}")
+    trust = _checked_weight(trust, np.asarray(np.isfinite(at).all(axis=1)))
+    safe = np.where(trust[:, None] > 0, at, np.float32(0.0))
+    return _interpolate(texels.face, texels.weight, corners, safe, trust)
+
+
+def points_from_texels(
+    texture: ArrayLike, corner_uv: ArrayLike, faces: ArrayLike, points: int
+) -> NDArray[np.float32]:
+    """Sample a dense texture at points, bilinearly; a point at a seam takes the mean of its sides.
+
+    Parameters
+    ----------
+    texture : array_like, shape (N, N) or (N, N, C)
+    corner_uv : array_like, shape (F, 3, 2)
+    faces : array_like of int, shape (F, 3)
+    points : int
+        Number of points.
+
+    Returns
+    -------
+    ndarray of float32, shape (points,) or (points, C)
+        0 for points of no triangle.
+    """
+    image = np.asarray(texture, np.float32)
+    layers = np.ascontiguousarray(image if image.ndim == 3 else image[..., None])
+    size = len(layers)
+    uv = np.asarray(corner_uv, np.float64).reshape(-1, 2)
+    x = np.clip(uv[:, 0] * size - 0.5, 0, size - 1)
+    y = np.clip((1.0 - uv[:, 1]) * size - 0.5, 0, size - 1)
+    j, i = np.minimum(x.astype(int), size - 2), np.minimum(y.astype(int), size - 2)
+    a, b = (x - j)[:, None], (y - i)[:, None]
+    seen = (1 - b) * ((1 - a) * layers[i, j] + a * layers[i, j + 1]) + b * (
+        (1 - a) * layers[i + 1, j] + a * layers[i + 1, j + 1]
+    )
+    corner = np.asarray(faces).reshape(-1)
+    count = np.maximum(np.bincount(corner, minlength=points), 1)
+    out = np.stack(
+        [np.bincount(corner, seen[:, c], minlength=points) / count for c in range(seen.shape[1])],
+        axis=-1,
+    ).astype(np.float32)
+    return out if image.ndim == 3 else out[:, 0]
+
+
+def push_pull(
+    values: ArrayLike, weight: ArrayLike, *, mask: ArrayLike | None = None
+) -> FilledTexture:
+    """Fill the gaps of a texture.
+
+    Parameters
+    ----------
+    values : array_like, shape (H, W) or (H, W, C)
+        Any numbers where `weight` is 0.
+    weight : array_like, shape (H, W)
+        Confidence, 0 to 1; texels of weight 1 keep their values. What is not finite has none.
+    mask : array_like of bool, shape (H, W), optional
+        Texels to fill; all by default. Values outside take no part.
+
+    Returns
+    -------
+    FilledTexture
+        Without any measured texel nothing is valid.
+    """
+    image = np.asarray(values, np.float32)
+    layers = image if image.ndim == 3 else image[..., None]
+    trust = np.asarray(weight, np.float32)
+    if layers.ndim != 3 or trust.shape != layers.shape[:2]:
+        raise ValueError(
+            f"weight: got shape {trust.shape} for values of shape {image.shape}, expected (H, W)"
+        )
+    wanted = np.ones(trust.shape, np.bool_) if mask is None else np.asarray(mask, np.bool_)
+    if wanted.shape != trust.shape:
+        raise ValueError(f"mask: got shape {wanted.shape}, expected {trust.shape}")
+    trust = _checked_weight(trust, np.isfinite(layers).all(axis=2) & wanted)
+    safe = np.ascontiguousarray(np.where(trust[..., None] > 0, layers, np.float32(0.0)))
+    levels = [(safe, trust)]
+    while max(levels[-1][1].shape) > 1:
+        levels.append(_pull(*levels[-1]))
+    filled, known = levels[-1]
+    for fine, fine_weight in reversed(levels[:-1]):
+        filled, known = _push(fine, fine_weight, filled, known)
+        _relax(filled, fine, fine_weight, known, SWEEPS)
+    valid = wanted & (known > 0)
+    return FilledTexture(
+        np.where(valid[..., None], filled, np.float32(0.0)),
+        np.where(valid, known, np.float32(0.0)),
+        np.asarray(valid, np.bool_),
+    )
+
+
+def densify(
+    texels: TexelMap, faces: ArrayLike, values: ArrayLike, weight: ArrayLike | None = None
+) -> FilledTexture:
+    """Make a dense texture of values at points: `texels_from_points`, then `push_pull`.
+
+    Texels outside the charts are filled too, so that bilinear sampling at seams finds values.
+    """
+    return push_pull(*texels_from_points(texels, faces, values, weight))
+
+
+def _checked_weight(weight: NDArray[np.float32], usable: Bools) -> NDArray[np.float32]:
+    good = np.isfinite(weight) & usable
+    known = np.where(good, weight, np.float32(0.0)).astype(np.float32)
+    if known.size and (known.min() < 0 or known.max() > 1):
+        raise ValueError(f"weight: got {known.min():g} to {known.max():g}, expected 0 to 1")
+    return known
+
+
+@njit(cache=True)
+def _rasterize(uv, size):  # type: ignore[no-untyped-def]
+    """Write the triangle whose inside holds each texel's centre; serial, for triangles overlap."""
+    face = np.full((size, size), -1, np.int32)
+    weight = np.zeros((size, size, 2), np.float32)
+    for f in range(len(uv)):
+        # in texels: column to the right, row down, centres at whole numbers
+        x0, y0 = uv[f, 0, 0] * size - 0.5, (1.0 - uv[f, 0, 1]) * size - 0.5
+        x1, y1 = uv[f, 1, 0] * size - 0.5, (1.0 - uv[f, 1, 1]) * size - 0.5
+        x2, y2 = uv[f, 2, 0] * size - 0.5, (1.0 - uv[f, 2, 1]) * size - 0.5
+        area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+        if area == 0.0:
+            continue
+        top = max(int(np.ceil(min(y0, y1, y2) - 1e-9)), 0)
+        bottom = min(int(np.floor(max(y0, y1, y2) + 1e-9)), size - 1)
+        left = max(int(np.ceil(min(x0, x1, x2) - 1e-9)), 0)
+        right = min(int(np.floor(max(x0, x1, x2) + 1e-9)), size - 1)
+        for i in range(top, bottom + 1):
+            for j in range(left, right + 1):
+                b = ((j - x0) * (y2 - y0) - (x2 - x0) * (i - y0)) / area
+                c = ((x1 - x0) * (i - y0) - (j - x0) * (y1 - y0)) / area
+                # a centre on an edge belongs to both sides
+                if b >= -1e-9 and c >= -1e-9 and b + c <= 1.0 + 1e-9 and face[i, j] < 0:
+                    face[i, j] = f
+                    weight[i, j, 0] = b
+                    weight[i, j, 1] = c
+    return face, weight
+
+
+@njit(cache=True, parallel=True)
+def _interpolate(face, weight, corners, values, trust):  # type: ignore[no-untyped-def]
+    size, channels = face.shape[0], values.shape[1]
+    out = np.zeros((size, size, channels), np.float32)
+    known = np.zeros((size, size), np.float32)
+    for i in prange(size):
+        for j in range(size):
+            f = face[i, j]
+            if f < 0:
+                continue
+            share = (
+                np.float32(1.0) - weight[i, j, 0] - weight[i, j, 1],
+                weight[i, j, 0],
+                weight[i, j, 1],
+            )
+            total = np.float32(0.0)
+            for k in range(3):
+                w = max(share[k], np.float32(0.0)) * trust[corners[f, k]]
+                total += w
+                for c in range(channels):
+                    out[i, j, c] += w * values[corners[f, k], c]
+            known[i, j] = min(total, np.float32(1.0))
+            for c in range(channels):
+                out[i, j, c] = out[i, j, c] / total if total > 0.0 else np.float32(0.0)
+    return out, known
+
+
+@njit(cache=True, parallel=True)
+def _pull(fine, weight):  # type: ignore[no-untyped-def]
+    """Return the level of half the size: weighted means of 4 x 4 texels, 1 3 3 1 each way."""
+    height, width, channels = fine.shape
+    rows, columns = (height + 1) // 2, (width + 1) // 2
+    out = np.zeros((rows, columns, channels), np.float32)
+    known = np.zeros((rows, columns), np.float32)
+    taps = np.array([0.125, 0.375, 0.375, 0.125], np.float32)
+    for i in prange(rows):
+        for j in range(columns):
+            total = np.float32(0.0)
+            for di in range(4):
+                y = 2 * i + di - 1
+                if y < 0 or y >= height:
+                    continue
+                for dj in range(4):
+                    x = 2 * j + dj - 1
+                    if x < 0 or x >= width or weight[y, x] == 0.0:
+                        continue
+                    w = taps[di] * taps[dj] * weight[y, x]
+                    total += w
+                    for c in range(channels):
+                        out[i, j, c] += w * fine[y, x, c]
+            if total > 0.0:
+                for c in range(channels):
+                    out[i, j, c] /= total
+                # a pixel that a quarter of its texels fill is known as well as they are
+                known[i, j] = min(np.float32(4.0) * total, np.float32(1.0))
+    return out, known
+
+
+@njit(cache=True, parallel=True)
+def _push(fine, weight, coarse, coarse_weight):  # type: ignore[no-untyped-def]
+    """Return the finer level with what it lacks taken from the coarser one, bilinearly."""
+    height, width, channels = fine.shape
+    rows, columns = coarse_weight.shape
+    out = np.empty_like(fine)
+    known = np.empty_like(weight)
+    for i in prange(height):
+        upper = min(max((i - 1) // 2, 0), rows - 1)
+        lower = min((i + 1) // 2, rows - 1)
+        near_i = np.float32(0.75) if i % 2 else np.float32(0.25)
+        for j in range(width):
+            w = weight[i, j]
+            if w >= 1.0:
+                known[i, j] = w
+                out[i, j] = fine[i, j]
+                continue
+            left = min(max((j - 1) // 2, 0), columns - 1)
+            right = min((j + 1) // 2, columns - 1)
+            near_j = np.float32(0.75) if j % 2 else np.float32(0.25)
+            total = np.float32(0.0)
+            trust = np.float32(0.0)
+            for c in range(channels):
+                out[i, j, c] = 0.0
+            for y, a in ((upper, near_i), (lower, np.float32(1.0) - near_i)):
+                for x, b in ((left, near_j), (right, np.float32(1.0) - near_j)):
+                    if coarse_weight[y, x] == 0.0:
+                        continue
+                    total += a * b
+                    trust += a * b * coarse_weight[y, x]
+                    for c in range(channels):
+                        out[i, j, c] += a * b * coarse[y, x, c]
+            # what comes from a level further up is trusted half as much
+            from_coarse = np.float32(0.5) * trust * (np.float32(1.0) - w)
+            for c in range(channels):
+                blurred = out[i, j, c] / total if total > 0.0 else np.float32(0.0)
+                out[i, j, c] = w * fine[i, j, c] + (np.float32(1.0) - w) * blurred
+                if total == 0.0:
+                    out[i, j, c] = fine[i, j, c]
+            known[i, j] = w + from_coarse
+    return out, known
+
+
+@njit(cache=True, parallel=True)
+def _relax(filled, fine, weight, known, sweeps):  # type: ignore[no-untyped-def]
+    """Move what is not measured towards the mean of its neighbours, black and white in turn."""
+    height, width, channels = filled.shape
+    for sweep in range(2 * sweeps):
+        for i in prange(height):
+            for j in range((i + sweep) % 2, width, 2):
+                w = weight[i, j]
+                if w >= 1.0 or known[i, j] == 0.0:
+                    continue
+                for c in range(channels):
+                    total = np.float32(0.0)
+                    count = np.float32(0.0)
+                    if i > 0:
+                        total += filled[i - 1, j, c]
+                        count += np.float32(1.0)
+                    if i < height - 1:
+                        total += filled[i + 1, j, c]
+                        count += np.float32(1.0)
+                    if j > 0:
+                        total += filled[i, j - 1, c]
+                        count += np.float32(1.0)
+                    if j < width - 1:
+                        total += filled[i, j + 1, c]
+                        count += np.float32(1.0)
+                    if count > 0.0:
+                        mean = total / count
+                        goal = w * fine[i, j, c] + (np.float32(1.0) - w) * mean
+                        filled[i, j, c] += _HASTE * (goal - filled[i, j, c])
