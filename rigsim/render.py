@@ -97,11 +97,21 @@ class Caster:
         self.mesh = mesh
         self.choice = choose_variant("rgb") if choice is None else choice
         self.attributes = np.concatenate([mesh.vertices_mm, mesh.normals, mesh.uv], axis=1)
+        self._face_normals: Float32Array | None = None
         self._tracer: _Tracer
         if self.choice.is_vectorized:
             self._tracer = _MitsubaTracer(mesh, self.choice)
         else:
             self._tracer = _EmbreeTracer(mesh)
+
+    @property
+    def face_normals(self) -> Float32Array:
+        """Unit normals of the triangles, shape (F, 3); zero where one has no area."""
+        if self._face_normals is None:
+            corners = self.mesh.vertices_mm[self.mesh.faces]
+            edges = corners[:, 1:] - corners[:, :1]
+            self._face_normals = _unit(np.cross(edges[:, 0], edges[:, 1]))
+        return self._face_normals
 
     @property
     def scene(self) -> Any:
@@ -244,15 +254,14 @@ def g_buffer(
         interpolate(caster.attributes, mesh.faces, prim, weight).reshape(*shape, 8), [3, 6], axis=-1
     )
     mask = prim >= 0
-    corners = mesh.vertices_mm[mesh.faces[prim[mask]]]
     face_normal = np.zeros((len(prim), 3), np.float32)
-    face_normal[mask] = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    face_normal[mask] = caster.face_normals[prim[mask]]
     buffers = GBuffer(
         mask=mask.reshape(shape),
         prim=prim.reshape(shape),
         position_mm=position,
         normal=_unit(normal),
-        face_normal=_unit(face_normal.reshape(*shape, 3)),
+        face_normal=face_normal.reshape(*shape, 3),
         uv=uv,
         to_camera=-directions,
     )
@@ -564,6 +573,7 @@ class _MitsubaTracer:
         hit = self.scene.ray_intersect_preliminary(
             self._ray(mi, origins, directions), coherent=True
         )
+        _evaluate(hit)  # else each of the reads below would trace anew
         valid = np.array(hit.is_valid())
         prim = np.where(valid, np.array(hit.prim_index).astype(np.int64), -1).astype(np.int32)
         weight = np.stack([np.array(hit.prim_uv.x), np.array(hit.prim_uv.y)], axis=-1)
@@ -603,6 +613,12 @@ class _EmbreeTracer:
             return np.zeros(0, np.bool_)
         hit = self._scene.run(origins, directions, dists=length.copy(), query="OCCLUDED")
         return np.asarray(hit) != -1
+
+
+def _evaluate(result: Any) -> None:
+    import drjit as dr
+
+    dr.eval(result)
 
 
 def _ray_arrays(origins: ArrayLike, directions: ArrayLike) -> tuple[Float32Array, Float32Array]:

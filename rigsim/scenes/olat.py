@@ -179,8 +179,9 @@ def find_hits(
     k, width, height = subpixels, view.width_px, view.height_px
     band = max(1, BAND_RAYS // (width * k * k))
     parts: list[tuple[NDArray[np.generic], ...]] = []
-    for top in range(0, height, band):
-        rows = (top, min(top + band, height))
+    begin, end = _rows_of(caster, view, bent=distortion is not None and bool(np.any(distortion)))
+    for top in range(begin, end, band):
+        rows = (top, min(top + band, end))
         buffers = g_buffer(caster, view, subpixels=k, rows=rows, distortion=distortion)
         # Rows of one pixel stand together: (H, k, W, k) -> (H, W, k, k).
         tall = rows[1] - rows[0]
@@ -217,6 +218,19 @@ def find_hits(
         camera_mm=np.asarray(view.position_mm, np.float64),
         kind=kind,
     )
+
+
+def _rows_of(caster: Caster, view: View, *, bent: bool) -> tuple[int, int]:
+    """Return the first row of the image that the mesh can reach, and the one after the last."""
+    offset = caster.mesh.vertices_mm - np.asarray(view.position_mm, np.float32)
+    _, up, back = (np.asarray(axis, np.float32) for axis in view.axes)
+    depth = -(offset @ back)
+    if bent or not float(depth.min()) > 1.0:
+        return 0, view.height_px
+    row = 0.5 * (view.height_px - 1) - view.focal_px * (offset @ up) / depth
+    begin, end = int(row.min()) - 1, int(row.max()) + 3
+    begin = min(max(begin, 0), view.height_px - 1)
+    return begin, min(max(end, begin + 1), view.height_px)
 
 
 def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> NDArray[np.bool_]:
@@ -264,11 +278,8 @@ def seen_from(hits: Hits, caster: Caster, lamp: Lamp) -> NDArray[np.bool_]:
 
 def lift(hits: Hits, caster: Caster) -> Float32Array:
     """Return where the rows' shadow rays start, above their triangles, shape (n, 3)."""
-    corners = caster.mesh.vertices_mm[caster.mesh.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    normal = np.divide(OFFSET_MM * normal, length, out=np.zeros_like(normal), where=length > 0.0)
-    return np.asarray(hits.position_mm + normal[hits.prim], np.float32)
+    offset = np.float32(OFFSET_MM) * caster.face_normals[hits.prim]
+    return np.asarray(hits.position_mm + offset, np.float32)
 
 
 def sum_rows(
