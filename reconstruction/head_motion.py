@@ -28,6 +28,8 @@ OUTLIER_SIGMAS, OUTLIER_PX = 4.0, 0.3
 NONRIGID_SHARE = 0.05
 """Share of such tracks, beyond the capture's usual one, from which a frame is not usable."""
 NONRIGID_AT_ALL = 0.3
+OFTEN = 1 / 3
+"""Part of the frames from which on a track that moves on its own is not one of the skin."""
 PART_MM = 15.0
 PART_TIMES = 2.5
 """Residual of the worst part of a face, over the capture's usual one, that is an expression."""
@@ -218,22 +220,20 @@ def estimate(
     found = []
     for time, pictures in enumerate(frames):
         if time == reference:
-            found.append(_Pose(np.zeros(6), np.zeros(6), np.zeros(0), 0.0, total, total))
+            found.append(_Pose(np.zeros(6), np.zeros(6), np.zeros(total)))
             continue
         found.append(_pose(pictures, cameras, points, chosen, evened, iterations))
-    return _judged(found, times, reference)
+    return _judged(found, np.concatenate([points[rows] for rows in chosen]), times, reference)
 
 
 @dataclass(frozen=True, slots=True)
 class _Pose:
-    """Rotation vector and translation of one frame, with the lengths of its tracks' residuals."""
+    """Rotation vector and translation of one frame, and what they leave of each track."""
 
     motion: Floats
     stderr: Floats
     residual_px: Floats
-    worst_part_px: float
-    tracks: int
-    started: int
+    """Length, infinite for a track that was lost."""
 
 
 def _checked(
@@ -279,16 +279,17 @@ def _pose(
     iterations: int,
 ) -> _Pose:
     seen: list[tuple[Camera, Floats, Floats]] = []
-    started = 0
+    kept = []
     for picture, camera, rows, even in zip(pictures, cameras, chosen, evened, strict=True):
         start = np.asarray(camera.project(points[rows])) if len(rows) else np.zeros((0, 2))
         tracks = registration.track(even, registration.evened(np.asarray(picture)), start)
-        started += len(rows)
+        kept.append(tracks.valid)
         if tracks.valid.any():
             seen.append((camera, points[rows][tracks.valid], tracks.points_px[tracks.valid]))
-    count = sum(len(p) for _, p, _ in seen)
-    if count < LEAST_TRACKS:
-        return _Pose(np.zeros(6), np.full(6, np.inf), np.zeros(0), 0.0, count, started)
+    found = np.concatenate(kept)
+    left = np.full(found.size, np.inf)
+    if np.count_nonzero(found) < LEAST_TRACKS:
+        return _Pose(np.zeros(6), np.full(6, np.inf), left)
     motion = np.zeros(6)
     for _ in range(iterations):
         r, J = _residuals(seen, motion)
@@ -309,8 +310,8 @@ def _pose(
     stderr = _stderr(r, J, u2, _blocks(seen))
     if not np.isfinite(stderr).all():
         motion = np.zeros(6)
-    worst = _worst_part(np.concatenate([p for _, p, _ in seen]), length)
-    return _Pose(motion, stderr, length, worst, count, started)
+    left[found] = length
+    return _Pose(motion, stderr, left)
 
 
 def _worst_part(points: Floats, length: Floats) -> float:
@@ -395,25 +396,24 @@ def _residuals(
     return np.where(known[:, None], r, 1e6), np.where(known[:, None, None], J, 0.0)
 
 
-def _judged(found: Sequence[_Pose], times: Floats, reference: int) -> HeadMotion:
+def _judged(found: Sequence[_Pose], points: Floats, times: Floats, reference: int) -> HeadMotion:
     """Compare the frames with each other: what is usual is noise, what is not an expression."""
-    scales = np.array(
-        [float(np.median(f.residual_px)) / _MAD if f.residual_px.size else 0.0 for f in found]
-    )
+    left = np.array([f.residual_px for f in found])
+    known = np.isfinite(left)
+    scales = np.array([_middle(row) / _MAD for row in left])
     told = np.array([np.isfinite(f.stderr).all() for f in found])
     others = told & (np.arange(len(found)) != reference)
-    usual = float(np.median(scales[others])) if others.any() else 0.0
-    share = np.zeros(len(found))
-    for number, pose in enumerate(found):
-        if number != reference and pose.started:
-            far = np.count_nonzero(pose.residual_px > max(OUTLIER_SIGMAS * usual, OUTLIER_PX))
-            lost = pose.started - pose.tracks
-            share[number] = (far + lost) / pose.started
-    base = float(np.median(share[others])) if others.any() else 0.0
-    usable = told & (share <= min(base + NONRIGID_SHARE, NONRIGID_AT_ALL))
-    worst = np.array([f.worst_part_px for f in found])
-    usual_part = float(np.median(worst[others])) if others.any() else 0.0
-    usable &= worst <= max(PART_TIMES * usual_part, OUTLIER_PX)
+    far = left > max(OUTLIER_SIGMAS * _middle(scales[others]), OUTLIER_PX)
+    # what leaves the head in many frames is no expression but an edge that hides points
+    steady = np.ones(len(points), bool)
+    if np.count_nonzero(others) >= 4:
+        steady = np.mean(far[others], axis=0) <= OFTEN
+    share = np.mean(far[:, steady], axis=1) if steady.any() else np.ones(len(found))
+    worst = np.array(
+        [_worst_part(points[use], row[use]) for row, use in zip(left, known & steady, strict=True)]
+    )
+    usable = told & (share <= min(_middle(share[others]) + NONRIGID_SHARE, NONRIGID_AT_ALL))
+    usable &= worst <= max(PART_TIMES * _middle(worst[others]), OUTLIER_PX)
     usable[reference] = True
     motion = np.array([f.motion for f in found])
     return HeadMotion(
@@ -425,5 +425,11 @@ def _judged(found: Sequence[_Pose], times: Floats, reference: int) -> HeadMotion
         residual_px=scales,
         nonrigid=share,
         worst_part_px=worst,
-        tracks=np.array([f.tracks for f in found], np.intp),
+        tracks=np.count_nonzero(known, axis=1),
     )
+
+
+def _middle(values: Floats) -> float:
+    """Return the median of the finite values, 0 where there are none."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else 0.0

@@ -13,8 +13,11 @@ from skinrig import (
     bench_chromophores,
     bench_dome_render,
     bench_flash,
+    bench_hdr,
     bench_light_order,
+    bench_motion,
     bench_photometric,
+    bench_surface,
     bench_tissue,
 )
 from skinrig.benchmark import StageBenchmark, to_document
@@ -29,6 +32,10 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "diffuse-albedo": bench_brdf.albedo,
     "brdf": bench_brdf.surface,
     "normals": bench_photometric.normals,
+    "hdr": bench_hdr.merging,
+    "lumitexels": bench_surface.lumitexels,
+    "texture-fill": bench_surface.filling,
+    "head-motion": bench_motion.motion,
     "light-order": bench_light_order.light_order,
 }
 
