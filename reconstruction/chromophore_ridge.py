@@ -88,7 +88,7 @@ def lines_of(table: ColorTable) -> Lines:
     return Lines(np.log(color), by_a / color, by_b / color)
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(fastmath=_FAST)
 def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
     """Return p' W q."""
     return (
@@ -101,7 +101,7 @@ def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(fastmath=_FAST)
 def _hermite(v0, v1, d0, d1, x, step):  # type: ignore[no-untyped-def]
     """Return the cubic with these values and derivatives at the ends, and its derivative."""
     rise = v1 - v0
@@ -112,7 +112,7 @@ def _hermite(v0, v1, d0, d1, x, step):  # type: ignore[no-untyped-def]
     return value, slope
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(fastmath=_FAST)
 def _color(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
     """Return the log color and its derivative by blood on line k, the node and the way past it."""
     y = (b - _LOW) / _STEP_B
@@ -130,7 +130,7 @@ def _color(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
     return f0, f1, f2, g0, g1, g2, j, x
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(fastmath=_FAST)
 def _prior_cost(prior, low, step, t):  # type: ignore[no-untyped-def]
     """Return -2 log p of a log shading; beyond the table its ends go on straight."""
     y = (t - low) / step
@@ -138,7 +138,7 @@ def _prior_cost(prior, low, step, t):  # type: ignore[no-untyped-def]
     return prior[i] + (y - i) * (prior[i + 1] - prior[i])
 
 
-@njit(inline="always", fastmath=_FAST)
+@njit(fastmath=_FAST)
 def _volume(k, x, end):  # type: ignore[no-untyped-def]
     """Return the volume fraction of melanin a part x of the way past line k."""
     a = _LOW + (k + x) * _STEP_A

@@ -37,7 +37,7 @@ def seen(table, c_m, c_hd, shading, rng, noise=NOISE):
 
 
 def test_the_kernel_sums_what_plain_numpy_sums_over_a_dense_plane(table, prior, rng):
-    c_m, c_hd, shading = skin(rng, 24, prior)
+    c_m, c_hd, shading = skin(rng, 10, prior)
     # down to skin whose blood nobody can see, and up to where melanin has two solutions
     c_m[:4], c_hd[:4], shading[:4] = [0.06, 0.09, 0.15, 0.45], [0.01, 0.1, 0.02, 0.06], 1.0
     noise = 0.006
@@ -46,7 +46,9 @@ def test_the_kernel_sums_what_plain_numpy_sums_over_a_dense_plane(table, prior, 
         rgb, table, prior=prior, variance=(noise * rgb) ** 2, model_error=model_error.load()
     )
     covariance = without_brightness(model_error.load() + 1e-12 * np.eye(3)) + noise**2 * np.eye(3)
-    slow = np.array([chromophore_reference.weigh(c, table, covariance, prior) for c in rgb])
+    slow = np.array(
+        [chromophore_reference.weigh(c, table, covariance, prior, size=(900, 300)) for c in rgb]
+    )
     for k, (center, reach) in enumerate(
         ((found.melanin, found.stderr_melanin), (found.hemoglobin, found.stderr_hemoglobin))
     ):
