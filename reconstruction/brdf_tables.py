@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 Brdf = Callable[[FloatArray, FloatArray], FloatArray]
 """Takes light and view, unit vectors (..., 3) where +z is the normal; gives 1/sr, NaN: unknown."""
 
-NODES_D, NODES_PHI, NODES_H = 32, 9, 90
+NODES_D, NODES_PHI, NODES_H = 32, 12, 90
 LANES = 16  # materials are padded to full vectors of float32
 LEAST = 1e-20
 """Values below this are stored as 0: a sum of denormal numbers is nine times as slow."""
@@ -47,7 +47,7 @@ class BrdfBasis:
 
     Attributes
     ----------
-    table : ndarray of float32, shape (32, 9, 90, L)
+    table : ndarray of float32, shape (32, 12, 90, L)
         1/sr at nodes of theta_d (even over [0, pi/2]), phi_d (even over [0, pi/2], folded by
         reciprocity and mirror symmetry) and theta_h (even in its square root over [0, pi/2]).
         L is K rounded up to a multiple of 16; columns from K on are 0.
@@ -79,7 +79,7 @@ class BrdfBasis:
         return len(self.names)
 
     def evaluate(self, light_dir: ArrayLike, view_dir: ArrayLike, normal: ArrayLike) -> FloatArray:
-        """Return each material's BRDF, trilinear between the nodes.
+        """Return each material's BRDF: linear in theta_d and theta_h, at the nearest phi_d.
 
         Parameters
         ----------
@@ -93,16 +93,12 @@ class BrdfBasis:
         """
         light, view, n = (np.asarray(v, dtype=np.float64) for v in (light_dir, view_dir, normal))
         mu_l, mu_v = np.sum(light * n, axis=-1), np.sum(view * n, axis=-1)
-        cell, part = _place(mu_l, mu_v, np.sum(light * view, axis=-1))
-        shape = np.broadcast_shapes(*(c.shape for c in cell))
-        found = np.zeros((*shape, self.table.shape[-1]))
-        for corner in range(8):
-            bits = [(corner >> axis) & 1 for axis in range(3)]
-            weight = np.ones(())
-            for p, b in zip(part, bits, strict=True):
-                weight = weight * (p if b else 1.0 - p)
-            index = tuple(c + b for c, b in zip(cell, bits, strict=True))
-            found += weight[..., None] * self.table[index]
+        (i_d, i_phi, i_h), (d, h) = _place(mu_l, mu_v, np.sum(light * view, axis=-1))
+        found = np.zeros(())
+        for up_d in (0, 1):
+            for up_h in (0, 1):
+                weight = (d if up_d else 1.0 - d) * (h if up_h else 1.0 - h)
+                found = found + weight[..., None] * self.table[i_d + up_d, i_phi, i_h + up_h]
         above = (mu_l > 0.0) & (mu_v > 0.0)
         return np.asarray(np.where(above[..., None], found, 0.0)[..., : self.size])
 
@@ -250,8 +246,8 @@ def _padded(columns: FloatArray, names: Sequence[str], light_radius_rad: float) 
 
 def _place(
     mu_l: FloatArray, mu_v: FloatArray, between: FloatArray
-) -> tuple[list[NDArray[np.intp]], list[FloatArray]]:
-    """Return cell and place in it along theta_d, phi_d, theta_h, from cosines alone."""
+) -> tuple[tuple[NDArray[np.intp], ...], tuple[FloatArray, FloatArray]]:
+    """Return the cell along theta_d, phi_d, theta_h and the place in it, from cosines alone."""
     cos_d = np.sqrt(np.clip(0.5 * (1.0 + between), 0.0, 1.0))
     sin_d = np.sqrt(np.clip(0.5 * (1.0 - between), 0.0, 1.0))
     cos_h = np.clip((mu_l + mu_v) / np.maximum(2.0 * cos_d, 1e-9), 0.0, 1.0)
@@ -263,8 +259,7 @@ def _place(
         np.arccos(cos_phi) / _HALF_PI * (NODES_PHI - 1),
         np.sqrt(np.arccos(cos_h) / _HALF_PI) * (NODES_H - 1),
     )
-    cells = [
-        np.clip(p.astype(np.intp), 0, size - 2)
-        for p, size in zip(place, (NODES_D, NODES_PHI, NODES_H), strict=True)
-    ]
-    return cells, [p - c for p, c in zip(place, cells, strict=True)]
+    d, phi, h = place
+    i_d = np.minimum(d.astype(np.intp), NODES_D - 2)
+    i_h = np.minimum(h.astype(np.intp), NODES_H - 2)
+    return (i_d, (phi + 0.5).astype(np.intp), i_h), (d - i_d, h - i_h)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, types, uint64
 
-NODES_D, NODES_PHI, NODES_H = 32, 9, 90  # of reconstruction.brdf_tables; its tests hold them equal
+NODES_D, NODES_PHI, NODES_H = 32, 12, 90  # of reconstruction.brdf_tables; its tests hold them equal
 MOST = 32
 """Most columns in a working set; when it is full, the unused ones leave it."""
 JOIN = 4
@@ -79,35 +79,37 @@ def _row_filler(fixed: int) -> Callable[..., Any]:
     """Return the kernel that fills a matrix; one of fixed width runs in unrolled vectors."""
 
     @njit(nogil=True, fastmath=_FAST)
-    def fill(flat, cos_l, place, count, rows):  # type: ignore[no-untyped-def]
+    def fill(flat, cos_l, place, weight, count, rows, square):  # type: ignore[no-untyped-def]
+        """Fill the matrix and the weighted squares of its columns."""
         lanes = uint64(fixed) if fixed > 0 else uint64(rows.shape[1])
         out = rows.reshape(-1)
+        block = np.zeros(rows.shape[1], dtype=np.float32)
+        square[:] = 0.0
         for i in range(count):
-            d, phi, h = place[0, i], place[1, i], place[2, i]
+            d, h = place[0, i], place[2, i]
             i_d = min(int64(d), NODES_D - 2)
-            i_phi = min(int64(phi), NODES_PHI - 2)
+            i_phi = int64(place[1, i] + 0.5)
             i_h = min(int64(h), NODES_H - 2)
-            d, phi, h = d - i_d, phi - i_phi, h - i_h
+            d, h = d - i_d, h - i_h
             # Unsigned offsets into a flat table: no test for negative ones keeps the loop whole.
             a = uint64((i_d * NODES_PHI + i_phi) * NODES_H + i_h) * lanes
-            b = a + uint64(NODES_H) * lanes
-            e = a + uint64(NODES_H * NODES_PHI) * lanes
-            f = e + uint64(NODES_H) * lanes
-            low, high = float32(1.0 - h), float32(h)
-            w_a = float32(cos_l[i] * (1.0 - d) * (1.0 - phi))
-            w_b = float32(cos_l[i] * (1.0 - d) * phi)
-            w_e = float32(cos_l[i] * d * (1.0 - phi))
-            w_f = float32(cos_l[i] * d * phi)
+            b = a + uint64(NODES_H * NODES_PHI) * lanes
+            w_a = float32(cos_l[i] * (1.0 - d) * (1.0 - h))
+            w_b = float32(cos_l[i] * (1.0 - d) * h)
+            w_e = float32(cos_l[i] * d * (1.0 - h))
+            w_f = float32(cos_l[i] * d * h)
+            w = weight[i]
             o = uint64(i) * lanes
             for k in range(lanes):
-                out[o + k] = low * (
-                    w_a * flat[a + k] + w_b * flat[b + k] + w_e * flat[e + k] + w_f * flat[f + k]
-                ) + high * (
-                    w_a * flat[a + lanes + k]
-                    + w_b * flat[b + lanes + k]
-                    + w_e * flat[e + lanes + k]
-                    + w_f * flat[f + lanes + k]
+                element = (w_a * flat[a + k] + w_b * flat[a + lanes + k]) + (
+                    w_e * flat[b + k] + w_f * flat[b + lanes + k]
                 )
+                out[o + k] = element
+                block[k] += (w * element) * element
+            if i % 64 == 63 or i == count - 1:
+                for k in range(lanes):
+                    square[k] += block[k]
+                    block[k] = float32(0.0)
 
     return fill
 
@@ -285,7 +287,6 @@ def _solve(  # type: ignore[no-untyped-def]
     for i in range(count):
         root[i] = math.sqrt(weight[i])
         target[i] = root[i] * value[i]
-    _squares(rows, weight, count, square)
     for p in range(size):
         _gather(rows, root, working[p], count, column[p])
     _join(0, size, column, target, count, gram, rhs)
@@ -446,19 +447,19 @@ def fit_points(  # type: ignore[no-untyped-def]
             if count == 0:
                 continue
             top /= count
-            _places(light[point], view[point], normal[point], picked, count, cos_l, place)
-            if lanes == 64:
-                _fill_64(flat, cos_l, place, count, rows)
-            elif lanes == 16:
-                _fill_16(flat, cos_l, place, count, rows)
-            else:
-                _fill_any(flat, cos_l, place, count, rows)
             # The first pass of several: noise, and an even misfit of 3 % of the RMS
             for i in range(count):
                 if reweightings > 0:
                     weight[i] = 1.0 / (var[i] + 1e-3 * top + 1e-30)
                 else:
                     weight[i] = 1.0 / var[i] if known else 1.0
+            _places(light[point], view[point], normal[point], picked, count, cos_l, place)
+            if lanes == 64:
+                _fill_64(flat, cos_l, place, weight, count, rows, square)
+            elif lanes == 16:
+                _fill_16(flat, cos_l, place, weight, count, rows, square)
+            else:
+                _fill_any(flat, cos_l, place, weight, count, rows, square)
             kept = 0
             for p in range(size):  # the neighbour's columns in use
                 if x[p] > 0.0:
@@ -476,6 +477,7 @@ def fit_points(  # type: ignore[no-untyped-def]
                 for i in range(count):
                     model[i] = y[i] - residual[i] / root[i]
                 scatter = _reweigh(y, var, model, count, weight, scatter)
+                _squares(rows, weight, count, square)
                 size = _solve(
                     rows, y, weight, count, materials, kinship, working, size, x,
                     column, gram, rhs, low, active, trial, refused, square, pull, root, target,
