@@ -92,6 +92,11 @@ class LumitexelStore:
             for view, rows in enumerate(self._rows)
         ]
 
+    @property
+    def view_count(self) -> int:
+        """Number of cameras."""
+        return len(self._cameras)
+
     def seen_by(self, view: int) -> NDArray[np.int32]:
         """Return the indices of the points that a camera sees."""
         return self._rows[view]

@@ -12,7 +12,7 @@ from typing import Any
 from capture.session import Session
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from reconstruction import flash_stages, stack_stages, stages
+from reconstruction import dome_stages, flash_stages, stack_stages, stages
 from reconstruction.evidence import Evidence, EvidenceError
 
 
@@ -23,10 +23,13 @@ class Recipe:
     maps: tuple[str, ...]
     """Names of the maps."""
     graph: Callable[[Evidence], list[stages.Stage]]
+    files: tuple[str, ...] = ()
+    """Names of what is no map and goes along: meshes, tables."""
 
 
 RECIPES: Mapping[str, Recipe] = {
     "subject": Recipe(flash_stages.MAPS, flash_stages.graph),
+    "olat": Recipe(dome_stages.MAPS, dome_stages.graph, dome_stages.FILES),
 }
 """By the kind of step that shows the subject."""
 LIGHT_LIST = Recipe(stack_stages.MAPS, stack_stages.graph)
@@ -113,24 +116,30 @@ def reconstruct(
         for stage in graph
         if set(stage.makes) & set(want)
         for name in stage.makes
-        if name in recipe.maps
+        if name in (*recipe.maps, *recipe.files)
     ]
     previous = _previous(Path(out))
     outcome = stages.run(graph, list(want), cache=_Kept(graph, previous), progress=progress)
     outcome = replace(outcome, assumed=tuple(evidence.assumed))
-    if not outcome.ran and previous is not None and set(want) <= set(previous.maps):
+    if not outcome.ran and previous is not None and set(want) <= set(_contents(previous)):
         return outcome
     keys = _all_keys(graph)
-    maps = {name: outcome.products[name] for name in want}
+    kept = {name: outcome.products[name] for name in want}
+    noted = dict(evidence.noted)
     if previous is not None:
         recorded = _recorded_keys(previous)
+        before = _contents(previous)
         for stage in graph:
             if recorded.get(stage.name) == keys[stage.name]:
                 for name in stage.makes:
-                    if name in previous.maps:
-                        maps.setdefault(name, previous.maps[name])
+                    if name in before:
+                        kept.setdefault(name, before[name])
+        if dict(previous.inputs) == evidence.hashes:
+            names = previous.parameters.get("noted", [])
+            for name in names if isinstance(names, list) else []:
+                noted.setdefault(str(name), previous.parameters.get(str(name)))
     appearance = SkinAppearance(
-        maps=maps,
+        maps={name: value for name, value in kept.items() if isinstance(value, SkinMap)},
         source=opened.source,
         parameters={
             "kind": "appearance",
@@ -139,11 +148,13 @@ def reconstruct(
             "truth": truth,
             "stages": {stage.name: keys[stage.name] for stage in graph},
             "assumed": evidence.assumed,
-            **evidence.noted,
+            "noted": sorted(noted),
+            **noted,
         },
         inputs=evidence.hashes,
         versions={name: metadata.version(name) for name in ("skinrig", "numpy", "scipy", "numba")},
         left_out=outcome.left_out,
+        files={name: value for name, value in kept.items() if isinstance(value, bytes)},
         seed=opened.seed,
     )
     store.write(out, appearance)
@@ -154,13 +165,14 @@ class _Kept:
     """Finished maps in an older APPEARANCE/ folder, by the hash of their stage."""
 
     def __init__(self, graph: Sequence[stages.Stage], previous: SkinAppearance | None) -> None:
-        self._by_key: dict[str, Mapping[str, SkinMap]] = {}
+        self._by_key: dict[str, Mapping[str, SkinMap | bytes]] = {}
         if previous is None:
             return
         recorded = _recorded_keys(previous)
+        before = _contents(previous)
         for stage in graph:
-            kept = {name: previous.maps[name] for name in stage.makes if name in previous.maps}
-            if stage.name in recorded and len(kept) == len(stage.makes):
+            kept = {name: before[name] for name in stage.makes if name in before}
+            if stage.name in recorded and kept:
                 self._by_key[recorded[stage.name]] = kept
 
     def load(self, key: str) -> Mapping[str, Any] | None:
@@ -174,6 +186,11 @@ def _previous(out: Path) -> SkinAppearance | None:
     if not (out / store.DOCUMENT).is_file():
         return None
     return store.read(out)
+
+
+def _contents(appearance: SkinAppearance) -> dict[str, SkinMap | bytes]:
+    """Return the maps and the files of an appearance by their names."""
+    return {**appearance.maps, **appearance.files}
 
 
 def _recorded_keys(appearance: SkinAppearance) -> dict[str, str]:

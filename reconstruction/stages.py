@@ -43,7 +43,7 @@ class Cache(Protocol):
     """Keeps products between runs, by the hash of everything they depend on."""
 
     def load(self, key: str) -> Mapping[str, Any] | None:
-        """Return the products kept under ``key``, or None."""
+        """Return the products kept under ``key``, all of them or some, or None."""
 
     def save(self, key: str, products: Mapping[str, Any]) -> None:
         """Keep ``products`` under ``key``."""
@@ -165,16 +165,18 @@ def run(
     ran: list[str] = []
     reused: list[str] = []
 
-    def provide(stage: Stage) -> None:
-        if stage.name in ran or stage.name in reused:
+    def provide(product: str) -> None:
+        if product in products:
             return
+        stage = made_by[product]
         kept = cache.load(keys[stage.name]) if cache is not None else None
-        if kept is not None:
-            products.update(kept)
-            reused.append(stage.name)
+        if kept is not None and product in kept:
+            products.update({name: kept[name] for name in kept if name not in products})
+            if stage.name not in reused:
+                reused.append(stage.name)
             return
-        for product in stage.needs:
-            provide(made_by[product])
+        for needed_product in stage.needs:
+            provide(needed_product)
         if progress is not None:
             progress(stage.name)
         made = stage.run(**{product: products[product] for product in stage.needs})
@@ -184,11 +186,13 @@ def run(
             )
         products.update(made)
         ran.append(stage.name)
+        if stage.name in reused:  # its maps were at hand, but not what only other stages need
+            reused.remove(stage.name)
         if cache is not None:
             cache.save(keys[stage.name], made)
 
     for product in want:
-        provide(made_by[product])
+        provide(product)
     left_out = [
         (stage.name, "nothing wanted depends on it") for stage in stages if stage not in needed
     ]

@@ -1,0 +1,432 @@
+"""The dome's stages: images under one light each and a scan, to normals, albedo and lobes."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration import geometry
+from capture.calibration.geometry import CameraPose
+from capture.calibration.lights import LightTable
+from capture.session import Session
+from model.skin import SkinMap
+from reconstruction import brdf_basis, brdf_tables, scan_mesh, scan_registration, stages
+from reconstruction import surface_estimates as estimates
+from reconstruction.brdf_tables import BrdfBasis
+from reconstruction.dome_images import DomeImage, DomeImages
+from reconstruction.dome_motion import Motion, follow_head
+from reconstruction.evidence import Evidence, EvidenceError
+from reconstruction.lumitexel_store import LumitexelStore
+from reconstruction.lumitexels import Surface
+from reconstruction.ray_casting import RayCaster
+from reconstruction.scan_mesh import RefinedScan
+from reconstruction.surface_estimates import PointValues
+from reconstruction.surface_texture import SurfaceTexture
+
+REVISION = 1
+"""Grows when the code of a stage changes its result, so that older maps are computed again."""
+
+RANK: Final = 4
+"""Common mixtures that the basis is reduced to, as many as Weyrich et al. 2005 use for a face."""
+BASIS_POINTS: Final = 5_000
+"""Points, drawn at random, that the mixtures are found on."""
+SCAN: Final = "scan.ply"
+ALIGNING_LIGHTS: Final = 40
+"""Lights whose images say where the scan is."""
+MEMORY_BYTES: Final = 2**30
+"""Size of the table of samples from which on it lies in files and not in memory."""
+FACE_MM2: Final = 60_000.0
+"""Area of a face; with the size of a pixel on it, it says how many points can be told apart."""
+POINT_LIMITS: Final = (8_000, 1_000_000)
+TEXTURE_LIMITS: Final = (128, 2048)
+
+WEIGHTS = tuple(f"basis_weight_{k}" for k in range(RANK))
+MAPS = (
+    "position", "half_vector_normals", "normals", "r_d", *WEIGHTS, "lobe_residual",
+    "normals_refined", "samples",
+)  # fmt: skip
+"""Maps that can be made of a dome session."""
+BASIS_FILE = "brdf_basis.npz"
+MESH_FILE = "mesh.obj"
+FILES = (MESH_FILE, BASIS_FILE)
+"""What goes along with the maps."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dome:
+    """The dome as calibrated, or as drawn, with the images it took."""
+
+    images: DomeImages
+    cameras: tuple[CameraPose, ...]
+    table: LightTable
+    """The lights, one row for each of ``images.lights``."""
+    lights: LightTable
+    """One row for each of ``images.captures``."""
+    response: tuple[NDArray[np.float32], ...]
+    """Response of each camera at the pixels of its images, (h, w, 3)."""
+    absolute: bool
+    """Whether the lights' intensities are known, and so the albedo."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Lumitexels of the surface, and the folder that holds them where they are many."""
+
+    store: LumitexelStore
+    folder: Any
+
+
+def graph(evidence: Evidence) -> list[stages.Stage]:
+    """Return the stages that a dome session can go through; see `stages.run`."""
+    dome = _dome(evidence)
+    base = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+
+    def stage(name: str, needs: tuple[str, ...], makes: tuple[str, ...], run: Any) -> stages.Stage:
+        return stages.Stage(name, needs, makes, run, base)
+
+    return [
+        stage("surface", (), ("surface",), lambda: {"surface": _surface(evidence, dome)}),
+        stage("texture", ("surface",), ("texture", "position", MESH_FILE),
+              lambda surface: _texture(dome, surface)),
+        stage("motion", ("surface",), ("motion",),
+              lambda surface: {"motion": _motion(evidence, dome, surface)}),
+        stage("lumitexels", ("surface", "motion"), ("lumitexels",),
+              lambda surface, motion: {
+                  "lumitexels": _lumitexels(evidence.session, dome, surface, motion)}),
+        stage("sample counts", ("lumitexels", "texture"), ("samples",), _counts),
+        stage("half-vector normals", ("lumitexels", "texture"), ("half_vector_normals",),
+              _half_vectors),
+        stage("normals", ("surface", "lumitexels", "texture"), ("point_normals", "normals"),
+              lambda surface, lumitexels, texture: _normals(dome, surface, lumitexels, texture)),
+        stage("albedo", ("lumitexels", "point_normals", "texture"), ("point_r_d", "r_d"),
+              lambda lumitexels, point_normals, texture: _albedo(
+                  dome, lumitexels, point_normals, texture)),
+        stage("lobes", ("lumitexels", "point_normals", "point_r_d", "texture"),
+              ("basis", "weights", *WEIGHTS, "lobe_residual", BASIS_FILE), _lobes),
+        stage("refined normals",
+              ("surface", "lumitexels", "point_normals", "point_r_d", "basis", "weights",
+               "texture"),
+              ("normals_refined",),
+              lambda surface, lumitexels, point_normals, point_r_d, basis, weights, texture:
+              _refined(dome, surface, lumitexels, point_normals, point_r_d, basis, weights,
+                       texture)),
+    ]  # fmt: skip
+
+
+def _dome(evidence: Evidence) -> Dome:
+    rig = evidence.session.rig
+    images = DomeImages(evidence.session)
+    views = [rig.view(name) for name in images.views]
+    serials = [view.serial for view in views]
+    found = evidence.load("geometry", serials, "the cameras stand as the rig's file draws them")
+    if found is None:
+        cameras = tuple(CameraPose.nominal(view) for view in views)
+    else:
+        poses = geometry.poses_from(found, rig.subset(views=images.views))
+        cameras = tuple(poses[view.name] for view in views)
+    lit = evidence.load(
+        "lights", images.lights,
+        "the lights stand and shine as the rig's file draws them; the albedo has no absolute scale",
+    )  # fmt: skip
+    lights_rig = rig.subset(lights=images.lights)
+    lights = LightTable.nominal(lights_rig)
+    if lit is not None:
+        lights = LightTable.from_calibration(lit, lights_rig)
+    dead = [name for name, good in zip(lights.names, lights.valid, strict=True) if not good]
+    if dead:
+        evidence.noted["lights_left_out"] = dead
+    response = tuple(_response(lights, camera) for camera in cameras)
+    return Dome(images, cameras, lights, lights, response, lit is not None)
+
+
+def _apart(session: Session, dome: Dome) -> Dome:
+    """Return the dome with each exposure an image of its own, as a moving head needs them."""
+    images = DomeImages(session, merge=False)
+    order = [images.lights.index(light) for light, _ in images.captures]
+    names = [f"{name} {exposure}" for name, exposure in images.captures]
+    return dataclasses.replace(dome, images=images, lights=_rows(dome.table, order, names))
+
+
+def _rows(lights: LightTable, order: list[int], names: list[str]) -> LightTable:
+    """Return a table with the rows of another in a given order, also more than once."""
+    kept = {
+        field: getattr(lights, field)[order]
+        for field in (
+            "position_mm", "intensity", "exponent", "axis", "valid",
+            "position_stderr_mm", "intensity_stderr", "exponent_stderr",
+        )
+    }  # fmt: skip
+    return dataclasses.replace(lights, names=tuple(names), **kept)
+
+
+def _response(lights: LightTable, camera: CameraPose) -> NDArray[np.float32]:
+    width, height = camera.image_size
+    row, column = np.mgrid[0 : height // 2, 0 : width // 2]
+    pixels = 2.0 * np.stack([column, row], axis=-1) + 0.5
+    return lights.response(camera.serial, pixels, camera.image_size).astype(np.float32)
+
+
+def pixel_mm(dome: Dome) -> float:
+    """Return the size of an image's pixel on the subject, mm."""
+    sizes = [
+        2.0 * float(np.linalg.norm(camera.center_mm)) / float(camera.matrix[0, 0])
+        for camera in dome.cameras
+    ]
+    return float(np.median(sizes))
+
+
+def _image(dome: Dome, view: int, capture: int) -> DomeImage:
+    light, exposure = dome.images.captures[capture]
+    image = dome.images.image(dome.images.views[view], light, exposure)
+    response = dome.response[view]
+    return DomeImage(image.rgb / response, image.variance / response**2, image.valid)
+
+
+def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
+    """Clean and refine the scan, and lay it onto the dome."""
+    session = evidence.session
+    if SCAN not in session.attachments():
+        raise EvidenceError(
+            f"session {session.id}: holds no scan; add one with `skinrig import mesh FILE`"
+        )
+    footprint = pixel_mm(dome)
+    points = int(np.clip(FACE_MM2 / footprint**2, *POINT_LIMITS))
+    scan = scan_mesh.prepare(session.attachment(SCAN), points=points)
+    chosen = _spread(dome.lights.position_mm, dome.lights.valid, ALIGNING_LIGHTS)
+
+    def stacks(view: int) -> NDArray[np.float32]:
+        layers = []
+        for capture in chosen:
+            image = _image(dome, view, capture)
+            gray = (image.rgb / np.maximum(dome.lights.intensity[capture].mean(), 1e-30)).mean(-1)
+            layers.append(
+                np.where(image.valid, gray * dome.lights.intensity[capture].mean(), np.nan)
+            )
+        return np.asarray(layers, np.float32)
+
+    fit = scan_registration.align(
+        scan.coarse,
+        cameras=dome.cameras,
+        lights=_rows(dome.lights, chosen, [dome.lights.names[k] for k in chosen]),
+        stacks=stacks,
+        binning=2,
+        rng=np.random.default_rng(0),
+    )
+    evidence.noted["registration"] = {
+        "rotation": fit.rotation.tolist(),
+        "translation_mm": fit.translation_mm.tolist(),
+        "stderr_rad_mm": fit.stderr.tolist(),
+        "residual_deg": fit.residual_deg,
+        "converged": fit.converged,
+        "points": len(scan.points_mm),
+        "pixel_mm": footprint,
+    }
+    return scan.moved(fit.rotation, fit.translation_mm)
+
+
+def _spread(position_mm: NDArray[np.float64], usable: NDArray[np.bool_], count: int) -> list[int]:
+    """Choose lights that light the face, each next one the farthest from those before."""
+    way = position_mm / np.linalg.norm(position_mm, axis=1, keepdims=True)
+    front = np.flatnonzero(usable & (way[:, 2] > -0.1))
+    if not len(front):
+        raise EvidenceError("lights: none that can be used stands before the face")
+    chosen = [int(front[np.argmax(way[front, 2])])]
+    nearest = way[front] @ way[chosen[0]]
+    while len(chosen) < min(count, len(front)):
+        best = int(front[np.argmin(nearest)])
+        if best in chosen:
+            break
+        chosen.append(best)
+        nearest = np.maximum(nearest, way[front] @ way[best])
+    return chosen
+
+
+def _texture(dome: Dome, surface: RefinedScan) -> Mapping[str, Any]:
+    side = 2 ** math.ceil(math.log2(math.sqrt(2.0 * len(surface.points_mm))))
+    texture = SurfaceTexture.of(surface, size=int(np.clip(side, *TEXTURE_LIMITS)))
+    return {
+        "texture": texture,
+        "position": texture.map(
+            surface.points_mm, None, np.ones(len(surface.points_mm), bool), "mm", "rig frame"
+        ),
+        MESH_FILE: texture.wavefront(),
+    }
+
+
+def _motion(evidence: Evidence, dome: Dome, surface: RefinedScan) -> Motion | None:
+    images = DomeImages(evidence.session, merge=False)
+    found = follow_head(evidence.session, images, dome.cameras, surface, pixel_mm(dome))
+    if found is not None:
+        evidence.noted["motion"] = found.record()
+    return found
+
+
+def _lumitexels(
+    session: Session, dome: Dome, surface: RefinedScan, motion: Motion | None
+) -> Samples:
+    if motion is not None and motion.still:
+        motion = None
+    if motion is not None:
+        dome = _apart(session, dome)
+    count = len(surface.points_mm) * len(dome.cameras) * len(dome.images.captures)
+    folder = tempfile.TemporaryDirectory(prefix="skinrig-") if 12 * count > MEMORY_BYTES else None
+    store = LumitexelStore(
+        Surface(surface.points_mm, surface.normals),
+        cameras=dome.cameras,
+        lights=dome.lights,
+        caster=RayCaster(surface.coarse.vertices_mm, surface.coarse.faces),
+        poses=None if motion is None else motion.poses,
+        binning=2,
+        folder=None if folder is None else Path(folder.name),
+    )
+    for view in range(len(dome.cameras)):
+        for capture in range(len(dome.images.captures)):
+            if not dome.lights.valid[capture]:
+                continue
+            if motion is not None and not motion.usable[capture]:
+                continue
+            image = _image(dome, view, capture)
+            store.add(view, capture, image.rgb, image.variance, image.valid)
+    return Samples(store, folder)
+
+
+def _counts(lumitexels: Samples, texture: SurfaceTexture) -> Mapping[str, SkinMap]:
+    found = estimates.collect(lumitexels.store, estimates.sample_counts)
+    return {"samples": texture.map(found.values[:, 0], None, found.valid, "1", "samples a point")}
+
+
+def _half_vectors(lumitexels: Samples, texture: SurfaceTexture) -> Mapping[str, SkinMap]:
+    found = estimates.collect(
+        lumitexels.store, lambda _, samples: estimates.normals_from_half_vectors(samples)
+    )
+    return {"half_vector_normals": texture.normals(found, "as published, world frame")}
+
+
+def _normals(
+    dome: Dome, surface: RefinedScan, lumitexels: Samples, texture: SurfaceTexture
+) -> Mapping[str, Any]:
+    found = estimates.collect(
+        lumitexels.store,
+        lambda part, samples: estimates.normals_from_shading(samples, surface.normals[part]),
+    )
+    found = estimates.with_misplacement(found, surface, pixel_mm(dome))
+    return {"point_normals": found, "normals": texture.normals(found, "world frame")}
+
+
+def _albedo(
+    dome: Dome, lumitexels: Samples, point_normals: PointValues, texture: SurfaceTexture
+) -> Mapping[str, Any]:
+    if not dome.absolute:
+        raise EvidenceError(
+            "r_d: the lights are not calibrated and an albedo has no scale without them; run "
+            "`skinrig calibrate lights` on a session of the white target"
+        )
+    good = point_normals.valid
+    typical = float(np.median(point_normals.stderr[good, 0])) if good.any() else 0.02
+    found = estimates.collect(
+        lumitexels.store,
+        lambda part, samples: estimates.albedo(
+            samples, estimates.part_of(point_normals, part), stderr_rad=typical
+        ),
+    )
+    return {
+        "point_r_d": found,
+        "r_d": texture.map(
+            found.values, found.stderr, found.valid, "1",
+            "diffuse reflectance, camera RGB over that of a perfect white",
+        ),
+    }  # fmt: skip
+
+
+def _lobes(
+    lumitexels: Samples, point_normals: PointValues, point_r_d: PointValues, texture: SurfaceTexture
+) -> Mapping[str, Any]:
+    materials = brdf_tables.default()
+    store = lumitexels.store
+    good = np.flatnonzero(point_r_d.valid)
+    if len(good) < RANK:
+        raise EvidenceError(f"lobes: only {len(good)} points have an albedo, expected {RANK}")
+    drawn = np.sort(np.random.default_rng(0).permutation(good)[:BASIS_POINTS])
+    fitted = []
+    for part, samples in store.chunks(estimates.chunk_points(store)):
+        rows = drawn[(drawn >= part.start) & (drawn < part.stop)] - part.start
+        if not len(rows):
+            continue
+        fitted.append(
+            brdf_basis.fit_weights(
+                estimates.surface_samples(
+                    estimates.rows_of(samples, rows),
+                    estimates.part_of(point_normals, part.start + rows),
+                    estimates.part_of(point_r_d, part.start + rows),
+                ),
+                materials,
+            ).weights
+        )
+    shares = np.concatenate(fitted)
+    mixes = [brdf_basis.reduce(shares, rank, basis=materials) for rank in range(1, 2 * RANK + 1)]
+    _, mix, _ = mixes[RANK - 1]
+    basis = materials.mixed(mix)
+    found = estimates.collect(
+        store,
+        lambda part, samples: estimates.lobe_weights(
+            samples, estimates.part_of(point_normals, part),
+            estimates.part_of(point_r_d, part), basis,
+        ),
+    )  # fmt: skip
+    maps = {
+        name: texture.map(
+            found.values[:, k], found.stderr[:, k], found.valid, "1", "share of a common mixture"
+        )
+        for k, name in enumerate(WEIGHTS)
+    }
+    maps["lobe_residual"] = texture.map(
+        found.values[:, RANK], None, found.valid, "1/sr", "weighted RMS of samples - model"
+    )
+    return {
+        "basis": basis,
+        "weights": found.values[:, :RANK],
+        **maps,
+        BASIS_FILE: _basis_bytes(materials, mix, [error for _, _, error in mixes]),
+    }
+
+
+def _basis_bytes(materials: BrdfBasis, mix: NDArray[np.float64], errors: list[float]) -> bytes:
+    stream = io.BytesIO()
+    np.savez_compressed(
+        stream,
+        materials=np.array(materials.names),
+        mix=mix,
+        light_radius_rad=materials.light_radius_rad,
+        error_by_rank=np.array(errors),
+    )
+    return stream.getvalue()
+
+
+def _refined(
+    dome: Dome,
+    surface: RefinedScan,
+    lumitexels: Samples,
+    point_normals: PointValues,
+    point_r_d: PointValues,
+    basis: BrdfBasis,
+    weights: NDArray[np.float64],
+    texture: SurfaceTexture,
+) -> Mapping[str, SkinMap]:
+    found = estimates.collect(
+        lumitexels.store,
+        lambda part, samples: estimates.normals_from_remainder(
+            samples, estimates.part_of(point_normals, part), estimates.part_of(point_r_d, part),
+            weights[part], basis,
+        ),
+    )  # fmt: skip
+    found = estimates.with_misplacement(found, surface, pixel_mm(dome))
+    return {"normals_refined": texture.normals(found, "by the fitted lobes, world frame")}

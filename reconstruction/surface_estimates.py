@@ -1,0 +1,345 @@
+"""Estimators run over all points of a surface, a bounded chunk of lumitexels at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import fresnel
+from reconstruction import (
+    brdf_basis,
+    diffuse_albedo,
+    half_vector_normals,
+    photometric_stereo,
+)
+from reconstruction.brdf_tables import BrdfBasis
+from reconstruction.lumitexel_store import LumitexelStore
+from reconstruction.lumitexels import Lumitexels
+from reconstruction.scan_mesh import RefinedScan
+
+CHUNK_SAMPLES: Final = 3_000_000
+"""Samples of a chunk; about 60 bytes each."""
+LEAST_LIGHTS: Final = 20
+LEAST_VIEWS: Final = 2
+"""A point lit or seen by fewer has no estimate."""
+LEAST_COS_LIGHT: Final = 0.15
+LEAST_COS_VIEW: Final = 0.2
+"""Normals are not estimated from flatter samples: the boundary's transmittance bends there."""
+HIGHLIGHT_RAD: Final = np.radians(35.0)
+"""Samples whose half vector lies nearer to the normal hold too much of the highlight: skin's
+facets have a Beckmann slope of about 0.3 (Weyrich et al. 2005), of which 98 % lie below this."""
+LOBE_POINTS: Final = 2_000
+"""Points whose lobes are evaluated at a time."""
+LOBE_ERROR: Final = 0.1
+"""Relative error of a fitted lobe, for the weight of samples in it."""
+MISPLACED_PX: Final = 0.35
+"""Standard deviation of where a sample is on the surface, over the size of a pixel."""
+UNRESOLVED_RAD: Final = np.radians(0.35)
+"""Standard deviation, in each direction, of relief that is too fine for the points."""
+
+Double = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointValues:
+    """An estimate at each point of a surface.
+
+    Attributes
+    ----------
+    values
+        (P, C) float64; 0 where not valid.
+    stderr
+        (P, C); of a normal the angle in each of two directions across it, rad, in all three.
+    valid
+        (P,) bool.
+    """
+
+    values: Double
+    stderr: Double
+    valid: NDArray[np.bool_]
+
+
+def chunk_points(store: LumitexelStore) -> int:
+    """Return how many points of a store make a chunk."""
+    return max(1, CHUNK_SAMPLES // max(store.light_count * store.view_count, 1))
+
+
+def transmitted(cos_light: NDArray[np.floating], cos_view: NDArray[np.floating]) -> Double:
+    """Return F_t(light) F_t(view), the share that the skin's boundary lets in and out again."""
+    inside = 1.0 - fresnel.reflectance(np.clip(cos_light, 0.0, 1.0), fresnel.ETA_SKIN)
+    outside = 1.0 - fresnel.reflectance(np.clip(cos_view, 0.0, 1.0), fresnel.ETA_SKIN)
+    return np.asarray(inside * outside)
+
+
+def seen_enough(samples: Lumitexels) -> NDArray[np.bool_]:
+    """Return which points have samples of enough lights and views, shape (P,)."""
+
+    def kinds(index: NDArray[np.integer]) -> NDArray[np.intp]:
+        hit = np.zeros((len(samples.valid), int(index.max(initial=-1)) + 1), bool)
+        for k in range(hit.shape[1]):
+            hit[:, k] = samples.valid[:, index == k].any(axis=1)
+        return np.count_nonzero(hit, axis=1)
+
+    return np.asarray((kinds(samples.light) >= LEAST_LIGHTS) & (kinds(samples.view) >= LEAST_VIEWS))
+
+
+def collect(
+    store: LumitexelStore,
+    estimate: Callable[[slice, Lumitexels], PointValues],
+    *,
+    progress: Callable[[float], None] | None = None,
+) -> PointValues:
+    """Estimate chunk by chunk and put the results together.
+
+    Parameters
+    ----------
+    store
+        Samples of P points.
+    estimate
+        Called with the points of a chunk and their samples.
+    progress
+        Called with the share of the points that is done, 0 to 1.
+    """
+    parts = []
+    count = len(store.surface)
+    for part, samples in store.chunks(chunk_points(store)):
+        parts.append(estimate(part, samples))
+        if progress is not None:
+            progress(part.stop / max(count, 1))
+    return PointValues(
+        np.concatenate([p.values for p in parts]),
+        np.concatenate([p.stderr for p in parts]),
+        np.concatenate([p.valid for p in parts]),
+    )
+
+
+def normals_from_half_vectors(samples: Lumitexels) -> PointValues:
+    """Return the published estimate: half vectors of each view's four brightest samples."""
+    found = half_vector_normals.estimate(
+        samples.f.mean(axis=-1), samples.light_dir, samples.view_dir, samples.view,
+        valid=samples.valid,
+    )  # fmt: skip
+    good = seen_enough(samples) & found.valid
+    return _of_normals(found.normals, found.stderr_rad, good)
+
+
+def normals_from_shading(
+    samples: Lumitexels,
+    normals: NDArray[np.floating],
+    *,
+    rounds: int = 2,
+    highlight_rad: float = HIGHLIGHT_RAD,
+) -> PointValues:
+    """Return normals by robust photometric stereo of the light from inside the skin.
+
+    Parameters
+    ----------
+    samples
+        Of P points.
+    normals
+        (P, 3) to begin with, as a rule the scan's: they tell which samples hold highlights, and
+        how much the boundary lets through.
+    rounds
+        Of estimating, each with the normals of the one before.
+    highlight_rad
+        Samples whose half vector lies nearer to the normal are left out.
+
+    Notes
+    -----
+    What has been inside is f_r = R_d F_t F_t / pi, so f_r cos(theta) pi / (F_t F_t) is R_d times
+    n . l, linear in n.
+    """
+    gray = samples.f.mean(axis=-1).astype(np.float64)
+    spread = samples.variance.mean(axis=-1).astype(np.float64) / 3.0
+    half = samples.light_dir + samples.view_dir
+    half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-6)
+    light_dir = np.ascontiguousarray(samples.light_dir.transpose(1, 0, 2))
+    start = np.asarray(normals, np.float64)
+    good = seen_enough(samples)
+    stderr = np.full(len(start), np.pi)
+    for _ in range(rounds):
+        cos_light = np.einsum("pmk,pk->pm", samples.light_dir, start)
+        cos_view = np.einsum("pmk,pk->pm", samples.view_dir, start)
+        use = (
+            samples.valid
+            & (cos_light > LEAST_COS_LIGHT)
+            & (cos_view > LEAST_COS_VIEW)
+            & (np.einsum("pmk,pk->pm", half, start) < np.cos(highlight_rad))
+        )
+        # the cosine that made f from the radiance is the scan's, not that of this round
+        scale = np.pi * samples.cos_light / np.maximum(transmitted(cos_light, cos_view), 1e-3)
+        found = photometric_stereo.estimate_normals(
+            np.where(use, gray * scale, 0.0).T.astype(np.float32),
+            light_dir,
+            variance=np.where(use, spread * scale**2, 1.0).T.astype(np.float32),
+            valid=np.ascontiguousarray(use.T),
+        )
+        start = np.where(found.valid[:, None], found.normals, start).astype(np.float64)
+        stderr = np.where(found.valid, found.stderr_rad, np.pi)
+        good &= found.valid
+    return _of_normals(start, stderr, good)
+
+
+def _of_normals(
+    normals: NDArray[np.floating], stderr_rad: NDArray[np.floating], good: NDArray[np.bool_]
+) -> PointValues:
+    spread = np.repeat(np.asarray(stderr_rad, np.float64)[:, None], 3, axis=1)
+    return PointValues(
+        np.where(good[:, None], normals, 0.0), np.where(good[:, None], spread, 0.0), good
+    )
+
+
+def albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> PointValues:
+    """Return R_d of three channels by eq. (6) of Weyrich et al. 2005, see `diffuse_albedo`.
+
+    Parameters
+    ----------
+    samples
+        Of P points.
+    normals
+        Of the same points.
+    stderr_rad
+        Typical standard error of the normals.
+    """
+    found = diffuse_albedo.estimate(
+        samples.f, samples.light_dir, samples.view_dir,
+        np.where(normals.valid[:, None], normals.values, np.nan).astype(np.float32),
+        eta=fresnel.ETA_SKIN, variance=samples.variance, valid=samples.valid,
+        normal_stderr_rad=stderr_rad,
+    )  # fmt: skip
+    good = found.valid & normals.valid & np.isfinite(found.stderr).all(axis=-1)
+    keep = good[:, None]
+    return PointValues(np.where(keep, found.r_d, 0.0), np.where(keep, found.stderr, 0.0), good)
+
+
+def surface_samples(
+    samples: Lumitexels, normals: PointValues, r_d: PointValues
+) -> brdf_basis.SurfaceSamples:
+    """Return what is left of the samples when the light from inside is taken off."""
+    return brdf_basis.surface_samples(
+        samples.f, samples.light_dir, samples.view_dir,
+        np.where(normals.valid[:, None], normals.values, (0.0, 0.0, 1.0)),
+        np.where(r_d.valid[:, None], r_d.values, np.nan),
+        eta=fresnel.ETA_SKIN, variance=samples.variance, valid=samples.valid,
+    )  # fmt: skip
+
+
+def lobe_weights(
+    samples: Lumitexels, normals: PointValues, r_d: PointValues, basis: BrdfBasis
+) -> PointValues:
+    """Return the shares of a basis at each point, and in the last column the fit's residual.
+
+    The standard error of the shares is that of the lobe's overall scale: single shares of nearly
+    dependent lobes are not determined.
+    """
+    found = brdf_basis.fit_weights(surface_samples(samples, normals, r_d), basis)
+    good = found.valid & normals.valid & r_d.valid
+    keep = good[:, None]
+    scale = np.where(np.isfinite(found.stderr), found.stderr, 1.0)
+    residual = np.where(good, found.residual, 0.0)
+    return PointValues(
+        np.concatenate([np.where(keep, found.weights, 0.0), residual[:, None]], axis=1),
+        np.where(keep, scale[:, None] * np.append(found.weights, residual[:, None], axis=1), 0.0),
+        good,
+    )
+
+
+def normals_from_remainder(
+    samples: Lumitexels,
+    normals: PointValues,
+    r_d: PointValues,
+    weights: Double,
+    basis: BrdfBasis,
+) -> PointValues:
+    """Return normals by photometric stereo of what fitted lobes leave of the samples.
+
+    With the highlights taken off, samples near the mirror direction count too.
+
+    Parameters
+    ----------
+    samples, normals, r_d
+        Of P points.
+    weights
+        Shares of the basis, (P, K).
+    basis
+        The reduced basis.
+    """
+    lobes = np.zeros(samples.valid.shape, np.float32)
+    rows = np.flatnonzero(normals.valid & r_d.valid)
+    for part in np.array_split(rows, max(len(rows) // LOBE_POINTS, 1)):
+        lobes[part] = brdf_basis.evaluate(
+            weights[part][:, None], basis, samples.light_dir[part], samples.view_dir[part],
+            normals.values[part][:, None],
+        )  # fmt: skip
+    # a lobe is known no better than a few percent: where it is strong a sample says less
+    bare = dataclasses.replace(
+        samples,
+        f=samples.f - lobes[..., None],
+        variance=samples.variance + np.square(LOBE_ERROR * lobes)[..., None],
+    )
+    good = normals.valid & r_d.valid
+    found = normals_from_shading(
+        bare, np.where(good[:, None], normals.values, (0.0, 0.0, 1.0)), rounds=1, highlight_rad=0.0
+    )
+    good = good & found.valid
+    return _of_normals(found.values, found.stderr[:, 0], good)
+
+
+def sample_counts(part: slice, samples: Lumitexels) -> PointValues:
+    """Return how many samples each point has; valid where they are enough for an estimate."""
+    counts = samples.counts[:, None].astype(np.float64)
+    return PointValues(counts, np.zeros_like(counts), seen_enough(samples))
+
+
+def part_of(values: PointValues, rows: slice | NDArray[np.integer]) -> PointValues:
+    """Return the estimates of some of the points."""
+    return PointValues(values.values[rows], values.stderr[rows], values.valid[rows])
+
+
+def rows_of(samples: Lumitexels, rows: NDArray[np.integer]) -> Lumitexels:
+    """Return the samples of some of the points."""
+    return dataclasses.replace(
+        samples,
+        **{
+            name: getattr(samples, name)[rows]
+            for name in (
+                "f", "variance", "light_dir", "view_dir", "cos_light", "cos_view", "valid",
+            )
+        },
+    )  # fmt: skip
+
+
+def with_misplacement(normals: PointValues, surface: RefinedScan, pixel_mm: float) -> PointValues:
+    """Add to the standard errors of normals what misplaced samples do to them.
+
+    Parameters
+    ----------
+    normals
+        At the surface's points.
+    surface
+        With its triangles: they say how fast the normals turn.
+    pixel_mm
+        Size of an image's pixel on the subject: scan, registration and cameras together place a
+        sample within about `MISPLACED_PX` of it, and within it normals are averaged.
+    """
+    edges = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]]])
+    edges = edges[normals.valid[edges].all(axis=1)]
+    turn = np.linalg.norm(normals.values[edges[:, 0]] - normals.values[edges[:, 1]], axis=1)
+    apart = np.linalg.norm(
+        surface.points_mm[edges[:, 0]] - surface.points_mm[edges[:, 1]], axis=1
+    ).astype(np.float64)
+    squared = np.square(turn / np.maximum(apart, 0.25 * pixel_mm))
+    total = np.zeros(len(normals.valid))
+    count = np.zeros(len(normals.valid))
+    for side in (0, 1):
+        np.add.at(total, edges[:, side], squared)
+        np.add.at(count, edges[:, side], 1.0)
+    bend = np.sqrt(total / np.maximum(count, 1.0))  # rad/mm
+    spread = np.hypot(MISPLACED_PX * pixel_mm * bend, UNRESOLVED_RAD)
+    stderr = np.hypot(normals.stderr, spread[:, None])
+    return PointValues(normals.values, np.where(normals.valid[:, None], stderr, 0.0), normals.valid)
