@@ -278,9 +278,9 @@ def find_moved(
 ) -> tuple[Moved, ...]:
     """Find cameras that moved since the previous calibration, by their residuals.
 
-    The boards are placed with the previous cameras; a camera is blamed if leaving it out makes the
-    others agree best, and its own residual against them is large. One after the other is blamed
-    until the rest agrees.
+    For each camera the boards are placed by all others, as they were calibrated before. A camera
+    that disagrees with others that agree is blamed, the worst first; then the rest is asked again
+    without it, until all agree.
 
     Parameters
     ----------
@@ -314,9 +314,10 @@ def find_moved(
     left = list(names)
     while len(left) > max(2, len(names) // 2):
         trials = {name: _agreement(sightings, board, previous, left, without=name) for name in left}
-        culprit = min(trials, key=lambda name: trials[name][0])
-        rest_px, own_px, places = trials[culprit]
-        if not np.isfinite(own_px) or own_px < max(ratio * rest_px, least_px):
+        judged = {n: own / max(rest, least_px / ratio) for n, (rest, own, _) in trials.items()}
+        culprit = max(judged, key=lambda name: judged[name] if judged[name] > 0 else 0.0)
+        _, own_px, places = trials[culprit]
+        if not judged[culprit] > ratio:
             break
         images = {key: s for key, s in sightings.items() if key[0] == culprit and key[1] in places}
         now = _resection(images, board, previous[culprit], places)

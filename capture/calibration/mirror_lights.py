@@ -166,7 +166,9 @@ def find_highlights(image: NDArray, window: SphereWindow) -> tuple[FloatArray, F
     if values.size < 9:
         return np.zeros((0, 2)), np.zeros(0)
     usual = float(np.median(values))
-    sigma = 1.4826 * float(np.median(np.abs(values - usual)))
+    # the median deviation of a few levels of the converter may be 0
+    quiet = values[np.abs(values - usual) <= np.quantile(np.abs(values - usual), 0.98)]
+    sigma = max(1.4826 * float(np.median(np.abs(values - usual))), float(quiet.std()))
     above = np.where(window.inside, part - usual, 0.0)
     limit = max(NOISE_SIGMAS * sigma, LEAST_PEAK * float(above.max()), 1e-12)
     spots, count = label(above > limit, structure=np.ones((3, 3)))
