@@ -90,6 +90,13 @@ class NoisyDome(RuleBasedStateMachine):
         self.ask("SYST:ARM")
         self.ask(f"LED:ON {led},{ms},{level}")
 
+    @rule(times=st.integers(2, 6), pause_s=st.sampled_from([0.06, 0.12, 0.3]))
+    def blink(self, times, pause_s):
+        self.ask("SYST:ARM")
+        for _ in range(times):
+            self.ask(f"LED:ON {LEDS[0]},20")
+            self.listen(pause_s)
+
     @rule(leds=st.lists(st.sampled_from(LEDS), min_size=1, max_size=8),
           ms=st.sampled_from([40, 90, 200]))  # fmt: skip
     def load(self, leds, ms):
@@ -221,5 +228,5 @@ def ignore_flicker(monkeypatch):
 def test_a_box_with_one_rule_left_out_is_caught(monkeypatch, leave_out, broken):
     leave_out(monkeypatch)
     with pytest.raises(AssertionError) as caught:
-        explore(300, phases=[Phase.generate])
+        explore(600, phases=[Phase.generate])
     assert broken in [entry.name for entry in caught.traceback]
