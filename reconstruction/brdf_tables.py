@@ -41,7 +41,7 @@ class BasisError(ValueError):
     """A folder or a set of tables that makes no basis."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class BrdfBasis:
     """BRDFs of K materials on one grid.
 
@@ -104,21 +104,13 @@ class BrdfBasis:
 
     def strength(self) -> FloatArray:
         """Return each material's RMS over the grid, (K,), 1/sr; nodes count by solid angle."""
-        return np.asarray(np.sqrt(np.diag(self._gram())))
+        return np.asarray(np.sqrt(np.diag(_gram(self))))
 
     def kinship(self) -> FloatArray:
         """Return the cosines between the materials, (K, K): 1 for one of the same shape."""
-        gram = self._gram()
+        gram = _gram(self)
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         return np.ascontiguousarray(gram / size / size[:, None])
-
-    def _gram(self) -> FloatArray:
-        d, _, h = nodes()
-        solid = np.sin(2.0 * d)[:, None] * (np.sin(h) * np.gradient(h))
-        weight = np.sqrt(np.broadcast_to((solid / solid.sum())[:, None], self.table.shape[:3]))
-        scaled = self.table[..., : self.size] * weight[..., None].astype(np.float32)
-        flat = scaled.reshape(-1, self.size)
-        return np.asarray(flat.T @ flat, dtype=np.float64) / NODES_PHI
 
     def mixed(self, mix: ArrayLike) -> BrdfBasis:
         """Return the basis whose R materials are the rows of `mix`, (R, K), at least 0."""
@@ -195,6 +187,17 @@ def nodes() -> tuple[FloatArray, FloatArray, FloatArray]:
         np.linspace(0.0, _HALF_PI, NODES_PHI),
         np.linspace(0.0, 1.0, NODES_H) ** 2 * _HALF_PI,
     )
+
+
+@lru_cache(maxsize=4)
+def _gram(basis: BrdfBasis) -> FloatArray:
+    """Return the products of the materials over the grid, nodes counting by solid angle."""
+    d, _, h = nodes()
+    solid = np.sin(2.0 * d)[:, None] * (np.sin(h) * np.gradient(h))
+    weight = np.sqrt(np.broadcast_to((solid / solid.sum())[:, None], basis.table.shape[:3]))
+    scaled = basis.table[..., : basis.size] * weight[..., None].astype(np.float32)
+    flat = scaled.reshape(-1, basis.size)
+    return np.asarray(flat.T @ flat, dtype=np.float64) / NODES_PHI
 
 
 def _convolved(brdf: Brdf, radius_rad: float) -> FloatArray:
