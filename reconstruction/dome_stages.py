@@ -37,6 +37,8 @@ REVISION = 1
 
 RANK: Final = 4
 """Common mixtures that the basis is reduced to, as many as Weyrich et al. 2005 use for a face."""
+RANKS: Final = (1, 2, RANK, 2 * RANK)
+"""Ranks whose errors are recorded."""
 BASIS_POINTS: Final = 5_000
 """Points, drawn at random, that the mixtures are found on."""
 SCAN: Final = "scan.ply"
@@ -372,8 +374,8 @@ def _lobes(
             ).weights
         )
     shares = np.concatenate(fitted)
-    mixes = [brdf_basis.reduce(shares, rank, basis=materials) for rank in range(1, 2 * RANK + 1)]
-    _, mix, _ = mixes[RANK - 1]
+    mixes = {rank: brdf_basis.reduce(shares, rank, basis=materials) for rank in RANKS}
+    mix = mixes[RANK][1]
     basis = materials.mixed(mix)
     found = estimates.collect(
         store,
@@ -395,18 +397,21 @@ def _lobes(
         "basis": basis,
         "weights": found.values[:, :RANK],
         **maps,
-        BASIS_FILE: _basis_bytes(materials, mix, [error for _, _, error in mixes]),
+        BASIS_FILE: _basis_bytes(materials, mix, {rank: m[2] for rank, m in mixes.items()}),
     }
 
 
-def _basis_bytes(materials: BrdfBasis, mix: NDArray[np.float64], errors: list[float]) -> bytes:
+def _basis_bytes(
+    materials: BrdfBasis, mix: NDArray[np.float64], errors: Mapping[int, float]
+) -> bytes:
     stream = io.BytesIO()
     np.savez_compressed(
         stream,
         materials=np.array(materials.names),
         mix=mix,
         light_radius_rad=materials.light_radius_rad,
-        error_by_rank=np.array(errors),
+        ranks=np.array(list(errors)),
+        error_by_rank=np.array(list(errors.values())),
     )
     return stream.getvalue()
 

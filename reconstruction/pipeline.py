@@ -25,11 +25,13 @@ class Recipe:
     graph: Callable[[Evidence], list[stages.Stage]]
     files: tuple[str, ...] = ()
     """Names of what is no map and goes along: meshes, tables."""
+    always: tuple[str, ...] = ()
+    """What the other maps mean nothing without."""
 
 
 RECIPES: Mapping[str, Recipe] = {
     "subject": Recipe(flash_stages.MAPS, flash_stages.graph),
-    "olat": Recipe(dome_stages.MAPS, dome_stages.graph, dome_stages.FILES),
+    "olat": Recipe(dome_stages.MAPS, dome_stages.graph, dome_stages.FILES, ("position",)),
 }
 """By the kind of step that shows the subject."""
 LIGHT_LIST = Recipe(stack_stages.MAPS, stack_stages.graph)
@@ -110,6 +112,7 @@ def reconstruct(
         raise EvidenceError(f"want: got {unknown[0]!r}, expected names out of {known}")
     evidence = Evidence.of(opened, calibration, state=state, on_date=on_date)
     graph = recipe.graph(evidence)
+    want = [*want, *recipe.always]
     # a stage's other maps cost nothing more, and only whole stages can be reused
     want = [
         name

@@ -125,7 +125,7 @@ def normals_from_half_vectors(samples: Lumitexels) -> PointValues:
         valid=samples.valid,
     )  # fmt: skip
     good = seen_enough(samples) & found.valid
-    return _of_normals(found.normals, found.stderr_rad, good)
+    return _of_normals(found.normals, found.stderr_rad / np.sqrt(2.0), good)
 
 
 def normals_from_shading(
@@ -180,7 +180,8 @@ def normals_from_shading(
             valid=np.ascontiguousarray(use.T),
         )
         start = np.where(found.valid[:, None], found.normals, start).astype(np.float64)
-        stderr = np.where(found.valid, found.stderr_rad, np.pi)
+        # of the angle; in each of two directions across the normal it is less by the root of two
+        stderr = np.where(found.valid, found.stderr_rad / np.sqrt(2.0), np.pi)
         good &= found.valid
     return _of_normals(start, stderr, good)
 

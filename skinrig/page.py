@@ -77,6 +77,11 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str
     return f"<table>{title}<thead><tr>{header}</tr></thead><tbody>{body}</tbody></table>"
 
 
+def folded(title: str, body: str) -> str:
+    """Return HTML that opens when its title is clicked; printed pages show the title only."""
+    return f"<details><summary>{escape(title)}</summary>{body}</details>"
+
+
 def facts(values: Mapping[str, object]) -> str:
     """Return a two-column table of names and values."""
     return table(("what", "value"), list(values.items()))

@@ -311,6 +311,10 @@ def _document_section(document: Mapping[str, Any]) -> str:
     return body
 
 
+LONG_TABLE = 30
+"""Rows beyond which a table is folded away."""
+
+
 def _calibration_section(folder: Path) -> str:
     body = f"<h2>Calibration: {page.escape(folder.name)}</h2>"
     for path in sorted(folder.glob("*.json")):
@@ -326,7 +330,8 @@ def _calibration_section(folder: Path) -> str:
             for name, entry in sorted(names.items())
             if len(entry["value"]) <= 12
         ]
-        body += page.table(("device", "quantity", "value", "standard error"), rows)
+        table = page.table(("device", "quantity", "value", "standard error"), rows)
+        body += table if len(rows) <= LONG_TABLE else page.folded(f"{len(rows)} quantities", table)
     return body
 
 
