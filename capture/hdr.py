@@ -350,7 +350,12 @@ def _merge_tiles(  # type: ignore[no-untyped-def]
                 first[i] = max(r, np.float32(0.0)) * per_gain
                 s[i] = 0.0
                 w[i] = 0.0
-            for k in range(len(addresses)):
+            for k in range(0, len(addresses) - 1, 2):
+                one = carray(_as_pointer(addresses[k]), size, np.uint16)[start : start + count]
+                two = carray(_as_pointer(addresses[k + 1]), size, np.uint16)[start : start + count]
+                _add_pair(one, two, times[k], times[k + 1], first, floor, black, white, s, w)
+            if len(addresses) % 2:
+                k = len(addresses) - 1
                 frame = carray(_as_pointer(addresses[k]), size, np.uint16)[start : start + count]
                 _add_weighed(frame, times[k], first, floor, black, white, s, w)
         for i in range(count):
@@ -378,3 +383,16 @@ def _add_weighed(frame, t, first, floor, black, white, s, w):  # type: ignore[no
         weight = np.float32(v < white) * t / (first[i] * t + floor)
         s[i] += weight * (v - black)
         w[i] += weight * t
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
+def _add_pair(one, two, t, u, first, floor, black, white, s, w):  # type: ignore[no-untyped-def]
+    """Add the tiles of two frames with one division for both: a / x + b / y = (a y + b x) / x y."""
+    for i in range(len(s)):
+        v, z = np.float32(one[i]), np.float32(two[i])
+        x, y = first[i] * t + floor, first[i] * u + floor
+        shared = np.float32(1.0) / (x * y)
+        a = np.float32(v < white) * t * y * shared
+        b = np.float32(z < white) * u * x * shared
+        s[i] += a * (v - black) + b * (z - black)
+        w[i] += a * t + b * u

@@ -50,7 +50,8 @@ def merging(*, toy: bool) -> StageBenchmark:
         )
     ours, theirs, ratio = _beside_opencv(frames, times, rounds=1 if toy else 15)
     points.append(Point({"frames": FRAMES, "way": "beside"}, ours, error, (error, error), least))
-    name = f"times faster than OpenCV's Debevec on {FRAMES} x {side}^2 x 3 (its fastest {theirs:.3f} s)"
+    size = f"{FRAMES} x {side}^2 x 3"
+    name = f"times faster than OpenCV's Debevec on {size} (its fastest {theirs:.3f} s)"
     return StageBenchmark(
         "hdr",
         "RMS relative error of radiance, %",
