@@ -11,6 +11,7 @@ from typing import Any
 from skinrig import (
     bench_brdf,
     bench_chromophores,
+    bench_dome_calibration,
     bench_dome_render,
     bench_flash,
     bench_hdr,
@@ -36,6 +37,8 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "lumitexels": bench_surface.lumitexels,
     "texture-fill": bench_surface.filling,
     "head-motion": bench_motion.motion,
+    "dome-geometry": bench_dome_calibration.geometry,
+    "dome-lights": bench_dome_calibration.lights,
     "light-order": bench_light_order.light_order,
 }
 

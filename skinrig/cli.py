@@ -213,7 +213,7 @@ def calibrate(
     for text in done.findings:
         console.say(f"found: {text}")
     for change in done.drift:
-        if change.sigmas is None or abs(change.sigmas) > 2:
+        if change.change and (change.sigmas is None or abs(change.sigmas) > 2):
             console.say(f"drift: {change}")
     console.say(f"{done.path}: valid until {done.calibration.valid_until}")
     console.document(

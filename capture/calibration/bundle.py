@@ -43,6 +43,7 @@ HUBER = 2.5  # robust sigmas beyond which a corner counts less
 MAX_STEPS = 100
 STOP = 1e-10  # relative decrease of the cost
 LEAST_SIGMA_PX = 1e-9
+RMS_OF_MEDIAN = 1.2011  # of distances whose coordinates are normal: (1 / ln 2) ** 0.5
 LEAST_SHARED = 2  # places that a camera must share with others
 
 
@@ -148,7 +149,7 @@ class Moved:
     name, serial : str
         View and camera.
     rms_px : float
-        Residual of the previous calibration.
+        Residual of the previous calibration, by the median.
     shift_mm, turn_rad : float
         How far its centre of projection went, and how it turned.
     """
@@ -345,13 +346,13 @@ def _agreement(
         if pose in places and name in names:
             gaps = _gaps(cameras[name], places[pose], board, sighting)
             (own if name == without else others).append(gaps)
-    square = np.concatenate(others) ** 2
-    if not square.size:
+    together, alone = np.concatenate(others), np.concatenate(own)
+    if not together.size:
         return np.inf, np.nan, places
-    alone = np.concatenate(own) ** 2
+    # by the median: a camera that moved moves all its corners, a bad corner is one of many
     return (
-        float(np.sqrt(square.mean())),
-        float(np.sqrt(alone.mean())) if alone.size else np.nan,
+        RMS_OF_MEDIAN * float(np.median(together)),
+        RMS_OF_MEDIAN * float(np.median(alone)) if alone.size else np.nan,
         places,
     )
 
