@@ -8,7 +8,15 @@ from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
-from numba import carray, njit, parallel_chunksize, prange, types
+from numba import (
+    carray,
+    get_num_threads,
+    njit,
+    parallel_chunksize,
+    prange,
+    set_num_threads,
+    types,
+)
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +29,7 @@ STEPS: Final = 1
 """Rounds of weighing; a second changes the estimate by less than 1 % of its standard error."""
 _TILE: Final = 512
 _CHUNK: Final = 128
+_SMALL: Final = 1 << 17  # pixels
 """Tiles that a thread takes at a time, so that one on a busy core holds up no other."""
 _FAST: Final = {"nsz", "arcp", "contract", "reassoc"}
 
@@ -218,6 +227,9 @@ def merge(
     valid = np.empty(shape, np.bool_)
     # times are scaled to 1 so that float32 holds any of them
     longest = float(times.max())
+    # waking a second thread takes longer than a small frame; the choice holds for this thread only
+    threads = get_num_threads()
+    set_num_threads(1 if radiance.size < _SMALL else threads)
     with parallel_chunksize(_CHUNK):
         _merge_tiles(
             np.array([row.ctypes.data for row in rows], np.int64),
@@ -232,6 +244,7 @@ def merge(
             variance.reshape(-1),
             valid.reshape(-1),
         )
+    set_num_threads(threads)
     return radiance, variance, valid
 
 

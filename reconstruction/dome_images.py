@@ -201,8 +201,11 @@ class DomeImages:
         values = np.zeros(first.cfa.shape, np.float32)
         variance = np.zeros_like(values)
         good = np.zeros(values.shape, bool)
-        for cell, black in enumerate(first.black):
+        # one black level for all colors, as a rule: then the mosaic is merged as a whole
+        whole = len(set(first.black)) == 1
+        for cell, black in enumerate(first.black[:1] if whole else first.black):
             part = slice(cell // 2, None, 2), slice(cell % 2, None, 2)
+            part = (slice(None), slice(None)) if whole else part
             rate, spread, valid = hdr.merge(
                 [frame.cfa[part] for frame in frames],
                 times,

@@ -17,13 +17,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from model.fresnel import ETA_SKIN, reflectance
 from reconstruction.lumitexels import Camera, Lights, Surface, visibility
-from reconstruction.mesh_repair import TriangleMesh
+from reconstruction.mesh_repair import Faces, TriangleMesh
 from reconstruction.ray_casting import RayCaster
 
 Floats = NDArray[np.floating]
 Double = NDArray[np.float64]
 
+COS_HIGHLIGHT: Final = float(np.cos(np.radians(35.0)))
+"""Half vectors closer to the normal than 35 degrees may be those of a highlight."""
+MIN_COS_LIGHT: Final = 0.15
+MIN_COS_VIEW: Final = 0.2
+WIDEST_PX: Final = 320
+"""Larger images are binned 2 x 2 until they are no wider."""
 MIN_COSINE: Final = 0.35
 """Points seen at a flatter angle say nothing: 70 degrees."""
 CELL_MM: Final = 20.0
@@ -85,6 +92,7 @@ def photometric_normals(
     lights: Lights,
     caster: RayCaster,
     *,
+    surface_normals: Floats,
     binning: int = 1,
     rounds: int = 4,
 ) -> NormalEvidence:
@@ -99,15 +107,21 @@ def photometric_normals(
         As many as there are images.
     caster : RayCaster
         The scan about where it is: it tells how far each pixel's surface is from the lights.
+    surface_normals : ndarray, shape (F, 3)
+        Unit normals of the scan's triangles as it is now: they tell, within some degrees, where
+        highlights are.
     binning : int
         Camera pixels along each side of an image pixel.
     rounds : int
-        Of least squares that leave out shadows and highlights further.
+        Of least squares that leave out shadows further.
 
     Notes
     -----
-    ``signal / irradiance = albedo n . l`` by least squares; from round to round samples in shadow
-    and samples that lie off the fit by their residuals (Cauchy weights) count less.
+    ``signal / irradiance = albedo T(l) T(v) n . l`` by least squares, with the share T of light
+    that passes the skin's boundary (Fresnel, eta 1.4). Samples are left out whose half vector lies
+    within 35 degrees of the scan's normal, where the boundary itself shines, and flat ones, where
+    T falls steeply; shadows and samples off the fit (Cauchy weights) count less from round to
+    round.
     """
     count, height, width = stack.shape
     if count != len(lights.position_mm):
@@ -124,13 +138,30 @@ def photometric_normals(
         points = center[part] + distance[part, None] * ways[part]
         direction, white = lights.irradiance(points)
         values = stack.reshape(count, -1)[:, part] / np.maximum(white.mean(axis=-1), 1e-30)
-        found, share = _robust_normals(direction, values, rounds)
+        rough = surface_normals[hit[part]]
+        cos_view = -np.einsum("pk,pk->p", ways[part], rough)
+        cos_light = np.einsum("lpk,pk->lp", direction, rough)
+        half = direction - ways[part]
+        cos_half = np.einsum("lpk,pk->lp", half, rough) / np.linalg.norm(half, axis=-1)
+        diffuse = (cos_half < COS_HIGHLIGHT) & (cos_light > MIN_COS_LIGHT)
+        diffuse &= cos_view > MIN_COS_VIEW
+        passed = _passed(cos_light) * _passed(cos_view)
+        found, share = _robust_normals(
+            direction, np.where(diffuse, values / passed, np.nan), rounds
+        )
         facing = np.einsum("pk,pk->p", found, ways[part]) < 0
         normals[part] = np.where(facing[:, None], found, 0.0)
         weight[part] = np.where(facing, share, 0.0)
     return NormalEvidence(
         camera, normals.reshape(height, width, 3), weight.reshape(height, width), binning
     )
+
+
+def _passed(cosine: Double) -> Double:
+    """Return the share of light that passes the skin's boundary at a cosine, at least 0.05."""
+    at = np.linspace(0.0, 1.0, 513)
+    share = 1.0 - reflectance(at, ETA_SKIN)
+    return np.maximum(np.interp(cosine, at, share), 0.05)
 
 
 def _robust_normals(direction: Double, values: Floats, rounds: int) -> tuple[Double, Double]:
@@ -285,14 +316,24 @@ def align(
     normals = mesh.normals()
     rows = rng.permutation(len(mesh.vertices_mm))[:points]
     p, n = mesh.vertices_mm[rows], normals[rows]
-    images = [stacks(view) for view in range(len(cameras))]
+    images = []
+    for view in range(len(cameras)):
+        image, side = _binned(stacks(view))
+        images.append((image, side * binning))
     fit: RigidFit | None = None
     for number in range(rounds):
         moved = mesh.vertices_mm if fit is None else fit.move(mesh.vertices_mm)
         caster = RayCaster(moved, mesh.faces)
         evidence = [
-            photometric_normals(images[view], camera, lights, caster, binning=binning)
-            for view, camera in enumerate(cameras)
+            photometric_normals(
+                image,
+                camera,
+                lights,
+                caster,
+                surface_normals=_face_normals(mesh.faces, normals, fit),
+                binning=side,
+            )
+            for (image, side), camera in zip(images, cameras, strict=True)
         ]
         here = p if fit is None else fit.move(p)
         facing = n if fit is None else n @ fit.rotation.T
@@ -314,6 +355,23 @@ def align(
     if fit is None:
         raise RegistrationError(f"rounds: got {rounds}, expected at least 1")
     return fit
+
+
+def _binned(stack: Floats) -> tuple[NDArray[np.float32], int]:
+    """Return images no wider than `WIDEST_PX`, and the side of their pixels; NaN spreads."""
+    image, side = np.asarray(stack, np.float32), 1
+    while max(image.shape[1:]) > WIDEST_PX:
+        height, width = (n - n % 2 for n in image.shape[1:])
+        blocks = image[:, :height, :width].reshape(len(image), height // 2, 2, width // 2, 2)
+        image, side = blocks.mean(axis=(2, 4)), 2 * side
+    return image, side
+
+
+def _face_normals(faces: Faces, normals: Floats, fit: RigidFit | None) -> Double:
+    """Return the mean of the vertex normals of each triangle, turned as the fit has it."""
+    mean = np.asarray(normals, np.float64)[faces].sum(axis=1)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    return mean if fit is None else mean @ fit.rotation.T
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,6 +33,8 @@ LEAST_COS_VIEW: Final = 0.2
 HIGHLIGHT_RAD: Final = np.radians(35.0)
 """Samples whose half vector lies nearer to the normal hold too much of the highlight: skin's
 facets have a Beckmann slope of about 0.3 (Weyrich et al. 2005), of which 98 % lie below this."""
+PEAK_RAD: Final = np.radians(25.0)
+"""The same where the lobes are known and taken off: only their peaks are left out."""
 LOBE_POINTS: Final = 2_000
 """Points whose lobes are evaluated at a time."""
 LOBE_ERROR: Final = 0.1
@@ -285,7 +287,10 @@ def normals_from_remainder(
     )
     good = normals.valid & r_d.valid
     found = normals_from_shading(
-        bare, np.where(good[:, None], normals.values, (0.0, 0.0, 1.0)), rounds=1, highlight_rad=0.0
+        bare,
+        np.where(good[:, None], normals.values, (0.0, 0.0, 1.0)),
+        rounds=1,
+        highlight_rad=PEAK_RAD,
     )
     good = good & found.valid
     return _of_normals(found.values, found.stderr[:, 0], good)

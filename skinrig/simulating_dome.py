@@ -17,6 +17,8 @@ from skinrig.simulation import Order, Simulated, SimulationError, drive, open_se
 WIDTHS_PX = {"small": 200, "full": 1300}
 LIGHTS = {"small": 48, "full": None}
 VIEWS = {"small": 6, "full": None}
+BEHIND = -0.3
+"""Cosine from +z beyond which a light stands too far behind the face to be chosen among few."""
 SCAN = "scan.ply"
 SCAN_TRIANGLES = {"small": 12_000, "full": 40_000}
 TRACKING_EVERY = 24
@@ -109,7 +111,11 @@ def small_dome(
             continue
         if not 1 <= count <= len(rows):
             raise SimulationError(f"{field}: got {count}, expected 1 to {len(rows)}")
-        kept[field] = [rows[k].name for k in spread(np.array([r.position_mm for r in rows]), count)]
+        places = np.array([row.position_mm for row in rows])
+        # few lights stand where they reach a face; many stand all around
+        use = np.flatnonzero(places[:, 2] >= BEHIND * np.linalg.norm(places, axis=1))
+        use = use if len(use) >= count else np.arange(len(rows))
+        kept[field] = [rows[use[k]].name for k in spread(places[use], count)]
     rig = rig.subset(lights=kept["lights"], views=kept["views"])
     return rig if width_px in (None, rig.views[0].width_px) else rig.resized(int(width_px or 0))
 
