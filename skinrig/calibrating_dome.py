@@ -11,7 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture import raw
-from capture.calibration import bundle, geometry, light_fit, mirror_lights, mirror_sphere, store
+from capture.calibration import (
+    bundle,
+    geometry,
+    light_fit,
+    mirror_lights,
+    mirror_sphere,
+    moved_camera,
+    store,
+)
 from capture.calibration.board import Board, Sighting, find_board
 from capture.calibration.lights import LightTable
 from capture.calibration.mosaic import channel_levels, neutral_mosaic
@@ -155,7 +163,7 @@ def _moved(
     """Return what moved since the geometry in a folder; nothing without one."""
     try:
         previous = geometry.poses_from(store.load(folder, "geometry"), rig)
-        return tuple(str(moved) for moved in bundle.find_moved(sightings, board, previous))
+        return tuple(str(moved) for moved in moved_camera.find_moved(sightings, board, previous))
     except (store.CalibrationMissing, store.CalibrationMismatch, bundle.BundleError):
         return ()
 

@@ -17,6 +17,7 @@ from capture.calibration import (
     light_fit,
     mirror_lights,
     mirror_sphere,
+    moved_camera,
     store,
 )
 from capture.calibration.board import Board, find_board
@@ -137,9 +138,9 @@ def test_a_moved_camera_is_named_from_new_images(geometry_of_dome):
     after = dataclasses.replace(dome, rig=dataclasses.replace(dome.rig, views=views))
     poses = (0, 1, 2, 4, 5)
     seen = boards_seen(target_scene("charuco", rig, seed=12, dome=after), poses)
-    assert [m.name for m in bundle.find_moved(seen, BOARD, found.cameras)] == ["C07"]
+    assert [m.name for m in moved_camera.find_moved(seen, BOARD, found.cameras)] == ["C07"]
     same = boards_seen(target_scene("charuco", rig, seed=13, dome=dome), poses)
-    assert bundle.find_moved(same, BOARD, found.cameras) == ()
+    assert moved_camera.find_moved(same, BOARD, found.cameras) == ()
 
 
 def mirrors_seen(dome, rig, spheres, *, groups, radius_mm=50.0):
