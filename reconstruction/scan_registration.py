@@ -25,9 +25,11 @@ from reconstruction.ray_casting import RayCaster
 Floats = NDArray[np.floating]
 Double = NDArray[np.float64]
 
-COS_HIGHLIGHT: Final = float(np.cos(np.radians(35.0)))
-"""Half vectors closer to the normal than 35 degrees may be those of a highlight."""
-MIN_COS_LIGHT: Final = 0.15
+COS_HIGHLIGHT: Final = float(np.cos(np.radians(45.0)))
+"""Half vectors closer to the normal than 45 degrees may be those of a highlight."""
+LEAST_LIGHTS: Final = 9
+"""So many lights take part at a pixel even where some are nearer to the highlight."""
+MIN_COS_LIGHT: Final = 0.3
 MIN_COS_VIEW: Final = 0.2
 WIDEST_PX: Final = 320
 """Larger images are binned 2 x 2 until they are no wider."""
@@ -119,7 +121,7 @@ def photometric_normals(
     -----
     ``signal / irradiance = albedo T(l) T(v) n . l`` by least squares, with the share T of light
     that passes the skin's boundary (Fresnel, eta 1.4). Samples are left out whose half vector lies
-    within 35 degrees of the scan's normal, where the boundary itself shines, and flat ones, where
+    within 45 degrees of the scan's normal, where the boundary itself shines, and flat ones, where
     T falls steeply; shadows and samples off the fit (Cauchy weights) count less from round to
     round.
     """
@@ -143,8 +145,11 @@ def photometric_normals(
         cos_light = np.einsum("lpk,pk->lp", direction, rough)
         half = direction - ways[part]
         cos_half = np.einsum("lpk,pk->lp", half, rough) / np.linalg.norm(half, axis=-1)
-        diffuse = (cos_half < COS_HIGHLIGHT) & (cos_light > MIN_COS_LIGHT)
-        diffuse &= cos_view > MIN_COS_VIEW
+        facing_light = cos_light > MIN_COS_LIGHT
+        # of few lights those farthest from the highlight stay
+        ordered = np.sort(np.where(facing_light, cos_half, np.inf), axis=0)
+        edge = np.maximum(ordered[min(LEAST_LIGHTS, count) - 1], COS_HIGHLIGHT)
+        diffuse = facing_light & (cos_half <= edge) & (cos_view > MIN_COS_VIEW)
         passed = _passed(cos_light) * _passed(cos_view)
         found, share = _robust_normals(
             direction, np.where(diffuse, values / passed, np.nan), rounds
@@ -271,7 +276,9 @@ def register(
         vector = 0.5 * np.array(
             [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
         )
-        stderr = np.hypot(stderr, np.concatenate([vector, center_last - center_before]))
+        # how large such an error is shows there, not which way it goes
+        sizes = [np.linalg.norm(v) / np.sqrt(3) for v in (vector, center_last - center_before)]
+        stderr = np.hypot(stderr, np.repeat(sizes, 3))
     angle = np.degrees(2.0 * np.arcsin(np.clip(0.5 * np.median(system.size), 0.0, 1.0)))
     return RigidFit(
         turn, shift, turn @ middle + shift, stderr, float(angle), system.samples, converged
@@ -286,7 +293,7 @@ def align(
     stacks: Callable[[int], Floats],
     binning: int = 1,
     points: int = 6000,
-    rounds: int = 2,
+    rounds: int = 3,
     rng: np.random.Generator,
 ) -> RigidFit:
     """Register a scan to a dome from its own images.

@@ -103,14 +103,14 @@ def test_a_scan_outside_all_views_is_named(head, maps):
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_flawed_scan_is_laid_onto_the_dome_within_its_standard_errors(seed):
-    """16 views x 25 lights of a glossy Lambertian head with cast shadows, 1 % noise, 130 px wide.
+    """16 views x 38 lights of a head of glossy skin with cast shadows, 1 % noise, 130 px wide.
 
     Offset 6 mm and 2.5 degrees. Each of six errors within four standard errors: 0.04 % of false
     alarms in all three runs, if they were normal. Left in, the offset is a hundred of them.
     """
     head = build_head(np.random.default_rng(seed))
     rng = np.random.default_rng(seed)
-    rig = RIG.subset(lights=[f"L{k:03d}" for k in range(0, 150, 6)])
+    rig = RIG.subset(lights=[f"L{k:03d}" for k in range(0, 150, 4)])
     lights = LightTable.nominal(rig)
     caster = Caster(head)
     stacks = [_photographs(caster, view, lights, rng) for view in rig.views]
@@ -134,13 +134,23 @@ def test_a_flawed_scan_is_laid_onto_the_dome_within_its_standard_errors(seed):
     assert np.linalg.norm(left_in) > 3.0
 
 
+def entering(cosine):
+    """Return the share of light that passes a smooth boundary of index 1.4: Fresnel's formulas."""
+    c = np.clip(cosine, 1e-6, 1.0)
+    inside = np.sqrt(1 - (1 - c**2) / 1.4**2)
+    across = (c - 1.4 * inside) / (c + 1.4 * inside)
+    along = (1.4 * c - inside) / (1.4 * c + inside)
+    return 1 - 0.5 * (across**2 + along**2)
+
+
 def _photographs(caster, view, lights, rng):
-    """Return what a camera sees under each light, written here: Lambert, a highlight, shadows."""
+    """Return what a camera sees under each light: diffuse below a boundary, gloss, shadows."""
     seen = g_buffer(caster, view)
     points, normals = seen.position_mm[seen.mask], seen.normal[seen.mask]
     way, white = lights.irradiance(points)
     albedo = 0.35 + 0.1 * np.sin(0.2 * points[:, 0]) * np.cos(0.15 * points[:, 1])
     images = np.zeros((len(way), *seen.mask.shape), np.float32)
+    leaving = entering(np.einsum("pk,pk->p", seen.to_camera[seen.mask], normals))
     for number, direction in enumerate(way):
         length = np.linalg.norm(lights.position_mm[number] - points, axis=1)
         lit = ~caster.blocked(points + 0.05 * normals, direction, length)
@@ -148,6 +158,6 @@ def _photographs(caster, view, lights, rng):
         half /= np.linalg.norm(half, axis=1, keepdims=True)
         gloss = 0.8 * np.clip(np.einsum("pk,pk->p", half, normals), 0, 1) ** 60
         cosine = np.clip(np.einsum("pk,pk->p", direction, normals), 0, None)
-        value = (albedo + gloss) * cosine * lit * white[number, :, 1]
+        value = (albedo * entering(cosine) * leaving + gloss) * cosine * lit * white[number, :, 1]
         images[number][seen.mask] = value * (1 + 0.01 * rng.standard_normal(len(value)))
     return images
