@@ -12,11 +12,14 @@ from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
 from capture.rig import Rig, load_rig
 from model import store
 from skinrig.light_safety import light_figures, light_lines
+from skinrig.reflection_evaluation import TEST_FILE, make_test
 from skinrig.simulation import Order, Simulated, SimulationError, drive, open_session, truth_folder
 
 WIDTHS_PX = {"small": 200, "full": 1300}
 LIGHTS = {"small": 48, "full": None}
 VIEWS = {"small": 6, "full": None}
+SITES = ("forehead", "nose bridge", "cheek left", "cheek right", "chin")
+"""Where the truth keeps pictures of the reflection."""
 BEHIND = -0.3
 """Cosine from +z beyond which a light stands too far behind the face to be chosen among few."""
 SCAN = "scan.ply"
@@ -68,10 +71,19 @@ def simulate_dome(order: Order) -> Simulated:
     if order.target is None:
         truth = truth_folder(order.out)
         appearance = scene.truth_appearance()
+        landmarks = scene.subject.landmarks_mm()
         appearance = dataclasses.replace(
             appearance,
             parameters={"kind": "truth", "state": "neutral", **appearance.parameters, **scan},
             inputs={"session": session.content_hash},
+            files={
+                TEST_FILE: make_test(
+                    scene,
+                    appearance,
+                    rng=np.random.default_rng([order.seed, 8]),
+                    sites={name: landmarks[name] for name in SITES},
+                )
+            },
             seed=order.seed,
         )
         store.write(truth, appearance)

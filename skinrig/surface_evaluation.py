@@ -115,12 +115,13 @@ def match(appearance: SkinAppearance, truth: SkinAppearance, *, near_mm: float =
     usable = _valid(true_place)
     if "mask" in truth.maps:
         usable = usable & (truth.maps["mask"].values > 0.5)
-    known = np.flatnonzero(usable)
-    if not len(known):
+    # a texel whose nearest true one does not count, under a brow, has no truth either
+    known = np.flatnonzero(usable | np.any(true_place.values != 0.0, axis=-1))
+    if not usable.any():
         raise SurfaceTruthError("truth: no texel of it is valid")
     tree = cKDTree(true_place.values.reshape(-1, 3)[known])
     distance, index = tree.query(place, workers=1)
-    near = distance <= near_mm
+    near = (distance <= near_mm) & usable.reshape(-1)[known[index]]
     if not near.any():
         raise SurfaceTruthError(
             f"position: no texel lies within {near_mm:g} mm of the true surface; nearest "

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from model.skin import SkinAppearance, SkinMap
-from skinrig import page
+from skinrig import page, reflection_evaluation
 from skinrig import surface_evaluation as evaluation
 
 WIDTH_PX = 220
@@ -126,6 +126,7 @@ def section(
         body += f"<h3>{page.escape(key)}</h3><div class=maps>{''.join(figures)}</div>"
     if truth is not None:
         body += _errors(name, appearance, truth, checks)
+        body += _reflection(name, appearance, truth, checks)
     return body
 
 
@@ -209,6 +210,40 @@ def _errors(
             for row in found
         ],
     )  # fmt: skip
+
+
+def _reflection(
+    name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
+) -> str:
+    """Compare the fitted reflection with the true one, in held-out directions and on spheres."""
+    held_out = reflection_evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
+    if held_out is None:
+        return ""
+    checks.append(
+        page.Check(
+            f"{name}: reflection in held-out directions, median error",
+            100 * held_out.median,
+            100 * reflection_evaluation.HELD_OUT_LIMIT,
+            "<=",
+            "%",
+            f"{held_out.points} points x {held_out.directions} directions",
+        )
+    )
+    low, high = held_out.interval
+    body = "<h3>Reflection in directions that no light of the capture had</h3>" + page.table(
+        ("points", "directions", "median error %", "68 % interval", "in highlights %"),
+        [(held_out.points, held_out.directions, 100 * held_out.median,
+          f"{100 * low:.3g} – {100 * high:.3g}", 100 * held_out.highlights)],
+    )  # fmt: skip
+    figures = []
+    for site, true_image, image in reflection_evaluation.spheres(appearance, truth):
+        bright = float(np.percentile(true_image.max(axis=-1), 99.5)) or 1.0
+        figures.append(page.color_picture(f"{site}: truth", true_image / bright))
+        if image is not None:
+            figures.append(page.color_picture(f"{site}: estimate", image / bright))
+    if figures:
+        body += f"<h3>Reflection on spheres</h3><div class=maps>{''.join(figures)}</div>"
+    return body
 
 
 def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
