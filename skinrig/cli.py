@@ -62,7 +62,7 @@ def _root(
 @app.command()
 def demo(
     out: Out = Path("demo"),
-    rigs: Annotated[str, typer.Option(help="Which rigs, separated by commas.")] = "flash",
+    rigs: Annotated[str, typer.Option(help="Which rigs, separated by commas.")] = "flash,dome",
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
