@@ -37,6 +37,8 @@ REVISION = 1
 
 RANK: Final = 4
 """Common mixtures that the basis is reduced to, as many as Weyrich et al. 2005 use for a face."""
+UNUSUAL: Final = 6.0
+"""Times the usual strength from which on a point's mixture is not used to find the common ones."""
 RANKS: Final = (1, 2, RANK, 2 * RANK)
 """Ranks whose errors are recorded."""
 BASIS_POINTS: Final = 5_000
@@ -373,7 +375,7 @@ def _lobes(
                 materials,
             ).weights
         )
-    shares = np.concatenate(fitted)
+    shares = _comparable(np.concatenate(fitted), materials)
     mixes = {rank: brdf_basis.reduce(shares, rank, basis=materials) for rank in RANKS}
     mix = mixes[RANK][1]
     basis = materials.mixed(mix)
@@ -399,6 +401,23 @@ def _lobes(
         **maps,
         BASIS_FILE: _basis_bytes(materials, mix, {rank: m[2] for rank, m in mixes.items()}),
     }
+
+
+def _comparable(shares: NDArray[np.float64], materials: BrdfBasis) -> NDArray[np.float64]:
+    """Return mixtures scaled to reflect equally much, without those that no sample holds down.
+
+    A lobe so narrow that no pair of light and view met it can have any share.
+    """
+    total = shares @ materials.strength()
+    some = total[total > 0]
+    usual = float(np.median(some)) if len(some) else 0.0
+    kept = (total > 0) & (total < UNUSUAL * usual)
+    if np.count_nonzero(kept) < RANKS[-1]:
+        raise EvidenceError(
+            f"lobes: {np.count_nonzero(kept)} of {len(shares)} points show how the surface "
+            f"reflects, expected at least {RANKS[-1]}; more lights or views would show it"
+        )
+    return shares[kept] / total[kept, None]
 
 
 def _basis_bytes(
