@@ -16,7 +16,7 @@ from skinrig.console import Console
 
 app = typer.Typer(
     name="skinrig",
-    help="Acquisition and calibration of skin appearance, with rigs that can be simulated.",
+    help="Capture, calibrate and reconstruct skin appearance, with rigs that can be simulated.",
     epilog="Begin with: skinrig demo",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -62,7 +62,7 @@ def _root(
 @app.command()
 def demo(
     out: Out = Path("demo"),
-    rigs: Annotated[str, typer.Option(help="Which rigs, separated by commas.")] = "flash,dome",
+    rigs: Annotated[str, typer.Option(help="Rigs: flash, dome, or both.")] = "flash,dome",
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
@@ -80,9 +80,13 @@ def demo(
 def simulate(
     rig: Annotated[str, typer.Argument(help="Name of a rig: flash or dome.")],
     out: Out,
-    size: Annotated[str, typer.Option(help="small or full.")] = "small",
-    lights: Annotated[int | None, typer.Option(help="So many lights of the dome.")] = None,
-    views: Annotated[int | None, typer.Option(help="So many cameras of the dome.")] = None,
+    size: Annotated[str, typer.Option(help="Of the pictures: small or full.")] = "small",
+    lights: Annotated[
+        int | None, typer.Option(help="How many of the dome's lights; default 48, full all 150.")
+    ] = None,
+    views: Annotated[
+        int | None, typer.Option(help="How many of the dome's cameras; default 6, full all 16.")
+    ] = None,
     move: Annotated[bool, typer.Option("--move", help="The face in the dome moves.")] = False,
     seed: Seed = 0,
     subject: Annotated[str, typer.Option(help="Preset, I to VI, palest or darkest.")] = "III",
@@ -94,7 +98,10 @@ def simulate(
             "of the dome charuco, mirror."
         ),
     ] = None,
-    state: Annotated[list[str] | None, typer.Option(help="State of the face; repeatable.")] = None,
+    state: Annotated[
+        list[str] | None,
+        typer.Option(help="State of the face before the flash rig; repeatable."),
+    ] = None,
     consent: Consent = None,
     consent_expires: ConsentExpires = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
@@ -139,7 +146,9 @@ def capture(
     port: Annotated[list[str] | None, typer.Option(help="Box: NAME=URL; repeatable.")] = None,
     camera: Annotated[list[str] | None, typer.Option(help="Camera: VIEW=URL; repeatable.")] = None,
     plan: Annotated[Path | None, typer.Option(help="Plan, JSON; default: the rig's own.")] = None,
-    target: Annotated[str | None, typer.Option(help="Plan of a calibration target.")] = None,
+    target: Annotated[
+        str | None, typer.Option(help="Plan of a calibration target, named as for simulate.")
+    ] = None,
     subject: Annotated[str, typer.Option(help="Pseudonym of the subject.")] = "anonymous",
     consent: Consent = None,
     consent_expires: ConsentExpires = None,
@@ -170,7 +179,7 @@ def capture(
 
 @app.command()
 def serve(
-    rig: Annotated[str, typer.Argument(help="Name of a rig.")],
+    rig: Annotated[str, typer.Argument(help="Name of a rig: flash or dome.")],
     pty: Annotated[bool, typer.Option("--pty", help="Boxes on a pseudo terminal.")] = False,
     tcp: Annotated[str, typer.Option(help="Address for boxes and cameras.")] = "127.0.0.1:0",
     anywhere: Annotated[
@@ -192,12 +201,20 @@ def serve(
 @app.command()
 def calibrate(
     kind: Annotated[
-        str, typer.Argument(help="sensor, color, polarization, white, geometry or lights.")
+        str,
+        typer.Argument(
+            help="Of the flash rig sensor, color, polarization, white; of the dome geometry, "
+            "lights."
+        ),
     ],
     sessions: Annotated[list[Path], typer.Argument(help="Sessions of the target.")],
     out: Out = Path("calibration"),
-    square_mm: Annotated[float, typer.Option(help="Side of the board's squares.")] = 36.0,
-    sphere_mm: Annotated[float, typer.Option(help="Radius of the mirror sphere.")] = 50.0,
+    square_mm: Annotated[
+        float, typer.Option(help="Side of the squares of geometry's board, mm.")
+    ] = 36.0,
+    sphere_mm: Annotated[
+        float, typer.Option(help="Radius of the mirror sphere of lights, mm.")
+    ] = 50.0,
     json: Json = False,
 ) -> None:
     """Make a calibration from sessions of a target and say how it drifted.
@@ -276,7 +293,7 @@ def import_mesh(
     file: Annotated[Path, typer.Argument(help="Scanned mesh: .obj or .ply.")],
     session: Annotated[Path, typer.Option(help="Session that gets the mesh.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="Copy to write, of a session that is closed.")
+        Path | None, typer.Option("--out", help="New folder for a copy, where it is closed.")
     ] = None,
     unit: Annotated[str, typer.Option(help="Unit of the file: mm, cm, m or inch.")] = "mm",
     json: Json = False,
@@ -294,7 +311,8 @@ def import_mesh(
         f"{done.path}: {done.vertices} vertices, {done.faces} triangles, {size} mm, "
         f"{'with' if done.has_uv else 'without'} texture coordinates"
     )
-    console.say(f"next: skinrig verify {done.path}")
+    after = f"reconstruct {done.path} --want normals --out appearance"
+    console.say(f"next: skinrig {after if done.reopened else f'verify {done.path}'}")
     console.document(
         "skinrig.import/1",
         {"path": done.path, "vertices": done.vertices, "faces": done.faces,
@@ -310,9 +328,12 @@ def import_lp(
         Path | None, typer.Option(help=".lp, list of directions, or folder of a chrome ball.")
     ] = None,
     mask: Annotated[Path | None, typer.Option(help="Picture that is bright at the object.")] = None,
-    encoding: Annotated[str, typer.Option(help="Of values: auto, sRGB or linear.")] = "auto",
+    encoding: Annotated[
+        str, typer.Option(help="How 8-bit and PNG values code light: auto, sRGB or linear.")
+    ] = "auto",
     mm_per_px: Annotated[
-        float | None, typer.Option(help="Pixel size: the list's rows are positions in mm.")
+        float | None,
+        typer.Option(help="Size of a pixel; then the list's rows are positions in mm."),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -347,7 +368,9 @@ def import_lp(
 @app.command()
 def reconstruct(
     session: Annotated[Path, typer.Argument(help="SESSION/ folder.")],
-    want: Annotated[str, typer.Option(help="Maps, separated by commas.")],
+    want: Annotated[
+        str, typer.Option(help="Maps, separated by commas; a wrong name lists those there are.")
+    ],
     out: Out,
     calibration: Annotated[Path | None, typer.Option(help="CALIBRATION/ folder.")] = None,
     state: Annotated[str, typer.Option(help="State of the subject.")] = "neutral",
