@@ -339,7 +339,10 @@ def _albedo(
     found = estimates.collect(
         lumitexels.store,
         lambda part, samples: estimates.albedo(
-            samples, estimates.part_of(point_normals, part), stderr_rad=typical
+            samples,
+            estimates.part_of(point_normals, part),
+            stderr_rad=typical,
+            pixel_mm=pixel_mm(dome),
         ),
     )
     return {
