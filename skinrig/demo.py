@@ -30,7 +30,7 @@ DOME_SUBJECT = "III"
 DOME_WANT = (
     "half_vector_normals", "normals", "normals_refined", "r_d", "lobe_residual", "samples",
 )  # fmt: skip
-DOME_WIDTH_PX = 200
+DOME_WIDTH_PX = 320
 """Pixels across each of the dome's cameras, unless said otherwise."""
 
 

@@ -15,7 +15,7 @@ from skinrig.light_safety import light_figures, light_lines
 from skinrig.reflection_evaluation import TEST_FILE, make_test
 from skinrig.simulation import Order, Simulated, SimulationError, drive, open_session, truth_folder
 
-WIDTHS_PX = {"small": 200, "full": 1300}
+WIDTHS_PX = {"small": 320, "full": 1300}
 LIGHTS = {"small": 48, "full": None}
 VIEWS = {"small": 6, "full": None}
 SITES = ("forehead", "nose bridge", "cheek left", "cheek right", "chin")

@@ -17,6 +17,9 @@ CHANNELS = ("red", "green", "blue")
 NORMAL_MAPS = ("half_vector_normals", "normals", "normals_refined")
 
 NORMAL_LIMIT_DEG = 1.0
+JUDGED_PIXEL_MM = 1.1
+"""Size of a pixel on the face up to which the limit of normals is promised: coarser ones average
+eyelids, nostrils and lips over more than they are wide."""
 ALBEDO_LIMIT = 0.03
 
 # of an error with the same deviation in two directions, the length that 68.27 % stay below
