@@ -83,7 +83,7 @@ def test_nothing_measured_gives_a_map_without_a_valid_texel_and_without_nan(surf
 
 
 def test_normals_between_points_are_unit_vectors(surface):
-    way = surface.points_mm.astype(np.float64) + (0.0, 0.0, 60.0)
+    way = surface.points_mm + np.array([0.0, 0.0, 60.0])
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     found = SurfaceTexture.of(surface, size=64).normals(
         PointValues(way, np.full(way.shape, 0.01), whole(surface)), "world"
