@@ -218,15 +218,50 @@ def test_relative_links_lead_somewhere(page):
     assert [target for target in local if not (page.parent / target).exists()] == []
 
 
-def test_the_maps_page_lists_every_map_of_the_pipeline():
-    from reconstruction.flash_stages import MAPS
+MAPS_PAGE = ROOT / "docs" / "maps.md"
 
-    listed = [
-        name
-        for row in rows(ROOT / "docs" / "maps.md", "Maps of the flash rig")
-        for name in SPAN.findall(row[0])
-    ]
-    assert sorted(listed) == sorted(MAPS)
+
+def recipes():
+    """Every recipe with the heading that its maps stand under."""
+    from reconstruction import pipeline
+
+    headings = {"subject": "Maps of the flash rig", "olat": "Maps of the dome"}
+    found = {headings[kind]: recipe for kind, recipe in pipeline.RECIPES.items()}
+    return {**found, "Maps of pictures under listed lights": pipeline.LIGHT_LIST}
+
+
+def test_the_maps_page_lists_every_map_of_every_recipe():
+    listed = {
+        heading: sorted(name for row in rows(MAPS_PAGE, heading) for name in SPAN.findall(row[0]))
+        for heading in recipes()
+    }
+    assert listed == {heading: sorted(recipe.maps) for heading, recipe in recipes().items()}
+
+
+def test_the_maps_page_lists_the_files_that_go_along():
+    listed = {SPAN.findall(row[0])[0] for row in rows(MAPS_PAGE, "Files of the dome")}
+    assert listed == {name for recipe in recipes().values() for name in recipe.files}
+
+
+def test_the_decision_on_long_modules_names_those_that_there_are():
+    page = ROOT / "docs" / "decisions" / "0004-modules-longer-than-300-lines.md"
+    decision = page.read_text("utf-8").split("## Decision\n")[1].split("\n## ")[0]
+    package, named_there = "", set()
+    for name in SPAN.findall(decision):
+        if "/" in name:
+            continue
+        package = package if name.startswith(".") else name.rpartition(".")[0]
+        named_there.add(package + name if name.startswith(".") else name)
+    lines = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts): len(
+            path.read_text("utf-8").splitlines()
+        )
+        for where in PACKAGES
+        for path in (ROOT / where).rglob("*.py")
+    }
+    assert sorted(named_there - set(lines)) == []
+    # above 300 a module is looked at, above 400 it is listed or cut
+    assert {name for name, count in lines.items() if count > 400} - named_there == set()
 
 
 def source_texts():
