@@ -198,13 +198,14 @@ def _image(dome: Dome, view: int, capture: int) -> DomeImage:
 def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
     """Clean and refine the scan, and lay it onto the dome."""
     session = evidence.session
-    if SCAN not in session.attachments():
+    if evidence.scan is None and SCAN not in session.attachments():
         raise EvidenceError(
             f"session {session.id}: holds no scan; add one with `skinrig import mesh FILE`"
         )
     footprint = pixel_mm(dome)
     points = int(np.clip(FACE_MM2 / footprint**2, *POINT_LIMITS))
-    scan = scan_mesh.prepare(session.attachment(SCAN), points=points)
+    mesh = session.attachment(SCAN) if evidence.scan is None else evidence.scan
+    scan = scan_mesh.prepare(mesh, points=points)
     chosen = _spread(dome.lights.position_mm, dome.lights.valid, ALIGNING_LIGHTS)
 
     def stacks(view: int) -> NDArray[np.float32]:

@@ -33,6 +33,8 @@ class Evidence:
         The date that calibrations must be valid on.
     assumed
         What was taken for granted for want of a calibration, one line each.
+    scan
+        PLY of the face in mm that takes the place of the session's own; None: the session's.
     hashes
         SHA-256 of everything that was read, by what it is.
     noted
@@ -43,13 +45,19 @@ class Evidence:
     calibration: Path | None
     state: str
     on_date: date
+    scan: bytes | None = None
     assumed: list[str] = field(default_factory=list)
     hashes: dict[str, str] = field(default_factory=dict)
     noted: dict[str, Any] = field(default_factory=dict)
 
     @staticmethod
     def of(
-        session: Session, calibration: str | Path | None, *, state: str, on_date: date | None
+        session: Session,
+        calibration: str | Path | None,
+        *,
+        state: str,
+        on_date: date | None,
+        scan: str | Path | None = None,
     ) -> Evidence:
         """Begin with what the session itself says that it assumed.
 
@@ -62,13 +70,18 @@ class Evidence:
             raise EvidenceError(
                 f"calibration: {calibration} is no folder; `skinrig calibrate` makes one"
             )
+        hashes = {"session": session.content_hash}
+        mesh = None if scan is None else Path(scan).read_bytes()
+        if mesh is not None:
+            hashes["scan"] = hashlib.sha256(mesh).hexdigest()
         return Evidence(
             session=session,
             calibration=None if calibration is None else Path(calibration),
             state=state,
             on_date=on_date or session.manifest.created_at.date(),
             assumed=[str(text) for text in session.manifest.extra.get("assumed", [])],
-            hashes={"session": session.content_hash},
+            scan=mesh,
+            hashes=hashes,
         )
 
     def load(

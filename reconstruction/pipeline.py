@@ -66,6 +66,7 @@ def reconstruct(
     calibration: str | Path | None = None,
     state: str = "neutral",
     on_date: date | None = None,
+    scan: str | Path | None = None,
     truth: str = "",
     progress: Callable[[str], None] | None = None,
 ) -> stages.Outcome:
@@ -86,6 +87,8 @@ def reconstruct(
         Which state of the subject.
     on_date
         The date the calibrations must be valid on; None: that of the session.
+    scan
+        A mesh of the face, PLY in mm, instead of the one that a dome session holds.
     truth
         Name of the TRUTH/ folder beside ``out``, for the report.
     progress
@@ -110,7 +113,7 @@ def reconstruct(
     unknown = [name for name in want if name not in recipe.maps]
     if unknown:
         raise EvidenceError(f"want: got {unknown[0]!r}, expected names out of {known}")
-    evidence = Evidence.of(opened, calibration, state=state, on_date=on_date)
+    evidence = Evidence.of(opened, calibration, state=state, on_date=on_date, scan=scan)
     graph = recipe.graph(evidence)
     want = [*want, *recipe.always]
     # a stage's other maps cost nothing more, and only whole stages can be reused

@@ -374,6 +374,9 @@ def reconstruct(
     out: Out,
     calibration: Annotated[Path | None, typer.Option(help="CALIBRATION/ folder.")] = None,
     state: Annotated[str, typer.Option(help="State of the subject.")] = "neutral",
+    scan: Annotated[
+        Path | None, typer.Option(help="Mesh of the face, PLY in mm, instead of a dome session's.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Make maps of a session; computes only what is wanted and not there yet.
@@ -387,7 +390,7 @@ def reconstruct(
     truth = truth_beside(session)
     done = pipeline.reconstruct(
         session, want=[w.strip() for w in want.split(",") if w.strip()], out=out,
-        calibration=calibration, state=state, progress=console.progress,
+        calibration=calibration, state=state, scan=scan, progress=console.progress,
         truth=truth.name if truth else "",
     )  # fmt: skip
     for text in done.assumed:

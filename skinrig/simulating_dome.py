@@ -11,6 +11,7 @@ from capture.plan import Plan
 from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
 from capture.rig import Rig, load_rig
 from model import store
+from model.skin import SkinAppearance
 from skinrig.light_safety import light_figures, light_lines
 from skinrig.reflection_evaluation import TEST_FILE, make_test
 from skinrig.simulation import Order, Simulated, SimulationError, drive, open_session, truth_folder
@@ -23,6 +24,7 @@ SITES = ("forehead", "nose bridge", "cheek left", "cheek right", "chin")
 BEHIND = -0.3
 """Cosine from +z beyond which a light stands too far behind the face to be chosen among few."""
 SCAN = "scan.ply"
+TRUE_MESH = "mesh.ply"
 SCAN_TRIANGLES = {"small": 12_000, "full": 40_000}
 TRACKING_EVERY = 24
 
@@ -71,25 +73,33 @@ def simulate_dome(order: Order) -> Simulated:
     if order.target is None:
         truth = truth_folder(order.out)
         appearance = scene.truth_appearance()
-        landmarks = scene.subject.landmarks_mm()
         appearance = dataclasses.replace(
             appearance,
             parameters={"kind": "truth", "state": "neutral", **appearance.parameters, **scan},
             inputs={"session": session.content_hash},
-            files={
-                TEST_FILE: make_test(
-                    scene,
-                    appearance,
-                    rng=np.random.default_rng([order.seed, 8]),
-                    sites={name: landmarks[name] for name in SITES},
-                )
-            },
+            files=_truth_files(scene, appearance, order.seed),
             seed=order.seed,
         )
         store.write(truth, appearance)
     return Simulated(
         order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures
     )
+
+
+def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, bytes]:
+    """Return the true mesh, and how the face reflects in directions that no light has."""
+    from rigsim.scan_flaws import binary_ply
+
+    mesh, landmarks = scene.subject.mesh, scene.subject.landmarks_mm()
+    return {
+        TRUE_MESH: binary_ply(mesh.vertices_mm, mesh.faces),
+        TEST_FILE: make_test(
+            scene,
+            truth,
+            rng=np.random.default_rng([seed, 8]),
+            sites={name: landmarks[name] for name in SITES},
+        ),
+    }
 
 
 def small_dome(
