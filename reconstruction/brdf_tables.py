@@ -152,6 +152,23 @@ def tabulate(materials: dict[str, Brdf], *, light_radius_rad: float = 0.0) -> Br
     return _padded(np.stack(columns, axis=-1), list(materials), light_radius_rad)
 
 
+def of_columns(
+    columns: FloatArray | NDArray[np.float32], names: Sequence[str], *, light_radius_rad: float
+) -> BrdfBasis:
+    """Return the basis whose table, without its padding, was kept.
+
+    Parameters
+    ----------
+    columns
+        BRDFs at the nodes, 1/sr, shape (32, N_phi, 90, K); see `BrdfBasis.table`.
+    names
+        Of the K materials.
+    light_radius_rad
+        Of the light that they are convolved with.
+    """
+    return _padded(np.asarray(columns, np.float64), names, light_radius_rad)
+
+
 def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
     """Return a basis of the MERL files in a folder, their channels averaged to one.
 

@@ -115,7 +115,9 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
               lambda lumitexels, point_normals, texture: _albedo(
                   dome, lumitexels, point_normals, texture)),
         stage("lobes", ("lumitexels", "point_normals", "point_r_d", "texture"),
-              ("basis", "weights", *WEIGHTS, "lobe_residual", BASIS_FILE), _lobes),
+              ("basis", "weights", *WEIGHTS, "lobe_residual", BASIS_FILE),
+              lambda lumitexels, point_normals, point_r_d, texture: _lobes(
+                  evidence, lumitexels, point_normals, point_r_d, texture)),
         stage("refined normals",
               ("surface", "lumitexels", "point_normals", "point_r_d", "basis", "weights",
                "texture"),
@@ -356,9 +358,14 @@ def _albedo(
 
 
 def _lobes(
-    lumitexels: Samples, point_normals: PointValues, point_r_d: PointValues, texture: SurfaceTexture
+    evidence: Evidence,
+    lumitexels: Samples,
+    point_normals: PointValues,
+    point_r_d: PointValues,
+    texture: SurfaceTexture,
 ) -> Mapping[str, Any]:
-    materials = brdf_tables.default()
+    folder = evidence.basis
+    materials = brdf_tables.default() if folder is None else brdf_tables.load(folder)
     store = lumitexels.store
     good = np.flatnonzero(point_r_d.valid)
     if len(good) < RANK:
@@ -432,6 +439,7 @@ def _basis_bytes(
         stream,
         materials=np.array(materials.names),
         mix=mix,
+        table=materials.mixed(mix).table[..., :RANK],
         light_radius_rad=materials.light_radius_rad,
         ranks=np.array(list(errors)),
         error_by_rank=np.array(list(errors.values())),

@@ -35,6 +35,8 @@ class Evidence:
         What was taken for granted for want of a calibration, one line each.
     scan
         PLY of the face in mm that takes the place of the session's own; None: the session's.
+    basis
+        Folder of MERL tables to fit surface lobes with; None: the generated dielectrics.
     hashes
         SHA-256 of everything that was read, by what it is.
     noted
@@ -46,6 +48,7 @@ class Evidence:
     state: str
     on_date: date
     scan: bytes | None = None
+    basis: Path | None = None
     assumed: list[str] = field(default_factory=list)
     hashes: dict[str, str] = field(default_factory=dict)
     noted: dict[str, Any] = field(default_factory=dict)
@@ -58,13 +61,14 @@ class Evidence:
         state: str,
         on_date: date | None,
         scan: str | Path | None = None,
+        basis: str | Path | None = None,
     ) -> Evidence:
         """Begin with what the session itself says that it assumed.
 
         Raises
         ------
         EvidenceError
-            When ``calibration`` is no folder.
+            When ``calibration`` or ``basis`` is no folder.
         """
         if calibration is not None and not Path(calibration).is_dir():
             raise EvidenceError(
@@ -74,6 +78,9 @@ class Evidence:
         mesh = None if scan is None else Path(scan).read_bytes()
         if mesh is not None:
             hashes["scan"] = hashlib.sha256(mesh).hexdigest()
+        tables = None if basis is None else Path(basis)
+        if tables is not None:
+            hashes["basis"] = _digest_of(tables)
         return Evidence(
             session=session,
             calibration=None if calibration is None else Path(calibration),
@@ -81,6 +88,7 @@ class Evidence:
             on_date=on_date or session.manifest.created_at.date(),
             assumed=[str(text) for text in session.manifest.extra.get("assumed", [])],
             scan=mesh,
+            basis=tables,
             hashes=hashes,
         )
 
@@ -121,3 +129,15 @@ class Evidence:
                 return found
         self.assumed.append(otherwise)
         return None
+
+
+def _digest_of(folder: Path) -> str:
+    """Return the hash of a folder's tables, their names and contents."""
+    if not folder.is_dir():
+        raise EvidenceError(f"basis: {folder} is no folder; give one with MERL .binary files")
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.binary")):
+        digest.update(path.name.encode() + b"\0")
+        with open(path, "rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()

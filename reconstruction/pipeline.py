@@ -67,6 +67,7 @@ def reconstruct(
     state: str = "neutral",
     on_date: date | None = None,
     scan: str | Path | None = None,
+    basis: str | Path | None = None,
     truth: str = "",
     progress: Callable[[str], None] | None = None,
 ) -> stages.Outcome:
@@ -89,6 +90,9 @@ def reconstruct(
         The date the calibrations must be valid on; None: that of the session.
     scan
         A mesh of the face, PLY in mm, instead of the one that a dome session holds.
+    basis
+        Folder of MERL ``.binary`` tables that surface lobes are fitted with, instead of the
+        generated dielectrics.
     truth
         Name of the TRUTH/ folder beside ``out``, for the report.
     progress
@@ -113,7 +117,9 @@ def reconstruct(
     unknown = [name for name in want if name not in recipe.maps]
     if unknown:
         raise EvidenceError(f"want: got {unknown[0]!r}, expected names out of {known}")
-    evidence = Evidence.of(opened, calibration, state=state, on_date=on_date, scan=scan)
+    evidence = Evidence.of(
+        opened, calibration, state=state, on_date=on_date, scan=scan, basis=basis
+    )
     graph = recipe.graph(evidence)
     want = [*want, *recipe.always]
     # a stage's other maps cost nothing more, and only whole stages can be reused

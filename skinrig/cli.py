@@ -377,6 +377,9 @@ def reconstruct(
     scan: Annotated[
         Path | None, typer.Option(help="Mesh of the face, PLY in mm, instead of a dome session's.")
     ] = None,
+    basis: Annotated[
+        Path | None, typer.Option(help="Folder of MERL tables to fit a dome's lobes with.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Make maps of a session; computes only what is wanted and not there yet.
@@ -390,7 +393,7 @@ def reconstruct(
     truth = truth_beside(session)
     done = pipeline.reconstruct(
         session, want=[w.strip() for w in want.split(",") if w.strip()], out=out,
-        calibration=calibration, state=state, scan=scan, progress=console.progress,
+        calibration=calibration, state=state, scan=scan, basis=basis, progress=console.progress,
         truth=truth.name if truth else "",
     )  # fmt: skip
     for text in done.assumed:

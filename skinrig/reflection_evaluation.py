@@ -136,7 +136,9 @@ def basis_of(appearance: SkinAppearance) -> BrdfBasis | None:
     if BASIS_FILE not in appearance.files or any(w not in appearance.maps for w in WEIGHTS):
         return None
     with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as stored:
-        return brdf_tables.default(float(stored["light_radius_rad"])).mixed(stored["mix"])
+        names = [f"mix {k}" for k in range(len(WEIGHTS))]
+        radius = float(stored["light_radius_rad"])
+        return brdf_tables.of_columns(stored["table"], names, light_radius_rad=radius)
 
 
 def compare(
