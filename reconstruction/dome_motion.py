@@ -93,13 +93,14 @@ def follow_head(
     Returns
     -------
     Motion or None
-        One row for each of ``images.captures``; None where there are no tracking frames.
+        One row for each of ``images.captures``; None where fewer than two tracking frames show
+        all views.
     """
     by_step: dict[str, dict[str, Any]] = {}
     for record in session.frames("tracking"):
         by_step.setdefault(record.step_id, {})[record.camera] = record
     whole = [shots for shots in by_step.values() if set(images.views) <= set(shots)]
-    if not whole:
+    if len(whole) < 2:
         return None
     times = np.array([_time_s(shots[images.views[0]]) for shots in whole])
     order = np.argsort(times)
@@ -134,6 +135,11 @@ def follow_head(
     apart = np.sqrt(np.mean(np.sum(moved**2, axis=-1), axis=-1))
     usable = found.covered(when)
     still = bool(usable.all() and apart.max(initial=0.0) < STILL_PX * pixel_mm)
+    if not usable.any():
+        raise EvidenceError(
+            f"session {session.id}: no image lies between two tracking frames that tell where the "
+            "head was; capture again, with the face at rest"
+        )
     return Motion(poses, usable, found, apart, still)
 
 

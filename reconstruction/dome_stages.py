@@ -19,7 +19,14 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.lights import LightTable
 from capture.session import Session
 from model.skin import SkinMap
-from reconstruction import brdf_basis, brdf_tables, scan_mesh, scan_registration, stages
+from reconstruction import (
+    brdf_basis,
+    brdf_tables,
+    photometric_stereo,
+    scan_mesh,
+    scan_registration,
+    stages,
+)
 from reconstruction import surface_estimates as estimates
 from reconstruction.brdf_tables import BrdfBasis
 from reconstruction.dome_images import DomeImage, DomeImages
@@ -46,6 +53,8 @@ BASIS_POINTS: Final = 5_000
 SCAN: Final = "scan.ply"
 ALIGNING_LIGHTS: Final = 40
 """Lights whose images say where the scan is."""
+SIGNAL: Final = 5.0
+"""Times its noise from which on a pixel shows something."""
 MEMORY_BYTES: Final = 2**30
 """Size of the table of samples from which on it lies in files and not in memory."""
 FACE_MM2: Final = 60_000.0
@@ -145,13 +154,18 @@ def _dome(evidence: Evidence) -> Dome:
     )  # fmt: skip
     lights_rig = rig.subset(lights=images.lights)
     lights = LightTable.nominal(lights_rig)
+    # a calibration from spheres alone says nothing of strengths, one from the plate none of places
+    nominal: dict[str, str] = {}
     if lit is not None:
         lights = LightTable.from_calibration(lit, lights_rig)
+        nominal = {k: lit.notes[k] for k in ("positions", "intensities") if k in lit.notes}
+        evidence.assumed += [f"the lights' {what} are {why}" for what, why in nominal.items()]
     dead = [name for name, good in zip(lights.names, lights.valid, strict=True) if not good]
     if dead:
         evidence.noted["lights_left_out"] = dead
     response = tuple(_response(lights, camera) for camera in cameras)
-    return Dome(images, cameras, lights, lights, response, lit is not None)
+    absolute = lit is not None and "intensities" not in nominal
+    return Dome(images, cameras, lights, lights, response, absolute)
 
 
 def _apart(session: Session, dome: Dome) -> Dome:
@@ -204,30 +218,40 @@ def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
         raise EvidenceError(
             f"session {session.id}: holds no scan; add one with `skinrig import mesh FILE`"
         )
+    _require(dome)
     footprint = pixel_mm(dome)
     points = int(np.clip(FACE_MM2 / footprint**2, *POINT_LIMITS))
     mesh = session.attachment(SCAN) if evidence.scan is None else evidence.scan
     scan = scan_mesh.prepare(mesh, points=points)
     chosen = _spread(dome.lights.position_mm, dome.lights.valid, ALIGNING_LIGHTS)
+    shares = []
 
     def stacks(view: int) -> NDArray[np.float32]:
         layers = []
         for capture in chosen:
             image = _image(dome, view, capture)
-            gray = (image.rgb / np.maximum(dome.lights.intensity[capture].mean(), 1e-30)).mean(-1)
-            layers.append(
-                np.where(image.valid, gray * dome.lights.intensity[capture].mean(), np.nan)
-            )
+            gray = image.rgb.mean(axis=-1)
+            noise = np.sqrt(image.variance.sum(axis=-1)) / 3.0
+            seen = image.valid & (gray > SIGNAL * noise)
+            shares.append((np.mean(~image.valid), np.mean(seen)))
+            layers.append(np.where(image.valid, gray, np.nan))
         return np.asarray(layers, np.float32)
 
-    fit = scan_registration.align(
-        scan.coarse,
-        cameras=dome.cameras,
-        lights=_rows(dome.lights, chosen, [dome.lights.names[k] for k in chosen]),
-        stacks=stacks,
-        binning=2,
-        rng=np.random.default_rng(0),
-    )
+    try:
+        fit = scan_registration.align(
+            scan.coarse,
+            cameras=dome.cameras,
+            lights=_rows(dome.lights, chosen, [dome.lights.names[k] for k in chosen]),
+            stacks=stacks,
+            binning=2,
+            rng=np.random.default_rng(0),
+        )
+    except scan_registration.RegistrationError as exc:
+        lost, seen = 100.0 * np.mean(shares, axis=0)
+        raise EvidenceError(
+            f"surface: the scan was not found in the images: {exc}; {lost:.1f} % of their pixels "
+            f"are saturated in every exposure, {seen:.1f} % are brighter than their noise"
+        ) from exc
     evidence.noted["registration"] = {
         "rotation": fit.rotation.tolist(),
         "translation_mm": fit.translation_mm.tolist(),
@@ -238,6 +262,21 @@ def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
         "pixel_mm": footprint,
     }
     return scan.moved(fit.rotation, fit.translation_mm)
+
+
+def _require(dome: Dome) -> None:
+    """Refuse fewer views or lights than any point needs, and lights that lie in a plane."""
+    views, lights = len(dome.cameras), int(np.count_nonzero(dome.lights.valid))
+    if views < estimates.LEAST_VIEWS:
+        raise EvidenceError(
+            f"views: got images of {views}, expected at least {estimates.LEAST_VIEWS}"
+        )
+    if lights < estimates.LEAST_LIGHTS:
+        raise EvidenceError(
+            f"lights: got {lights} that can be used, expected at least {estimates.LEAST_LIGHTS}"
+        )
+    place = dome.lights.position_mm[dome.lights.valid]
+    photometric_stereo.require_spread(place / np.linalg.norm(place, axis=1, keepdims=True))
 
 
 def _spread(position_mm: NDArray[np.float64], usable: NDArray[np.bool_], count: int) -> list[int]:
@@ -272,8 +311,8 @@ def _texture(dome: Dome, surface: RefinedScan) -> Mapping[str, Any]:
 def _motion(evidence: Evidence, dome: Dome, surface: RefinedScan) -> Motion | None:
     images = DomeImages(evidence.session, merge=False)
     found = follow_head(evidence.session, images, dome.cameras, surface, pixel_mm(dome))
-    if found is not None:
-        evidence.noted["motion"] = found.record()
+    # without tracking frames nobody knows whether the head held still
+    evidence.noted["motion"] = {"tracking_frames": 0} if found is None else found.record()
     return found
 
 
