@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final, Literal, Protocol, TypeAlias, get_args
+from typing import Any, Final, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from capture.rig import Rig, RigError, View
 from rigsim.dome_build import BuiltDome, build, image_of, pixel_corner_rays
 from rigsim.led_light import lobe_exponent, white_intensity
 from rigsim.scenes import mirror_ball, printed_plate
+from rigsim.scenes.dome import Pulse
 from rigsim.scenes.printed_plate import CELL_MM, Plate
 from rigsim.sensor import expose, sensor_of
 
@@ -77,26 +78,6 @@ PLACES: Final[dict[str, int]] = {
 HAND_MM: Final = 3.0
 HAND_DEG: Final = 2.0
 """Standard deviations of where an operator puts a target."""
-
-
-class Pulse(Protocol):
-    """A lit LED, as the world reports it, clipped to the exposure."""
-
-    @property
-    def led(self) -> int:
-        """Channel of the box."""
-
-    @property
-    def level(self) -> float:
-        """Fraction of full power, 0 to 1."""
-
-    @property
-    def t_on_s(self) -> float:
-        """World time at which it went on, s."""
-
-    @property
-    def t_off_s(self) -> float:
-        """World time at which it went off, s."""
 
 
 class TargetError(ValueError):
