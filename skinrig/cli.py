@@ -132,11 +132,15 @@ def _next_step(rig: str, session: Path, target: str | None) -> str:
     kinds = {"white": "white", "flat": "sensor", "dark": "sensor", "chart": "color",
              "malus": "polarization"}  # fmt: skip
     if rig == "dome":
-        kinds = {"charuco": "geometry", "mirror": "lights", "white": "lights", "dark": "sensor"}
+        kinds = {"charuco": "geometry", "mirror": "lights", "white": "lights"}
     if target is None:
-        want = "normals,r_d" if rig == "dome" else "melanin,hemoglobin"
+        want = "normals,r_d --calibration calibration" if rig == "dome" else "melanin,hemoglobin"
         return f"skinrig reconstruct {session} --want {want} --out appearance"
-    return f"skinrig calibrate {kinds[target]} {session} --out calibration"
+    if target not in kinds:
+        return f"skinrig verify {session}"
+    named = f"SESSION-MIRROR {session}" if kinds[target] == "lights" else f"{session}"
+    named = f"{session} SESSION-WHITE" if target == "mirror" else named  # one calibration of both
+    return f"skinrig calibrate {kinds[target]} {named} --out calibration"
 
 
 @app.command()

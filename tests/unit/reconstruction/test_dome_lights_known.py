@@ -1,0 +1,77 @@
+"""What a calibration of the dome's lights does not hold is said, and never used as if it did."""
+
+from datetime import UTC, date, datetime
+
+import numpy as np
+import pytest
+
+from capture import raw
+from capture.calibration import store
+from capture.calibration.lights import LightTable
+from capture.plan import Plan, Step
+from capture.rig import load_rig
+from capture.session import Session, Subject
+from reconstruction import dome_stages
+from reconstruction.evidence import Evidence, EvidenceError
+
+RIG = load_rig("dome").subset(lights=["L000", "L001"], views=["C00"]).resized(24)
+TODAY = date(2026, 11, 21)
+
+
+@pytest.fixture
+def session(tmp_path):
+    view = RIG.views[0]
+    steps = tuple(
+        Step(f"O{light.name}", "olat", {"light": light.name, "exposure": 0, "pass": 0},
+             {"light": light.name, "exposure_s": 0.06, "level": 1.0}, ("C00",))
+        for light in RIG.lights
+    )  # fmt: skip
+    with Session.create(
+        tmp_path / "session", plan=Plan("dome", steps), rig=RIG, devices={},
+        subject=Subject("P1", ("research",)), source="simulated", seed=0,
+        now=lambda: datetime(2026, 11, 21, tzinfo=UTC),
+    ) as session:  # fmt: skip
+        for step in steps:
+            blob = raw.encode_dng(
+                np.full((view.height_px, view.width_px), 900, np.uint16), pattern=view.cfa,
+                black=view.black_level, white=view.white_level, exposure_s=0.06,
+                camera_serial=view.serial, step_id=step.id, session_id=session.id,
+            )  # fmt: skip
+            session.commit(step.id, "C00", blob, settings=step.settings, actual={}, t_host_s=2.0)
+        session.close()
+    return Session.open(tmp_path / "session")
+
+
+def evidence_with(session, folder, notes):
+    table = LightTable.nominal(RIG)
+    store.save(
+        table.to_calibration(rig="dome", source="simulated", created=TODAY, notes=notes), folder
+    )
+    return Evidence.of(session, folder, state="neutral", on_date=TODAY)
+
+
+def albedo_of(evidence):
+    """Ask for the albedo of nothing at all: what is refused first is what is not known."""
+    (stage,) = [s for s in dome_stages.graph(evidence) if s.name == "albedo"]
+    stage.run(None, None, None)
+
+
+def test_lights_without_measured_strengths_give_no_albedo(session, tmp_path):
+    evidence = evidence_with(session, tmp_path / "c", {"intensities": "nominal and relative"})
+    with pytest.raises(EvidenceError, match="the lights are not calibrated"):
+        albedo_of(evidence)
+    assert "the lights' intensities are nominal and relative" in evidence.assumed
+
+
+def test_lights_without_measured_places_are_named_as_assumed(session, tmp_path):
+    evidence = evidence_with(session, tmp_path / "c", {"positions": "nominal"})
+    with pytest.raises(AttributeError):  # goes on to the samples, of which there are none
+        albedo_of(evidence)
+    assert "the lights' positions are nominal" in evidence.assumed
+
+
+def test_whole_calibrations_leave_only_the_cameras_to_assume(session, tmp_path):
+    evidence = evidence_with(session, tmp_path / "c", {})
+    with pytest.raises(AttributeError):
+        albedo_of(evidence)
+    assert evidence.assumed == ["the cameras stand as the rig's file draws them"]
