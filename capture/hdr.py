@@ -230,21 +230,23 @@ def merge(
     # waking a second thread takes longer than a small frame; the choice holds for this thread only
     threads = get_num_threads()
     set_num_threads(1 if radiance.size < _SMALL else threads)
-    with parallel_chunksize(_CHUNK):
-        _merge_tiles(
-            np.array([row.ctypes.data for row in rows], np.int64),
-            (times / longest).astype(np.float32),
-            _starters(times),
-            np.float32(1.0 / gain),
-            np.float32((read_noise / gain) ** 2 + 1.0 / 12.0),
-            np.float32(black),
-            np.float32(white),
-            np.float32(1.0 / longest),
-            radiance.reshape(-1),
-            variance.reshape(-1),
-            valid.reshape(-1),
-        )
-    set_num_threads(threads)
+    try:
+        with parallel_chunksize(_CHUNK):
+            _merge_tiles(
+                np.array([row.ctypes.data for row in rows], np.int64),
+                (times / longest).astype(np.float32),
+                _starters(times),
+                np.float32(1.0 / gain),
+                np.float32((read_noise / gain) ** 2 + 1.0 / 12.0),
+                np.float32(black),
+                np.float32(white),
+                np.float32(1.0 / longest),
+                radiance.reshape(-1),
+                variance.reshape(-1),
+                valid.reshape(-1),
+            )
+    finally:
+        set_num_threads(threads)
     return radiance, variance, valid
 
 
