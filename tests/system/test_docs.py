@@ -243,6 +243,38 @@ def test_the_maps_page_lists_the_files_that_go_along():
     assert listed == {name for recipe in recipes().values() for name in recipe.files}
 
 
+def test_the_figures_of_the_domes_light_are_those_of_its_plan():
+    from capture.plan.dome import dome_plan
+    from capture.rig import load_rig
+    from skinrig.light_safety import light_figures
+
+    rig = load_rig("dome")
+    plan = dome_plan(rig)
+    figures = light_figures(plan, rig)
+    count = {kind: sum(s.kind == kind for s in plan.steps) for kind in ("olat", "tracking", "dark")}
+    text = " ".join((ROOT / "docs" / "light-dome.md").read_text("utf-8").split())
+    assert count["olat"] == 2 * len(rig.lights)
+    for claim in (
+        f"plan of {len(plan.steps)} steps ({len(rig.lights)} lights",
+        f"{count['tracking']} tracking frames, {count['dark']} darks;",
+        f"darks; {plan.estimated_s(rig):.0f} s)",
+        f"{figures['flashes_per_s']:.1f} flashes in the worst second",
+        f"{figures['flicker_rms']:.2f} of light between 3 and 65 Hz",
+        f"at most {figures['led_ws']:.3g} Ws from one LED",
+        f"of the {figures['limit_ws']:g} Ws allowed",
+    ):
+        assert claim in text, claim
+
+
+def test_the_limits_of_the_domes_light_are_those_of_its_rig_file():
+    from capture.rig import LedLimits, load_rig
+
+    limits = load_rig("dome").leds or LedLimits()
+    for names, shipped, _ in rows(ROOT / "docs" / "light-dome.md", "Light: flicker and dose"):
+        for name, value in zip(SPAN.findall(names), shipped.split(","), strict=True):
+            assert float(re.search(r"[\d.]+", value).group()) == getattr(limits, name), name
+
+
 def test_the_decision_on_long_modules_names_those_that_there_are():
     page = ROOT / "docs" / "decisions" / "0004-modules-longer-than-300-lines.md"
     decision = page.read_text("utf-8").split("## Decision\n")[1].split("\n## ")[0]
