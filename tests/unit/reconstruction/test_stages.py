@@ -79,3 +79,83 @@ def test_two_makers_of_one_product_are_refused():
 def test_a_stage_that_makes_something_else_is_found_out():
     with pytest.raises(StageError, match="made"):
         run([Stage("a", (), ("x",), lambda: {"z": 1})], ["x"])
+
+
+class Folder:
+    """Keeps maps and files alone, as a finished folder does, not what stages hand each other."""
+
+    def __init__(self, *kept):
+        self.kept = kept
+        self.by_key = {}
+
+    def load(self, key):
+        return self.by_key.get(key)
+
+    def save(self, key, products):
+        kept = {name: value for name, value in products.items() if name in self.kept}
+        if kept:
+            self.by_key[key] = kept
+
+
+def surface_graph(calls):
+    """Stages that make a map and hand something on, and one whose map comes with a file."""
+
+    def note(name, result):
+        def work(**inputs):
+            calls.append(name)
+            return result(**inputs)
+
+        return work
+
+    return [
+        Stage("samples", (), ("samples",), note("samples", lambda: {"samples": 4})),
+        Stage("normals", ("samples",), ("point_normals", "normals"),
+              note("normals", lambda samples: {"point_normals": samples, "normals": -samples})),
+        Stage("lobes", ("samples", "point_normals"), ("weight", "basis.npz"),
+              note("lobes", lambda samples, point_normals:
+                   {"weight": samples * point_normals, "basis.npz": b"table"})),
+    ]  # fmt: skip
+
+
+def test_a_stage_whose_map_is_kept_but_not_what_it_hands_on_runs_again():
+    calls, folder = [], Folder("normals", "weight", "basis.npz")
+    first = run(surface_graph(calls), ["normals"], cache=folder)
+    assert first.ran == ("samples", "normals")
+    calls.clear()
+    outcome = run(surface_graph(calls), ["normals", "weight"], cache=folder)
+    # the lobes need what the normals hand on, and nobody kept that
+    assert calls == ["samples", "normals", "lobes"]
+    assert outcome.products == {"normals": -4, "weight": 16}
+    assert outcome.ran == ("samples", "normals", "lobes")
+    assert outcome.reused == ()
+    assert outcome.left_out == ()
+
+
+def test_a_map_that_is_kept_is_not_made_again_for_a_stage_that_does_not_need_it():
+    calls, folder = [], Folder("normals", "weight", "basis.npz")
+    run(surface_graph(calls), ["weight"], cache=folder)
+    calls.clear()
+    outcome = run(surface_graph(calls), ["normals", "weight"], cache=folder)
+    assert calls == []
+    assert set(outcome.reused) == {"normals", "lobes"}
+    assert outcome.left_out == (("samples", "what depends on it was reused"),)
+
+
+def test_files_go_along_with_the_maps_of_their_stage():
+    calls, folder = [], Folder("normals", "weight", "basis.npz")
+    made = run(surface_graph(calls), ["weight", "basis.npz"], cache=folder).products
+    again = run(surface_graph(calls), ["basis.npz"], cache=folder)
+    assert made["basis.npz"] == again.products["basis.npz"] == b"table"
+    assert again.ran == ()
+    assert calls == ["samples", "normals", "lobes"]
+
+
+def test_a_stage_that_can_be_reused_only_in_part_is_made_whole():
+    """A folder that lost one of two maps of a stage has neither made from other inputs."""
+    calls, folder = [], Folder("weight")
+    run(surface_graph(calls), ["weight"], cache=folder)
+    calls.clear()
+    outcome = run(surface_graph(calls), ["weight", "basis.npz"], cache=folder)
+    assert calls == ["samples", "normals", "lobes"]
+    assert outcome.products == {"weight": 16, "basis.npz": b"table"}
+    assert outcome.reused == ()
