@@ -15,6 +15,7 @@ from reconstruction import (
     brdf_basis,
     diffuse_albedo,
     half_vector_normals,
+    mixture_kernels,
     photometric_stereo,
 )
 from reconstruction.brdf_tables import BrdfBasis
@@ -35,8 +36,6 @@ HIGHLIGHT_RAD: Final = np.radians(35.0)
 facets have a Beckmann slope of about 0.3 (Weyrich et al. 2005), of which 98 % lie below this."""
 PEAK_RAD: Final = np.radians(25.0)
 """The same where the lobes are known and taken off: only their peaks are left out."""
-LOBE_POINTS: Final = 2_000
-"""Points whose lobes are evaluated at a time."""
 LOBE_ERROR: Final = 0.1
 """Relative error of a fitted lobe, for the weight of samples in it."""
 MISPLACED_PX: Final = 0.27
@@ -286,13 +285,14 @@ def normals_from_remainder(
     basis
         The reduced basis.
     """
-    lobes = np.zeros(samples.valid.shape, np.float32)
-    rows = np.flatnonzero(normals.valid & r_d.valid)
-    for part in np.array_split(rows, max(len(rows) // LOBE_POINTS, 1)):
-        lobes[part] = brdf_basis.evaluate(
-            weights[part][:, None], basis, samples.light_dir[part], samples.view_dir[part],
-            normals.values[part][:, None],
-        )  # fmt: skip
+    known = normals.valid & r_d.valid
+    lobes = mixture_kernels.evaluate(
+        basis.table,
+        np.where(known[:, None], weights, 0.0),
+        samples.light_dir,
+        samples.view_dir,
+        normals.values,
+    )
     # a lobe is known no better than a few percent: where it is strong a sample says less
     bare = dataclasses.replace(
         samples,

@@ -1,0 +1,40 @@
+"""Compiled mixtures are those of the plain evaluation."""
+
+import numpy as np
+
+from reconstruction import brdf_basis, brdf_tables, mixture_kernels
+
+
+def directions(rng, *shape):
+    way = rng.standard_normal((*shape, 3))
+    return (way / np.linalg.norm(way, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def test_mixtures_are_the_plain_ones_also_below_the_horizon(rng):
+    basis = brdf_tables.default().mixed(np.eye(brdf_tables.default().size)[[3, 20, 40, 55]])
+    weights = rng.random((30, 4))
+    light, view = directions(rng, 30, 50), directions(rng, 30, 50)
+    normals = directions(rng, 30).astype(np.float64)
+    quick = mixture_kernels.evaluate(basis.table, weights, light, view, normals)
+    plain = brdf_basis.evaluate(
+        weights[:, None], basis, light.astype(np.float64), view.astype(np.float64), normals[:, None]
+    )
+    below = (np.einsum("pmk,pk->pm", light, normals) <= 0) | (
+        np.einsum("pmk,pk->pm", view, normals) <= 0
+    )
+    assert below.sum() > 500
+    assert not quick[below].any()
+    # nodes of azimuth are taken at the nearest: a rounding apart may choose the other one
+    apart = np.abs(quick - plain) > 1e-4 * plain + 1e-6
+    assert apart.mean() < 1e-3
+
+
+def test_mirror_and_normal_directions_have_a_place(rng):
+    basis = brdf_tables.default().mixed(np.eye(brdf_tables.default().size)[[3]])
+    up = np.array([[0.0, 0.0, 1.0]])
+    light = np.array([[[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [1.0, 0.0, 0.0]]], np.float32)
+    view = np.array([[[0.0, 0.0, 1.0], [-0.6, 0.0, 0.8], [-1.0, 0.0, 0.0]]], np.float32)
+    out = mixture_kernels.evaluate(basis.table, np.ones((1, 1)), light, view, up)
+    assert np.isfinite(out).all()
+    assert out[0, 0] > 0
+    assert out[0, 2] == 0
