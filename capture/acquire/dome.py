@@ -246,11 +246,14 @@ class _Run:
         raise given_up(f"{len(left)} steps from {left[0].id} on", why, self._session)
 
     def _attempt(self, steps: list[Step], attempt: int) -> tuple[list[Step], str]:
-        """Run steps as one sequence, or one by one where that would flicker too much."""
+        """Run steps as one sequence, or one by one where that would flicker too much.
+
+        The box counts what was lit before, too: after a little darkness a single step passes.
+        """
         try:
             return self._sequence(steps, attempt)
         except CommandRefused as error:
-            if error.code not in (Code.FLICKER, Code.DUTY) or len(steps) == 1:
+            if error.code not in (Code.FLICKER, Code.DUTY):
                 raise
             log.info("%s; the %d steps are taken one by one", error, len(steps))
         left: list[Step] = []

@@ -9,7 +9,8 @@ from capture.acquire import AcquisitionError, Interrupted, run_plan
 from capture.acquire.dome import check_safety
 from capture.devices.camera import CameraError, Trigger, open_camera
 from capture.devices.dome import DomeBox
-from capture.devices.port import LinkLost, Port
+from capture.devices.port import CommandRefused, LinkLost, Port
+from capture.devices.wire import Code
 from capture.plan import Plan, Step
 from capture.plan.dome import dome_calibration_plan, dome_plan
 from capture.plan.rows import lights_of
@@ -332,6 +333,24 @@ def test_targets_are_put_into_their_places_one_after_the_other(make):
     bench.run(prompt=asked.append, eyes="closed")
     assert asked == ["pose 0", "pose 1", "pose 2"]
     check_frames(bench)
+
+
+def test_targets_that_are_moved_at_once_are_not_lit_faster_than_open_eyes_may_see(make):
+    bench = make(dome_calibration_plan(RIG, "charuco", poses=6))
+    refused = []
+    judge = bench.box.arm_sequence
+
+    def arm(rows):
+        try:
+            return judge(rows)
+        except CommandRefused as error:
+            refused.append(error.code)
+            raise
+
+    bench.box.arm_sequence = arm
+    done = bench.run(prompt=lambda text: None, eyes="open")
+    assert done.steps == len(bench.plan.steps)
+    assert Code.FLICKER in refused  # else the poses came too slowly to show anything
 
 
 def test_what_flickers_when_taken_again_alone_is_taken_in_single_flashes(make, monkeypatch):
