@@ -6,8 +6,9 @@ import dataclasses
 import io
 import math
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -88,6 +89,8 @@ class Dome:
     """Response of each camera at the pixels of its images, (h, w, 3)."""
     absolute: bool
     """Whether the lights' intensities are known, and so the albedo."""
+    tell: Callable[[str, float], None]
+    """Says how far a stage is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,9 +118,10 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
         stage("lumitexels", ("surface", "motion"), ("lumitexels",),
               lambda surface, motion: {
                   "lumitexels": _lumitexels(evidence.session, dome, surface, motion)}),
-        stage("sample counts", ("lumitexels", "texture"), ("samples",), _counts),
+        stage("sample counts", ("lumitexels", "texture"), ("samples",),
+              lambda lumitexels, texture: _counts(dome, lumitexels, texture)),
         stage("half-vector normals", ("lumitexels", "texture"), ("half_vector_normals",),
-              _half_vectors),
+              lambda lumitexels, texture: _half_vectors(dome, lumitexels, texture)),
         stage("normals", ("surface", "lumitexels", "texture"), ("point_normals", "normals"),
               lambda surface, lumitexels, texture: _normals(dome, surface, lumitexels, texture)),
         stage("albedo", ("lumitexels", "point_normals", "texture"), ("point_r_d", "r_d"),
@@ -165,7 +169,7 @@ def _dome(evidence: Evidence) -> Dome:
         evidence.noted["lights_left_out"] = dead
     response = tuple(_response(lights, camera) for camera in cameras)
     absolute = lit is not None and "intensities" not in nominal
-    return Dome(images, cameras, lights, lights, response, absolute)
+    return Dome(images, cameras, lights, lights, response, absolute, evidence.tell)
 
 
 def _apart(session: Session, dome: Dome) -> Dome:
@@ -335,6 +339,7 @@ def _lumitexels(
         folder=None if folder is None else Path(folder.name),
     )
     for view in range(len(dome.cameras)):
+        dome.tell("lumitexels", view / len(dome.cameras))
         for capture in range(len(dome.images.captures)):
             if not dome.lights.valid[capture]:
                 continue
@@ -345,14 +350,20 @@ def _lumitexels(
     return Samples(store, folder)
 
 
-def _counts(lumitexels: Samples, texture: SurfaceTexture) -> Mapping[str, SkinMap]:
-    found = estimates.collect(lumitexels.store, estimates.sample_counts)
+def _counts(dome: Dome, lumitexels: Samples, texture: SurfaceTexture) -> Mapping[str, SkinMap]:
+    found = estimates.collect(
+        lumitexels.store, estimates.sample_counts, progress=partial(dome.tell, "sample counts")
+    )
     return {"samples": texture.map(found.values[:, 0], None, found.valid, "1", "samples a point")}
 
 
-def _half_vectors(lumitexels: Samples, texture: SurfaceTexture) -> Mapping[str, SkinMap]:
+def _half_vectors(
+    dome: Dome, lumitexels: Samples, texture: SurfaceTexture
+) -> Mapping[str, SkinMap]:
     found = estimates.collect(
-        lumitexels.store, lambda _, samples: estimates.normals_from_half_vectors(samples)
+        lumitexels.store,
+        lambda _, samples: estimates.normals_from_half_vectors(samples),
+        progress=partial(dome.tell, "half-vector normals"),
     )
     return {"half_vector_normals": texture.normals(found, "as published, world frame")}
 
@@ -363,6 +374,7 @@ def _normals(
     found = estimates.collect(
         lumitexels.store,
         lambda part, samples: estimates.normals_from_shading(samples, surface.normals[part]),
+        progress=partial(dome.tell, "normals"),
     )
     found = estimates.with_misplacement(found, surface, pixel_mm(dome))
     return {"point_normals": found, "normals": texture.normals(found, "world frame")}
@@ -386,6 +398,7 @@ def _albedo(
             stderr_rad=typical,
             pixel_mm=pixel_mm(dome),
         ),
+        progress=partial(dome.tell, "albedo"),
     )
     return {
         "point_r_d": found,
@@ -435,6 +448,7 @@ def _lobes(
             samples, estimates.part_of(point_normals, part),
             estimates.part_of(point_r_d, part), basis,
         ),
+        progress=partial(evidence.tell, "lobes"),
     )  # fmt: skip
     maps = {
         name: texture.map(
@@ -502,6 +516,7 @@ def _refined(
             samples, estimates.part_of(point_normals, part), estimates.part_of(point_r_d, part),
             weights[part], basis,
         ),
+        progress=partial(dome.tell, "refined normals"),
     )  # fmt: skip
     found = estimates.with_misplacement(found, surface, pixel_mm(dome))
     return {"normals_refined": texture.normals(found, "by the fitted lobes, world frame")}

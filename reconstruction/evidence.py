@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
@@ -11,6 +12,9 @@ from typing import Any
 
 from capture.calibration import store as calibration_store
 from capture.session import Session
+
+TELL_S = 5.0
+"""Seconds between two lines about the same stage."""
 
 
 class EvidenceError(ValueError):
@@ -41,6 +45,8 @@ class Evidence:
         SHA-256 of everything that was read, by what it is.
     noted
         JSON values that belong into the record of the maps.
+    progress
+        Called with a line of text now and then while a stage runs.
     """
 
     session: Session
@@ -52,6 +58,15 @@ class Evidence:
     assumed: list[str] = field(default_factory=list)
     hashes: dict[str, str] = field(default_factory=dict)
     noted: dict[str, Any] = field(default_factory=dict)
+    progress: Callable[[str], None] | None = None
+    _told_at: float = 0.0
+
+    def tell(self, stage: str, done: float) -> None:
+        """Say how far a stage is, 0 to 1, every few seconds at most."""
+        now = time.monotonic()
+        if self.progress is not None and now - self._told_at >= TELL_S:
+            self._told_at = now
+            self.progress(f"{stage}: {100 * done:.0f} %")
 
     @staticmethod
     def of(

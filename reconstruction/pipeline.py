@@ -120,6 +120,7 @@ def reconstruct(
     evidence = Evidence.of(
         opened, calibration, state=state, on_date=on_date, scan=scan, basis=basis
     )
+    evidence.progress = progress
     graph = recipe.graph(evidence)
     want = [*want, *recipe.always]
     # a stage's other maps cost nothing more, and only whole stages can be reused
