@@ -1,0 +1,84 @@
+"""The demo as a newcomer runs it: rigs by name, a folder that is its own, a report at the end."""
+
+import json
+
+import pytest
+
+from skinrig.cli import main
+from skinrig.console import Console
+from skinrig.demo import RIGS, DemoError, run_demo
+
+
+@pytest.fixture
+def without_benchmarks(monkeypatch):
+    """Benchmarks have tests of their own, and take as long as they are allowed to."""
+    monkeypatch.setattr("skinrig.bench_stages.run_stages", lambda *_, **__: {"passed": True})
+
+
+@pytest.mark.parametrize("rigs", ["submarine", "dome,submarine", "", "flash,"])
+def test_an_unknown_rig_is_named_with_those_that_there_are(rigs, tmp_path, capsys):
+    out = tmp_path / "demo"
+    assert main(["demo", "--rigs", rigs, "--out", str(out)]) == 3
+    said = capsys.readouterr().err
+    assert "expected out of flash, dome" in said
+    assert "Traceback" not in said
+    assert not out.exists()
+
+
+def test_a_folder_that_is_not_a_demos_is_left_as_it_was(tmp_path):
+    kept = tmp_path / "thesis.txt"
+    kept.write_text("three years of work")
+    with pytest.raises(DemoError, match="name another folder with --out"):
+        run_demo(tmp_path, ["dome"], console=Console(False))
+    assert kept.read_text() == "three years of work"
+    assert list(tmp_path.iterdir()) == [kept]
+
+
+def test_each_rig_that_is_named_runs_and_no_other(tmp_path, monkeypatch, without_benchmarks):
+    ran = []
+    for rig in list(RIGS):
+        monkeypatch.setitem(RIGS, rig, lambda *_, rig=rig: ran.append(rig))
+    monkeypatch.setattr("skinrig.report.build", lambda *_, **__: "<html></html>")
+    for asked, expected in ((["dome"], ["dome"]), (["flash"], ["flash"]),
+                            (["dome", "flash"], ["flash", "dome"])):  # fmt: skip
+        ran.clear()
+        run_demo(tmp_path / "demo", asked, console=Console(False))
+        assert ran == expected
+
+
+def shown(out, capsys):
+    document = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert document["schema"] == "skinrig.demo/1"
+    report = (out / "report.html").read_text(encoding="utf-8")
+    assert "Traceback" not in report
+    return document, report
+
+
+@pytest.mark.long
+@pytest.mark.timeout(600)
+def test_the_dome_alone_goes_from_targets_to_a_report(tmp_path, capsys, without_benchmarks):
+    out = tmp_path / "demo"
+    assert main(["demo", "--rigs", "dome", "--out", str(out), "--json"]) == 0
+    document, report = shown(out, capsys)
+    errors = {name: error for _, name, error, *_ in document["errors"]}
+    # a pixel is 3.3 mm on the face: coarser than what a full dome is held to
+    assert errors["normals"] < 4.0
+    assert errors["normals_refined"] < 4.0
+    assert max(errors[f"r_d {c}"] for c in ("red", "green", "blue")) < 6.0
+    assert errors["reflection, held out"] < 8.0
+    assert {path.name for path in out.glob("session-*")} == {
+        f"session-dome-{name}" for name in ("charuco", "mirror", "white", "III")
+    }
+    assert "R_d" in report or "r_d" in report
+    # again into the same folder: it is the demo's own and made anew
+    assert (out / ".skinrig-demo").is_file()
+
+
+@pytest.mark.long
+@pytest.mark.timeout(600)
+def test_the_flash_rig_alone_goes_from_targets_to_a_report(tmp_path, capsys, without_benchmarks):
+    out = tmp_path / "demo"
+    document = run_demo(out, ["flash"], console=Console(True), width_px=384)
+    assert all("flash" in subject for subject, *_ in document["errors"])
+    assert (out / "report.html").stat().st_size > 10_000
+    assert not list(out.glob("*dome*"))
