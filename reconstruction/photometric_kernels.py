@@ -23,6 +23,7 @@ SHARED, PER_POINT, NEAR = 0, 1, 2
 # Row of the table of settings, which carries them in the type of the data.
 SHADOW, GRAZING, TUKEY, TOLERANCE, FLOOR, L1_SOFT = 0, 1, 2, 3, 4, 5
 MIN_SPREAD, BRIGHT_PART, DARK_SIGMAS, DARK_FIT, LEAST_SHARE = 6, 7, 8, 9, 10
+FEW, TIGHT, CLEAR, LOOSE = 11, 12, 13, 14
 # Rows of the table of results.
 NX, NY, NZ, ALBEDO, RESIDUAL, STDERR, STDERR_ALBEDO, USED, SCALE = range(9)
 ROWS = 9
@@ -329,6 +330,43 @@ def _finish(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _plain(x, y, z, v, s, e, q, m):  # type: ignore[no-untyped-def]
+    """Return least squares with each sample weighed by the square of its intensity.
+
+    Leaves the weights' roots in e, intensities in q and the weights in m.
+    """
+    zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
+    top = zero
+    for k in range(x.size):
+        q[k] = v[k] / s[k] if s[k] > zero else zero
+        top = max(top, q[k])
+    for k in range(x.size):
+        e[k] = min(max(q[k], zero) / top, one)
+        m[k] = e[k] * e[k]
+    b0, b1, b2 = zero, zero, zero
+    for _ in range(2):  # the second step refines the digits of the first
+        d0, d1, d2 = _step_squares(x, y, z, v, m, b0, b1, b2)
+        b0, b1, b2 = x.dtype.type(b0 + d0), x.dtype.type(b1 + d1), x.dtype.type(b2 + d2)
+    return b0, b1, b2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _clearly_off(x, y, z, s, q, b0, b1, b2, bright, clear):  # type: ignore[no-untyped-def]
+    """Count samples off a fit by more than a part of a bright one; less counts as its square.
+
+    Dark samples, which shadows are, count by their brightness.
+    """
+    zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
+    total = zero
+    for k in range(x.size):
+        if s[k] > zero:
+            fit = max((x[k] * b0 + y[k] * b1 + z[k] * b2) / s[k], zero)
+            r = min(max(q[k] / bright, zero), one) * (q[k] - fit) / (clear * bright)
+            total += min(r * r, one)
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fit_point(  # type: ignore[no-untyped-def]
     x, y, z, v, s, e, q, m, robust, known, l1_steps, steps, settings, sums, out,
 ):  # fmt: skip
@@ -409,7 +447,23 @@ def _fit_point(  # type: ignore[no-untyped-def]
         b0, b1, b2 = kind(b0 + d0), kind(b1 + d1), kind(b2 + d2)
         if step > 2 and d0 * d0 + d1 * d1 + d2 * d2 < near * (b0 * b0 + b1 * b1 + b2 * b2):
             break
-    return _finish(x, y, z, v, s, e, m, b0, b1, b2, scale, above, known, True, settings, sums, out)
+    done = _finish(x, y, z, v, s, e, m, b0, b1, b2, scale, above, known, True, settings, sums, out)
+    loose = scale * kind(lit) / (bright * total)
+    if known or not done or n >= settings[FEW] or loose <= settings[TIGHT]:
+        return done
+    # few samples, and the robust fit is not much better than real surfaces are Lambertian: what
+    # looks like an outlier may be chance, unless it is a clear one; more so the looser the fit
+    p0, p1, p2 = _plain(x, y, z, v, s, e, q, m)
+    clear = settings[CLEAR]
+    gained = _clearly_off(x, y, z, s, q, p0, p1, p2, bright, clear)
+    gained -= _clearly_off(x, y, z, s, q, b0, b1, b2, bright, clear)
+    if gained > one + loose / settings[LOOSE]:
+        return done
+    for k in range(x.size):
+        m[k] = one if s[k] > zero else zero
+        x[k], y[k], z[k] = x[k] * e[k], y[k] * e[k], z[k] * e[k]
+        v[k], s[k] = v[k] * e[k], s[k] * e[k]
+    return _finish(x, y, z, v, s, e, m, p0, p1, p2, one, zero, known, False, settings, sums, out)
 
 
 def _fit_points(  # type: ignore[no-untyped-def]

@@ -32,6 +32,13 @@ Floating = NDArray[np.floating]
 TILE_POINTS = 8192
 LEAST_SHARE = 0.5
 """Of the samples that are not dark, how many must agree with a robust fit."""
+TIGHT = 0.02
+"""Standard deviation of a robust fit's residuals, over a bright sample, up to which it stands as
+it is: real matte surfaces depart from Lambert's law by more."""
+CLEAR = 0.2
+"""Residual over a bright sample from which a sample is a clear outlier."""
+LOOSE = 0.15
+"""Standard deviation as of `TIGHT` that asks for one more clear outlier as evidence."""
 FLATTEST = 3e-3
 """Least over largest singular value of the light directions, below which they lie in a plane."""
 
@@ -54,6 +61,9 @@ class Robustness:
     tuning
         Residual, in standard deviations, from which a sample has no weight; 4.685 has 95 % of
         the efficiency of least squares where all is normal.
+    few
+        A point with fewer samples than this, and no variance given, has the plain fit
+        (``robust=False``) unless there is evidence for the robust one; 0: always the robust.
     """
 
     l1_iterations: int = 16
@@ -61,6 +71,7 @@ class Robustness:
     shadow: float = 0.1
     grazing: float = 0.05
     tuning: float = 4.685
+    few: int = 16
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
@@ -69,6 +80,7 @@ class Robustness:
             ("iterations", self.iterations >= 1, "at least 1"),
             ("shadow", 0.0 <= self.shadow < 1.0, "in [0, 1)"),
             ("grazing", 0.0 <= self.grazing < 1.0, "in [0, 1)"),
+            ("few", self.few >= 0, "at least 0"),
             ("tuning", 1.0 <= self.tuning < np.inf, "1 or more"),
         ):
             if not good:
@@ -110,7 +122,8 @@ def estimate_normals(
         Default: all the same, 1 (with positions: 1 at the median distance).
     variance : array_like, optional
         Of the samples: a number, (N,) or (N, ...). Where None, noise is taken to be the same
-        under all lights (relative to their intensity) and its size from the residuals.
+        under all lights (relative to their intensity) and its size from the residuals; of few
+        lights these tell little, see `Robustness.few`.
     valid : ndarray of bool, shape (N, ...) or (...), optional
         Samples, or points, to use: not saturated, not occluded.
     robust : bool
@@ -140,6 +153,12 @@ def estimate_normals(
     M-estimate (Huber 1981, doi 10.1002/0471725250, section 7.6); a known variance is taken as
     known unless the residuals exceed it beyond chance.
 
+    With few samples a median residual is little evidence, and matte surfaces depart from
+    Lambert's law by a few percent, most where they are dark: what is rejected then may be good.
+    So where no variance is given and `Robustness.few` says so, the fit of ``robust=False`` stands
+    unless the robust one leaves residuals of less than 2 % of a bright sample, or it makes at
+    least one sample fewer a clear outlier; the more, the larger its own residuals are.
+
     Examples
     --------
     >>> lights = np.array([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8]])
@@ -166,6 +185,7 @@ def estimate_normals(
         [
             chosen.shadow, chosen.grazing, chosen.tuning, 1e-3,
             1e-6 if kind is np.float32 else 1e-13, 0.01, 1e-5, 1 / 8, 3.0, 1.5, LEAST_SHARE,
+            chosen.few, TIGHT, CLEAR, LOOSE,
         ],
         kind,
     )  # fmt: skip

@@ -8,6 +8,7 @@ import tifffile
 from model import store
 from model.metrics import angular_error_rad
 from reconstruction import pipeline
+from reconstruction.photometric_stereo import Robustness, estimate_normals
 from skinrig.cli import main
 
 
@@ -93,6 +94,31 @@ def test_the_real_buddha_agrees_with_its_reference(tmp_path, capsys, test_data):
     assert error.mean() <= 1.2
     upside_down = angular_error_rad(normals.values[seen], reference[::-1][seen])
     assert np.degrees(np.nanmean(upside_down)) > 5.0
+
+
+def test_normals_of_the_real_buddha_with_nothing_said_agree_with_its_reference(test_data):
+    folder = test_data / "photometric_stereo"
+    rows = (folder / "lights.txt").read_text().split("\n")
+    lights = np.array([row.split()[-3:] for row in rows if len(row.split()) >= 3], np.float64)
+    color = np.stack([cv2.imread(str(folder / "buddha" / f"buddha.{k}.png")) for k in range(12)])
+    mask = cv2.imread(str(folder / "buddha" / "buddha.mask.png"), cv2.IMREAD_GRAYSCALE) > 127
+    reference = np.load(folder / "buddha" / "buddha_ref.npz")["normals"][::-1].astype(np.float64)
+    mask &= np.linalg.norm(reference, axis=-1) > 0.5
+
+    def error_deg(images, **options):
+        found = estimate_normals(images, lights, **options)
+        seen = found.valid & mask
+        assert seen.sum() > 0.99 * mask.sum()
+        return np.degrees(angular_error_rad(found.normals[seen], reference[seen])).mean()
+
+    gray = color @ [0.114, 0.587, 0.299]
+    green = color[..., 1]
+    assert error_deg(gray) <= 1.0
+    assert error_deg(green, valid=mask) <= 1.0
+    assert error_deg((green / 255).astype(np.float32)) <= 1.0
+    assert error_deg(color.mean(axis=-1)) <= 1.2
+    # the test can fail: few lights are too few for the robust fit alone
+    assert error_deg(gray, robustness=Robustness(few=0)) > 2.0
 
 
 def test_what_a_stack_cannot_be_made_into_is_refused(tmp_path, capsys):
