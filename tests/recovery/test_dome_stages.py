@@ -324,6 +324,7 @@ def test_without_tracking_frames_the_record_says_that_nobody_followed_the_head(f
     assert found[1].maps.parameters["motion"] == {"tracking_frames": 0}
 
 
+@pytest.mark.long
 def test_without_calibrated_lights_there_is_no_albedo_and_the_error_says_what_to_do(found):
     folder, _ = found
     with pytest.raises(EvidenceError, match="skinrig calibrate lights"):
