@@ -34,7 +34,7 @@ from reconstruction.dome_images import DomeImage, DomeImages
 from reconstruction.dome_motion import Motion, follow_head
 from reconstruction.evidence import Evidence, EvidenceError
 from reconstruction.lumitexel_store import LumitexelStore
-from reconstruction.lumitexels import Surface
+from reconstruction.lumitexels import Lumitexels, Surface
 from reconstruction.ray_casting import RayCaster
 from reconstruction.scan_mesh import RefinedScan
 from reconstruction.surface_estimates import PointValues
@@ -99,6 +99,20 @@ class Samples:
 
     store: LumitexelStore
     folder: Any
+    lights: int
+    """Lights of the dome: where exposures stay apart, several captures are of one."""
+
+    def collect(
+        self,
+        estimate: Callable[[slice, Lumitexels], PointValues],
+        progress: Callable[[float], None] | None = None,
+    ) -> PointValues:
+        """Estimate at all points; see `estimates.collect`."""
+
+        def by_light(part: slice, samples: Lumitexels) -> PointValues:
+            return estimate(part, dataclasses.replace(samples, light=samples.light % self.lights))
+
+        return estimates.collect(self.store, by_light, progress=progress)
 
 
 def graph(evidence: Evidence) -> list[stages.Stage]:
@@ -106,8 +120,19 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     dome = _dome(evidence)
     base = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
 
-    def stage(name: str, needs: tuple[str, ...], makes: tuple[str, ...], run: Any) -> stages.Stage:
-        return stages.Stage(name, needs, makes, run, base)
+    unscaled = (
+        ""
+        if dome.absolute
+        else (
+            "r_d: the lights are not calibrated and an albedo has no scale without them; run "
+            "`skinrig calibrate lights` on sessions of the mirror spheres and the white target"
+        )
+    )
+
+    def stage(
+        name: str, needs: tuple[str, ...], makes: tuple[str, ...], run: Any, refused: str = ""
+    ) -> stages.Stage:
+        return stages.Stage(name, needs, makes, run, base, refused)
 
     return [
         stage("surface", (), ("surface",), lambda: {"surface": _surface(evidence, dome)}),
@@ -126,7 +151,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
               lambda surface, lumitexels, texture: _normals(dome, surface, lumitexels, texture)),
         stage("albedo", ("lumitexels", "point_normals", "texture"), ("point_r_d", "r_d"),
               lambda lumitexels, point_normals, texture: _albedo(
-                  dome, lumitexels, point_normals, texture)),
+                  dome, lumitexels, point_normals, texture), unscaled),
         stage("lobes", ("lumitexels", "point_normals", "point_r_d", "texture"),
               ("basis", "weights", *WEIGHTS, "lobe_residual", BASIS_FILE),
               lambda lumitexels, point_normals, point_r_d, texture: _lobes(
@@ -347,12 +372,12 @@ def _lumitexels(
                 continue
             image = _image(dome, view, capture)
             store.add(view, capture, image.rgb, image.variance, image.valid)
-    return Samples(store, folder)
+    return Samples(store, folder, len(dome.table.names))
 
 
 def _counts(dome: Dome, lumitexels: Samples, texture: SurfaceTexture) -> Mapping[str, SkinMap]:
-    found = estimates.collect(
-        lumitexels.store, estimates.sample_counts, progress=partial(dome.tell, "sample counts")
+    found = lumitexels.collect(
+        estimates.sample_counts, progress=partial(dome.tell, "sample counts")
     )
     return {"samples": texture.map(found.values[:, 0], None, found.valid, "1", "samples a point")}
 
@@ -360,8 +385,7 @@ def _counts(dome: Dome, lumitexels: Samples, texture: SurfaceTexture) -> Mapping
 def _half_vectors(
     dome: Dome, lumitexels: Samples, texture: SurfaceTexture
 ) -> Mapping[str, SkinMap]:
-    found = estimates.collect(
-        lumitexels.store,
+    found = lumitexels.collect(
         lambda _, samples: estimates.normals_from_half_vectors(samples),
         progress=partial(dome.tell, "half-vector normals"),
     )
@@ -371,8 +395,7 @@ def _half_vectors(
 def _normals(
     dome: Dome, surface: RefinedScan, lumitexels: Samples, texture: SurfaceTexture
 ) -> Mapping[str, Any]:
-    found = estimates.collect(
-        lumitexels.store,
+    found = lumitexels.collect(
         lambda part, samples: estimates.normals_from_shading(samples, surface.normals[part]),
         progress=partial(dome.tell, "normals"),
     )
@@ -383,15 +406,9 @@ def _normals(
 def _albedo(
     dome: Dome, lumitexels: Samples, point_normals: PointValues, texture: SurfaceTexture
 ) -> Mapping[str, Any]:
-    if not dome.absolute:
-        raise EvidenceError(
-            "r_d: the lights are not calibrated and an albedo has no scale without them; run "
-            "`skinrig calibrate lights` on a session of the white target"
-        )
     good = point_normals.valid
     typical = float(np.median(point_normals.stderr[good, 0])) if good.any() else 0.02
-    found = estimates.collect(
-        lumitexels.store,
+    found = lumitexels.collect(
         lambda part, samples: estimates.albedo(
             samples,
             estimates.part_of(point_normals, part),
@@ -442,8 +459,7 @@ def _lobes(
     mixes = {rank: brdf_basis.reduce(shares, rank, basis=materials) for rank in RANKS}
     mix = mixes[RANK][1]
     basis = materials.mixed(mix)
-    found = estimates.collect(
-        store,
+    found = lumitexels.collect(
         lambda part, samples: estimates.lobe_weights(
             samples, estimates.part_of(point_normals, part),
             estimates.part_of(point_r_d, part), basis,
@@ -510,8 +526,7 @@ def _refined(
     weights: NDArray[np.float64],
     texture: SurfaceTexture,
 ) -> Mapping[str, SkinMap]:
-    found = estimates.collect(
-        lumitexels.store,
+    found = lumitexels.collect(
         lambda part, samples: estimates.normals_from_remainder(
             samples, estimates.part_of(point_normals, part), estimates.part_of(point_r_d, part),
             weights[part], basis,

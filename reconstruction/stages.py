@@ -30,6 +30,8 @@ class Stage:
     parameters
         What else its result depends on, as JSON values: settings, hashes of the inputs that
         are no products, and a number that grows when the code changes its result.
+    refused
+        Why it cannot run, where that is known beforehand; empty: it can.
     """
 
     name: str
@@ -37,6 +39,7 @@ class Stage:
     makes: tuple[str, ...]
     run: Callable[..., Mapping[str, Any]]
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    refused: str = ""
 
 
 class Cache(Protocol):
@@ -161,6 +164,10 @@ def run(
     keys: dict[str, str] = {}
     for stage in needed:
         keys[stage.name] = input_hash(stage, [keys[made_by[p].name] for p in stage.needs])
+    for stage in needed:  # before anything is computed in vain
+        kept = cache.load(keys[stage.name]) if cache is not None else None
+        if stage.refused and kept is None:
+            raise StageError(stage.refused)
     products: dict[str, Any] = {}
     ran: list[str] = []
     reused: list[str] = []

@@ -141,7 +141,7 @@ def normals_from_shading(
     samples: Lumitexels,
     normals: NDArray[np.floating],
     *,
-    rounds: int = 2,
+    rounds: int = 3,
     highlight_rad: float = HIGHLIGHT_RAD,
 ) -> PointValues:
     """Return normals by robust photometric stereo of the light from inside the skin.

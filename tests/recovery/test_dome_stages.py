@@ -21,7 +21,7 @@ from capture.rig import load_rig
 from capture.session import Session, Subject
 from model import store
 from reconstruction import pipeline
-from reconstruction.evidence import EvidenceError
+from reconstruction.stages import StageError
 from skinrig.simulating_dome import small_dome
 
 AXES_MM = np.array([58.0, 85.0, 66.0])
@@ -327,7 +327,7 @@ def test_without_tracking_frames_the_record_says_that_nobody_followed_the_head(f
 @pytest.mark.long
 def test_without_calibrated_lights_there_is_no_albedo_and_the_error_says_what_to_do(found):
     folder, _ = found
-    with pytest.raises(EvidenceError, match="skinrig calibrate lights"):
+    with pytest.raises(StageError, match="skinrig calibrate lights"):
         pipeline.reconstruct(folder / "session-ellipsoid", want=["r_d"], out=folder / "without")
     assert not (folder / "without").exists()
 

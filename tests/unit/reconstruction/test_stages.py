@@ -159,3 +159,13 @@ def test_a_stage_that_can_be_reused_only_in_part_is_made_whole():
     assert calls == ["samples", "normals", "lobes"]
     assert outcome.products == {"weight": 16, "basis.npz": b"table"}
     assert outcome.reused == ()
+
+
+def test_what_is_known_to_be_refused_is_refused_before_anything_is_computed():
+    ran = []
+    costly = Stage("costly", (), ("x",), lambda: ran.append(1) or {"x": 1})
+    refused = Stage("scaled", ("x",), ("y",), lambda x: {"y": x}, refused="y: has no scale")
+    with pytest.raises(StageError, match="has no scale"):
+        run([costly, refused], ["x", "y"])
+    assert ran == []
+    assert run([costly, refused], ["x"]).products == {"x": 1}
