@@ -20,7 +20,7 @@ from reconstruction.evidence import Evidence, EvidenceError
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
 from reconstruction.photometric_stereo import estimate_normals
 
-REVISION = 1
+REVISION = 2
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
 MAPS = ("normals", "albedo", "residual")
