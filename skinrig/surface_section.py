@@ -14,6 +14,7 @@ from skinrig import surface_evaluation as evaluation
 
 WIDTH_PX = 220
 GRAY = 0.5
+FIRST = ("r_d", "normals_refined", "normals", "half_vector_normals")
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,7 @@ def section(
             usable = usable & (truth.maps["mask"].values > 0.5)
         known = np.flatnonzero(usable)
         true_view = FrontView.of(true_place.values.reshape(-1, 3)[known].astype(float), box)
-    for key, skin_map in sorted(appearance.maps.items()):
+    for key, skin_map in sorted(appearance.maps.items(), key=lambda item: _rank(item[0])):
         if key == "position" or key.startswith("_"):
             continue
         values = skin_map.values[rows, columns]
@@ -128,6 +129,11 @@ def section(
         body += _errors(name, appearance, truth, checks)
         body += _reflection(name, appearance, truth, checks)
     return body
+
+
+def _rank(key: str) -> tuple[int, str]:
+    """Order maps: what people look for first, then by name."""
+    return (FIRST.index(key) if key in FIRST else len(FIRST), key)
 
 
 def _shown(title: str, key: str, image: NDArray[np.float64], valid: NDArray[np.bool_]) -> str:

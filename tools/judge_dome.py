@@ -32,7 +32,9 @@ def main(arguments: list[str]) -> None:
     for target in ("charuco", "mirror", "white"):
         if not (out / f"session-{target}").exists():
             with timed(f"capture {target}"):
-                simulate_session("dome", out / f"session-{target}", target=target, **size)
+                simulate_session(
+                    "dome", out / f"session-{target}", target=target, size="full", **size
+                )
     if not (out / "calibration").exists():
         with timed("calibrate"):
             calibrate("geometry", [out / "session-charuco"], out / "calibration")
