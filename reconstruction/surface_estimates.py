@@ -164,7 +164,8 @@ def normals_from_shading(
     n . l, linear in n.
     """
     gray = samples.f.mean(axis=-1).astype(np.float64)
-    spread = samples.variance.mean(axis=-1).astype(np.float64) / 3.0
+    # samples that do not count have no finite variance
+    spread = np.where(samples.valid, samples.variance.mean(axis=-1), 0.0).astype(np.float64) / 3.0
     half = samples.light_dir + samples.view_dir
     half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-6)
     light_dir = np.ascontiguousarray(samples.light_dir.transpose(1, 0, 2))
