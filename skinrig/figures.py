@@ -73,13 +73,14 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     for index in np.flatnonzero(on_front):
         label = ", ".join(f"{k} {v}" for k, v in points[index]["knobs"].items())
         label += "  (knee)" if index == document.get("knee") else ""
-        axes.annotate(
+        words = axes.annotate(
             label,
             (seconds[index], error[index]),
             xytext=(5, 5),
             textcoords="offset points",
             fontsize=7,
         )
+        words.set_in_layout(False)  # a long label must not squeeze the axes away
     bounds = np.array([p.get("cramer_rao_bound") or np.nan for p in points], float)
     if np.isfinite(bounds).any():
         known = np.isfinite(bounds)
