@@ -147,6 +147,56 @@ class LedLimits:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Caliper:
+    """A caliper whose jaws are taped to the skin, and stretch or compress what lies between.
+
+    How much force it may use is no property of the rig: who captures must say it.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    aperture_mm: float
+    """Distance of the jaws at step 0, mm, > 0."""
+    step_mm: float
+    """How far a step moves them, mm, > 0."""
+    first_step: int
+    """Narrowest position, <= 0."""
+    last_step: int
+    """Widest position, >= 0."""
+    angles_deg: tuple[float, ...]
+    """Angles that it can be set to, from +x towards +y, 0 <= degrees < 180."""
+    speed_mm_per_s: float
+    """How fast the jaws move, mm/s, > 0."""
+
+    def __post_init__(self) -> None:
+        checks = Checks("Caliper", RigError)
+        checks.positive(
+            aperture_mm=self.aperture_mm,
+            step_mm=self.step_mm,
+            speed_mm_per_s=self.speed_mm_per_s,
+        )
+        open_mm = self.aperture_mm + self.first_step * self.step_mm
+        narrow = self.first_step <= 0 and open_mm > 0
+        checks.that("first_step", self.first_step, narrow, "<= 0, and the jaws apart")
+        checks.that("last_step", self.last_step, self.last_step >= 0, ">= 0")
+        for angle in self.angles_deg:
+            checks.that("angles_deg", angle, 0 <= angle < 180, _AXIS)
+        differ = len(set(self.angles_deg)) == len(self.angles_deg) > 0
+        checks.that("angles_deg", self.angles_deg, differ, "at least one, none twice")
+        checks.close()
+
+    def reading_mm(self, step: int) -> float:
+        """Return the distance of the jaws at a step, mm.
+
+        Examples
+        --------
+        >>> load_rig("gradient").caliper.reading_mm(-2)
+        6.4
+        """
+        return self.aperture_mm + step * self.step_mm
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class View:
     """One camera of the rig: pinhole, sensor and analyser, all nominal."""
 
@@ -313,6 +363,8 @@ class Rig:
     """Time to turn the analyser, s, >= 0."""
     leds: LedLimits | None = None
     """Limits of the rig's LEDs; None: it has none."""
+    caliper: Caliper | None = None
+    """What stretches the skin; None: nothing does."""
 
     def __post_init__(self) -> None:
         checks = Checks(f"Rig {self.name!r}", RigError)
@@ -352,6 +404,20 @@ class Rig:
         (504, 336, 45.0)
         """
         return dataclasses.replace(self, views=tuple(v.resized(width_px) for v in self.views))
+
+    def cropped(self, width_px: int) -> Rig:
+        """Return this rig with the middle ``width_px`` columns and as many rows of every view.
+
+        Examples
+        --------
+        >>> small = load_rig("gradient").cropped(512).view("cam")
+        >>> small.height_px, round(small.field_mm[0], 3), small.pixel_um
+        (512, 3.072, 5.5)
+        """
+        views = tuple(
+            dataclasses.replace(v, width_px=width_px, height_px=width_px) for v in self.views
+        )
+        return dataclasses.replace(self, views=views)
 
     def subset(
         self, *, lights: Sequence[str] | None = None, views: Sequence[str] | None = None

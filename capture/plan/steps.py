@@ -17,9 +17,14 @@ Value = str | int | float | bool
 Kind = Literal[
     "dark", "flat", "chart", "malus", "subject",
     "olat", "tracking", "charuco", "mirror", "white",
+    "gradient", "ball",
 ]  # fmt: skip
 Polarizer = Literal["parallel", "crossed"]
 
+Pattern = Literal["full", "x", "y", "z", "-x", "-y", "-z", "dark"]
+"""Light of the gradient sphere: 1, or (1 + w)/2 with w a coordinate of the way to the light."""
+
+PATTERNS: tuple[str, ...] = get_args(Pattern)
 KINDS: tuple[str, ...] = get_args(Kind)
 POLARIZERS: tuple[str, ...] = get_args(Polarizer)
 
@@ -33,6 +38,7 @@ _SETTINGS: Mapping[str, tuple[tuple[type, ...], Any, str]] = {
     "level": ((int, float), lambda v: 0 <= v <= 1, "0 <= level <= 1"),
     "light": ((str,), lambda v: is_id(v), "a light's name, or none"),
     "leds": ((str,), lambda v: all(is_id(name) for name in v.split("+")), "names joined by +"),
+    "pattern": ((str,), lambda v: v in PATTERNS, f"one of {', '.join(PATTERNS)}"),
     "dwell_s": ((int, float), lambda v: 0 < v < math.inf, "seconds > 0"),
 }
 
@@ -51,14 +57,16 @@ class Step:
         Unlike every other step's, usable in a file name.
     kind : str
         Of the flash rig "flat", "chart", "malus" or "subject"; of the dome "olat" (one light at a
-        time), "tracking" (several at once), "charuco", "mirror" or "white"; of both "dark".
+        time), "tracking" (several at once), "charuco", "mirror" or "white"; of the gradient sphere
+        "gradient" (skin) or "ball" (a ball of black glass); of all "dark".
     index : mapping of str to str, int or float
         Where the step stands in its series, e.g. ``{"state": "neutral", "repeat": 0}``.
     settings : mapping of str to str, int, float or bool
         ``polarizer`` ("parallel" or "crossed"), ``power`` (0 to 1 of a light's full energy),
         ``exposure_s`` (s), ``iso``; ``analyser_deg`` (rotator reading, degrees; 0 is parallel, 90
         crossed) takes precedence over ``polarizer``. On the dome ``light`` (its name), or ``leds``
-        (names joined by +), at ``level`` (0 to 1) for ``dwell_s``. A rig may bring further names.
+        (names joined by +), at ``level`` (0 to 1) for ``dwell_s``; in the gradient sphere
+        ``pattern`` instead of lights. A rig may bring further names.
     cameras : tuple of str
         Views that take a frame.
 

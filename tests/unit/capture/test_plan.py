@@ -115,7 +115,7 @@ def test_a_setting_that_cannot_be_is_named(settings, expected):
 
 
 def test_settings_of_other_rigs_are_allowed():
-    assert subject_step(pattern="X", stretch_mm=0.8).settings["stretch_mm"] == 0.8
+    assert subject_step(zone="X", stretch_mm=0.8).settings["stretch_mm"] == 0.8
 
 
 @pytest.mark.parametrize("twin", ["S1", "s1"])
