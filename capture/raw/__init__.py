@@ -2,7 +2,7 @@
 
 from capture.raw.dng import encode_dng, write_dng
 from capture.raw.frame import RawError, RawFrame, noise_profile
-from capture.raw.linear import Demosaic, LinearImage, interpolate, linear_rgb
+from capture.raw.linear import Demosaic, LinearImage, interpolate, linear_mono, linear_rgb
 from capture.raw.reading import decode, read
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "decode",
     "encode_dng",
     "interpolate",
+    "linear_mono",
     "linear_rgb",
     "noise_profile",
     "read",

@@ -95,6 +95,46 @@ def linear_rgb(
     return interpolate(x, variance, frame.cfa < frame.white, frame.pattern, demosaic=demosaic)
 
 
+def linear_mono(
+    frame: RawFrame, *, gain: float | None = None, read_noise: float | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Return the linear values of a monochrome frame with their variance.
+
+    Parameters
+    ----------
+    frame : RawFrame
+        Of a sensor without color filters.
+    gain, read_noise : float, optional
+        As in `linear_rgb`.
+
+    Returns
+    -------
+    values, variance : ndarray of float32, shape (H, W)
+        (DN - black) / (white - black), negative values kept, and its variance.
+    valid : ndarray of bool, shape (H, W)
+        False where saturated.
+
+    Raises
+    ------
+    RawError
+        For a frame with color filters, and where nothing says how noisy the sensor is.
+
+    Examples
+    --------
+    >>> frame = RawFrame(cfa=np.full((2, 2), 612, np.uint16), pattern="MONO", black=(512.0,),
+    ...                  white=1512)
+    >>> linear_mono(frame, gain=2.0, read_noise=4.0)[0][0, 0].round(6).item()
+    0.10000000149011612
+    """
+    checks = Checks("linear_mono", RawError)
+    pair = (gain is None) == (read_noise is None)
+    checks.that("gain, read_noise", (gain, read_noise), pair, "both or neither")
+    checks.that("pattern", frame.pattern, frame.pattern == "MONO", "MONO")
+    checks.close()
+    x, variance = _pixels(frame, gain, read_noise)
+    return x, variance, frame.cfa < frame.white
+
+
 def interpolate(
     values: NDArray[np.float32],
     variance: NDArray[np.float32],
@@ -135,7 +175,8 @@ def _pixels(
     x = np.empty(frame.cfa.shape, np.float32)
     variance = np.empty_like(x)
     for cell, black in enumerate(frame.black):
-        rows, columns = slice(cell // 2, None, 2), slice(cell % 2, None, 2)
+        step = 1 if frame.pattern == "MONO" else 2
+        rows, columns = slice(cell // 2, None, step), slice(cell % 2, None, step)
         span = np.float32(1.0 / (frame.white - black))
         part = (frame.cfa[rows, columns].astype(np.float32) - np.float32(black)) * span
         if gain is not None and read_noise is not None:
