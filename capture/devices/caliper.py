@@ -1,0 +1,243 @@
+"""The stretching caliper's box: one method a command, units in and out, no policy.
+
+Its jaws are taped to the skin by a person. Nothing moves unless the box is armed, homed, and has
+been told a force limit, for which there is no default. An armed box that hears nothing for its
+lease lets the skin go: renew the lease (`CaliperBox.listen`, or any question) while another box
+lights and cameras look. `CaliperBox.dark`, `release` and the closing of the driver let go, too.
+
+What the caliper reads is the distance of its jaws; the skin between them has stretched by less,
+because the tape gives way.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from .box import Box, BoxStatus
+from .port import PortTimeout
+
+__all__ = ["CaliperBox", "CaliperStatus", "Ended", "MoveReport"]
+
+Ended = Literal["reached", "force", "stall", "detached", "no_home", "stopped"]
+_ENDS: dict[str, Ended] = {
+    "REACHED": "reached",
+    "FORCE": "force",
+    "STALL": "stall",
+    "DETACHED": "detached",
+    "NOHOME": "no_home",
+    "STOPPED": "stopped",
+}
+_LISTEN_S = 0.1
+"""Silence between two renewals of the lease; shorter than the shortest lease."""
+_MARGIN_S = 2.0
+"""Longer than this over its own time no move may take."""
+
+
+@dataclass(frozen=True, slots=True)
+class MoveReport:
+    """How a move ended."""
+
+    number: int
+    """Moves since the box was made, this one included."""
+    ended: Ended
+    """reached: the jaws stand where they were sent. force: the limit was met; the jaws have gone
+    back to where they stood before. stall: the motor has lost steps; home again. detached: the
+    force fell to nothing at once; the jaws stand where that was. no_home: the home mark was not
+    found. stopped: the move was cut short by a release, whatever its reason."""
+    step: int
+    """Step that the jaws stand at or nearest to, now."""
+    reading_mm: float
+    """Distance of the jaws by the box's own count when the move ended, mm; of a force trip: when
+    the limit was met."""
+    force_n: float
+    """Force between the jaws then, N; > 0 when the skin pulls them together, < 0 when it pushes
+    them apart. One that grows no more from step to step tells of skin that has buckled."""
+    t_box_s: float
+    """Time of the end on the box's clock, s since its power-up."""
+
+
+class CaliperStatus(BoxStatus):
+    """The bits of ``STAT?``."""
+
+    __slots__ = ()
+
+    @property
+    def moving(self) -> bool:
+        """Whether something moves."""
+        return bool(self.bits & 16)
+
+    @property
+    def homed(self) -> bool:
+        """Whether the box knows where its jaws are."""
+        return bool(self.bits & 32)
+
+    @property
+    def attached(self) -> bool:
+        """Whether the box holds skin, as far as it knows."""
+        return bool(self.bits & 64)
+
+    @property
+    def force_tripped(self) -> bool:
+        """Whether the last move met the force limit."""
+        return bool(self.bits & 128)
+
+
+class CaliperBox(Box):
+    """Driver of the caliper's box; see `capture.devices.box.Box`.
+
+    Its limits (``limits``): ``step_min``, ``step_max``, ``step_mm``, ``aperture_mm`` (at step 0),
+    ``angles_deg``, ``speed_mm_per_s``, ``turn_deg_per_s``, ``force_limit_min_n``,
+    ``force_limit_max_n``, ``control_period_ms``.
+
+    One angle of a capture::
+
+        box.arm(); box.set_force_limit(newton); box.home(); box.set_angle(45.0)
+        operator.prompt(...)          # a person tapes the jaws to the skin; the lease may run out
+        box.arm(); box.attach()
+        box.move_to(-1)               # ... and listen() or force_n() while others work
+        box.release()
+    """
+
+    kind: ClassVar[str] = "caliper"
+
+    def status(self) -> CaliperStatus:
+        """Return the status bits."""
+        return CaliperStatus(int(self._number("STAT?")))
+
+    # settings ---------------------------------------------------------------------------------
+
+    def set_force_limit(self, newton: float) -> None:
+        """Set the greatest force between the jaws, N, pulling or pushing; a reset forgets it.
+
+        Raises
+        ------
+        CommandRefused
+            Out of the range of the sensor (-222), or below the force that there is now (106).
+        """
+        self._port.ask(f"CAL:FORC:LIM {_decimal('newton', newton)}")
+
+    def force_limit_n(self) -> float | None:
+        """Return the force limit, N; None: nobody has set one, and nothing will move."""
+        payload = self._port.ask("CAL:FORC:LIM?")
+        if payload == "NONE":
+            return None
+        return self._to_number("CAL:FORC:LIM?", payload)
+
+    def force_n(self) -> float:
+        """Return the force between the jaws, N; > 0 pulls them together. Renews the lease."""
+        return self._number("CAL:FORC?")
+
+    def reading_mm(self) -> float | None:
+        """Return the distance of the jaws by the box's count, mm; None: it is not homed."""
+        payload = self._port.ask("CAL:POS?")
+        if payload == "NONE":
+            return None
+        return self._to_number("CAL:POS?", payload)
+
+    # moves ------------------------------------------------------------------------------------
+
+    def home(self) -> MoveReport:
+        """Find the home mark and stand at step 0; refused while skin is held."""
+        return self._finish(self._port.ask("CAL:HOME"))
+
+    def set_angle(self, angle_deg: float) -> None:
+        """Turn the jaws to one of ``limits["angles_deg"]`` and wait; refused while skin is held."""
+        self._port.ask(f"CAL:ANG {_decimal('angle_deg', angle_deg)}")
+        self._wait(360.0 / float(self.limits["turn_deg_per_s"]) + _MARGIN_S)
+
+    def angle_deg(self) -> float:
+        """Return the angle that the jaws have or turn to, degrees."""
+        return self._number("CAL:ANG?")
+
+    def attach(self) -> None:
+        """Pass on that a person has taped the jaws to the skin: the box tares and holds it.
+
+        Raises
+        ------
+        CommandRefused
+            Unless the box is armed, homed, at rest, and at step 0.
+        """
+        self._port.ask("CAL:ATT")
+
+    def attached(self) -> bool:
+        """Tell whether the box holds skin, as far as its force sensor can tell."""
+        return self._flag("CAL:ATT?")
+
+    def move_to(self, step: int) -> MoveReport:
+        """Move the jaws to a step (n x ``step_mm`` from step 0) and wait until they stand.
+
+        The lease is renewed meanwhile. A retry on the line never moves twice.
+
+        Raises
+        ------
+        CommandRefused
+            Nothing moved: not armed (-203), 108 after the lease ran out, no force limit or not
+            homed (-213), beyond the travel (-222), the force sensor dead (-240), the emergency
+            stop open (107), or the last trip of the force was on the way there (106).
+        PortTimeout
+            When the box does not report the end.
+        """
+        return self._finish(self._port.ask(f"CAL:STEP:ABS {step}"))
+
+    def last_move(self) -> MoveReport | None:
+        """Return how the last move ended, None when there was none since power-up."""
+        payload = self._port.ask("CAL:LAST?")
+        return None if payload == "NONE" else self._report("CAL:LAST?", payload)
+
+    def release(self) -> None:
+        """Let the skin go, at once; a person has to tape the jaws again."""
+        self._port.ask("CAL:REL")
+
+    def listen(self, seconds: float) -> None:
+        """Let `seconds` pass while the box holds what it holds: the lease is renewed."""
+        left_s = seconds
+        while left_s > 0.0:
+            self._port.listen(min(left_s, _LISTEN_S))
+            self.ping()
+            left_s -= _LISTEN_S
+
+    def _finish(self, payload: str) -> MoveReport:
+        """Wait for the end of the move that the box has accepted as number `payload`."""
+        if not payload.isdecimal():
+            raise self._bad("CAL:STEP:ABS", payload, "the number of the move")
+        number, limits = int(payload), self.limits
+        travel_mm = (limits["step_max"] - limits["step_min"] + 2) * float(limits["step_mm"])
+        self._wait(4.0 * travel_mm / float(limits["speed_mm_per_s"]) + _MARGIN_S)
+        report = self.last_move()
+        if report is None or report.number != number:
+            raise self._bad("CAL:LAST?", str(report), f"the end of move {number}")
+        return report
+
+    def _wait(self, timeout_s: float) -> None:
+        waited_s = 0.0
+        while not self._flag("*OPC?"):
+            if waited_s >= timeout_s:
+                raise PortTimeout(
+                    f"{self._port.url}: the caliper still moves after {timeout_s:.1f} s; stop it"
+                )
+            self._port.listen(_LISTEN_S)
+            waited_s += _LISTEN_S
+
+    def _report(self, text: str, payload: str) -> MoveReport:
+        try:
+            number, ended, step, reading, force, t_us = payload.split(",")
+            return MoveReport(
+                int(number), _ENDS[ended], int(step), float(reading), float(force), int(t_us) / 1e6
+            )
+        except (ValueError, KeyError) as exc:
+            raise self._bad(text, payload, "number,END,step,mm,N,us") from exc
+
+    def _to_number(self, text: str, payload: str) -> float:
+        try:
+            return float(payload)
+        except ValueError as exc:
+            raise self._bad(text, payload, "a number") from exc
+
+
+def _decimal(field: str, value: float) -> str:
+    if not math.isfinite(value):
+        raise ValueError(f"{field}: got {value}, expected a finite number")
+    text = f"{value:.4f}".rstrip("0").rstrip(".")
+    return "0" if text in ("-0", "") else text

@@ -1,0 +1,213 @@
+"""The gradient sphere's box: one method a command, units in and out, no policy.
+
+A pattern is a light of all LEDs at once: full, or weighted by a coordinate of the way to each of
+them (`capture.plan.steps.PATTERNS`). A scan is a table of patterns: uploaded, compared by its
+checksum, armed, which makes the box judge it, and triggered; the box then steps by itself, turns
+the analyser where a row asks for another reading (in the dark), releases the cameras once each
+light is steady, and reports each release. The lease runs meanwhile: `listen` renews it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from capture.plan.steps import PATTERNS
+
+from .led_box import LEVEL_STEPS, Eyes, Judgment, LedBox, LedStatus, Position
+from .port import PortTimeout
+
+__all__ = [
+    "Eyes",
+    "GradientSphereBox",
+    "Judgment",
+    "PatternRow",
+    "Position",
+    "SphereStatus",
+]
+
+Polarizer = Literal["parallel", "crossed"]
+READINGS_DEG: dict[str, float] = {"parallel": 0.0, "crossed": 90.0}
+"""Reading of the analyser in each state."""
+_WAIT_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class PatternRow:
+    """One row of a scan."""
+
+    pattern: str
+    """full, x, y, z, -x, -y, -z or dark."""
+    analyser_deg: float
+    """Reading of the analyser, degrees, 0 to 180; 0 is parallel, 90 crossed. Where it differs from
+    that of the row before, the box turns it first, in the dark; that time is not part of
+    ``dwell_s``."""
+    level: float
+    """Light relative to full, 0 to 1; the box sets thousandths."""
+    dwell_s: float
+    """How long, s; the box counts microseconds."""
+    mask: int
+    """Cameras that are released: bit 0 is the first."""
+
+    def text(self) -> str:
+        """Return the row in the one spelling that the table's checksum is taken of.
+
+        Examples
+        --------
+        >>> PatternRow("-x", 90.0, 0.5, 0.03, 1).text()
+        '-X:90:500:30000:1'
+        >>> PatternRow("dark", 0.0, 1.0, 0.03, 1).text()
+        'DARK:0:0:30000:1'
+        """
+        level = 0 if self.pattern == "dark" else round(self.level * LEVEL_STEPS)
+        angle = _decimal("analyser_deg", self.analyser_deg, 3)
+        dwell_us = round(self.dwell_s * 1e6)
+        return f"{_pattern(self.pattern).upper()}:{angle}:{level}:{dwell_us}:{self.mask:X}"
+
+
+class SphereStatus(LedStatus):
+    """The bits of ``STAT?``."""
+
+    __slots__ = ()
+
+    @property
+    def turning(self) -> bool:
+        """Whether the analyser turns."""
+        return bool(self.bits & 1024)
+
+
+class GradientSphereBox(LedBox):
+    """Driver of the gradient sphere's box; see `capture.devices.box.Box`.
+
+    Its limits (``limits``) are named as the dome's, and ``move_s_per_deg`` (time in which the
+    analyser turns by one degree, s), ``analyser_min_deg`` and ``analyser_max_deg``.
+    """
+
+    kind: ClassVar[str] = "gradient_sphere"
+
+    def status(self) -> SphereStatus:
+        """Return the status bits."""
+        return SphereStatus(int(self._number("STAT?")))
+
+    # analyser ---------------------------------------------------------------------------------
+
+    def set_polarizer(self, polarizer: str) -> None:
+        """Begin to turn the analyser to "parallel" or "crossed"; refused while a light is on."""
+        if polarizer not in READINGS_DEG:
+            raise ValueError(f"polarizer: got {polarizer!r}, expected 'parallel' or 'crossed'")
+        self._port.ask(f"POL {READINGS_DEG[polarizer]:.0f}")
+
+    def set_analyser(self, angle_deg: float) -> None:
+        """Begin to turn the analyser to a reading of 0 to 180 degrees."""
+        self._port.ask(f"POL:ANG {_decimal('angle_deg', angle_deg, 3)}")
+
+    def analyser_deg(self) -> float:
+        """Return the reading that the analyser has or turns to, in degrees."""
+        return self._number("POL?")
+
+    def settled(self) -> bool:
+        """Tell whether the analyser stands still and no scan is running."""
+        return self._flag("*OPC?")
+
+    def wait_settled(self, timeout_s: float = 5.0) -> None:
+        """Wait until the analyser stands still; the lease is renewed.
+
+        Raises
+        ------
+        PortTimeout
+            When it does not in `timeout_s`.
+        """
+        waited_s = 0.0
+        while not self.settled():
+            if waited_s >= timeout_s:
+                raise PortTimeout(
+                    f"{self._port.url}: the analyser still turns after {timeout_s:g} s; check it"
+                )
+            self.listen(_WAIT_S)
+            waited_s += _WAIT_S
+
+    # single patterns --------------------------------------------------------------------------
+
+    def light(self, pattern: str, seconds: float, *, level: float = 1.0) -> None:
+        """Light a pattern for `seconds` (at most 0.5) from now; "dark" puts the light out.
+
+        Refused (-213) while the analyser turns.
+        """
+        if pattern == "dark":
+            self.put_out()
+            return
+        span_ms = _decimal("seconds", seconds * 1e3, 6)
+        self._port.ask(f"PATT {_pattern(pattern).upper()},{span_ms},{round(level * LEVEL_STEPS)}")
+
+    def put_out(self) -> None:
+        """Put the light out."""
+        self._port.ask("PATT DARK")
+
+    def lit(self) -> str:
+        """Return the pattern that is on, "dark" for none."""
+        payload = self._port.ask("PATT?").lower()
+        if payload not in PATTERNS:
+            raise self._bad("PATT?", payload, "a pattern")
+        return payload
+
+    # scans ------------------------------------------------------------------------------------
+
+    def load(self, rows: Sequence[PatternRow]) -> None:
+        """Replace the box's table and compare its checksum.
+
+        Raises
+        ------
+        BadAnswer
+            When the box holds another table than was sent.
+        """
+        self._send_table("SEQ", [row.text() for row in rows], joint=";")
+
+    def arm_scan(self, rows: int) -> Judgment:
+        """Let the box judge its table of `rows` rows and make it ready for one run.
+
+        Raises
+        ------
+        CommandRefused
+            Beyond duty (101), heat (102), dose (104), or flicker for open eyes (105); -213 while
+            the analyser turns.
+        """
+        return self._arm_table(rows)
+
+    # gains ------------------------------------------------------------------------------------
+
+    def set_gains(self, gains: Sequence[float]) -> None:
+        """Make every LED give only a share of what a pattern asks of it, so that all are alike.
+
+        Parameters
+        ----------
+        gains
+            One per LED, 0 to 1; the box sets thousandths. A reset forgets them.
+
+        Raises
+        ------
+        BadAnswer
+            When the box holds others than were sent.
+        """
+        for number, gain in enumerate(gains):
+            if not 0.0 <= gain <= 1.0:
+                raise ValueError(f"gains[{number}]: got {gain}, expected 0 to 1")
+        self._send_table("GAIN", [str(round(gain * LEVEL_STEPS)) for gain in gains], joint="+")
+
+    def clear_gains(self) -> None:
+        """Let every LED give what a pattern asks of it."""
+        self._port.ask("GAIN:CLE")
+
+
+def _pattern(name: str) -> str:
+    if name not in PATTERNS:
+        raise ValueError(f"pattern: got {name!r}, expected one of {', '.join(PATTERNS)}")
+    return name
+
+
+def _decimal(field: str, value: float, digits: int) -> str:
+    if not math.isfinite(value):
+        raise ValueError(f"{field}: got {value}, expected a finite number")
+    text = f"{value:.{digits}f}".rstrip("0").rstrip(".")
+    return "0" if text in ("-0", "") else text
