@@ -167,6 +167,8 @@ class Caliper:
     """Angles that it can be set to, from +x towards +y, 0 <= degrees < 180."""
     speed_mm_per_s: float
     """How fast the jaws move, mm/s, > 0."""
+    settle_s: float = 0.3
+    """How long the skin is left to creep after a move before it is scanned, s, >= 0."""
 
     def __post_init__(self) -> None:
         checks = Checks("Caliper", RigError)
@@ -175,6 +177,7 @@ class Caliper:
             step_mm=self.step_mm,
             speed_mm_per_s=self.speed_mm_per_s,
         )
+        checks.that("settle_s", self.settle_s, 0 <= self.settle_s < math.inf, "seconds >= 0")
         open_mm = self.aperture_mm + self.first_step * self.step_mm
         narrow = self.first_step <= 0 and open_mm > 0
         checks.that("first_step", self.first_step, narrow, "<= 0, and the jaws apart")

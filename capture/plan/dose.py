@@ -1,4 +1,4 @@
-"""How much light a plan of the dome gives to the subject, before it is given.
+"""How much light a plan of LEDs gives to the subject, before it is given.
 
 The blue-light limit of a source that somebody stares at is a weighted radiance times time of
 1e6 J m^-2 sr^-1 within 1e4 s (IEC 62471:2006, section 4.3.3). Here all of an LED's radiance counts
@@ -37,7 +37,7 @@ class DoseReport:
 
 
 def dose_report(plan: Plan, rig: Rig) -> DoseReport:
-    """Return the light that a plan of the dome gives.
+    """Return the light that a plan of the dome, or of the gradient sphere, gives.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def dose_report(plan: Plan, rig: Rig) -> DoseReport:
     """
     on_s = np.zeros(len(rig.lights))
     for row in led_rows(plan.steps, rig):
-        on_s[list(row.leds)] += row.level * row.dwell_s
+        on_s += row.given(len(rig.lights)) * row.dwell_s
     power_w = np.array([light.power_w or 0.0 for light in rig.lights])
     radiance = np.array(
         [

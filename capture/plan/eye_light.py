@@ -3,6 +3,9 @@
 An eye is a small plane at its place in the nominal head, facing +z. It receives an LED's intensity
 in its direction times the cosine to +z over the distance squared; what comes from behind does not
 reach it. Lids, pupil and gaze are left out: eyes are taken as open and looking straight ahead.
+
+In the gradient sphere a patch of skin is at the origin and the eyes are somewhere beside it, within
+a sixth of the way to the lights: they are taken at the patch.
 """
 
 from __future__ import annotations
@@ -17,6 +20,9 @@ from capture.rig import Light, Rig, Vector
 
 EYES_MM: tuple[Vector, Vector] = ((-31.0, 25.0, 80.0), (31.0, 25.0, 80.0))
 """Corneas of a nominal adult head in the rig frame, mm."""
+
+PATCH_MM: tuple[Vector, ...] = ((0.0, 0.0, 0.0),)
+"""Where the eyes are taken to be when a patch of skin is at the origin."""
 
 
 def radiant_intensity(light: Light) -> float:
@@ -40,15 +46,16 @@ def radiant_intensity(light: Light) -> float:
 
 
 def eye_light(
-    rig: Rig, *, eyes_mm: Sequence[Vector] = EYES_MM, facing: Vector = (0.0, 0.0, 1.0)
+    rig: Rig, *, eyes_mm: Sequence[Vector] | None = None, facing: Vector = (0.0, 0.0, 1.0)
 ) -> NDArray[np.float64]:
     """Return each light's irradiance at the eyes at level 1, mean of both, W/m^2.
 
     Parameters
     ----------
     rig : Rig
-    eyes_mm : sequence of 3-vectors
-        Where the eyes are, mm, rig frame.
+    eyes_mm : sequence of 3-vectors, optional
+        Where the eyes are, mm, rig frame; by default those of a nominal head, or, before a caliper,
+        the patch itself.
     facing : 3-vector
         Where they look, unit length.
 
@@ -70,6 +77,8 @@ def eye_light(
     axes = -places / np.linalg.norm(places, axis=1)[:, None]
     on_axis = np.array([radiant_intensity(light) for light in rig.lights])
     total = np.zeros(len(places))
+    if eyes_mm is None:
+        eyes_mm = EYES_MM if rig.caliper is None else PATCH_MM
     for eye in eyes_mm:
         towards = np.asarray(eye, np.float64) - places
         distance_mm = np.linalg.norm(towards, axis=1)

@@ -1,4 +1,4 @@
-"""How much the dome's light flickers for the subject's open eyes.
+"""How much the light of LEDs flickers for the subject's open eyes.
 
 Flashes at 3 Hz or more can provoke seizures in people who are sensitive to light (Harding, Wilkins,
 Erba, Barkley, Fisher 2005, doi:10.1111/j.1528-1167.2005.31305.x); the band reported is 3 to about
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from capture.plan.eye_light import eye_light
 from capture.plan.rows import LedRow, led_rows, passes
-from capture.plan.steps import Plan
+from capture.plan.steps import Plan, Step
 from capture.rig import LedLimits, Rig
 
 BAND_HZ = (3.0, 65.0)
@@ -68,7 +68,7 @@ def eye_signal(
     ndarray
         (T,), W/m^2.
     """
-    light = np.array([row.level * float(weights[list(row.leds)].sum()) for row in rows])
+    light = np.array([float(row.given(len(weights)) @ weights) for row in rows])
     ends = np.cumsum([row.dwell_s for row in rows])
     starts = np.concatenate([[0.0], ends[:-1] - overlap_s]) if len(rows) else ends
     # the integral of each row's light up to t is a ramp from its start to its end
@@ -161,10 +161,12 @@ def flicker_of_rows(
 def flicker_report(plan: Plan, rig: Rig) -> FlickerReport:
     """Return the flicker of a plan for open eyes: the worst figures of its pieces.
 
+    Where the analyser turns between two patterns of the gradient sphere it is dark.
+
     Parameters
     ----------
     plan : Plan
-        Of the dome.
+        Of the dome or the gradient sphere.
     rig : Rig
         With the lights that the plan names.
 
@@ -180,7 +182,7 @@ def flicker_report(plan: Plan, rig: Rig) -> FlickerReport:
     weights = eye_light(rig)
     overlap_s = rig.leds.overlap_s if rig.leds is not None else 0.0
     reports = [
-        flicker_of_rows(led_rows(piece, rig), weights, overlap_s=overlap_s)
+        flicker_of_rows(_with_turns(piece, rig), weights, overlap_s=overlap_s)
         for piece in passes(plan.steps)
     ]
     seconds = sum(report.seconds for report in reports)
@@ -191,3 +193,16 @@ def flicker_report(plan: Plan, rig: Rig) -> FlickerReport:
         seconds,
         mean / seconds if seconds else 0.0,
     )
+
+
+def _with_turns(steps: Sequence[Step], rig: Rig) -> list[LedRow]:
+    """Return the rows of steps, and darkness where the analyser turns between two of them."""
+    rows: list[LedRow] = []
+    before: object = None
+    for step, row in zip(steps, led_rows(steps, rig), strict=True):
+        asked = step.settings.get("analyser_deg", step.settings.get("polarizer"))
+        if rows and "pattern" in step.settings and asked != before:
+            rows.append(LedRow((), 0.0, rig.polarizer_move_s))
+        before = asked
+        rows.append(row)
+    return rows

@@ -1,12 +1,18 @@
-"""Rows of light: what the steps of a plan ask of the dome's LEDs, one after the other."""
+"""Rows of light: what the steps of a plan ask of a rig's LEDs, one after the other."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
-from capture.plan.steps import Step
-from capture.rig import Rig
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.plan.steps import Step, require
+from capture.rig import Rig, Vector
+
+_AXES = {"x": 0, "y": 1, "z": 2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +25,49 @@ class LedRow:
     """Light relative to full, 0 to 1."""
     dwell_s: float
     """How long, s."""
+    shares: tuple[float, ...] = ()
+    """Of the level, what each of the LEDs gives, 0 to 1; empty: all of them all of it."""
+
+    def given(self, lights: int) -> NDArray[np.float64]:
+        """Return the level of each of so many lights, shape (lights,), 0 to 1.
+
+        Examples
+        --------
+        >>> LedRow((0, 2), 0.5, 0.03, (1.0, 0.2)).given(3).tolist()
+        [0.5, 0.0, 0.1]
+        """
+        levels = np.zeros(lights)
+        levels[list(self.leds)] = self.level * np.array(self.shares or (1.0,) * len(self.leds))
+        return levels
+
+
+def pattern_shares(places_mm: Sequence[Vector], pattern: str) -> NDArray[np.float64]:
+    """Return what a pattern of the gradient sphere asks of lights at these places, 0 to 1.
+
+    Parameters
+    ----------
+    places_mm : sequence of 3-vectors
+        Rig frame.
+    pattern : str
+        "full": 1; "x": (1 + x)/2 with x of the unit vector to the light, "-x": (1 - x)/2; so y and
+        z; "dark": 0.
+
+    Returns
+    -------
+    ndarray of float64, shape (lights,)
+
+    Examples
+    --------
+    >>> pattern_shares([(600.0, 0.0, 0.0), (0.0, 0.0, 600.0)], "-x").tolist()
+    [0.0, 0.5]
+    """
+    places = np.asarray(places_mm, np.float64)
+    if pattern in ("full", "dark"):
+        return np.full(len(places), float(pattern == "full"))
+    axis = _AXES.get(pattern.removeprefix("-"))
+    require(axis is not None, "pattern", pattern, "full, x, y, z, -x, -y, -z or dark")
+    coordinate = places[:, axis] / np.linalg.norm(places, axis=1)
+    return 0.5 * (1.0 - coordinate if pattern.startswith("-") else 1.0 + coordinate)
 
 
 def lights_of(step: Step) -> tuple[str, ...]:
@@ -36,7 +85,7 @@ def lights_of(step: Step) -> tuple[str, ...]:
 
 
 def led_rows(steps: Iterable[Step], rig: Rig) -> tuple[LedRow, ...]:
-    """Return what steps of the dome ask of the LEDs of ``rig``, one row a step.
+    """Return what steps of the dome, or the sphere, ask of the LEDs of ``rig``, one row a step.
 
     Raises
     ------
@@ -46,20 +95,31 @@ def led_rows(steps: Iterable[Step], rig: Rig) -> tuple[LedRow, ...]:
     numbers = {light.name: number for number, light in enumerate(rig.lights)}
     rows = []
     for step in steps:
+        dwell_s = float(step.settings.get("dwell_s", 0.0))
+        if (pattern := step.settings.get("pattern", "dark")) != "dark":
+            places = tuple(light.position_mm for light in rig.lights)
+            level = float(step.settings.get("level", 1.0))
+            shares = _shares(places, str(pattern))
+            rows.append(LedRow(tuple(range(len(places))), level, dwell_s, shares))
+            continue
         names = lights_of(step)
         for name in names:
             rig.light(name)  # names what is unknown
         level = float(step.settings.get("level", 0.0)) if names else 0.0
-        dwell_s = float(step.settings.get("dwell_s", 0.0))
         rows.append(LedRow(tuple(numbers[name] for name in names), level, dwell_s))
     return tuple(rows)
+
+
+@lru_cache(maxsize=64)
+def _shares(places_mm: tuple[Vector, ...], pattern: str) -> tuple[float, ...]:
+    return tuple(pattern_shares(places_mm, pattern).tolist())
 
 
 def passes(steps: Sequence[Step]) -> list[list[Step]]:
     """Cut steps where cameras must be set anew or something must be put before them.
 
-    Steps of one piece share exposure, sensitivity, cameras and pose, and so can follow one another
-    without a pause.
+    Steps of one piece share exposure, sensitivity, cameras, pose and the state of the skin, and so
+    can follow one another without a pause.
     """
     pieces: list[list[Step]] = []
     before: object = None
@@ -68,6 +128,7 @@ def passes(steps: Sequence[Step]) -> list[list[Step]]:
         key = (
             settings["exposure_s"], settings.get("iso", 100), step.cameras,
             index.get("pose"), index.get("sphere"), index.get("pass"), step.kind == "dark",
+            index.get("angle"), index.get("caliper"),
         )  # fmt: skip
         if not pieces or key != before:
             pieces.append([])

@@ -200,10 +200,12 @@ class Plan:
 
         Per step the slowest camera's exposure and read-out, or the recycling of the flash or the
         time that the light stays on where that is longer, and the turning of the analyser where
-        its state changes.
+        its state changes. Where a caliper's position changes its way, and the time in which the
+        skin creeps; not the time of the person who tapes it.
         """
         total = 0.0
         state: object = None
+        held: tuple[object, int] = (None, 0)
         for step in self.steps:
             readout_s = max(rig.view(name).readout_s for name in step.cameras)
             power = float(step.settings.get("power", 0.0))
@@ -211,8 +213,18 @@ class Plan:
             pause_s = max(pause_s, float(step.settings.get("dwell_s", 0.0)))
             total += max(float(step.settings.get("exposure_s", 0.0)) + readout_s, pause_s)
             asked = step.settings.get("analyser_deg", step.settings.get("polarizer"))
-            total += rig.polarizer_move_s if asked not in (state, None) else 0.0
+            turn_s = rig.polarizer_move_s if asked not in (state, None) else 0.0
             state = state if asked is None else asked
+            move_s = 0.0
+            if rig.caliper is not None and "caliper" in step.index:
+                now = (step.index.get("angle"), int(step.index["caliper"]))
+                if now != held:
+                    # a turned caliper is taped on anew, at step 0
+                    way = abs(now[1] - (held[1] if now[0] == held[0] else 0))
+                    move_s = way * rig.caliper.step_mm / rig.caliper.speed_mm_per_s
+                    move_s += rig.caliper.settle_s
+                held = now
+            total += max(turn_s, move_s)  # the analyser turns while the jaws move
         return total
 
     def to_json(self) -> dict[str, Any]:

@@ -1,0 +1,328 @@
+"""Plans of the gradient sphere: skin under patterns, state of strain by state, and its targets.
+
+A state of the skin is a position of the caliper. It is scanned once: some patterns with the
+analyser parallel, the same crossed. Patterns follow one another from bright to dark, and those that
+complete each other stand side by side, so that the light flickers little and skin that moves has
+moved little between x and -x.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from typing import Literal, get_args
+
+import numpy as np
+
+from capture.plan.rows import led_rows
+from capture.plan.steps import PATTERNS, POLARIZERS, Kind, Plan, Step, Value, require
+from capture.rig import Caliper, LedLimits, Rig
+
+GradientTarget = Literal["ball", "dark", "flat"]
+
+DWELL_S = 0.031
+"""Light of a pattern: 16 of them take half a second, and all LEDs stay within a duty of a quarter,
+because x and -x together are one full."""
+EXPOSURE_S = 0.018
+"""Fits into it with the read-out."""
+SCAN_ORDER = ("full", "z", "x", "-x", "y", "-y", "-z", "dark")
+"""From bright to dark for an eye beside the patch."""
+BALL_LEVEL = 0.03
+"""A ball of black glass shows the LEDs themselves: 4 % of what is far brighter than lit skin."""
+FLAT_LEVELS = (0.03, 0.06, 0.12, 0.19, 0.25, 0.38, 0.5, 0.63, 0.75, 1.0)
+"""Levels of the photon transfer series: dense in the shadows, up to full scale."""
+
+_Index = dict[str, str | int | float]
+
+
+def state_name(angle_deg: float, step: int) -> str:
+    """Return the name of a state of the skin: the caliper's angle and position.
+
+    Examples
+    --------
+    >>> state_name(0, 0), state_name(45.0, -2), state_name(0, 3)
+    ('a000_n0', 'a045_m2', 'a000_p3')
+    """
+    letter = "n" if step == 0 else "m" if step < 0 else "p"
+    return f"a{round(angle_deg):03d}_{letter}{abs(step)}"
+
+
+def state_of(step: Step) -> str | None:
+    """Return the state that a step shows; None where the caliper holds no skin.
+
+    Examples
+    --------
+    >>> index = {"angle": 90, "caliper": 1, "pattern": "x", "polarizer": "crossed"}
+    >>> state_of(Step("s", "gradient", index, {}, ("cam",)))
+    'a090_p1'
+    """
+    if step.kind != "gradient" or "caliper" not in step.index:
+        return None
+    return state_name(float(step.index["angle"]), int(step.index["caliper"]))
+
+
+def gradient_plan(
+    rig: Rig,
+    *,
+    angles: Sequence[float] | None = None,
+    steps: tuple[int, int] | None = None,
+    patterns: Sequence[str] = PATTERNS,
+    darks: int = 2,
+    exposure_s: float = EXPOSURE_S,
+    dwell_s: float = DWELL_S,
+    level: float = 1.0,
+    iso: int = 100,
+) -> Plan:
+    """Plan a capture of skin under patterns, stretched and compressed along several axes.
+
+    Parameters
+    ----------
+    rig : Rig
+        With a caliper.
+    angles : sequence of float, optional
+        Angles of the caliper, degrees, of those it has; all of them by default.
+    steps : pair of int, optional
+        First (<= 0) and last (>= 0) position; all of the caliper's by default. How far skin really
+        follows is found out when it is captured.
+    patterns : sequence of str
+        Of :data:`capture.plan.steps.PATTERNS`.
+    darks : int
+        Frames without light at the beginning, >= 0, beside the "dark" of each scan.
+    exposure_s, dwell_s : float
+        Exposure, and light, of each pattern, s.
+    level : float
+        Of the LEDs, 0 < level <= 1.
+    iso : int
+
+    Returns
+    -------
+    Plan
+        Darks, then per angle the neutral state, compression step by step, and stretching step by
+        step from neutral; per state every pattern parallel, then crossed. Ids are like
+        "a000-m2-par-x".
+
+    Raises
+    ------
+    PlanError
+        For what the rig's LEDs or caliper may not do.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> rig = load_rig("gradient")
+    >>> plan = gradient_plan(rig, angles=[0], steps=(-1, 1), darks=0)
+    >>> [state for state, _ in states(plan)], len(plan.steps)
+    (['a000_n0', 'a000_m1', 'a000_p1'], 48)
+    >>> plan.steps[0].id, plan.steps[-2].id
+    ('a000-n0-par-full', 'a000-p1-cro--z')
+    """
+    caliper = _caliper(rig)
+    known = caliper.angles_deg
+    chosen = known if angles is None else tuple(float(angle) for angle in angles)
+    for angle in chosen:
+        require(angle in known, "angles", angle, f"of {', '.join(f'{a:g}' for a in known)}")
+    require(len(set(chosen)) == len(chosen) > 0, "angles", chosen, "at least one, none twice")
+    first, last = (caliper.first_step, caliper.last_step) if steps is None else steps
+    within = f"{caliper.first_step} to 0, and 0 to {caliper.last_step}"
+    good = caliper.first_step <= first <= 0 <= last <= caliper.last_step
+    require(good, "steps", (first, last), within)
+    ordered = _ordered(patterns)
+    require(0 < level <= 1, "level", level, "0 < level <= 1")
+    require(darks >= 0, "darks", darks, ">= 0")
+    series = _Series(rig, exposure_s=exposure_s, dwell_s=dwell_s, iso=iso)
+    series.darks(darks)
+    for angle in chosen:
+        for position in (0, *range(-1, first - 1, -1), *range(1, last + 1)):
+            name = state_name(angle, position).replace("_", "-")
+            for polarizer in POLARIZERS:
+                for pattern in ordered:
+                    series.add(
+                        f"{name}-{polarizer[:3]}-{pattern}", "gradient",
+                        {"angle": _whole(angle), "caliper": position, "pattern": pattern,
+                         "polarizer": polarizer},
+                        pattern=pattern, polarizer=polarizer, level=level,
+                    )  # fmt: skip
+    return series.plan()
+
+
+def gradient_calibration_plan(
+    rig: Rig,
+    target: GradientTarget,
+    *,
+    repeats: int | None = None,
+    darks: int = 2,
+    level: float = BALL_LEVEL,
+    exposure_s: float = EXPOSURE_S,
+    dwell_s: float = DWELL_S,
+    iso: int = 100,
+) -> Plan:
+    """Plan the frames of one calibration of the gradient sphere; no caliper takes part.
+
+    Parameters
+    ----------
+    rig : Rig
+        With LEDs.
+    target : {"ball", "dark", "flat"}
+        "ball": a ball of black glass under "full" and "dark", parallel and crossed, at ``level``;
+        "flat": an even white field at 10 levels (photon transfer pairs); "dark": the cap on.
+    repeats : int, optional
+        Frames per condition: by default 4 of the ball, 2 (>= 2) of the flat, 16 of the dark.
+    darks : int
+        Frames without light before the flats, >= 0.
+    level : float
+        Of the LEDs that the ball shows, 0 < level <= 1.
+    exposure_s, dwell_s, iso
+        As for `gradient_plan`.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> rig = load_rig("gradient")
+    >>> plan = gradient_calibration_plan(rig, "ball")
+    >>> len(plan.steps), plan.steps[0].kind, dict(plan.steps[-1].index)
+    (16, 'ball', {'pattern': 'dark', 'polarizer': 'crossed', 'repeat': 3})
+    """
+    targets = get_args(GradientTarget)
+    require(target in targets, "target", target, f"one of {', '.join(targets)}")
+    count = {"ball": 4, "flat": 2, "dark": 16}[target] if repeats is None else repeats
+    least = 2 if target == "flat" else 1
+    require(count >= least, "repeats", count, f">= {least}")
+    require(darks >= 0, "darks", darks, ">= 0")
+    require(0 < level <= 1, "level", level, "0 < level <= 1")
+    series = _Series(rig, exposure_s=exposure_s, dwell_s=dwell_s, iso=iso)
+    if target == "dark":
+        series.darks(count)
+    elif target == "flat":
+        series.darks(darks)
+        for number, power in enumerate(FLAT_LEVELS):
+            for repeat in range(count):
+                series.add(
+                    f"F{number}-{repeat:02d}", "flat", {"level": power, "repeat": repeat},
+                    pattern="full", polarizer="parallel", level=power,
+                )  # fmt: skip
+    else:
+        for polarizer in POLARIZERS:
+            for pattern in ("full", "dark"):
+                for repeat in range(count):
+                    series.add(
+                        f"B-{polarizer[:3]}-{pattern}-{repeat:02d}", "ball",
+                        {"pattern": pattern, "polarizer": polarizer, "repeat": repeat},
+                        pattern=pattern, polarizer=polarizer, level=level,
+                    )  # fmt: skip
+    return series.plan()
+
+
+def states(plan: Plan) -> Iterator[tuple[str, list[Step]]]:
+    """Return the states of a plan in its order, each with its steps."""
+    for name, group in groupby(plan.steps, key=state_of):
+        if name is not None:
+            yield name, list(group)
+
+
+def scan_duty(steps: Sequence[Step], rig: Rig) -> float:
+    """Return the most mean level of an LED over the rig's window, of steps without a pause.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> rig = load_rig("gradient")
+    >>> plan = gradient_plan(rig, angles=[0], steps=(0, 0), darks=0)
+    >>> round(scan_duty(plan.steps, rig), 3)
+    0.248
+    """
+    limits = rig.leds or LedLimits()
+    rows = led_rows(steps, rig)
+    levels = np.array([row.given(len(rig.lights)) for row in rows])
+    ends = np.zeros(len(rows))
+    clock, before = 0.0, None
+    for number, (step, row) in enumerate(zip(steps, rows, strict=True)):
+        asked = step.settings.get("analyser_deg", step.settings.get("polarizer"))
+        clock += rig.polarizer_move_s if before not in (None, asked) else 0.0
+        before = asked
+        clock += row.dwell_s
+        ends[number] = clock
+    starts = ends - [row.dwell_s for row in rows]
+    # the mean is greatest in a window that ends with a row, or begins with one
+    edges = np.concatenate([ends, starts + limits.duty_window_s])
+    most = 0.0
+    for end in edges:
+        begin = end - limits.duty_window_s
+        inside = np.clip(np.minimum(ends, end) - np.maximum(starts, begin), 0.0, None)
+        most = max(most, float((inside @ levels).max()) / limits.duty_window_s)
+    return most
+
+
+def _caliper(rig: Rig) -> Caliper:
+    require(rig.caliper is not None, "rig", rig.name, "one with a caliper")
+    return rig.caliper  # type: ignore[return-value]
+
+
+def _whole(angle_deg: float) -> int | float:
+    return int(angle_deg) if float(angle_deg).is_integer() else float(angle_deg)
+
+
+def _ordered(patterns: Sequence[str]) -> list[str]:
+    chosen = list(patterns)
+    for pattern in chosen:
+        require(pattern in PATTERNS, "patterns", pattern, f"of {', '.join(PATTERNS)}")
+    require(len(set(chosen)) == len(chosen) > 0, "patterns", chosen, "at least one, none twice")
+    return sorted(chosen, key=SCAN_ORDER.index)
+
+
+class _Series:
+    """Steps being collected, for all views of one rig at one exposure."""
+
+    def __init__(self, rig: Rig, *, exposure_s: float, dwell_s: float, iso: int) -> None:
+        require(rig.leds is not None, "rig", rig.name, "one with LEDs and their limits")
+        limits = rig.leds or LedLimits()
+        require(0 < dwell_s <= limits.max_on_s, "dwell_s", dwell_s, f"<= {limits.max_on_s:g}")
+        readout_s = max(view.readout_s for view in rig.views)
+        lag_s = max(view.shutter_lag_s for view in rig.views)
+        room_s = dwell_s - limits.settle_s - limits.overlap_s - lag_s
+        require(
+            0 < exposure_s <= room_s and exposure_s + readout_s + lag_s <= dwell_s,
+            "exposure_s", exposure_s,
+            f"to fit with read-out {readout_s:g} s into {dwell_s:g} s a pattern",
+        )  # fmt: skip
+        self._rig = rig
+        self._limits = limits
+        self._cameras = tuple(view.name for view in rig.views)
+        self._every: dict[str, Value] = {
+            "exposure_s": float(exposure_s), "dwell_s": float(dwell_s), "iso": iso,
+        }  # fmt: skip
+        self._steps: list[Step] = []
+
+    def add(self, identity: str, kind: Kind, index: _Index, **settings: Value) -> None:
+        step = Step(identity, kind, index, {**settings, **self._every}, self._cameras)
+        self._steps.append(step)
+
+    def darks(self, count: int) -> None:
+        for repeat in range(count):
+            self.add(
+                f"D{repeat:03d}", "dark", {"repeat": repeat},
+                pattern="dark", polarizer="parallel", level=0.0,
+            )  # fmt: skip
+
+    def plan(self) -> Plan:
+        """Return the plan; a piece of it that asks too much of an LED is refused."""
+        limits = self._limits
+        judged: dict[tuple[object, ...], float] = {}
+        for _, group in groupby(self._steps, key=lambda step: state_of(step) or step.kind):
+            piece = list(group)
+            key = tuple((s.settings["pattern"], s.settings["level"]) for s in piece)
+            if key not in judged:
+                judged[key] = scan_duty(piece, self._rig)
+        most = max(judged.values(), default=0.0)
+        require(
+            most <= limits.max_duty, "duty", f"{most:.3f} over {limits.duty_window_s:g} s",
+            f"at most {limits.max_duty:g}: less level, shorter light or fewer patterns",
+        )  # fmt: skip
+        return Plan(
+            self._rig.name,
+            tuple(self._steps),
+            {
+                "max_duty": limits.max_duty,
+                "max_on_s": limits.max_on_s,
+                "dose_ws": limits.dose_ws,
+            },
+        )
