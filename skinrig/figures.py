@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -121,6 +122,42 @@ def bars(
         axes.axhline(limit, color="0.5", ls="--", lw=1)
     axes.set_xticks(position, labels, fontsize=8)
     axes.set_ylabel(unit)
+    axes.set_title(title, fontsize=10)
+    axes.legend(fontsize=7, frameon=False)
+    return _svg(figure)
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One series of a plot: points with standard errors, a line, or both."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    stderr: Sequence[float] | None = None
+    marks: bool = True
+    """Whether points are marked."""
+    line: bool = True
+    """Whether they are joined."""
+
+
+def curves(title: str, x_name: str, y_name: str, series: Sequence[Curve]) -> str:
+    """Draw series over a common axis, with bars of one standard error; NaN leaves a gap."""
+    figure, axes = _figure(5.2, 3.4)
+    for number, curve in enumerate(series):
+        color = _COLORS[number % len(_COLORS)]
+        style = ("o" if curve.marks else "") + ("-" if curve.line else "")
+        x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
+        if curve.stderr is None:
+            axes.plot(x, y, style or "o", color=color, ms=4, lw=1.2, label=curve.name)
+            continue
+        bars = np.where(np.isfinite(curve.stderr), np.asarray(curve.stderr, float), 0.0)
+        axes.errorbar(
+            x, y, yerr=bars, fmt=style or "o", color=color, ms=4, lw=1.2, elinewidth=1,
+            label=curve.name,
+        )  # fmt: skip
+    axes.set_xlabel(x_name)
+    axes.set_ylabel(y_name)
     axes.set_title(title, fontsize=10)
     axes.legend(fontsize=7, frameon=False)
     return _svg(figure)
