@@ -10,7 +10,7 @@ from pathlib import Path
 from capture.documents import Fault
 from capture.session.disk import read_file
 from capture.session.errors import NotASession, SessionDamage, SessionError
-from capture.session.journal import AttachmentLine, CloseLine, FrameLine, Walk, walk
+from capture.session.journal import AttachmentLine, CloseLine, FrameLine, LeftOutLine, Walk, walk
 from capture.session.manifest import Manifest, decode
 
 MANIFEST, JOURNAL, FRAMES, ORPHANS = "session.json", "journal.jsonl", "frames", "orphans"
@@ -35,6 +35,11 @@ class Contents:
     def attachment_lines(self) -> tuple[AttachmentLine, ...]:
         """All committed attachments, in the order of commitment."""
         return tuple(line for _, line in self.walk.lines if isinstance(line, AttachmentLine))
+
+    @property
+    def left_out_lines(self) -> tuple[LeftOutLine, ...]:
+        """What was left out and why, in the order in which it was."""
+        return tuple(line for _, line in self.walk.lines if isinstance(line, LeftOutLine))
 
     @property
     def file_lines(self) -> tuple[FrameLine | AttachmentLine, ...]:
@@ -86,6 +91,7 @@ def read_contents(path: Path) -> Contents:
 def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
     """Note the first line that the plan does not allow: an unknown step, a frame twice."""
     seen: set[str] = set()
+    left_out: set[str] = set()
     steps = {step.id: step for step in manifest.plan.steps}
     frames = 0
     for byte, line in walked.lines:
@@ -94,6 +100,11 @@ def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
         elif isinstance(line, AttachmentLine):
             got, good, expected = line.file, line.file not in seen, "each attachment once"
             seen.add(line.file)
+        elif isinstance(line, LeftOutLine):
+            strangers = [step for step in line.steps if step not in steps or step in left_out]
+            got, good = ", ".join(strangers), not strangers
+            expected = "steps of the plan, each left out once"
+            left_out.update(line.steps)
         else:
             got, good, expected = line.file, line.file not in seen, "each frame once"
             seen.add(line.file)
@@ -101,6 +112,8 @@ def _against_plan(walked: Walk, manifest: Manifest, where: str) -> Walk:
             step = steps.get(line.step)
             if step is None:
                 got, good, expected = line.step, False, "a step of the plan"
+            elif line.step in left_out:
+                got, good, expected = line.step, False, "no frame of a step that was left out"
             elif line.camera not in step.cameras:
                 got, good, expected = line.camera, False, f"one of {', '.join(step.cameras)}"
         if not good:

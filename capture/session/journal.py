@@ -1,4 +1,4 @@
-"""journal.jsonl: one sealed line per frame or attachment, each chained to all before it.
+"""journal.jsonl: one sealed line per frame, attachment or omission, chained to all before it.
 
 A line is ``{"h":HASH,"r":RECORD}`` in canonical JSON, with HASH the SHA-256 of the hash before and
 of RECORD; the first is chained to the seal of session.json. So a line of another session, a line
@@ -112,6 +112,39 @@ class AttachmentLine:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LeftOutLine:
+    """Steps of the plan that will not be captured, as the journal holds them."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    steps: tuple[str, ...]
+    reason: str
+    """Why, for people."""
+    about: Mapping[str, Value]
+    """What was found, for programs: texts and numbers."""
+    t_host_s: float
+
+    def __post_init__(self) -> None:
+        checks = Checks("Line of steps left out", SessionDamage)
+        differ = len(set(self.steps)) == len(self.steps) > 0
+        checks.that("steps", self.steps, differ, "at least one, none twice")
+        for step in self.steps:
+            checks.that("steps", step, is_id(step), ID_RULE)
+        checks.that("reason", self.reason, bool(self.reason.strip()), "a text")
+        checks.close()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the line's record."""
+        return {
+            "type": "left_out",
+            "steps": list(self.steps),
+            "reason": self.reason,
+            "about": dict(self.about),
+            "t_host_s": self.t_host_s,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CloseLine:
     """The end of a session: nothing may follow."""
 
@@ -119,7 +152,7 @@ class CloseLine:
 
     frames: int
     missing: tuple[str, ...]
-    """Steps of the plan that were not captured."""
+    """Steps of the plan that were neither captured nor left out with a reason of their own."""
     reason: str
     """Why they were not, empty where none is missing."""
 
@@ -133,7 +166,7 @@ class CloseLine:
         }
 
 
-Line = FrameLine | AttachmentLine | CloseLine
+Line = FrameLine | AttachmentLine | LeftOutLine | CloseLine
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,9 +278,11 @@ def _unseal(text: bytes, head: str, where: str) -> tuple[Line | None, str]:
         return parse(FrameLine, record, where=where, error=SessionDamage), digest
     if kind == "attachment":
         return parse(AttachmentLine, record, where=where, error=SessionDamage), digest
+    if kind == "left_out":
+        return parse(LeftOutLine, record, where=where, error=SessionDamage), digest
     if kind == "close":
         return parse(CloseLine, record, where=where, error=SessionDamage), digest
-    raise _damage(where, None, "type", shown(kind), '"frame", "attachment" or "close"')
+    raise _damage(where, None, "type", shown(kind), '"frame", "attachment", "left_out" or "close"')
 
 
 def _is_torn(text: bytes, unended: bool, *, last: bool, head: str) -> bool:

@@ -35,6 +35,7 @@ from capture.session.journal import (
     AttachmentLine,
     CloseLine,
     FrameLine,
+    LeftOutLine,
     Line,
     attachment_file,
     frame_file,
@@ -318,6 +319,62 @@ class Session(SessionView):
         self._write(descriptor, line, bytes(data))
         self._attached[name] = line
 
+    def leave_out(
+        self,
+        step_ids: Sequence[str],
+        *,
+        reason: str,
+        about: Mapping[str, Value] | None = None,
+        t_host_s: float,
+    ) -> None:
+        """Note, safe from a power cut, that steps will not be captured, and why.
+
+        The session is complete without them. Frames that they have already stay on the disk and do
+        not count: what cannot be had whole is not had.
+
+        Parameters
+        ----------
+        step_ids : sequence of str
+            Steps of the plan that were not left out before.
+        reason : str
+            For people.
+        about : mapping, optional
+            What was found: texts, finite numbers, true or false.
+        t_host_s : float
+            The host's time, s.
+
+        Raises
+        ------
+        SessionError
+            Where the session is closed, a step is unknown or was left out before, or no reason is
+            given; nothing is written.
+        SessionDiskError
+            Where the disk refuses; nothing committed before is touched, and the session can be
+            resumed.
+        """
+        descriptor = self._writable()
+        checks = Checks("Steps left out", SessionError)
+        differ = len(set(step_ids)) == len(step_ids) > 0
+        checks.that("step_ids", tuple(step_ids), differ, "at least one, none twice")
+        checks.that("reason", reason, bool(reason.strip()), "a text")
+        for step_id in step_ids:
+            self.plan.step(step_id)  # names what is unknown
+            checks.that("step_ids", step_id, step_id not in self._left_out, "not left out before")
+        checks.close()
+        line = LeftOutLine(
+            steps=tuple(step_ids), reason=reason, about=dict(about or {}), t_host_s=float(t_host_s)
+        )
+        text, head = self._seal(line)
+        try:
+            with DiskErrors(self.path):
+                self._append(descriptor, text)
+        except SessionDiskError:
+            # how much reached the medium is unknown: only resume() can tell
+            self.release()
+            raise
+        self._head = head
+        self._left_out.update(dict.fromkeys(line.steps, line))
+
     def _write(self, descriptor: int, line: FrameLine | AttachmentLine, blob: bytes) -> None:
         """Bring a file and then its line of the journal to the medium."""
         text, head = self._seal(line)
@@ -345,7 +402,7 @@ class Session(SessionView):
         Parameters
         ----------
         missing_because : str
-            Why steps of the plan are missing; required where some are.
+            Why steps of the plan are missing; required where some are that were not left out.
 
         Raises
         ------
@@ -400,6 +457,9 @@ class Session(SessionView):
         if camera not in step.cameras:
             faults = [Fault("camera", shown(camera), f"one of {', '.join(step.cameras)}")]
             raise SessionError(f"step {step_id!r} has no such camera", faults=faults)
+        if step_id in self._left_out:
+            faults = [Fault("step", shown(step_id), "one that was not left out")]
+            raise SessionError("the step was left out", where=str(self.path), faults=faults)
         done = self._lines.get((step_id, camera), [])
         expected = done[-1].attempt + 1 if done else 1
         if attempt < 1 or (done and attempt != expected):
@@ -424,7 +484,9 @@ class Session(SessionView):
         try:
             text, head = seal_line(self._head, line)
         except (TypeError, ValueError, RecursionError) as exc:
-            values = "about" if isinstance(line, AttachmentLine) else "settings, actual"
+            values = (
+                "about" if isinstance(line, AttachmentLine | LeftOutLine) else "settings, actual"
+            )
             faults = [Fault(values, str(exc), "texts, finite numbers, true or false")]
             raise SessionError("the journal line cannot be written", faults=faults) from exc
         if len(text) > MAX_LINE_BYTES:

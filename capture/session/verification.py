@@ -110,13 +110,17 @@ def _state(place: Path, contents: Contents) -> list[str]:
         where = f"{place / JOURNAL}, byte {walk.end}"
         notes.append(f"{where}: {walk.torn} bytes of a line cut off by a crash; resuming cuts them")
     done = {(line.step, line.camera) for line in contents.frame_lines}
-    steps = contents.manifest.plan.steps
+    left_out = {step: line.reason for line in contents.left_out_lines for step in line.steps}
+    steps = [step for step in contents.manifest.plan.steps if step.id not in left_out]
     missing = sum((step.id, camera) not in done for step in steps for camera in step.cameras)
     end = contents.close_line
     if end is None:
         notes.append(f"{place}: not closed, {missing} frames of the plan are missing")
     elif missing:
         notes.append(f"{place}: closed with {missing} frames missing: {end.reason}")
+    for reason in dict.fromkeys(left_out.values()):
+        count = sum(other == reason for other in left_out.values())
+        notes.append(f"{place}: {count} steps left out: {reason}")
     if (place / ORPHANS).is_dir() and (orphans := os.listdir(place / ORPHANS)):
         notes.append(f"{place / ORPHANS}: {len(orphans)} files set aside after interruptions")
     for name in sorted(set(os.listdir(place)) - _KNOWN):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Literal
@@ -13,7 +14,7 @@ from capture.rig import Rig
 from capture.session.contents import Contents
 from capture.session.errors import ConsentError, SessionDamage, SessionError
 from capture.session.frames import FrameRecord, check_file
-from capture.session.journal import AttachmentLine, FrameLine
+from capture.session.journal import AttachmentLine, FrameLine, LeftOutLine
 from capture.session.manifest import ANY_USE, Manifest, Subject
 
 
@@ -31,18 +32,48 @@ class SessionView:
         self._attached: dict[str, AttachmentLine] = {
             line.name: line for line in contents.attachment_lines
         }
+        self._left_out: dict[str, LeftOutLine] = {
+            step: line for line in contents.left_out_lines for step in line.steps
+        }
 
     def todo(self) -> list[tuple[Step, str]]:
-        """Return the steps and cameras without a committed frame, in the order of the plan."""
+        """Return the steps and cameras without a committed frame, in the order of the plan.
+
+        Steps that were left out are not to be done.
+        """
         return [
             (step, camera)
             for step in self.plan.steps
+            if step.id not in self._left_out
             for camera in step.cameras
             if (step.id, camera) not in self._lines
         ]
 
+    def left_out(self) -> Mapping[str, str]:
+        """Return the steps that will not be captured, each with the reason, in the plan's order."""
+        return {
+            step.id: self._left_out[step.id].reason
+            for step in self.plan.steps
+            if step.id in self._left_out
+        }
+
+    def left_out_line(self, step_id: str) -> LeftOutLine:
+        """Return what the journal says of a step that was left out.
+
+        Raises
+        ------
+        SessionError
+            Where it was not.
+        """
+        if step_id not in self._left_out:
+            faults = [Fault("step", shown(step_id), "a step that was left out")]
+            raise SessionError("was not left out", where=str(self.path), faults=faults)
+        return self._left_out[step_id]
+
     def frames(self, kind: str | None = None, **index: str | int | float) -> list[FrameRecord]:
         """Return the last attempt of each committed frame, in the order of the plan.
+
+        Frames of a step that was left out afterwards are not among them.
 
         Parameters
         ----------
@@ -56,6 +87,7 @@ class SessionView:
             FrameRecord(step=step, line=self._lines[step.id, camera][-1])
             for step in self.plan.steps
             if kind in (None, step.kind)
+            and step.id not in self._left_out
             and all(step.index.get(key, missing) == value for key, value in index.items())
             for camera in step.cameras
             if (step.id, camera) in self._lines

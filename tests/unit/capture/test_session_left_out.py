@@ -1,0 +1,135 @@
+"""Steps that are left out with a reason: durable, never captured afterwards, no loss of others."""
+
+import errno
+
+import numpy as np
+import pytest
+
+from capture import raw
+from capture.plan import PlanError, flash_plan
+from capture.rig import load_rig
+from capture.session import Disk, Session, SessionDiskError, SessionError, Subject, verify
+
+RIG = load_rig("flash").resized(16)
+PLAN = flash_plan(RIG, states=("neutral", "anger"), darks=1)
+WHY = "the skin buckled"
+
+
+@pytest.fixture
+def session(tmp_path):
+    with Session.create(
+        tmp_path / "s", plan=PLAN, rig=RIG, devices={}, subject=Subject("P042", ("research",)),
+        source="measured",
+    ) as made:  # fmt: skip
+        yield made
+
+
+def commit(session, step_id):
+    blob = raw.encode_dng(
+        np.full((10, 16), 600, np.uint16), pattern="RGGB", black=512, white=16383,
+        step_id=step_id, session_id=session.id,
+    )  # fmt: skip
+    session.commit(step_id, "cam", blob, settings={}, actual={}, t_host_s=0.0)
+
+
+def commit_all(session):
+    for step, _ in session.todo():
+        commit(session, step.id)
+
+
+def test_steps_left_out_are_not_to_do_and_the_session_closes_complete(session):
+    session.leave_out(["S002", "S003"], reason=WHY, about={"aperture_mm": 5.6}, t_host_s=7.0)
+    assert [step.id for step, _ in session.todo()] == ["D000", "S000", "S001"]
+    commit_all(session)
+    session.close()
+    again = Session.open(session.path)
+    assert again.closed
+    assert again.left_out() == {"S002": WHY, "S003": WHY}
+    line = again.left_out_line("S003")
+    assert (line.about["aperture_mm"], line.t_host_s) == (5.6, 7.0)
+    found = verify(session.path)
+    assert found.ok
+    assert found.warnings == (f"{session.path}: 2 steps left out: {WHY}",)
+
+
+def test_what_was_left_out_survives_an_interruption(session):
+    session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
+    session.release()
+    with Session.resume(session.path) as again:
+        assert again.left_out() == {"S003": WHY}
+        commit_all(again)
+        again.close()
+    assert [r.step_id for r in Session.open(session.path).frames()] == [
+        "D000", "S000", "S001", "S002",
+    ]  # fmt: skip
+
+
+def test_frames_of_a_step_that_is_left_out_afterwards_stay_and_do_not_count(session):
+    commit_all(session)
+    session.leave_out(["S001"], reason=WHY, t_host_s=0.0)
+    assert "S001" not in [r.step_id for r in session.frames()]
+    assert (session.path / "frames" / "S001+cam.dng").is_file()
+    session.close()
+    found = verify(session.path)
+    assert (found.ok, found.frames) == (True, 5)
+
+
+def test_other_steps_that_are_missing_still_need_a_reason(session):
+    session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
+    with pytest.raises(SessionError, match="4 missing"):
+        session.close()
+    session.close(missing_because="the subject left")
+    assert any("4 frames missing" in text for text in verify(session.path).warnings)
+
+
+def test_a_step_left_out_is_neither_captured_nor_left_out_again(session):
+    session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
+    before = (session.path / "journal.jsonl").read_bytes()
+    with pytest.raises(SessionError, match="was left out"):
+        commit(session, "S003")
+    with pytest.raises(SessionError, match="not left out before"):
+        session.leave_out(["S002", "S003"], reason=WHY, t_host_s=0.0)
+    assert (session.path / "journal.jsonl").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("steps", "reason", "error"),
+    [([], WHY, SessionError), (["S001", "S001"], WHY, SessionError), (["S001"], " ", SessionError),
+     (["S9"], WHY, PlanError)],
+)  # fmt: skip
+def test_what_cannot_be_left_out_leaves_no_trace(session, steps, reason, error):
+    with pytest.raises(error):
+        session.leave_out(steps, reason=reason, t_host_s=0.0)
+    assert (session.path / "journal.jsonl").read_bytes() == b""
+
+
+def test_one_flipped_bit_of_a_reason_is_found(session):
+    session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
+    commit_all(session)
+    session.close()
+    file = session.path / "journal.jsonl"
+    data = bytearray(file.read_bytes())
+    data[data.index(b"buckled")] ^= 1
+    file.write_bytes(data)
+    assert not verify(session.path).ok
+
+
+def test_a_refusing_disk_costs_the_reason_and_nothing_acknowledged(session):
+    class Full(Disk):
+        full = False
+
+        def write(self, descriptor, data):
+            if self.full:
+                raise OSError(errno.ENOSPC, "no space left")
+            super().write(descriptor, data)
+
+    session.release()
+    disk = Full()
+    again = Session.resume(session.path, disk=disk)
+    commit(again, "D000")
+    disk.full = True
+    with pytest.raises(SessionDiskError):
+        again.leave_out(["S003"], reason=WHY, t_host_s=0.0)
+    with Session.resume(session.path) as third:
+        assert third.left_out() == {}
+        assert [r.step_id for r in third.frames()] == ["D000"]
