@@ -76,12 +76,12 @@ class CaliperStatus(BoxStatus):
     @property
     def attached(self) -> bool:
         """Whether the box holds skin, as far as it knows."""
-        return bool(self.bits & 64)
+        return bool(self.bits & 512)
 
     @property
     def force_tripped(self) -> bool:
         """Whether the last move met the force limit."""
-        return bool(self.bits & 128)
+        return bool(self.bits & 1024)
 
 
 class CaliperBox(Box):

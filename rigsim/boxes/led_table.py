@@ -83,8 +83,8 @@ def parse_rows(text: str, *, count: int, at_once: int, cameras: int, most_us: in
     return rows
 
 
-def table_crc(rows: Sequence[Row]) -> str:
-    """Return the checksum of a table: CRC-16/IBM-3740 of its rows joined by newlines."""
+def table_crc(rows: Sequence[object]) -> str:
+    """Return the checksum of a table: CRC-16/IBM-3740 of its rows' texts joined by newlines."""
     return f"{wire.crc16(chr(10).join(map(str, rows)).encode()):04X}"
 
 

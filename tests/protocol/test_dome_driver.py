@@ -86,7 +86,7 @@ def test_a_long_table_is_loaded_in_short_lines_and_its_checksum_compared(bench):
 
 
 def test_another_table_than_was_sent_is_noticed(bench, monkeypatch):
-    monkeypatch.setattr("rigsim.boxes.dome.table_crc", lambda table: "1234")
+    monkeypatch.setattr("rigsim.boxes.led_sequencer.table_crc", lambda table: "1234")
     with pytest.raises(BadAnswer, match="the table that was sent"):
         bench.box.load(rows(UNSEEN[:2]))
 

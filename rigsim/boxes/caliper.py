@@ -1,0 +1,484 @@
+"""The stretching caliper's box: two jaws on a motor, a force sensor, a turning ring; sans-I/O.
+
+Its manual is its command table (`CaliperUnit.commands`) and these rules. Nothing moves unless the
+box is armed (-203), has been told a force limit, for which there is no default, and, for steps, has
+found its home mark (-213 each). Moves are absolute and slow: they are accepted at once with their
+number, and over when ``*OPC?`` says 1; the event ``CAL:END`` and ``CAL:LAST?`` tell how. Force is
+looked at once each control period. Where it meets the limit, pulling or pushing, the jaws go back
+to where they stood before, and a move that way again is refused with 106. A motor that has lost
+steps stops, and must be homed. Force that falls to nothing while the jaws open is skin that has
+come off. ``CAL:REL`` lets the skin go, and so does all that makes other boxes dark: ``SAFE``,
+``ABOR``, ``*RST``, a silent host, the emergency stop, and the loss of power. After that a person
+has to tape the jaws to the skin again, and to say so with ``CAL:ATT``, which tares the sensor.
+
+The box does not know what is between its jaws: it moves a `JawLoad` and feels its force.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from capture.devices.wire import Code
+from capture.rig import Caliper
+
+from .controller import Command, Refused, number
+
+__all__ = ["CONTROL_S", "CaliperUnit", "JawLoad"]
+
+CONTROL_S = 5e-3
+"""Period in which position and force are looked at while the motor runs, s."""
+MOST_STEPS = 15
+FORCE_LIMIT_N = (0.05, 10.0)
+"""What the sensor can tell; what skin may bear is for a person to say."""
+LAG_MM = 0.05
+"""Steps that the motor has lost, mm, from which a stall is known."""
+TURN_DEG_PER_S = 90.0
+ZERO_N = 0.01
+"""Deviation of what a sensor says of no force before it is tared, N."""
+HOME_SPEED = 0.5
+"""Of the normal one."""
+COMES_OFF_FROM_N = 0.05
+COMES_OFF_SHARE = 0.25
+"""Share that is left, after one control period, of the force on skin that has come off."""
+LET_GO_S = 0.25
+"""Force that is still beyond the limit so long after the jaws have turned back: let go."""
+
+MOVING, HOMED, INTERLOCK, ATTACHED, TRIPPED = 16, 32, 256, 512, 1024
+_STEP = re.compile(r"-?[0-9]{1,3}")
+
+
+class JawLoad(Protocol):
+    """What the jaws act upon."""
+
+    @property
+    def force_n(self) -> float:
+        """Force on the jaws, N; > 0 pulls them together."""
+
+    def attach(self, angle_deg: float) -> None:
+        """Be held, at the jaws' present distance, from now on."""
+
+    def turn(self, angle_deg: float) -> None:
+        """Have the jaws turned while they hold nothing."""
+
+    def move(self, aperture_mm: float) -> None:
+        """Have the jaws moved to a distance."""
+
+    def release(self) -> None:
+        """Be let go."""
+
+
+@dataclass(slots=True)
+class _Move:
+    """A move that is under way."""
+
+    number: int
+    homing: bool
+    start_s: float
+    from_mm: float
+    to_mm: float
+    speed_mm_per_s: float
+    stalls_at_mm: float | None
+    ticks: int = 0
+    tripped_s: float = math.inf  # when the force met its limit; since then it goes back
+    reading_mm: float = 0.0  # of that moment
+    force_n: float = 0.0
+
+    @property
+    def direction(self) -> int:
+        return 1 if self.to_mm > self.from_mm else -1
+
+    @property
+    def arrives_s(self) -> float:
+        return self.start_s + abs(self.to_mm - self.from_mm) / self.speed_mm_per_s
+
+    @property
+    def next_s(self) -> float:
+        return min(self.start_s + (self.ticks + 1) * CONTROL_S, self.arrives_s)
+
+    def driven_to_mm(self, now: float) -> float:
+        if now >= self.arrives_s:
+            return self.to_mm
+        return self.from_mm + self.direction * self.speed_mm_per_s * (now - self.start_s)
+
+
+class CaliperUnit:
+    """State of the caliper's box behind its controller.
+
+    Parameters
+    ----------
+    caliper
+        Its travel, steps, angles and speed; at most 15 steps either way.
+    load
+        What is between its jaws.
+    on_change
+        Called with the world time in s after whatever has changed what the jaws hold.
+    stall
+        Probability that a move's motor stalls on the way.
+    home_missed, sensor_dead, interlock, interlock_after
+        See `rigsim.faults.Faults`.
+    rng
+        Where the jaws stand at first, and stalls.
+    """
+
+    kind = "caliper"
+    model = "CALIPER1"
+
+    def __init__(
+        self,
+        caliper: Caliper,
+        load: JawLoad,
+        *,
+        on_change: Callable[[float], None],
+        stall: float = 0.0,
+        home_missed: bool = False,
+        sensor_dead: bool = False,
+        interlock: bool = False,
+        interlock_after: float = math.inf,
+        rng: np.random.Generator,
+    ) -> None:
+        self._caliper = caliper
+        self._load = load
+        self._on_change = on_change
+        self._stall = stall
+        self._home_missed = home_missed
+        self._sensor_dead = sensor_dead
+        self._interlock_at = -math.inf if interlock else interlock_after
+        self._rng = rng
+        self.step_min = max(caliper.first_step, -MOST_STEPS)
+        self.step_max = min(caliper.last_step, MOST_STEPS)
+        half = 0.5 * caliper.step_mm
+        self._ends_mm = (
+            caliper.reading_mm(self.step_min) - half,
+            caliper.reading_mm(self.step_max) + half,
+        )
+        self.interlock = interlock
+        # what stays as it is without power: jaws, ring, and the count of moves
+        self.aperture_mm = float(rng.uniform(*self._ends_mm))
+        self.angle_deg = caliper.angles_deg[0]
+        self._offset_n = float(rng.normal(0.0, ZERO_N))
+        self._zero_n = 0.0
+        self.moves: list[tuple[float, float]] = []  # when and whereto each began
+        self._events: list[tuple[str, str]] = []
+        self._move: _Move | None = None
+        self.attached = False
+        load.move(self.aperture_mm)
+        load.turn(self.angle_deg)
+        self.reset(0.0, power_up=True)
+
+    # settings ---------------------------------------------------------------------------------
+
+    def reset(self, now: float, *, power_up: bool) -> None:
+        """Return to the settings of power-up: nothing held, no force limit, not homed."""
+        self.go_dark(now)
+        if power_up:
+            self._powered_at = now
+            self._events.clear()
+            self.last_report = ""
+        self.homed = False
+        self.limit_n: float | None = None
+        self._barred: tuple[int, float] | None = None  # direction and reading of a force trip
+        self._turning: tuple[float, float] | None = None  # until when, and whereto
+        self._last_force_n = 0.0
+
+    def capabilities(self) -> Mapping[str, Any]:
+        """Return limits and counts, units in the names."""
+        return {
+            "step_min": self.step_min,
+            "step_max": self.step_max,
+            "step_mm": self._caliper.step_mm,
+            "aperture_mm": self._caliper.aperture_mm,
+            "angles_deg": list(self._caliper.angles_deg),
+            "speed_mm_per_s": self._caliper.speed_mm_per_s,
+            "turn_deg_per_s": TURN_DEG_PER_S,
+            "force_limit_min_n": FORCE_LIMIT_N[0],
+            "force_limit_max_n": FORCE_LIMIT_N[1],
+            "control_period_ms": CONTROL_S * 1e3,
+        }
+
+    def commands(self) -> Mapping[str, Command]:
+        """Return the command table: the manual of the box."""
+        return {
+            "CAL:HOME": Command(
+                self._home, armed=True, manual="find the home mark, end at step 0: number"
+            ),
+            "CAL:STEP:ABS": Command(
+                self._step, "<n>", armed=True, manual="jaws to n steps from home: number"
+            ),
+            "CAL:POS?": Command(self._position, manual="distance of the jaws, mm, or NONE"),
+            "CAL:LAST?": Command(
+                self._last,
+                manual="last move: number, REACHED, FORCE, STALL, DETACHED, NOHOME or STOPPED, "
+                "step, mm, N, us; or NONE",
+            ),
+            "CAL:ANG": Command(
+                self._turn, "<deg>", armed=True, manual="turn empty jaws to one of their angles"
+            ),
+            "CAL:ANG?": Command(self._get_angle, manual="angle aimed at, degrees"),
+            "CAL:ATT": Command(
+                self._attach, armed=True, manual="a person has taped the jaws: tare, and hold"
+            ),
+            "CAL:ATT?": Command(self._is_attached, manual="1 skin is held, 0 not"),
+            "CAL:REL": Command(self._let_go, bare=True, manual="let the skin go at once"),
+            "CAL:FORC?": Command(self._get_force, manual="N, > 0 pulls the jaws together"),
+            "CAL:FORC:LIM": Command(
+                self._set_limit, "<N>", manual="most force, pulling or pushing; no default"
+            ),
+            "CAL:FORC:LIM?": Command(self._get_limit, manual="that limit, N, or NONE"),
+        }
+
+    # time -------------------------------------------------------------------------------------
+
+    def deadline(self) -> float:
+        """Return when the box will next look at a move, or something ends by itself, in s."""
+        due = math.inf if self.interlock else self._interlock_at
+        if self._move is not None:
+            due = min(due, self._move.next_s)
+        if self._turning is not None:
+            due = min(due, self._turning[0])
+        return due
+
+    def advance(self, now: float) -> None:
+        """Let time pass up to `now`, in s."""
+        while (due := self.deadline()) <= now:
+            if not self.interlock and self._interlock_at <= due:
+                self.interlock = True
+                self._release(due, "INTERLOCK")
+            if self._turning is not None and self._turning[0] <= due:
+                self.angle_deg, self._turning = self._turning[1], None
+                self._load.turn(self.angle_deg)
+                self._on_change(due)
+            if self._move is not None and self._move.next_s <= due:
+                self._control(self._move, due)
+
+    def take_events(self) -> list[tuple[str, str]]:
+        """Return and forget what the box has to say unasked: name and payload."""
+        events, self._events = self._events, []
+        return events
+
+    def go_dark(self, now: float) -> None:
+        """Let the skin go and stop whatever moves."""
+        self._release(now, "DARK")
+
+    def busy(self, now: float) -> bool:
+        """Tell whether jaws or ring move."""
+        return self._move is not None or self._turning is not None
+
+    def status_bits(self, now: float) -> int:
+        """Return 16 moving, 32 homed, 256 stop open, 512 skin held, 1024 force limit met."""
+        bits = MOVING * self.busy(now) + HOMED * self.homed + INTERLOCK * self.interlock
+        return bits + ATTACHED * self.attached + TRIPPED * (self._barred is not None)
+
+    @property
+    def felt_n(self) -> float:
+        """What the sensor says since it was tared, N."""
+        return self._load.force_n + self._offset_n - self._zero_n
+
+    def _control(self, move: _Move, now: float) -> None:
+        """Drive the jaws on by one control period, and look at what they meet."""
+        driven_mm = move.driven_to_mm(now)
+        stop_mm, direction = move.stalls_at_mm, move.direction
+        stuck = stop_mm is not None and direction * (driven_mm - stop_mm) > 0.0
+        self.aperture_mm = stop_mm if stuck and stop_mm is not None else driven_mm
+        self._load.move(self.aperture_mm)
+        self._on_change(now)
+        move.ticks += 1
+        limit_n, force_n = self.limit_n or 0.0, self.felt_n
+        before_n, self._last_force_n = self._last_force_n, force_n
+        lost = abs(driven_mm - self.aperture_mm) > LAG_MM
+        if self._came_off(direction, before_n, force_n):
+            self.attached = False
+            self._load.release()
+            self._on_change(now)
+            self._end(move, "DETACHED", now)
+        elif math.isfinite(move.tripped_s):
+            if abs(force_n) >= limit_n and (lost or now > move.tripped_s + LET_GO_S):
+                self._release(now, "FORCE")
+            elif lost:
+                self._lose_steps(move, now)
+            elif now >= move.arrives_s:
+                self._end(move, "FORCE", now)
+        elif abs(force_n) >= limit_n:
+            self._turn_back(move, now)
+        elif lost:
+            self._lose_steps(move, now)
+        elif now >= move.arrives_s:
+            self._arrive(move, now)
+
+    def _came_off(self, direction: int, before_n: float, force_n: float) -> bool:
+        pulled = self.attached and direction > 0 and before_n >= COMES_OFF_FROM_N
+        return pulled and abs(force_n) <= COMES_OFF_SHARE * before_n
+
+    def _turn_back(self, move: _Move, now: float) -> None:
+        """Go back to where the jaws stood before: the force has met its limit."""
+        move.reading_mm, move.force_n, move.tripped_s = self.aperture_mm, self.felt_n, now
+        self._barred = (move.direction, self.aperture_mm)
+        self._say("CAL:FORC:TRIP", f"{self.aperture_mm:.3f},{move.force_n:.3f}", now)
+        move.to_mm, move.from_mm = move.from_mm, self.aperture_mm
+        move.start_s, move.ticks, move.stalls_at_mm = now, 0, None
+
+    def _lose_steps(self, move: _Move, now: float) -> None:
+        """End a move whose motor no longer follows: only the home mark tells where the jaws are."""
+        if move.homing:
+            self._end(move, "NOHOME", now)
+            return
+        self.homed = False
+        self._end(move, "STALL", now)
+
+    def _arrive(self, move: _Move, now: float) -> None:
+        self.homed = self.homed or move.homing
+        self._end(move, "REACHED", now)
+
+    def _end(self, move: _Move, how: str, now: float) -> None:
+        self._move = None
+        caliper = self._caliper
+        step = round((self.aperture_mm - caliper.aperture_mm) / caliper.step_mm)
+        reading_mm, force_n = self.aperture_mm, self.felt_n
+        if how == "FORCE":
+            reading_mm, force_n = move.reading_mm, move.force_n
+        clock_us = round((now - self._powered_at) * 1e6)
+        self.last_report = f"{move.number},{how},{step},{reading_mm:.3f},{force_n:.3f},{clock_us}"
+        self._events.append(("CAL:END", self.last_report))
+
+    def _say(self, name: str, payload: str, now: float) -> None:
+        self._events.append((name, f"{payload},{round((now - self._powered_at) * 1e6)}"))
+
+    def _release(self, now: float, why: str) -> None:
+        if self._move is not None:
+            self._end(self._move, "FORCE" if why == "FORCE" else "STOPPED", now)
+        self._turning = None
+        self._barred = None
+        if self.attached:
+            self.attached = False
+            self._say("CAL:FREE", why, now)
+        self._last_force_n = 0.0
+        self._load.release()
+        self._on_change(now)
+
+    # moves ------------------------------------------------------------------------------------
+
+    def _require_fit(self, now: float) -> None:
+        """Refuse to move with the stop open, a dead sensor, no limit, or on the move."""
+        if self.interlock:
+            raise Refused(Code.INTERLOCK)
+        if self._sensor_dead:
+            raise Refused(Code.HARDWARE, "the force sensor is dead")
+        if self.busy(now):
+            raise Refused(Code.IGNORED, "on the move")
+
+    def _require_limit(self) -> None:
+        if self.limit_n is None:
+            raise Refused(Code.IGNORED, "CAL:FORC:LIM first; there is no default")
+
+    def _require_free(self) -> None:
+        if self.attached:
+            raise Refused(Code.IGNORED, "skin is held; CAL:REL first")
+
+    def _begin(self, to_mm: float, now: float, *, homing: bool) -> str:
+        caliper = self._caliper
+        stalls_at_mm = None
+        if self._rng.random() < self._stall:
+            share = float(self._rng.random())
+            stalls_at_mm = self.aperture_mm + share * (to_mm - self.aperture_mm)
+        speed = caliper.speed_mm_per_s * (HOME_SPEED if homing else 1.0)
+        self.moves.append((now, to_mm))
+        self._move = _Move(
+            len(self.moves), homing, now, self.aperture_mm, to_mm, speed, stalls_at_mm
+        )
+        self._last_force_n = self.felt_n
+        return str(len(self.moves))
+
+    def _home(self, _: str, now: float) -> str:
+        self._require_fit(now)
+        self._require_limit()
+        self._require_free()
+        self.homed = False
+        home_mm = self._caliper.aperture_mm
+        answer = self._begin(home_mm, now, homing=True)
+        if self._home_missed and self._move is not None:
+            # on to the end of the travel, where the motor loses its steps
+            end_mm = self._ends_mm[0] if self.aperture_mm > home_mm else self._ends_mm[1]
+            beyond_mm = math.copysign(2.0 * LAG_MM, end_mm - home_mm)
+            self._move.to_mm, self._move.stalls_at_mm = end_mm + beyond_mm, end_mm
+        return answer
+
+    def _step(self, arguments: str, now: float) -> str:
+        if _STEP.fullmatch(arguments) is None:
+            raise Refused(Code.SYNTAX, "expected a whole number of steps")
+        step = int(arguments)
+        if not self.step_min <= step <= self.step_max:
+            raise Refused(Code.OUT_OF_RANGE, f"expected {self.step_min} to {self.step_max} steps")
+        self._require_fit(now)
+        self._require_limit()
+        if not self.homed:
+            raise Refused(Code.IGNORED, "CAL:HOME first")
+        to_mm = self._caliper.reading_mm(step)
+        if self._barred is not None:
+            direction, reading_mm = self._barred
+            if direction * (to_mm - reading_mm) >= 0.0:
+                raise Refused(Code.FORCE, f"the limit was met at {reading_mm:.3f} mm")
+        return self._begin(to_mm, now, homing=False)
+
+    def _position(self, _: str, now: float) -> str:
+        return f"{self.aperture_mm:.3f}" if self.homed else "NONE"
+
+    def _last(self, _: str, now: float) -> str:
+        return self.last_report or "NONE"
+
+    def _turn(self, arguments: str, now: float) -> str:
+        angle_deg = number(arguments, 0.0, 180.0, "degrees")
+        if angle_deg not in self._caliper.angles_deg:
+            known = ", ".join(f"{angle:g}" for angle in self._caliper.angles_deg)
+            raise Refused(Code.OUT_OF_RANGE, f"expected one of {known} degrees")
+        self._require_fit(now)
+        self._require_free()
+        turns_s = abs(angle_deg - self.angle_deg) / TURN_DEG_PER_S
+        self._turning = (now + turns_s, angle_deg)
+        self.advance(now)
+        return ""
+
+    def _get_angle(self, _: str, now: float) -> str:
+        return f"{self.angle_deg if self._turning is None else self._turning[1]:g}"
+
+    # skin -------------------------------------------------------------------------------------
+
+    def _attach(self, _: str, now: float) -> str:
+        self._require_fit(now)
+        self._require_free()
+        home_mm = self._caliper.aperture_mm
+        if not self.homed or abs(self.aperture_mm - home_mm) > 1e-6:
+            raise Refused(Code.IGNORED, "CAL:HOME, or step 0, first")
+        self._zero_n = self._load.force_n + self._offset_n
+        self._load.attach(self.angle_deg)
+        self.attached = True
+        self._barred = None
+        self._on_change(now)
+        return ""
+
+    def _is_attached(self, _: str, now: float) -> str:
+        return str(int(self.attached))
+
+    def _let_go(self, _: str, now: float) -> str:
+        self._release(now, "ASKED")
+        return ""
+
+    def _get_force(self, _: str, now: float) -> str:
+        if self._sensor_dead:
+            raise Refused(Code.HARDWARE, "the force sensor is dead")
+        return f"{self.felt_n:.3f}"
+
+    def _set_limit(self, arguments: str, now: float) -> str:
+        limit_n = number(arguments, *FORCE_LIMIT_N, "N")
+        if abs(self.felt_n) >= limit_n:
+            raise Refused(Code.FORCE, f"there are {self.felt_n:.3f} N now; CAL:REL first")
+        self.limit_n = limit_n
+        self._barred = None
+        return ""
+
+    def _get_limit(self, _: str, now: float) -> str:
+        return "NONE" if self.limit_n is None else f"{self.limit_n:g}"
