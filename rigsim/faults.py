@@ -27,6 +27,7 @@ _PROBABILITIES = (
     "babble",
     "brownout",
     "misfire",
+    "jaw_stall",
     "stale",
     "drop_frame",
     "wrong_camera",
@@ -41,6 +42,7 @@ _TIMES = (
     "replug_after",
     "stall_after",
     "stall_s",
+    "interlock_after",
 )
 
 
@@ -105,15 +107,25 @@ class Faults:
     heat: float = 0.0
     """How hot lamps' and LEDs' drivers are at power-up, 0 to 1; the flash's trips at 0.8."""
     led_dead: str = ""
-    """Numbers of LEDs of the dome that draw no current, joined by +."""
+    """Numbers of LEDs that draw no current, joined by +."""
     led_weak: str = ""
-    """LEDs of the dome that give less light than they are driven for: number=share, joined by +."""
+    """LEDs that give less light than they are driven for: number=share, joined by +."""
     misfire: float = 0.0
     """Probability that the tube does not ignite."""
     slow_charge: float = 1.0
     """How many times longer the capacitor takes."""
     interlock: bool = False
     """The emergency-stop line is open."""
+    interlock_after: float = math.inf
+    """The emergency stop of a caliper is opened so long after power-up, s."""
+    jaw_stall: float = 0.0
+    """Probability that the motor of a caliper stalls in a move."""
+    home_missed: bool = False
+    """The home mark of a caliper is never seen."""
+    force_dead: bool = False
+    """The force sensor of a caliper draws no current."""
+    skin_stiff: float = 1.0
+    """How many times stiffer than usual the skin between a caliper's jaws is."""
     stale: float = 0.0
     """Probability that a camera hands out its previous frame first."""
     drop_frame: float = 0.0
@@ -140,6 +152,8 @@ class Faults:
             raise ValueError(f"heat: got {self.heat}, expected 0 <= heat < 1")
         if not 0.0 < self.slow_charge < math.inf:
             raise ValueError(f"slow_charge: got {self.slow_charge}, expected more than 0")
+        if not 0.0 < self.skin_stiff < math.inf:
+            raise ValueError(f"skin_stiff: got {self.skin_stiff}, expected more than 0")
         if not abs(self.drift_ppm) < 1e5:
             raise ValueError(f"drift_ppm: got {self.drift_ppm}, expected less than 1e5")
         if not all(0.0 <= share <= 1.0 for share in self.weak_leds.values()):
@@ -243,7 +257,12 @@ CATALOGUE: tuple[FaultKind, ...] = (
         "refused -240 or 102, dead LEDs named; weak ones are left to calibration",
     ),
     FaultKind(16, "flash not charged, or misfire", ("slow_charge", "misfire"), "-213 or -240"),
-    FaultKind(17, "stepper stalls, home missed, force trip", (), "no such box yet"),
+    FaultKind(
+        17,
+        "stepper stalls, home missed, force trip, force sensor dead, stop opened",
+        ("jaw_stall", "home_missed", "skin_stiff", "force_dead", "interlock_after"),
+        "the move ends and says why, or is refused 106, 107 or -240; no force beyond its limit",
+    ),
     FaultKind(18, "pump leaks, shutter stuck", (), "no such box yet"),
     FaultKind(
         19,

@@ -16,7 +16,7 @@ import zlib
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,22 +24,48 @@ from numpy.typing import NDArray
 from capture.devices.camera import Exposure
 from capture.rig import LedLimits, Rig, View, load_rig
 
+from .boxes.caliper import CaliperUnit
 from .boxes.controller import Controller, Device
 from .boxes.dome import DomeUnit, LedPulse
 from .boxes.flash import FlashPop, FlashUnit
+from .boxes.gradient_sphere import GradientSphereUnit, PatternLight
 from .faults import NO_FAULTS, Faults
 from .link import Link
+from .taped_skin import GripState, TapedSkin
 
 if TYPE_CHECKING:
     from .camera import CameraBody
 
-__all__ = ["FlashPop", "LedPulse", "Light", "Scene", "World", "WorldClock", "get"]
+__all__ = [
+    "CaliperScene",
+    "FlashPop",
+    "GripState",
+    "LedPulse",
+    "Light",
+    "PatternLight",
+    "Scene",
+    "World",
+    "WorldClock",
+    "get",
+]
 
-SERIAL_NUMBERS = {"flash": "FL-0001", "dome": "DM-0001"}
+SERIAL_NUMBERS = {
+    "flash": "FL-0001",
+    "dome": "DM-0001",
+    "gradient_sphere": "GS-0001",
+    "caliper": "CA-0001",
+}
+RIG_OF_BOX = {
+    "flash": "flash",
+    "dome": "dome",
+    "gradient_sphere": "gradient",
+    "caliper": "gradient",
+}
+"""Which rig that ships has a box."""
 TRANSCRIPT_LINES = 4096
 
-Light = FlashPop | LedPulse
-"""Light that came out of a box: a pop of the flash, or a stretch of one LED's light."""
+Light = FlashPop | LedPulse | PatternLight
+"""Light that came out of a box: a pop of the flash, or a stretch of an LED's or a pattern's."""
 
 
 class Scene(Protocol):
@@ -50,9 +76,24 @@ class Scene(Protocol):
     ) -> NDArray[np.uint16]:
         """Return the DN, shape (H, W), of one exposure lit by `pops`.
 
-        They are what the rig's box gives: `FlashPop` of the flash, or `LedPulse` of the dome,
-        clipped to the time in which the shutter was open.
+        They are what the rig's box gives: `FlashPop` of the flash, `LedPulse` of the dome, or
+        `PatternLight` of the gradient sphere, clipped to the time in which the shutter was open.
         """
+
+
+class CaliperScene(Protocol):
+    """What is in front of the cameras of a rig with a caliper."""
+
+    def exposure(
+        self,
+        view_name: str,
+        *,
+        pops: Sequence[Any],
+        exposure_s: float,
+        seed: int,
+        grip: GripState,
+    ) -> NDArray[np.uint16]:
+        """Return the DN, shape (H, W), of one exposure, see `Scene`; of skin held by `grip`."""
 
 
 class WorldClock:
@@ -94,6 +135,12 @@ class World:
         All pops so far.
     pulses : list of LedPulse
         All light of LEDs that has ended, in the order in which it did.
+    patterns : list of PatternLight
+        The same of the patterns of a gradient sphere.
+    grips : list of (float, GripState)
+        What the caliper has held, from each world time in s on; empty where the rig has none.
+    skin : TapedSkin or None
+        What the caliper acts upon; None where the rig has none.
     """
 
     def __init__(
@@ -102,7 +149,7 @@ class World:
         *,
         seed: int = 0,
         clock: Literal["virtual", "real"] = "virtual",
-        scene: Scene | None = None,
+        scene: Scene | CaliperScene | None = None,
         faults: Faults | None = None,
     ) -> None:
         if clock not in ("virtual", "real"):
@@ -114,6 +161,13 @@ class World:
         self.faults = NO_FAULTS if faults is None else faults
         self.pops: list[FlashPop] = []
         self.pulses: list[LedPulse] = []
+        self.patterns: list[PatternLight] = []
+        self.grips: list[tuple[float, GripState]] = []
+        self.skin: TapedSkin | None = None
+        if self.rig.caliper is not None:
+            stiffness = self.faults.skin_stiff
+            self.skin = TapedSkin(self.rig.caliper, seed=seed, stiffness=stiffness)
+            self._note_grip(0.0)
         self.clock = WorldClock(self)
         self.transcript: deque[str] = deque(maxlen=TRANSCRIPT_LINES)
         self.lock = threading.RLock()
@@ -123,10 +177,16 @@ class World:
         self._name = ""
         self._cameras: dict[str, CameraBody] = {}
         self._dome: DomeUnit | None = None
+        self._sphere: GradientSphereUnit | None = None
         self._links = {name: self._make_box(name) for name in self.rig.boxes}
 
     def _make_box(self, name: str) -> Link:
-        kinds = {"flash": self._make_flash, "dome": self._make_dome}
+        kinds = {
+            "flash": self._make_flash,
+            "dome": self._make_dome,
+            "gradient_sphere": self._make_sphere,
+            "caliper": self._make_caliper,
+        }
         if name not in kinds:
             raise ValueError(f"boxes: got {name!r}, expected one of {', '.join(kinds)}")
         rng = self.rng_for("box", name)
@@ -168,6 +228,38 @@ class World:
             interlock=self.faults.interlock,
         )
         return self._dome
+
+    def _make_sphere(self, rng: np.random.Generator) -> Device:
+        self._sphere = GradientSphereUnit(
+            self.rig.lights,
+            self.rig.leds or LedLimits(),
+            cameras=len(self.rig.views),
+            move_s=self.rig.polarizer_move_s,
+            on_pattern=self.patterns.append,
+            on_trigger=self._trigger,
+            dead=self.faults.dead_leds,
+            weak=self.faults.weak_leds,
+            heat=self.faults.heat,
+            interlock=self.faults.interlock,
+        )
+        return self._sphere
+
+    def _make_caliper(self, rng: np.random.Generator) -> Device:
+        if self.rig.caliper is None or self.skin is None:
+            raise ValueError(
+                f"caliper: got none in rig {self.rig.name!r}, expected its description"
+            )
+        return CaliperUnit(
+            self.rig.caliper,
+            self.skin,
+            on_change=self._note_grip,
+            stall=self.faults.jaw_stall,
+            home_missed=self.faults.home_missed,
+            sensor_dead=self.faults.force_dead,
+            interlock=self.faults.interlock,
+            interlock_after=self.faults.interlock_after,
+            rng=rng,
+        )
 
     def rng_for(self, *names: str) -> np.random.Generator:
         """Return a generator that depends on the world's seed and on `names` only."""
@@ -249,26 +341,40 @@ class World:
     def light_between(self, start: float, end: float) -> tuple[Light, ...]:
         """Return pops from `start` to `end`, both included, and LEDs' light clipped to them."""
         with self.lock:
-            return self.pops_between(start, end) + self._pulses_between(start, end)
-
-    def _pulses_between(self, start: float, end: float) -> tuple[Light, ...]:
-        # light is kept in the order in which it ended
-        first = bisect_right(self.pulses, start, key=lambda pulse: pulse.t_off_s)
-        found = self.pulses[first:]
-        if self._dome is not None:
-            found += self._dome.light_now(self.now)
-        return tuple(
-            dataclasses.replace(
-                pulse, t_on_s=max(pulse.t_on_s, start), t_off_s=min(pulse.t_off_s, end)
+            now = self.now
+            pulses = [] if self._dome is None else self._dome.light_now(now)
+            patterns = [] if self._sphere is None else self._sphere.light_now(now)
+            return (
+                *self.pops_between(start, end),
+                *_clipped(self.pulses, pulses, start, end),
+                *_clipped(self.patterns, patterns, start, end),
             )
-            for pulse in found
-            if pulse.t_on_s < end and pulse.t_off_s > start
-        )
 
     def pops_between(self, start: float, end: float) -> tuple[FlashPop, ...]:
         """Return the pops from `start` to `end`, both included, in s."""
         with self.lock:
             return tuple(pop for pop in self.pops if start <= pop.t_s <= end)
+
+    def grip_at(self, t_s: float) -> GripState:
+        """Return what the caliper held at a world time, s.
+
+        Raises
+        ------
+        ValueError
+            Where the rig has no caliper.
+        """
+        with self.lock:
+            if not self.grips:
+                raise ValueError(f"caliper: rig {self.rig.name!r} has none")
+            first = bisect_right(self.grips, t_s, key=lambda entry: entry[0])
+            return self.grips[max(first - 1, 0)][1]
+
+    def _note_grip(self, now: float) -> None:
+        if self.skin is not None and (state := self.skin.state) != self._last_grip():
+            self.grips.append((now, state))
+
+    def _last_grip(self) -> GripState | None:
+        return self.grips[-1][1] if self.grips else None
 
     def expose(
         self,
@@ -296,10 +402,15 @@ class World:
         """
         end = t_start + exposure.exposure_s
         seen = self.light_between(t_start, end) if pops is None else tuple(pops)
-        scene = self.scene
-        if scene is None:
+        if self.scene is None:
             return _dark_frame(self.rig.view(view_name), np.random.default_rng(seed))
-        return scene.exposure(view_name, pops=seen, exposure_s=exposure.exposure_s, seed=seed)
+        exposure_s = exposure.exposure_s
+        if self.rig.caliper is not None:
+            held = cast(CaliperScene, self.scene)
+            grip = self.grip_at(t_start)
+            return held.exposure(view_name, pops=seen, exposure_s=exposure_s, seed=seed, grip=grip)
+        scene = cast(Scene, self.scene)
+        return scene.exposure(view_name, pops=seen, exposure_s=exposure_s, seed=seed)
 
     # names ------------------------------------------------------------------------------------
 
@@ -333,6 +444,21 @@ def get(name: str) -> World:
         known = ", ".join(_BENCH) or "none"
         raise KeyError(f"world: got {name!r}, expected a registered one: {known}")
     return _BENCH[name]
+
+
+_Switched = TypeVar("_Switched", bound=LedPulse | PatternLight)
+
+
+def _clipped(
+    ended: Sequence[_Switched], going_on: Sequence[_Switched], start: float, end: float
+) -> list[_Switched]:
+    """Return light, in the order in which it ended, clipped to what lies from start to end."""
+    first = bisect_right(ended, start, key=lambda light: light.t_off_s)
+    return [
+        dataclasses.replace(light, t_on_s=max(light.t_on_s, start), t_off_s=min(light.t_off_s, end))
+        for light in [*ended[first:], *going_on]
+        if light.t_on_s < end and light.t_off_s > start
+    ]
 
 
 def _dark_frame(view: View, rng: np.random.Generator) -> NDArray[np.uint16]:

@@ -20,6 +20,7 @@ from .led_box import LEVEL_STEPS, Eyes, Judgment, LedBox, LedStatus, Position
 from .port import PortTimeout
 
 __all__ = [
+    "READINGS_DEG",
     "Eyes",
     "GradientSphereBox",
     "Judgment",

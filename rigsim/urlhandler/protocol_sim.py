@@ -28,7 +28,7 @@ from capture.rig import load_rig
 from rigsim import world as worlds
 from rigsim.faults import Faults
 from rigsim.link import Link, LinkStalled, Unplugged
-from rigsim.world import SERIAL_NUMBERS, World
+from rigsim.world import RIG_OF_BOX, World
 
 __all__ = ["Serial", "world_of_url"]
 
@@ -64,7 +64,7 @@ def world_of_url(url: str) -> tuple[World, str]:
         faults = Faults.from_text(settings)
     except ValueError as exc:
         raise ValueError(f"{url}: {exc}") from exc
-    rig = load_rig(box if box in SERIAL_NUMBERS else "flash")
+    rig = load_rig(RIG_OF_BOX.get(box, "flash"))
     made = World(rig, seed=int(seed), clock="real" if clock == "real" else "virtual", faults=faults)
     _with_box(made, box, url).register(name)
     return made, box

@@ -1,0 +1,347 @@
+"""The gradient sphere's box: patterns of light of all LEDs, and a turning analyser; sans-I/O.
+
+Its manual is its command table (`GradientSphereUnit.commands`) and these rules. A pattern is a
+light of all LEDs at once: full, or weighted by (1 + w) / 2 or (1 - w) / 2 with w a coordinate of
+the unit way to the LED. ``PATT`` carries its own end. A scan is a table of patterns with readings
+of the analyser, see `rigsim.boxes.led_sequencer`: the box steps by itself; where a row asks for
+another reading than the row before, the light goes out, the analyser turns, and only then the
+row's light comes on. Outside of scans, light while the analyser turns and turning in the light are
+refused (-213). Gains make every LED give a share of what the pattern asks of it. LEDs that draw no
+current are reported as ``LED:FAIL``; that others give less light than they are driven for, the box
+does not notice.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from capture.devices.wire import Code
+from capture.rig import LedLimits, Light
+
+from .controller import Command, Refused, choice, number
+from .eye_guard import Lit
+from .led_sequencer import LED_MS, LedSequencer, Run, whole
+from .led_table import LEVEL_STEPS, Switch, table_crc
+from .pattern_table import (
+    ANALYSER_DEG,
+    PatternRow,
+    parse_patterns,
+    pattern_name,
+    pattern_shares,
+    schedule,
+    starts,
+)
+
+__all__ = ["GradientSphereUnit", "PatternLight"]
+
+DEFAULT_MS = 100.0
+TURNING = 1024
+_GAINS = re.compile(r"[0-9]{1,4}(\+[0-9]{1,4})*")
+
+
+@dataclass(frozen=True, slots=True)
+class PatternLight:
+    """Light of one pattern from one switching to the next."""
+
+    pattern: str
+    """full, x, y, z, -x, -y or -z."""
+    level: float
+    """Light that all LEDs were driven for, relative to full, 0 to 1."""
+    t_on_s: float
+    """World time when it came on, s."""
+    t_off_s: float
+    """World time when it went off, s."""
+    analyser_deg: float
+    """Reading of the analyser meanwhile, degrees; 0 parallel, 90 crossed."""
+    led_shares: tuple[float, ...] = ()
+    """What each LED gave of what the pattern at this level asks of it: its gain, times its health
+    (0 when dead, less than 1 when weak); empty: 1 for all."""
+
+
+class GradientSphereUnit(LedSequencer[PatternRow]):
+    """State of the gradient sphere's box behind its controller.
+
+    Parameters
+    ----------
+    lights, limits
+        Its LEDs, and what they may do.
+    cameras
+        How many cameras hang on it.
+    move_s
+        Time the analyser takes for 90 degrees, s.
+    on_pattern
+        Called with each stretch of light when it has ended.
+    on_trigger
+        Called with the world time in s and the mask of each release of cameras.
+    dead, weak, heat, interlock
+        See `rigsim.faults.Faults`; dead and weak LEDs by number.
+    """
+
+    kind = "gradient_sphere"
+    model = "SPHERE1"
+
+    def __init__(
+        self,
+        lights: Sequence[Light],
+        limits: LedLimits,
+        *,
+        cameras: int,
+        move_s: float,
+        on_pattern: Callable[[PatternLight], None],
+        on_trigger: Callable[[float, int], None],
+        dead: frozenset[int] = frozenset(),
+        weak: Mapping[int, float] | None = None,
+        heat: float = 0.0,
+        interlock: bool = False,
+    ) -> None:
+        self._on_pattern = on_pattern
+        self._s_per_deg = move_s / 90.0
+        self._shares = pattern_shares(lights)
+        health = np.ones(len(lights))
+        for led, share in (weak or {}).items():
+            health[led] = share
+        health[list(dead)] = 0.0
+        self._health = health
+        self._shining: PatternLight | None = None  # what is on; its end is not known yet
+        self.analyser_deg = 0.0
+        self._settled_at = 0.0
+        super().__init__(
+            lights,
+            limits,
+            cameras=cameras,
+            on_light=self._ended,
+            on_trigger=on_trigger,
+            dead=dead,
+            weak=weak,
+            heat=heat,
+            interlock=interlock,
+        )
+        self.reset(0.0, power_up=True)
+
+    def reset(self, now: float, *, power_up: bool) -> None:
+        """Return to the settings of power-up; the analyser turns to parallel."""
+        super().reset(now, power_up=power_up)
+        self.gains = [LEVEL_STEPS] * self.bank.count
+        self._gains_sent: list[int] = []
+        self._failed: set[int] = set()
+        self._turn(0.0, now)
+
+    def capabilities(self) -> Mapping[str, Any]:
+        """Return limits and counts, units in the names."""
+        return {
+            **super().capabilities(),
+            "analyser_min_deg": ANALYSER_DEG[0],
+            "analyser_max_deg": ANALYSER_DEG[1],
+            "move_s_per_deg": round(self._s_per_deg, 9),
+        }
+
+    def commands(self) -> Mapping[str, Command]:
+        """Return the command table: the manual of the box."""
+        return {
+            **super().commands(),
+            "SEQ:DEF": Command(
+                self._define_rows,
+                "<first>,<pattern>:<deg>:<level>:<us>:<mask>;...",
+                manual="rows from number first: pattern, analyser, thousandths, us, hex cameras",
+            ),
+            "PATT": Command(
+                self._light,
+                "<pattern>[,<ms>[,<level>]]",
+                armed=True,
+                manual="FULL, X, Y, Z, -X, -Y, -Z for 1 to 500 ms (100), thousandths (1000); DARK",
+            ),
+            "PATT?": Command(self._lit_now, manual="pattern that is on, DARK for none"),
+            "POL": Command(self._set_stop, "0|90", manual="turn the analyser to a stop"),
+            "POL:ANG": Command(
+                self._set_angle, "<deg>", manual="turn the analyser to a reading, 0 to 180 degrees"
+            ),
+            "POL?": Command(self._get_angle, manual="reading aimed at, degrees"),
+            "GAIN:CLE": Command(self._clear_gains, manual="all gains 1000"),
+            "GAIN:DEF": Command(
+                self._define_gains,
+                "<first>,<gain>+<gain>...",
+                manual="gains of LEDs from number first on, thousandths",
+            ),
+            "GAIN:CRC?": Command(self._gains_checksum, manual="gains sent, and their checksum"),
+        }
+
+    # analyser ---------------------------------------------------------------------------------
+
+    def turning(self, now: float) -> bool:
+        """Tell whether the analyser turns."""
+        return now < self._settled_at
+
+    def busy(self, now: float) -> bool:
+        """Tell whether a scan is stepping or the analyser turns."""
+        return super().busy(now) or self.turning(now)
+
+    def status_bits(self, now: float) -> int:
+        """Return those of all boxes with LEDs, and 1024 turning."""
+        return super().status_bits(now) | TURNING * self.turning(now)
+
+    def _turn(self, reading_deg: float, now: float) -> None:
+        start = max(now, self._settled_at)
+        self._settled_at = start + abs(reading_deg - self.analyser_deg) * self._s_per_deg
+        self.analyser_deg = reading_deg
+
+    def _set_stop(self, arguments: str, now: float) -> str:
+        return self._set_angle(choice(arguments, ("0", "90")), now)
+
+    def _set_angle(self, arguments: str, now: float) -> str:
+        reading_deg = round(number(arguments, *ANALYSER_DEG, "degrees"), 3)
+        self._require_still()
+        if self.lit:
+            raise Refused(Code.IGNORED, "a light is on; PATT DARK first")
+        self._sequence_armed = False
+        self._turn(reading_deg, now)
+        return ""
+
+    def _get_angle(self, _: str, now: float) -> str:
+        return f"{self.analyser_deg:.3f}"
+
+    def _require_settled(self, now: float) -> None:
+        if self.turning(now):
+            wait_ms = (self._settled_at - now) * 1e3
+            raise Refused(Code.IGNORED, f"analyser turning, {wait_ms:.0f} ms")
+
+    # light ------------------------------------------------------------------------------------
+
+    def light_now(self, now: float) -> list[PatternLight]:
+        """Return the light that is going on, as given so far."""
+        shining = self._shining
+        if shining is None or not self.lit:
+            return []
+        return [self._until(shining, max(now, shining.t_on_s))]
+
+    def _until(self, light: PatternLight, t_off_s: float) -> PatternLight:
+        return PatternLight(
+            light.pattern,
+            light.level,
+            light.t_on_s,
+            t_off_s,
+            light.analyser_deg,
+            light.led_shares,
+        )
+
+    def _ended(self, lit: Lit) -> None:
+        """Pass on a pattern when the first of its LEDs goes out: all of them do at once."""
+        shining, self._shining = self._shining, None
+        if shining is not None:
+            self._on_pattern(self._until(shining, lit.off_s))
+
+    def _levels(self, pattern: str, level: float) -> list[float]:
+        """Return what each LED is driven for."""
+        gains = np.array(self.gains) / LEVEL_STEPS
+        driven: list[float] = (level * gains * self._shares[pattern]).tolist()
+        return driven
+
+    def _shine(self, pattern: str, level: float, now: float, *, end_s: float = math.inf) -> None:
+        """Replace what is on by a pattern."""
+        self.bank.all_off(now)
+        if pattern == "dark":
+            return
+        for led, driven in enumerate(self._levels(pattern, level)):
+            if not self.bank.switch_on(led, driven, now, end_s=end_s) and led not in self._failed:
+                self._failed.add(led)
+                self._events.append(("LED:FAIL", str(led)))
+        shares = np.array(self.gains) / LEVEL_STEPS * self._health
+        given = () if (shares == 1.0).all() else tuple(shares.tolist())
+        self._shining = PatternLight(pattern, level, now, now, self.analyser_deg, given)
+
+    def _wanted(self, pattern: str, level: float, on_s: float, off_s: float) -> list[Lit]:
+        levels = self._levels(pattern, level)
+        return [Lit(led, driven, on_s, off_s) for led, driven in enumerate(levels) if driven > 0.0]
+
+    def _light(self, arguments: str, now: float) -> str:
+        self._require_still()
+        name, *more = arguments.split(",")
+        if len(more) > 2:
+            raise Refused(Code.SYNTAX, "expected PATTERN,MS,LEVEL")
+        pattern = pattern_name(name)
+        if pattern == "dark":
+            if more:
+                raise Refused(Code.SYNTAX, "expected DARK")
+            self.bank.all_off(now)
+            return ""
+        longest_ms = min(LED_MS[1], self._limits.max_on_s * 1e3)
+        span_ms = number(more[0], LED_MS[0], longest_ms, "ms") if more else DEFAULT_MS
+        level = whole(more[1], 1, LEVEL_STEPS) / LEVEL_STEPS if len(more) > 1 else 1.0
+        self._require_closed_stop()
+        self._require_settled(now)
+        end_s = now + span_ms / 1e3
+        wanted = self._wanted(pattern, level, now, end_s)
+        self.bank.require(wanted, now)
+        self._require_calm(wanted, now)
+        self._sequence_armed = False
+        self._failed = set()
+        self._shine(pattern, level, now, end_s=end_s)
+        return ""
+
+    def _lit_now(self, _: str, now: float) -> str:
+        shining = self._shining
+        return shining.pattern.upper() if self.lit and shining is not None else "DARK"
+
+    # scans ------------------------------------------------------------------------------------
+
+    def _parse_rows(self, text: str) -> list[PatternRow]:
+        return parse_patterns(text, cameras=self._cameras, most_us=self._row_max_us)
+
+    def _lit_by(self, rows: Sequence[PatternRow], now: float) -> list[Lit]:
+        self._require_settled(now)
+        times = starts(rows, reading_deg=self.analyser_deg, s_per_deg=self._s_per_deg)
+        found: list[Lit] = []
+        for row, (_, lit_s) in zip(rows, times, strict=True):
+            start_s = now + lit_s
+            found += self._wanted(row.pattern, row.level, start_s, start_s + row.dwell_us * 1e-6)
+        return found
+
+    def _schedule(self, rows: Sequence[PatternRow]) -> list[Switch]:
+        self._failed = set()
+        return schedule(
+            rows,
+            reading_deg=self.analyser_deg,
+            s_per_deg=self._s_per_deg,
+            settle_s=self._limits.settle_s,
+        )
+
+    def _switch_light(self, run: Run[PatternRow], switch: Switch, now: float) -> None:
+        row = run.rows[switch.row]
+        if switch.what == "rotate":
+            self.bank.all_off(now)
+            self._turn(row.analyser_deg, now)
+        else:
+            self._shine(row.pattern, row.level, now)
+
+    # gains ------------------------------------------------------------------------------------
+
+    def _clear_gains(self, _: str, now: float) -> str:
+        self._require_still()
+        self.gains = [LEVEL_STEPS] * self.bank.count
+        self._gains_sent = []
+        self._sequence_armed = False
+        return ""
+
+    def _define_gains(self, arguments: str, now: float) -> str:
+        self._require_still()
+        first_text, _, rest = arguments.partition(",")
+        if _GAINS.fullmatch(rest) is None:
+            raise Refused(Code.SYNTAX, "expected FIRST,GAIN+GAIN...")
+        first = whole(first_text, 0, len(self._gains_sent))
+        gains = [int(part) for part in rest.split("+")]
+        if first + len(gains) > self.bank.count or max(gains) > LEVEL_STEPS:
+            raise Refused(
+                Code.OUT_OF_RANGE, f"expected 0 to {LEVEL_STEPS} for {self.bank.count} LEDs"
+            )
+        self._gains_sent[first : first + len(gains)] = gains
+        self.gains[first : first + len(gains)] = gains
+        self._sequence_armed = False
+        return ""
+
+    def _gains_checksum(self, _: str, now: float) -> str:
+        return f"{len(self._gains_sent)},{table_crc(self._gains_sent)}"
