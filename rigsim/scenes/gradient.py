@@ -1,0 +1,596 @@
+"""The gradient rig: a patch of skin in a caliper, or a target, lit by patterns of polarized LEDs.
+
+Every state of the skin is pictured once, as Stokes vectors of the light's four moments after the
+lens; patterns and positions of the analyser are sums of these twelve images.
+
+The unit of light is fixed by the rig alone: a perfect white diffuser in the patch's place that
+faces the camera gives `METER_RATE_PER_S` full scales per second under all LEDs at level 1, behind
+the parallel analyser as behind the crossed one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import Final, Literal, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Rig, RigError
+from model.skin import SkinAppearance
+from rigsim import shading
+from rigsim.films import Films, films_of
+from rigsim.lens_blur import Lens, blur, lens_of
+from rigsim.lobe_moments import Surface, build_table
+from rigsim.mesh import Float32Array
+from rigsim.microrelief import BAND_NM, MicroSkin
+from rigsim.patch_motion import PatchMotion, Pose
+from rigsim.pigment import MELANIN_PRESETS
+from rigsim.scenes.gradient_patch import (
+    SHADOW_MARGIN_PX,
+    Grip,
+    Lighting,
+    PatchSurface,
+    sample_grid,
+    stand,
+)
+from rigsim.scenes.skin_glow import SIGMAS_MM
+from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.skin_layers import ETA
+from rigsim.skin_stretch import StretchedSkin, deform
+from rigsim.skin_table import SkinTable
+from rigsim.sphere_build import PATTERN_WEIGHTS, BuiltSphere, as_drawn
+
+FloatArray = NDArray[np.float64]
+TargetName: TypeAlias = Literal["flat", "dark"]
+
+METER_RATE_PER_S: Final = 60.0
+"""Full scales per second of white under all LEDs at level 1: in 30 ms pale skin gets 0.5 to 0.7 of
+full scale."""
+
+POWER_DEVIATION: Final = 0.001
+"""Relative standard deviation of the LEDs' common energy from pattern to pattern."""
+
+BLOOD: Final = 0.035
+"""Volume fraction of blood that decides how far light spreads in the patch."""
+
+DRIFT_MARGIN_PX: Final = 8
+"""Pixels around the picture that may drift into it."""
+
+KEPT_BYTES: Final = 2**29
+"""Pictures of states that are kept; one at least."""
+
+
+KEPT_RELIEFS: Final = 4
+"""Stretched patches that are kept."""
+
+
+class SceneError(ValueError):
+    """A scene is asked for something that it does not hold."""
+
+
+class Pattern(Protocol):
+    """A stretch of light, see `rigsim.boxes.gradient_sphere.PatternLight`."""
+
+    @property
+    def pattern(self) -> str:
+        """One of `rigsim.sphere_build.PATTERN_WEIGHTS`."""
+
+    @property
+    def level(self) -> float:
+        """Fraction of full power, 0 to 1."""
+
+    @property
+    def t_on_s(self) -> float:
+        """World time at which it went on, s."""
+
+    @property
+    def t_off_s(self) -> float:
+        """World time at which it went off, s."""
+
+    @property
+    def analyser_deg(self) -> float:
+        """Reading of the analyser's rotator, degrees."""
+
+
+class GradientScene:
+    """One patch of skin or one target in the gradient rig.
+
+    Parameters
+    ----------
+    rig
+        The drawing.
+    subject
+        A patch of skin, or "flat" (a white diffuser in the patch's place) or "dark" (a cap on the
+        lens).
+    compensation
+        How stretched skin narrows, see `rigsim.skin_stretch.deform`.
+    films
+        The polarizing films; None takes the rig's own, which its serial numbers decide.
+    sphere
+        The LEDs as they stand; None: as drawn.
+    motion
+        How the patch moves; None holds it still.
+    sensor
+        The camera's sensor; None takes what the rig states.
+    seed
+        Seeds what differs from exposure to exposure.
+    shadows
+        Whether the relief hides LEDs from itself.
+    optics
+        Whether lens and pixels blur; without, every pixel is the mean of its samples.
+    sectors
+        Directions in which horizons are found, a multiple of 4.
+    subpixels
+        Samples along each side of a pixel.
+    table_size
+        Nodes of the table of moments along each axis of the normals; None chooses by roughness.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        subject: MicroSkin | TargetName,
+        *,
+        compensation: Literal["volume", "none"] | float = "volume",
+        films: Films | None = None,
+        sphere: BuiltSphere | None = None,
+        motion: PatchMotion | None = None,
+        sensor: Sensor | None = None,
+        seed: int = 0,
+        shadows: bool = True,
+        optics: bool = True,
+        sectors: int = 32,
+        subpixels: int = 1,
+        table_size: int | None = None,
+    ) -> None:
+        if len(rig.views) != 1:
+            raise SceneError(f"views: got {len(rig.views)}, expected 1")
+        if isinstance(subject, str) and subject not in ("flat", "dark"):
+            raise SceneError(f"subject: got {subject!r}, expected flat, dark or skin")
+        if subpixels < 1:
+            raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
+        if sectors < 4 or sectors % 4:
+            raise SceneError(f"sectors: got {sectors}, expected a multiple of 4")
+        self.rig, self.subject, self.compensation = rig, subject, compensation
+        self.films = films_of(rig) if films is None else films
+        self.sphere = as_drawn(rig) if sphere is None else sphere
+        self.motion, self.seed = motion, seed
+        self.shadows, self.optics = shadows, optics
+        self.sectors, self.subpixels, self.table_size = sectors, subpixels, table_size
+        self._view = rig.views[0]
+        self._sensor = sensor_of(self._view) if sensor is None else sensor
+        self._lighting: Lighting | None = None
+        self._unit = METER_RATE_PER_S / _white_radiance(rig)
+        self._pictures: OrderedDict[tuple[object, ...], Float32Array] = OrderedDict()
+        self._reliefs: OrderedDict[tuple[float, float], StretchedSkin] = OrderedDict()
+        self._frames: dict[tuple[float, int], tuple[Float32Array, Float32Array]] = {}
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """What this scene does not build, with the reason."""
+        out = [
+            ("aberrations of the lens", "a macro lens at f/16 is near diffraction's limit"),
+            ("ambient light", "the room is dark"),
+            ("light from the sphere's frame and between its LEDs", "they are black"),
+        ]
+        if isinstance(self.subject, MicroSkin):
+            out += [
+                ("light from furrow to furrow", "0.3 % of the reflection; diffuse not measured"),
+                ("shadows of the caliper's jaws", "they are thin"),
+                ("hidden views", "the camera looks down within 1.2 degrees of the vertical"),
+                ("polarized single scattering", "light from inside is taken as depolarized"),
+                ("a lateral kernel that varies over the patch", "one, of its mean pigment"),
+                ("blur by movement within an exposure", "30 ms move less than 0.1 um"),
+            ]
+            if not self.shadows:
+                out.append(("shadows of the relief on itself", "shadows=False asks for it"))
+            if self.motion is None:
+                out.append(("movement of the patch", "motion=None asks for it"))
+        if not self.optics:
+            out.append(("diffraction and defocus", "optics=False asks for it"))
+        return out
+
+    @property
+    def lens(self) -> Lens:
+        """Return the camera's lens."""
+        return lens_of(self._view, self.rig.lights[0].illuminant)
+
+    def sensor(self, view_name: str | None = None) -> Sensor:
+        """Return the camera's sensor."""
+        self._check_view(view_name)
+        return self._sensor
+
+    # pictures -----------------------------------------------------------------------------------
+
+    def stokes(self, grip: Grip | None = None) -> Float32Array:
+        """Return the light on the sensor for each moment, before the analyser.
+
+        Parameters
+        ----------
+        grip
+            What the caliper holds; targets need none.
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (4, 3, H, W): moments 1, x, y, z; Stokes parameters in full scales per second at
+            level 1 (behind an analyser half of it comes through, see `moments`); without drift.
+        """
+        h, w = self._view.height_px, self._view.width_px
+        wide = self._picture(grip, (0.0, 0.0))
+        border = (wide.shape[1] - h) // 2
+        return wide[:, border : border + h, border : border + w].reshape(4, 3, h, w)
+
+    def moments(self, grip: Grip | None = None) -> dict[str, Float32Array]:
+        """Return the four moments behind the parallel and the crossed analyser.
+
+        Parameters
+        ----------
+        grip
+            What the caliper holds; targets need none.
+
+        Returns
+        -------
+        dict
+            "parallel" and "crossed": shape (4, H, W), float32, moments 1, x, y, z in full scales
+            per second at level 1, without noise, vignetting and drift.
+        """
+        stokes = self.stokes(grip)
+        return {
+            name: np.stack([self._analysed(s, reading) for s in stokes])
+            for name, reading in (("parallel", 0.0), ("crossed", 90.0))
+        }
+
+    def radiance(
+        self,
+        pattern: str,
+        *,
+        grip: Grip | None = None,
+        analyser_deg: float = 0.0,
+        t_s: float | None = None,
+    ) -> Float32Array:
+        """Return the light on the sensor under a pattern, without noise and vignetting.
+
+        Parameters
+        ----------
+        pattern
+            One of `rigsim.sphere_build.PATTERN_WEIGHTS`.
+        grip
+            What the caliper holds; targets need none.
+        analyser_deg
+            Reading of the analyser's rotator, degrees.
+        t_s
+            World time, s, which decides drift and jumps; None: neither.
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (H, W), full scales per second at level 1, >= 0.
+        """
+        shape = (self._view.height_px, self._view.width_px)
+        weights = np.array(_weights(pattern), np.float32)
+        if not weights.any():
+            return np.zeros(shape, np.float32)
+        jump, drift = (0.0, 0.0), (0.0, 0.0)
+        if self.motion is not None and t_s is not None and isinstance(self.subject, MicroSkin):
+            jump, drift = self.motion.jump_mm(t_s), self.motion.drift_mm(t_s)
+        wide = self._picture(grip, jump)
+        border = (wide.shape[1] - shape[0]) // 2
+        reach = border if any(drift) else 0
+        part = slice(border - reach, wide.shape[1] - border + reach)
+        column = slice(border - reach, wide.shape[2] - border + reach)
+        stokes = np.zeros((3, wide.shape[1] - 2 * (border - reach),
+                           wide.shape[2] - 2 * (border - reach)), np.float32)  # fmt: skip
+        for m in np.flatnonzero(weights):
+            stokes += weights[m] * wide[3 * m : 3 * m + 3, part, column]
+        image = self._analysed(stokes, analyser_deg, border_px=reach)
+        if reach:
+            image = _shifted(image, drift, self.lens.pixel_on_subject_um, reach)
+        # light taken away LED by LED leaves rounding errors where none is left
+        return np.maximum(image, np.float32(0.0))
+
+    def exposure(
+        self,
+        view_name: str,
+        *,
+        pops: Sequence[Pattern],
+        exposure_s: float,
+        seed: int,
+        grip: Grip | None = None,
+    ) -> NDArray[np.uint16]:
+        """Expose the camera once.
+
+        Parameters
+        ----------
+        view_name
+            Which camera.
+        pops
+            The patterns that shone, clipped to the exposure; none gives a dark frame.
+        exposure_s
+            Exposure time, s.
+        seed
+            Seed of this exposure's noise.
+        grip
+            What the caliper held when it began; skin needs one.
+
+        Returns
+        -------
+        ndarray of uint16
+            Raw DN, shape (H, W).
+        """
+        self._check_view(view_name)
+        rng = np.random.default_rng([self.seed, seed])
+        light = np.zeros((self._view.height_px, self._view.width_px), np.float32)
+        for pop in pops:
+            if not 0.0 <= pop.level <= 1.0:
+                raise SceneError(f"level of {pop.pattern!r}: got {pop.level}, expected 0 to 1")
+            if not pop.t_off_s >= pop.t_on_s:
+                raise SceneError(
+                    f"pattern {pop.pattern!r}: got {pop.t_on_s} to {pop.t_off_s} s, "
+                    "expected an end after its beginning"
+                )
+            energy = pop.level * (pop.t_off_s - pop.t_on_s)
+            energy *= 1.0 + POWER_DEVIATION * rng.standard_normal()
+            if energy > 0.0 and any(_weights(pop.pattern)):
+                light += np.float32(energy) * self.radiance(
+                    pop.pattern,
+                    grip=grip,
+                    analyser_deg=pop.analyser_deg,
+                    t_s=0.5 * (pop.t_on_s + pop.t_off_s),
+                )
+        return expose(light, sensor=self._sensor, rng=rng, exposure_s=exposure_s)
+
+    # truth --------------------------------------------------------------------------------------
+
+    def surface(
+        self, grip: Grip, *, subpixels: int = 1, border_px: int = 0,
+        jump_mm: tuple[float, float] = (0.0, 0.0),
+    ) -> PatchSurface:  # fmt: skip
+        """Return what stands at the camera's samples in a state, without drift."""
+        skin = self.skin
+        x, y = sample_grid(self._view, subpixels=subpixels, border_px=border_px)
+        pose = self.pose(grip)
+        moved = Pose(pose.x_mm + jump_mm[0], pose.y_mm + jump_mm[1], pose.turn_rad)
+        return stand(
+            self.relief(grip), grip, moved, x, y,
+            eye_mm=self._view.distance_mm, alpha=float(np.median(skin.alpha)),
+        )  # fmt: skip
+
+    def relief(self, grip: Grip) -> StretchedSkin:
+        """Return the skin in a state, in its own frame."""
+        skin = self.skin
+        key = (grip.stretch, grip.angle_deg if grip.stretch != 1.0 else 0.0)
+        if key not in self._reliefs:
+            while len(self._reliefs) >= KEPT_RELIEFS:
+                self._reliefs.popitem(last=False)
+            self._reliefs[key] = deform(
+                skin, stretch=key[0], angle_deg=key[1], compensation=self.compensation
+            )
+        self._reliefs.move_to_end(key)
+        return self._reliefs[key]
+
+    def pose(self, grip: Grip) -> Pose:
+        """Return where the skin lies in a state, drift and jumps aside."""
+        if self.motion is None:
+            return Pose(0.0, 0.0, 0.0)
+        return self.motion.pose(grip.angle_deg, grip.step)
+
+    def truth_appearance(self, grips: Sequence[Grip]) -> SkinAppearance:
+        """Return the truth of some states at the camera's own pixels.
+
+        See Also
+        --------
+        rigsim.scenes.gradient_truth.appearance : the maps and parameters.
+        """
+        from rigsim.scenes.gradient_truth import appearance
+
+        return appearance(self, grips)
+
+    # inside -------------------------------------------------------------------------------------
+
+    def _check_view(self, name: str | None) -> None:
+        if name is not None:
+            try:
+                self.rig.view(name)
+            except RigError as error:
+                raise SceneError(str(error)) from error
+
+    @property
+    def skin(self) -> MicroSkin:
+        """Return the patch of skin."""
+        if not isinstance(self.subject, MicroSkin):
+            raise SceneError(f"skin: got the target {self.subject!r}, expected a patch of skin")
+        return self.subject
+
+    def _analysed(
+        self, stokes: Float32Array, reading_deg: float, *, border_px: int = 0
+    ) -> Float32Array:
+        """Apply the analyser to Stokes vectors of shape (3, H, W)."""
+        cos2, sin2 = self._frame(reading_deg, border_px)
+        leak = 1.0 / self.films.analyser_extinction
+        turned = stokes[1] * cos2 + stokes[2] * sin2
+        return np.asarray(
+            np.float32(0.5 * (1.0 + leak)) * stokes[0] + np.float32(0.5 * (1.0 - leak)) * turned
+        )
+
+    def _frame(self, reading_deg: float, border_px: int) -> tuple[Float32Array, Float32Array]:
+        key = (reading_deg, border_px)
+        if key not in self._frames:
+            if len(self._frames) >= 4:
+                self._frames.clear()
+            passes_deg = self.films.passes_deg(self._view, "parallel", reading_deg)
+            x, y = sample_grid(self._view, subpixels=1, border_px=border_px)
+            right, up, _ = self._view.axes
+            to_camera = np.empty((len(y), len(x), 3), np.float32)
+            to_camera[..., 0], to_camera[..., 1] = -x[None, :], -y[:, None]
+            to_camera[..., 2] = self._view.distance_mm
+            to_camera /= np.linalg.norm(to_camera, axis=-1, keepdims=True)
+            self._frames[key] = shading.analyser_frame(
+                to_camera, passes_deg=passes_deg, image_right=right, image_up=up
+            )
+        return self._frames[key]
+
+    def _picture(self, grip: Grip | None, jump_mm: tuple[float, float]) -> Float32Array:
+        """Return the twelve images with a border, shape (12, H + 2 b, W + 2 b)."""
+        if isinstance(self.subject, MicroSkin):
+            if grip is None:
+                raise SceneError("grip: got none, expected what the caliper holds")
+            key: tuple[object, ...] = (
+                grip.angle_deg, grip.step, grip.aperture_mm, grip.stretch, grip.attached,
+                grip.buckled, *jump_mm,
+            )  # fmt: skip
+        else:
+            key = (self.subject,)
+        if key not in self._pictures:
+            if isinstance(self.subject, MicroSkin) and grip is not None:
+                picture = self._render(grip, jump_mm)
+            else:
+                picture = self._target()
+            picture *= np.float32(self._unit)
+            while self._pictures and (len(self._pictures) + 1) * picture.nbytes > KEPT_BYTES:
+                self._pictures.popitem(last=False)
+            self._pictures[key] = picture
+        self._pictures.move_to_end(key)
+        return self._pictures[key]
+
+    def _render(self, grip: Grip, jump_mm: tuple[float, float]) -> Float32Array:
+        s = self.subpixels
+        margin = SHADOW_MARGIN_PX if self.shadows else 0
+        wide = self.surface(grip, subpixels=s, border_px=DRIFT_MARGIN_PX + margin, jump_mm=jump_mm)
+        inner = slice(s * margin, -s * margin or None)
+        patch = _cut(wide, inner)
+        pitch_um = self.lens.pixel_on_subject_um / s
+        raw = self.lighting().stokes(
+            patch, wide.relief_um + wide.bulge_um, margin=s * margin, pitch_um=pitch_um
+        )
+        if self.optics:
+            return blur(raw, self.lens, depth_mm=patch.height_mm, subpixels=s)
+        k, h, w = raw.shape
+        return np.asarray(raw.reshape(k, h // s, s, w // s, s).mean(axis=(2, 4)), np.float32)
+
+    def lighting(self) -> Lighting:
+        """Return what the light does to this skin in any state."""
+        if self._lighting is None:
+            skin = self.skin
+            rough = float(np.median(skin.alpha))
+            half_mm = 0.5 * max(self._view.field_mm) + 0.1
+            surface = self.optical_surface(rough)
+            leds = tuple(
+                k
+                for k, (_, _, z) in enumerate(self.sphere.position_mm)
+                if not self.shadows or z > 0.0
+            )
+            size = self.table_size or (65 if skin.alpha.min() >= 0.15 else 129)
+            table = build_table(
+                self.sphere,
+                surface,
+                half_field_mm=half_mm,
+                alpha_range=(float(skin.alpha.min()), float(skin.alpha.max())),
+                size=size,
+                fields=2 if half_mm < 1.6 else 3,
+                leds=leds,
+            )
+            sigmas, weights = _lateral(skin)
+            self._lighting = Lighting(
+                self.sphere, surface, table, leds, self.sectors if self.shadows else 0,
+                sigmas, weights,
+            )  # fmt: skip
+        return self._lighting
+
+    def optical_surface(self, alpha: float) -> Surface:
+        """Return how a surface of a roughness reflects, and who looks at it."""
+        return Surface(
+            alpha, ETA, self._view.position_mm, self._view.axes[0], self.films.light_extinction
+        )
+
+    def _target(self) -> Float32Array:
+        shape = (self._view.height_px, self._view.width_px)
+        out = np.zeros((12, *shape), np.float32)
+        if self.subject == "flat":
+            x, y = sample_grid(self._view, subpixels=1, border_px=0)
+            for m, light in enumerate(_diffuser(self.sphere, self.films, x, y)):
+                out[3 * m] = light
+        return out
+
+
+def _weights(pattern: str) -> tuple[float, float, float, float]:
+    if pattern not in PATTERN_WEIGHTS:
+        raise SceneError(f"pattern: got {pattern!r}, expected one of {', '.join(PATTERN_WEIGHTS)}")
+    return PATTERN_WEIGHTS[pattern]
+
+
+def _white_radiance(rig: Rig) -> float:
+    """Return what an ideal white sends through ideal films under the sphere as drawn."""
+    drawn = as_drawn(rig)
+    place = drawn.position_mm
+    distance = np.linalg.norm(place, axis=1)
+    axis = np.array(rig.views[0].axes[2])
+    cosine = np.maximum(place @ axis / distance, 0.0)
+    share = drawn.intensity * (600.0 / distance) ** 2 * cosine
+    total = float(share.sum())
+    if not total > 0.0:
+        raise SceneError("lights: none shines on a plate at the origin that faces the camera")
+    return total / math.pi * 0.5 * 0.5
+
+
+def _diffuser(sphere: BuiltSphere, films: Films, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    """Return the radiance of a white diffuser at z = 0 for each moment, shape (4, H, W)."""
+    x, y = np.meshgrid(x_mm, y_mm)
+    film = 0.5 * (1.0 + 1.0 / films.light_extinction)
+    out = np.zeros((4, *x.shape))
+    for place, power, weight in zip(
+        sphere.position_mm, sphere.intensity, sphere.weights, strict=True
+    ):
+        if place[2] <= 0.0:
+            continue
+        square = (place[0] - x) ** 2 + (place[1] - y) ** 2 + place[2] ** 2
+        light = film / math.pi * power * 600.0**2 * place[2] / square**1.5
+        out += weight[:, None, None] * light
+    return out
+
+
+def _lateral(skin: MicroSkin) -> tuple[FloatArray, FloatArray]:
+    """Return the lateral kernel of the camera's band as a sum of Gaussians."""
+    table = SkinTable.load()
+    band = (table.wavelength_nm >= BAND_NM[0]) & (table.wavelength_nm <= BAND_NM[1])
+    weights = (band / band.sum())[:, None]
+    kernels = table.lateral_kernels(MELANIN_PRESETS[skin.preset], BLOOD, weights)
+    gaussians = kernels.gaussians(SIGMAS_MM)
+    return gaussians.sigmas_mm, gaussians.weights[0]
+
+
+def _cut(patch: PatchSurface, inner: slice) -> PatchSurface:
+    return PatchSurface(
+        *(
+            np.ascontiguousarray(getattr(patch, name)[inner, inner])
+            for name in (
+                "x_mm", "y_mm", "relief_um", "bulge_um", "normals", "albedo", "alpha", "skin"
+            )
+        )
+    )  # fmt: skip
+
+
+def _shifted(
+    image: Float32Array, shift_mm: tuple[float, float], pixel_um: float, border: int
+) -> Float32Array:
+    """Return a picture without its border after what it shows has moved (Lagrange, 6 points)."""
+    dx, dy = 1e3 * shift_mm[0] / pixel_um, -1e3 * shift_mm[1] / pixel_um
+    reach = border - 3
+    if max(abs(dx), abs(dy)) > reach:
+        raise SceneError(f"drift: got {dx:.1f}, {dy:.1f} px, expected at most {reach}")
+    out = image
+    for axis, shift in ((0, dy), (1, dx)):
+        whole = math.floor(-shift)
+        part = -shift - whole
+        nodes = np.arange(-2, 4)
+        taps = [math.prod((part - k) / (n - k) for k in nodes if k != n) for n in nodes]
+        size = out.shape[axis] - 2 * border
+        moved = np.zeros([size if a == axis else n for a, n in enumerate(out.shape)], np.float32)
+        for tap, n in zip(taps, nodes, strict=True):
+            at = np.arange(size) + border + whole + int(n)
+            moved += np.float32(tap) * np.take(out, at, axis=axis)
+        out = moved
+    return out

@@ -1,0 +1,204 @@
+"""The gradient rig's pictures: unit of light, orientation, polarization, states, noise."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from capture.rig import load_rig
+from rigsim.films import IDEAL
+from rigsim.microrelief import make_micro_skin
+from rigsim.patch_motion import PatchMotion
+from rigsim.scenes.gradient import METER_RATE_PER_S, GradientScene, SceneError
+from rigsim.sphere_build import PATTERN_WEIGHTS, build_sphere
+from rigsim.taped_skin import GripState
+
+NEUTRAL = GripState(0.0, 0, 8.0, 1.0, True, False)
+SIDE = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class Light:
+    pattern: str
+    level: float = 1.0
+    t_on_s: float = 0.0
+    t_off_s: float = 0.03
+    analyser_deg: float = 0.0
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return load_rig("gradient").cropped(SIDE)
+
+
+@pytest.fixture(scope="module")
+def skin():
+    return make_micro_skin("cheek", seed=3, size_mm=1.2)
+
+
+@pytest.fixture(scope="module")
+def flat_skin(skin):
+    even = np.full_like(skin.height_um, 0.0)
+    return dataclasses.replace(
+        skin, height_um=even, albedo=even + np.float32(0.3), alpha=even + np.float32(0.25)
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(rig, skin):
+    return GradientScene(rig, skin)
+
+
+def test_a_white_diffuser_gets_the_meter_rate_behind_either_analyser(rig):
+    """Tolerance: the corner of the field, and what the sphere as drawn is off its unit (none)."""
+    flat = GradientScene(rig, "flat", films=IDEAL)
+    for reading in (0.0, 90.0, 37.0):
+        image = flat.radiance("full", analyser_deg=reading)
+        np.testing.assert_allclose(image, METER_RATE_PER_S, rtol=1e-4)
+
+
+def test_every_pattern_is_the_sum_of_its_leds(rig, flat_skin):
+    """Lit by a sphere of one LED, a pattern is that LED's own weight times full."""
+    sphere = build_sphere(rig, seed=1)
+    for led in (3, 40):
+        one = np.zeros(len(sphere.intensity))
+        one[led] = 1.0
+        alone = GradientScene(rig, flat_skin, sphere=dataclasses.replace(sphere, intensity=one))
+        full = alone.radiance("full", grip=NEUTRAL)
+        assert full.min() > 0.0
+        for pattern, weights in PATTERN_WEIGHTS.items():
+            share = float(np.dot(weights, sphere.weights[led]))
+            got = alone.radiance(pattern, grip=NEUTRAL)
+            np.testing.assert_allclose(got, share * full, rtol=1e-3, atol=1e-4 * full.max())
+
+
+def test_a_pattern_and_its_complement_make_full(scene):
+    full = scene.radiance("full", grip=NEUTRAL)
+    for axis in "xyz":
+        both = scene.radiance(axis, grip=NEUTRAL) + scene.radiance(f"-{axis}", grip=NEUTRAL)
+        np.testing.assert_allclose(both, full, rtol=1e-5)
+    assert not scene.radiance("dark", grip=NEUTRAL).any()
+
+
+def test_slopes_towards_the_right_and_the_top_are_bright_under_x_and_y(scene):
+    """The surface's reflection, which crossing removes, leans with the normal."""
+    normals = scene.surface(NEUTRAL).normals
+    moments = scene.moments(NEUTRAL)
+    specular = moments["parallel"] - moments["crossed"]
+    inner = (slice(6, -6), slice(6, -6))
+    for axis in (0, 1):
+        ratio = (specular[1 + axis] / specular[0])[inner].ravel()
+        tilt = normals[..., axis][inner].ravel()
+        assert np.corrcoef(ratio, tilt)[0, 1] > 0.9
+        assert abs(np.corrcoef(ratio, normals[..., 1 - axis][inner].ravel())[0, 1]) < 0.5
+
+
+def test_crossed_polarizers_remove_the_surface_reflection_of_a_flat_patch(rig, flat_skin):
+    """Black skin, ideal films: what is left in the middle is what is off the central view."""
+    black = dataclasses.replace(flat_skin, albedo=np.zeros_like(flat_skin.albedo))
+    scene = GradientScene(rig, black, films=IDEAL)
+    moments = scene.moments(NEUTRAL)
+    leak = moments["crossed"][0] / moments["parallel"][0]
+    assert leak.max() < 0.02
+    turned = scene.radiance("full", grip=NEUTRAL, analyser_deg=80.0)
+    # Malus: sin^2(10 degrees) = 3 %
+    extra = (turned / moments["parallel"][0]).mean() - leak.mean()
+    assert extra == pytest.approx(np.sin(np.radians(10.0)) ** 2, abs=0.01)
+
+
+def test_crossed_pictures_show_the_pigment(scene):
+    surface = scene.surface(NEUTRAL)
+    crossed = scene.moments(NEUTRAL)["crossed"][0]
+    inner = (slice(6, -6), slice(6, -6))
+    assert np.corrcoef(crossed[inner].ravel(), surface.albedo[inner].ravel())[0, 1] > 0.8
+
+
+def test_jaws_are_dark_and_end_at_the_aperture(rig, flat_skin):
+    narrow = GripState(90.0, -4, 0.24, 1.0, True, False)
+    image = GradientScene(rig, flat_skin).radiance("full", grip=narrow)
+    pixel_mm = 0.006
+    y = -(np.arange(SIDE) - 0.5 * (SIDE - 1)) * pixel_mm
+    jaw, between = np.abs(y) > 0.12 + 0.03, np.abs(y) < 0.12 - 0.03
+    assert image[jaw].max() < 0.4 * image[between].min()
+
+
+def test_exposures_have_the_sensor_s_noise_and_no_other(scene):
+    """Two exposures of the same state differ by shot and read noise alone (chi-square, 1e-6)."""
+    frames = [
+        scene.exposure("cam", pops=[Light("full")], exposure_s=0.04, seed=k, grip=NEUTRAL)
+        for k in (1, 2)
+    ]
+    sensor = scene.sensor()
+    light = scene.radiance("full", grip=NEUTRAL) * 0.03
+    slope, offset = sensor.noise_profile(0.04)
+    span = sensor.white - sensor.black
+    # energies differ by 0.1 % each; a common gain is fitted out
+    a, b = ((f.astype(float) - sensor.black) / span for f in frames)
+    gain = float((a * b).sum() / (b * b).sum())
+    assert abs(gain - 1.0) < 0.01
+    chi2 = float(((a - gain * b) ** 2 / (2.0 * (slope * light + offset))).sum())
+    freedom = a.size - 1
+    assert abs(chi2 - freedom) < 5.0 * np.sqrt(2.0 * freedom)
+
+
+def test_no_light_gives_a_dark_frame(scene):
+    dark = scene.exposure("cam", pops=[], exposure_s=0.04, seed=1, grip=NEUTRAL)
+    assert dark.mean() == pytest.approx(scene.sensor().black, abs=0.5)
+
+
+def test_a_jump_of_20_pixels_moves_the_picture_by_20_pixels(rig, skin):
+    still = PatchMotion(0, angle_um=0.0, angle_turn_deg=0.0, state_um=0.0, state_turn_deg=0.0,
+                        drift_um=0.0, jumps_um={1.0: (120.0, 0.0)})  # fmt: skip
+    scene = GradientScene(rig, skin, motion=still)
+    before = scene.radiance("full", grip=NEUTRAL, t_s=0.5)
+    after = scene.radiance("full", grip=NEUTRAL, t_s=1.5)
+    inner = slice(8, -8)
+    np.testing.assert_allclose(after[inner, 28:-8], before[inner, 8:-28], rtol=0.02)
+    assert np.abs(after[inner, 28:-8] / before[inner, 28:-8] - 1).mean() > 0.02
+
+
+def test_drift_moves_the_picture_as_it_says(rig, skin):
+    """A drifted picture is the picture of skin that lies there; tolerance: 6-point shifts."""
+    still = {"angle_um": 0.0, "angle_turn_deg": 0.0, "state_um": 0.0, "state_turn_deg": 0.0}
+    drifting = PatchMotion(4, drift_um=4.0, **still)
+    t_s = 2.0
+    dx, dy = drifting.drift_mm(t_s)
+    assert np.hypot(dx, dy) > 1e-3
+    lying = PatchMotion(4, drift_um=0.0, jumps_um={0.0: (1e3 * dx, 1e3 * dy)}, **still)
+    drifted, lain, still_there = (
+        GradientScene(rig, skin, motion=motion).radiance("full", grip=NEUTRAL, t_s=t_s)
+        for motion in (drifting, lying, PatchMotion(4, drift_um=0.0, **still))
+    )
+    error = np.abs(drifted / lain - 1.0).max()
+    assert error < 0.01
+    assert np.abs(still_there / lain - 1.0).max() > 3.0 * error
+
+
+def test_truth_of_states_says_what_was_done(scene):
+    stretched = GripState(45.0, 2, 9.6, 1.15, True, False)
+    truth = scene.truth_appearance([NEUTRAL, stretched])
+    states = {row["name"]: row for row in truth.parameters["states"]}
+    assert set(states) == {"a000_n0", "a045_p2"}
+    gradient = np.array(states["a045_p2"]["gradient"])
+    axis = np.array([1.0, 1.0]) / np.sqrt(2.0)
+    assert axis @ gradient @ axis == pytest.approx(1.15)
+    assert np.linalg.det(gradient) == pytest.approx(1.15 * states["a045_p2"]["stretch_t"])
+    assert truth.maps["height"].values is truth.maps["height_a000_n0"].values
+    normals = truth.maps["normals_a045_p2"].values
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1.0, rtol=1e-5)
+    # heights and normals tell the same slopes (central differences of 12 um)
+    height = truth.maps["bulged_height_a045_p2"].values
+    slope = (height[:, 2:] - height[:, :-2]) / 12.0
+    told = -(normals[..., 0] / normals[..., 2])[:, 1:-1]
+    assert np.corrcoef(slope.ravel(), told.ravel())[0, 1] > 0.97
+
+
+def test_nonsense_is_refused(rig, skin, scene):
+    with pytest.raises(SceneError, match="grip: got none"):
+        scene.radiance("full")
+    with pytest.raises(SceneError, match="pattern: got 'w'"):
+        scene.radiance("w", grip=NEUTRAL)
+    with pytest.raises(SceneError, match="sectors"):
+        GradientScene(rig, skin, sectors=7)
+    with pytest.raises(SceneError, match="subject"):
+        GradientScene(rig, "cube")
