@@ -1,0 +1,467 @@
+"""What the lights of a gradient sphere see of a surface: moments of its lobe, by its normal.
+
+Under a sphere of lights the first moments of a reflection point along its lobe, and the mirror
+direction follows. With a finite number of lights, a hole, unequal light and a lobe that Fresnel and
+shadowing skew the moments point elsewhere. Both are the same sum over the lights, and are tabled
+here, by the normal, so that the estimator can look up which normal leads to what was seen.
+
+Normals and what is seen of them are written as places in an equal-area disc about the view (Lambert
+azimuthal): a place ``u`` is 2 sin(tilt / 2) long and points where the normal leans.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import spline_filter
+
+from model import fresnel, microfacet
+
+Floats = NDArray[np.float64]
+
+REACH = 1.3
+"""Length of the places that tables are made for: tilts up to 81 degrees."""
+MARGIN = 4
+"""Grid lines around them."""
+FINEST, COARSEST = 0.0125, 0.04
+"""Distance of grid lines; a lobe's roughness has four of them in between."""
+FIELD_MM = 1.0
+"""Step of the differences by which the tables follow a point that moves across the field."""
+
+F_X, F_Y, SCALE, CONCENTRATION, SYS_XX, SYS_XY, SYS_YY = range(7)
+"""Layers of a table: place seen (2); full light over a white diffuser's; length of the mean vector
+to the lights; covariance of the place seen from what is not known about the lights (3)."""
+LAYERS = 7
+FIELD_LAYERS = 4
+"""Further layers where the field counts: change of the place seen with the point, 1/mm."""
+
+
+class SphereLightsError(ValueError):
+    """Lights that no gradient sphere has."""
+
+
+def _none() -> Floats:
+    return np.zeros(0)
+
+
+@dataclass(frozen=True, slots=True)
+class SphereLights:
+    """The lights of a gradient sphere and their films, as they were measured.
+
+    Attributes
+    ----------
+    directions : ndarray, shape (L, 3)
+        Unit vectors from the middle of the patch to the lights, rig frame, at least four.
+    intensities : ndarray, shape (L,)
+        What each light gives at the patch, relative, >= 0; any scale. Default: all 1.
+    leakage : ndarray, shape (L,)
+        Of the specular reflection into the camera what passes crossed, over what passes parallel,
+        in [0, 1). Default: 0.
+    polarizers : ndarray, shape (L, 3)
+        Unit vectors of the electric field that each light sends to the patch. Default (0, 3): such
+        that what a facet reflects into the view is polarized along the analyser.
+    analyser : tuple of float
+        Passing axis of the analyser in its parallel state.
+    programmed : ndarray, shape (L, 3)
+        The vectors whose coordinates the patterns were made of; default: `directions`.
+    distance_mm : float
+        Of the lights from the middle of the patch; inf: a point's place does not count.
+    intensity_stderr : ndarray, shape (L,)
+        Standard error of `intensities`. Default: 0.
+    leakage_stderr : ndarray, shape (L,)
+        Standard error of `leakage`. Default: 0.
+
+    Examples
+    --------
+    >>> axes = np.concatenate([np.eye(3), -np.eye(3)])
+    >>> SphereLights(axes).intensities.tolist()
+    [1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+    """
+
+    directions: Floats
+    intensities: Floats = field(default_factory=_none)
+    leakage: Floats = field(default_factory=_none)
+    polarizers: Floats = field(default_factory=_none)
+    analyser: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    programmed: Floats = field(default_factory=_none)
+    distance_mm: float = np.inf
+    intensity_stderr: Floats = field(default_factory=_none)
+    leakage_stderr: Floats = field(default_factory=_none)
+
+    def __post_init__(self) -> None:
+        """Check shapes and ranges, and keep copies that cannot be written to."""
+        ways = _unit_vectors("directions", self.directions)
+        count = len(ways)
+        if count < 4:
+            raise SphereLightsError(f"directions: got {count} light(s), expected at least 4")
+        axis = _unit_vectors("analyser", np.asarray(self.analyser, np.float64)[None])[0]
+        # not given: stay empty, so that a later replace() of directions does not meet old ones
+        for name, default in (
+            ("intensities", 1.0),
+            ("leakage", 0.0),
+            ("intensity_stderr", 0.0),
+            ("leakage_stderr", 0.0),
+        ):
+            given = np.asarray(getattr(self, name), np.float64)
+            values = np.full(count, default) if given.size == 0 else given.copy()
+            if values.shape != (count,) or not np.isfinite(values).all() or (values < 0).any():
+                raise SphereLightsError(
+                    f"{name}: got shape {values.shape}, expected finite numbers >= 0, ({count},)"
+                )
+            _keep(self, name, values)
+        if not self.intensities.any():
+            raise SphereLightsError("intensities: got 0 for every light, expected some light")
+        if (self.leakage >= 1.0).any():
+            raise SphereLightsError(
+                f"leakage: got {self.leakage.max():g}, expected crossed over parallel below 1;"
+                " are the two states exchanged?"
+            )
+        for name in ("polarizers", "programmed"):
+            given = np.asarray(getattr(self, name), np.float64)
+            vectors = np.zeros((0, 3)) if given.size == 0 else _unit_vectors(name, given)
+            if len(vectors) not in (0, count):
+                raise SphereLightsError(f"{name}: got {len(vectors)} vectors, expected {count}")
+            _keep(self, name, vectors)
+        if len(self.polarizers):
+            along = np.abs(np.sum(self.polarizers * ways, axis=1))
+            if along.max() > 0.05:
+                raise SphereLightsError(
+                    f"polarizers[{along.argmax()}]: got a field along its own ray, expected one"
+                    " across it"
+                )
+        if not self.distance_mm > 0:
+            raise SphereLightsError(f"distance_mm: got {self.distance_mm}, expected more than 0")
+        _keep(self, "directions", ways)
+        object.__setattr__(self, "analyser", tuple(float(a) for a in axis))
+
+
+def _keep(lights: SphereLights, name: str, values: Floats) -> None:
+    values.flags.writeable = False
+    object.__setattr__(lights, name, values)
+
+
+def _unit_vectors(name: str, vectors: ArrayLike) -> Floats:
+    array = np.array(vectors, np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise SphereLightsError(f"{name}: got shape {array.shape}, expected (L, 3)")
+    length = np.linalg.norm(array, axis=1)
+    wrong = np.flatnonzero(~(np.abs(length - 1.0) < 0.01))
+    if wrong.size:
+        raise SphereLightsError(
+            f"{name}[{wrong[0]}]: got {array[wrong[0]].tolist()}, expected a unit vector"
+        )
+    return np.asarray(array / length[:, None])
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """A table of what is seen, by the normal's place; spline coefficients.
+
+    Attributes
+    ----------
+    coefficients : ndarray of float64, shape (G, G, K)
+        Cubic B-splines on a grid of places, first axis along the frame's second direction.
+    least, step : float
+        Place of the first grid line, distance of grid lines.
+    frame : ndarray, shape (3, 3)
+        Rows: right, up and the view, in the rig frame.
+    """
+
+    coefficients: Floats
+    least: float
+    step: float
+    frame: Floats
+
+
+def frame_of(view: ArrayLike) -> Floats:
+    """Return the orthonormal frame about a view, rows right, up, view; identity for +z."""
+    v = np.asarray(view, np.float64)
+    v = v / np.linalg.norm(v)
+    up = np.array([0.0, 1.0, 0.0]) if abs(v[1]) < 0.99 else np.array([0.0, 0.0, -1.0])
+    right = np.cross(up, v)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(v, right), v])
+
+
+def normal_at(place: Floats) -> Floats:
+    """Return the unit normals (..., 3) at places (..., 2), in the frame of the view.
+
+    Examples
+    --------
+    >>> normal_at(np.array([1.0, 0.0])).round(4).tolist()
+    [0.866, 0.0, 0.5]
+    """
+    square = np.minimum(np.sum(place**2, axis=-1, keepdims=True), 2.0)
+    return np.concatenate([place * np.sqrt(1.0 - square / 4.0), 1.0 - square / 2.0], axis=-1)
+
+
+def place_of(normal: Floats) -> Floats:
+    """Return the places (..., 2) of unit normals (..., 3), in the frame of the view."""
+    return np.asarray(normal[..., :2] * np.sqrt(2.0 / np.maximum(1.0 + normal[..., 2:], 1e-9)))
+
+
+def facet_reflectance(lights: SphereLights, view: Floats, eta: float) -> Floats:
+    """Return what facets that mirror each light into the view send through the analyser, (L,).
+
+    Over the light's own irradiance, after its film; the same for every normal, as the facet is.
+    """
+    light = lights.directions
+    facet = light + view
+    length = np.linalg.norm(facet, axis=1, keepdims=True)
+    facet = np.where(length > 1e-9, facet / np.maximum(length, 1e-9), view)
+    cosine = np.clip(np.sum(facet * light, axis=1), 1e-6, 1.0)
+    inside = np.sqrt(1.0 - (1.0 - cosine**2) / eta**2)
+    r_s = (cosine - eta * inside) / (cosine + eta * inside)
+    r_p = (eta * cosine - inside) / (eta * cosine + inside)
+    s = np.cross(facet, light)
+    size = np.linalg.norm(s, axis=1, keepdims=True)
+    # a light along the view: s and p are alike, and any direction across serves
+    s = np.where(size > 1e-9, s / np.maximum(size, 1e-9), frame_of(view)[0])
+    p_in, p_out = np.cross(-light, s), np.cross(np.broadcast_to(view, s.shape), s)
+    a_s, a_p = s @ np.asarray(lights.analyser), p_out @ np.asarray(lights.analyser)
+    if len(lights.polarizers):
+        e_s = np.sum(lights.polarizers * s, axis=1)
+        e_p = np.sum(lights.polarizers * p_in, axis=1)
+        return np.asarray((a_s * r_s * e_s + a_p * r_p * e_p) ** 2)
+    # the field that becomes the analyser's, of unit length: 1 / (a_s^2 / r_s^2 + a_p^2 / r_p^2)
+    lost = (a_s * r_p) ** 2 + (a_p * r_s) ** 2
+    return np.asarray((r_s * r_p) ** 2 / np.maximum(lost, 1e-300))
+
+
+def specular(
+    lights: SphereLights,
+    *,
+    view: ArrayLike,
+    alpha: float,
+    eta: float,
+    near: bool = False,
+    alpha_stderr: float = 0.0,
+) -> Response:
+    """Return the table of a rough dielectric surface, parallel less crossed.
+
+    Parameters
+    ----------
+    lights
+        The sphere.
+    view : array_like, shape (3,)
+        Unit vector to the camera.
+    alpha : float
+        GGX roughness of the facets.
+    eta : float
+        Refractive index of the surface.
+    near : bool
+        Add the layers by which a point's place in the field counts.
+    alpha_stderr : float
+        Standard error of `alpha`; enters the systematic covariance.
+
+    Raises
+    ------
+    SphereLightsError
+        For a roughness or index that no such surface has.
+    """
+    if not 0.02 <= alpha <= 1.0:
+        raise SphereLightsError(f"alpha: got {alpha}, expected a roughness in [0.02, 1]")
+    if not alpha_stderr >= 0.0:
+        raise SphereLightsError(f"alpha_stderr: got {alpha_stderr}, expected 0 or more")
+    way = _direction(view)
+    return _cached(_key(lights), way, float(alpha), _index(eta), near, float(alpha_stderr))
+
+
+def diffuse(lights: SphereLights, *, view: ArrayLike, eta: float, near: bool = False) -> Response:
+    """Return the table of a matte interior below a smooth surface: Lambert, Fresnel on entry."""
+    return _cached(_key(lights), _direction(view), np.nan, _index(eta), near, 0.0)
+
+
+def _direction(view: ArrayLike) -> tuple[float, ...]:
+    return tuple(float(x) for x in _unit_vectors("view", np.asarray(view, np.float64)[None])[0])
+
+
+def _index(eta: float) -> float:
+    if not 1.0 < eta < 4.0:
+        raise SphereLightsError(f"eta: got {eta}, expected 1 < eta < 4")
+    return float(eta)
+
+
+_Key = tuple[bytes, ...]
+
+
+def _key(lights: SphereLights) -> _Key:
+    arrays = (
+        lights.directions, lights.intensities, lights.leakage, lights.polarizers,
+        np.asarray(lights.analyser), lights.programmed, np.asarray(lights.distance_mm),
+        lights.intensity_stderr, lights.leakage_stderr,
+    )  # fmt: skip
+    return tuple(np.asarray(a, np.float64).tobytes() for a in arrays)
+
+
+def _lights(key: _Key) -> SphereLights:
+    d, e, k, p, a, w, distance, se, sk = (np.frombuffer(b) for b in key)
+    return SphereLights(
+        d.reshape(-1, 3), e, k, p.reshape(-1, 3), (float(a[0]), float(a[1]), float(a[2])),
+        w.reshape(-1, 3), float(distance[0]), se, sk,
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=48)
+def _cached(
+    key: _Key, view: tuple[float, ...], alpha: float, eta: float, near: bool, alpha_stderr: float
+) -> Response:
+    lights, frame = _lights(key), frame_of(view)
+    matte = np.isnan(alpha)
+    step = 0.05 if matte else float(np.clip(alpha / 4.0, FINEST, COARSEST))
+    lines = int(np.ceil(REACH / step)) + MARGIN
+    axis = step * np.arange(-lines, lines + 1)
+    places = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    # beyond the horizon's side of the disc: as at its end, so that splines stay calm
+    length = np.linalg.norm(places, axis=1, keepdims=True)
+    places = places * np.minimum(1.0, 1.38 / np.maximum(length, 1e-9))
+    normals = normal_at(places) @ frame
+    see = _matte_sums(lights, frame, eta) if matte else _glossy_sums(lights, frame, alpha, eta)
+    layers = np.empty((len(places), LAYERS + (FIELD_LAYERS if near else 0)))
+    for start in range(0, len(places), 2048):
+        part = slice(start, start + 2048)
+        shift = np.zeros(3)
+        layers[part, :LAYERS] = _layers(lights, frame, see(normals[part], shift), not matte)
+        for k in (0, 1) if near else ():
+            ends = [
+                _layers(lights, frame, see(normals[part], sign * FIELD_MM * frame[k]), not matte)
+                for sign in (-1.0, 1.0)
+            ]
+            layers[part, LAYERS + 2 * k : LAYERS + 2 * k + 2] = (
+                ends[1][:, :2] - ends[0][:, :2]
+            ) / (2.0 * FIELD_MM)
+        if alpha_stderr > 0.0:
+            step_a = 0.02 * alpha
+            ends = [
+                _layers(lights, frame, _glossy_sums(lights, frame, a, eta)(
+                    normals[part], np.zeros(3)), True)
+                for a in (alpha - step_a, alpha + step_a)
+            ]  # fmt: skip
+            move = (ends[1][:, :2] - ends[0][:, :2]) / (2.0 * step_a) * alpha_stderr
+            layers[part, SYS_XX] += move[:, 0] ** 2
+            layers[part, SYS_XY] += move[:, 0] * move[:, 1]
+            layers[part, SYS_YY] += move[:, 1] ** 2
+    layers[:, :2] -= places  # what differs from the normal's own place is smooth
+    grid = layers.reshape(len(axis), len(axis), -1)
+    coefficients = np.stack(
+        [spline_filter(grid[..., k], order=3, mode="mirror") for k in range(grid.shape[2])],
+        axis=-1,
+    )
+    coefficients.flags.writeable = False
+    return Response(coefficients, float(axis[0]), step, frame)
+
+
+Sums = Callable[[Floats, Floats], Floats]
+
+
+def _local(lights: SphereLights, point_mm: Floats) -> tuple[Floats, Floats]:
+    """Return directions to the lights, and their intensities, from a point near the origin."""
+    if not np.isfinite(lights.distance_mm):
+        return lights.directions, lights.intensities
+    way = lights.directions * lights.distance_mm - point_mm
+    distance = np.linalg.norm(way, axis=1)
+    return way / distance[:, None], lights.intensities * (lights.distance_mm / distance) ** 2
+
+
+def _white(lights: SphereLights, frame: Floats) -> float:
+    """Return what a white diffuser that faces the view shows under full light."""
+    facing = np.maximum(lights.directions @ frame[2], 0.0)
+    return float(np.sum(lights.intensities * facing) / np.pi)
+
+
+def _glossy_sums(lights: SphereLights, frame: Floats, alpha: float, eta: float) -> Sums:
+    view = frame[2]
+    mirrored = facet_reflectance(lights, view, eta) * (1.0 - lights.leakage)
+    # the analyser halves the white diffuser's light, and none of the polarized reflection's
+    mirrored = mirrored * 2.0 / max(_white(lights, frame), 1e-300)
+
+    def each(normals: Floats, point_mm: Floats) -> Floats:
+        ways, strength = _local(lights, point_mm)
+        half = ways + view
+        half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
+        mu_l, mu_v, mu_h = normals @ ways.T, normals @ view, normals @ half.T
+        lobe = microfacet.facet_density(mu_h, alpha)
+        lobe *= microfacet.visibility(mu_l, mu_v[:, None], alpha)
+        return np.asarray(lobe * np.maximum(mu_l, 0.0) * (strength * mirrored))
+
+    return each
+
+
+def _matte_sums(lights: SphereLights, frame: Floats, eta: float) -> Sums:
+    white = max(_white(lights, frame), 1e-300)
+    mean = 1.0 - fresnel.diffuse_external(eta)
+
+    def each(normals: Floats, point_mm: Floats) -> Floats:
+        ways, strength = _local(lights, point_mm)
+        mu = normals @ ways.T
+        c = np.clip(mu, 1e-6, 1.0)
+        inside = np.sqrt(1.0 - (1.0 - c**2) / eta**2)
+        t_s = 1.0 - ((c - eta * inside) / (c + eta * inside)) ** 2
+        t_p = 1.0 - ((eta * c - inside) / (eta * c + inside)) ** 2
+        share_s: Floats | float = 0.5
+        if len(lights.polarizers):
+            # s is along n x l: its part of the field, squared, by the triple product
+            across = np.einsum("lk,plk->pl", lights.polarizers, np.cross(normals[:, None], ways))
+            sine2 = 1.0 - c**2
+            share_s = np.where(sine2 > 1e-9, across**2 / np.maximum(sine2, 1e-9), 0.5)
+        entry = (t_s * share_s + t_p * (1.0 - share_s)) / mean
+        return np.asarray(entry * np.maximum(mu, 0.0) * (strength / (np.pi * white)))
+
+    return each
+
+
+def _layers(lights: SphereLights, frame: Floats, each: Floats, mirror: bool) -> Floats:
+    """Return the layers (P, LAYERS) of what each light gives (P, L)."""
+    axes = lights.programmed if len(lights.programmed) else lights.directions
+    axes = axes @ frame.T
+    full = each.sum(axis=1)
+    vector = each @ axes
+    place, slope = seen(vector, mirror)
+    some = np.maximum(lights.intensities, 1e-300)
+    doubt = (lights.intensity_stderr / some) ** 2
+    if mirror:
+        doubt = doubt + (lights.leakage_stderr / (1.0 - lights.leakage)) ** 2
+    out = np.zeros((len(each), LAYERS))
+    out[:, [F_X, F_Y]] = place
+    out[:, SCALE] = full
+    out[:, CONCENTRATION] = np.linalg.norm(vector, axis=1) / np.maximum(full, 1e-300)
+    if doubt.any():
+        move = np.einsum("pij,lj->pil", slope, axes) * (each * np.sqrt(doubt))[:, None]
+        out[:, SYS_XX] = np.sum(move[:, 0] ** 2, axis=1)
+        out[:, SYS_XY] = np.sum(move[:, 0] * move[:, 1], axis=1)
+        out[:, SYS_YY] = np.sum(move[:, 1] ** 2, axis=1)
+    return out
+
+
+def seen(vector: Floats, mirror: bool) -> tuple[Floats, Floats]:
+    """Return the place that a moment vector points at, and its derivative by the vector.
+
+    Parameters
+    ----------
+    vector : ndarray, shape (P, 3)
+        In the frame of the view.
+    mirror : bool
+        Whether the vector is a reflection's, and the normal half way between it and the view.
+
+    Returns
+    -------
+    place : ndarray, shape (P, 2)
+    slope : ndarray, shape (P, 2, 3)
+    """
+    size = np.maximum(np.linalg.norm(vector, axis=1), 1e-300)[:, None]
+    n = vector / size
+    turn = (np.eye(3) - n[:, :, None] * n[:, None, :]) / size[:, :, None]
+    if mirror:
+        half = n + np.array([0.0, 0.0, 1.0])
+        size = np.maximum(np.linalg.norm(half, axis=1), 1e-6)[:, None]
+        n = half / size
+        turn = (np.eye(3) - n[:, :, None] * n[:, None, :]) / size[:, :, None] @ turn
+    up = np.maximum(1.0 + n[:, 2], 1e-9)
+    scale = np.sqrt(2.0 / up)
+    slope = scale[:, None, None] * turn[:, :2]
+    slope -= (scale / (2.0 * up))[:, None, None] * n[:, :2, None] * turn[:, None, 2]
+    return place_of(n), slope
