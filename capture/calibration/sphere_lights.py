@@ -1,0 +1,385 @@
+"""The lights of a polarized sphere as calibrated: directions, intensities, films, and leakage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration.record import (
+    Calibration,
+    CalibrationMismatch,
+    Quantity,
+    Source,
+    default_validity,
+)
+from capture.calibration.store import load
+from capture.calibration.validity import require
+from capture.rig import Rig
+
+__all__ = ["SphereCalibration", "SphereFilms", "SphereLightTable"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SphereLightTable:
+    """Where the lights stand and how bright they are.
+
+    Attributes
+    ----------
+    names : tuple of str
+        In the rig's order.
+    directions : ndarray of float64, shape (L, 3)
+        Unit vectors from the rig's origin.
+    directions_stderr : ndarray of float64, shape (L, 3)
+        Standard errors; they have the ball's place in common.
+    intensities, intensities_stderr : ndarray of float64, shape (L,)
+        Light that reaches the origin, over the mean of the valid lights.
+    seen : ndarray of bool, shape (L,)
+        Where the direction was measured; elsewhere it is nominal.
+    valid : ndarray of bool, shape (L,)
+        Where the intensity was measured. Elsewhere it is nominal, 1.
+    dead : ndarray of bool, shape (L,)
+        Lights that gave none; they are valid, with an intensity near 0.
+    """
+
+    names: tuple[str, ...]
+    directions: FloatArray
+    directions_stderr: FloatArray
+    intensities: FloatArray
+    intensities_stderr: FloatArray
+    seen: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
+    dead: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        """Convert and check the arrays against each other."""
+        n = len(self.names)
+        _freeze(self, n, ("directions", "directions_stderr"), (n, 3), np.float64)
+        _freeze(self, n, ("intensities", "intensities_stderr"), (n,), np.float64)
+        _freeze(self, n, ("seen", "valid", "dead"), (n,), np.bool_)
+        length = np.linalg.norm(self.directions, axis=1)
+        if (np.abs(length - 1) > 1e-6).any():
+            raise ValueError("SphereLightTable.directions: expected unit vectors")
+        for name in ("directions_stderr", "intensities_stderr"):
+            if (getattr(self, name) < 0).any():
+                raise ValueError(f"SphereLightTable.{name}: got a negative number, expected >= 0")
+
+    @classmethod
+    def nominal(cls, rig: Rig) -> SphereLightTable:
+        """Return the lights as the rig's file describes them, errors 0, all as bright.
+
+        Examples
+        --------
+        >>> from capture.rig import load_rig
+        >>> table = SphereLightTable.nominal(load_rig("gradient"))
+        >>> table.directions[0].round(3).tolist(), float(table.intensities.mean())
+        ([-0.173, -0.073, 0.982], 1.0)
+        """
+        place = np.array([light.position_mm for light in rig.lights], np.float64)
+        strength = np.array([light.power_w or 0.0 for light in rig.lights])
+        strength = strength / np.sum(place**2, axis=1)
+        n = len(rig.lights)
+        return cls(
+            tuple(light.name for light in rig.lights),
+            place / np.linalg.norm(place, axis=1, keepdims=True),
+            np.zeros((n, 3)),
+            strength / strength.mean(),
+            np.zeros(n),
+            np.zeros(n, bool),
+            np.zeros(n, bool),
+            np.zeros(n, bool),
+        )
+
+    def to_calibration(
+        self,
+        *,
+        rig: str,
+        source: Source,
+        created: date,
+        ball: Mapping[str, Quantity] | None = None,
+        **about: Any,
+    ) -> Calibration:
+        """Return this as a `Calibration` of kind "lights", keyed by light.
+
+        Parameters
+        ----------
+        rig, source, created
+            As in `Calibration`.
+        ball : mapping of str to Quantity, optional
+            Of the target, kept under the serial "ball".
+        **about
+            ``valid_until``, ``notes``, ``inputs``, ``versions`` of `Calibration`.
+        """
+        values: dict[str, dict[str, Quantity]] = {
+            name: {
+                "direction": Quantity(self.directions[i], self.directions_stderr[i]),
+                "intensity": Quantity(self.intensities[i], self.intensities_stderr[i]),
+                "seen": Quantity(np.array(float(self.seen[i]))),
+                "valid": Quantity(np.array(float(self.valid[i]))),
+                "dead": Quantity(np.array(float(self.dead[i]))),
+            }
+            for i, name in enumerate(self.names)
+        }
+        if ball:
+            values["ball"] = dict(ball)
+        notes = {"unit": "intensity: light at the origin over the mean of the measured lights"}
+        return _calibration("lights", values, rig, source, created, notes, about)
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration, rig: Rig) -> SphereLightTable:
+        """Return the calibrated lights of a rig, in the rig's order.
+
+        Raises
+        ------
+        CalibrationMismatch
+            If the calibration is of another rig or lacks one of its lights.
+        """
+        table = _Columns(calibration, rig, "lights")
+        return cls(
+            table.names,
+            *table.both("direction"),
+            *table.both("intensity"),
+            table.values("seen").astype(bool),
+            table.values("valid").astype(bool),
+            table.values("dead").astype(bool),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SphereFilms:
+    """What the films leak, as seen on glass, and as skin will.
+
+    Attributes
+    ----------
+    names : tuple of str
+    leakage, leakage_stderr : ndarray of float64, shape (L,)
+        Of the mirror reflection of each light by a surface of index `eta`: crossed over parallel.
+    glass_leakage, glass_leakage_stderr : ndarray of float64, shape (L,)
+        Of the ball, as measured.
+    axis_error_rad, axis_error_stderr_rad : ndarray of float64, shape (L,)
+        By how much each light's polarizer is off its nominal axis.
+    valid : ndarray of bool, shape (L,)
+        Where the glass's leakage was measured; elsewhere `axis_error_rad` is what it may be, and
+        `leakage` what follows from the films alone.
+    misalignment_rad, misalignment_stderr_rad : float
+        What the analyser's reading lacks to its true angle.
+    light_leak, light_leak_stderr, analyser_leak, analyser_leak_stderr : float
+        Inverse extinction ratios of the films.
+    eta : float
+        Refractive index of the surface that `leakage` is for.
+    """
+
+    names: tuple[str, ...]
+    leakage: FloatArray
+    leakage_stderr: FloatArray
+    glass_leakage: FloatArray
+    glass_leakage_stderr: FloatArray
+    axis_error_rad: FloatArray
+    axis_error_stderr_rad: FloatArray
+    valid: NDArray[np.bool_]
+    misalignment_rad: float
+    misalignment_stderr_rad: float
+    light_leak: float
+    light_leak_stderr: float
+    analyser_leak: float
+    analyser_leak_stderr: float
+    eta: float
+
+    def __post_init__(self) -> None:
+        """Convert and check the arrays against each other."""
+        n = len(self.names)
+        arrays = (*_LEAKS, *(f"{name}_stderr" for name in _LEAKS[:2]))
+        _freeze(self, n, (*arrays, "axis_error_stderr_rad"), (n,), np.float64)
+        _freeze(self, n, ("valid",), (n,), np.bool_)
+        if (self.leakage < 0).any() or not self.eta > 1:
+            raise ValueError("SphereFilms: got a leakage < 0 or eta <= 1, expected >= 0 and > 1")
+
+    def to_calibration(
+        self, *, serial: str, rig: str, source: Source, created: date, **about: Any
+    ) -> Calibration:
+        """Return this as a `Calibration` of kind "polarization", by light, and of the camera.
+
+        Parameters
+        ----------
+        serial
+            Of the camera behind the analyser.
+        rig, source, created, **about
+            As for `SphereLightTable.to_calibration`.
+        """
+        values: dict[str, dict[str, Quantity]] = {
+            name: {
+                "leakage": Quantity(self.leakage[i], self.leakage_stderr[i]),
+                "glass_leakage": Quantity(self.glass_leakage[i], self.glass_leakage_stderr[i]),
+                "axis_error_rad": Quantity(self.axis_error_rad[i], self.axis_error_stderr_rad[i]),
+                "valid": Quantity(np.array(float(self.valid[i]))),
+            }
+            for i, name in enumerate(self.names)
+        }
+        values[serial] = {
+            "analyser_zero_rad": _one(self.misalignment_rad, self.misalignment_stderr_rad),
+            "light_leak": _one(self.light_leak, self.light_leak_stderr),
+            "analyser_leak": _one(self.analyser_leak, self.analyser_leak_stderr),
+            "eta": Quantity(np.array(self.eta)),
+        }
+        notes = {
+            "leakage": "of a mirror reflection into the camera, crossed over parallel",
+            "analyser_zero": "true angle of the analyser less its reading; from +x towards +y",
+        }
+        return _calibration("polarization", values, rig, source, created, notes, about)
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration, rig: Rig, serial: str) -> SphereFilms:
+        """Return the calibrated films of a rig and one of its cameras, in the rig's order.
+
+        Raises
+        ------
+        CalibrationMismatch
+            If the calibration is of another rig or camera, or lacks one of the rig's lights.
+        """
+        table = _Columns(calibration, rig, "polarization")
+        leakage, glass, axis = (table.both(name) for name in _LEAKS)
+        zero, light, analyser = (
+            calibration.quantity(serial, name)
+            for name in ("analyser_zero_rad", "light_leak", "analyser_leak")
+        )
+        return cls(
+            table.names,
+            *leakage,
+            *glass,
+            *axis,
+            table.values("valid").astype(bool),
+            *_pair(zero),
+            *_pair(light),
+            *_pair(analyser),
+            float(calibration.quantity(serial, "eta").value),
+        )
+
+
+_LEAKS = ("leakage", "glass_leakage", "axis_error_rad")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SphereCalibration:
+    """What a CALIBRATION/ folder says of a polarized sphere.
+
+    Attributes
+    ----------
+    lights : SphereLightTable
+    films : SphereFilms
+    """
+
+    lights: SphereLightTable
+    films: SphereFilms
+
+    @classmethod
+    def load(
+        cls, folder: str | Path, rig: Rig, *, view: str = "cam", on: date | None = None
+    ) -> SphereCalibration:
+        """Return the calibrated sphere of a rig from a CALIBRATION/ folder.
+
+        Parameters
+        ----------
+        folder : str or Path
+        rig : Rig
+            Its lights are returned, in its order.
+        view : str
+            Name of the camera behind the analyser.
+        on : date, optional
+            Day of use; None does not ask how old the calibration is.
+
+        Raises
+        ------
+        CalibrationMissing
+            If a kind is missing.
+        CalibrationMismatch, CalibrationExpired, CalibrationDamaged
+            If one cannot be used.
+        """
+        serial = rig.view(view).serial
+        names = [light.name for light in rig.lights]
+        lights, films = load(folder, "lights"), load(folder, "polarization")
+        if on is not None:
+            require(lights, rig=rig.name, serials=names, on_date=on, kind="lights")
+            serials = [*names, serial]
+            require(films, rig=rig.name, serials=serials, on_date=on, kind="polarization")
+        return cls(
+            SphereLightTable.from_calibration(lights, rig),
+            SphereFilms.from_calibration(films, rig, serial),
+        )
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Lights of measured intensity that shine, shape (L,)."""
+        return self.lights.valid & ~self.lights.dead
+
+
+class _Columns:
+    """Quantities of the lights of a rig, out of a calibration."""
+
+    def __init__(self, calibration: Calibration, rig: Rig, kind: str) -> None:
+        if calibration.kind != kind or calibration.rig != rig.name:
+            raise CalibrationMismatch(
+                f"calibration: got kind {calibration.kind!r} of rig {calibration.rig!r}, expected"
+                f" {kind!r} of {rig.name!r}"
+            )
+        self.names = tuple(light.name for light in rig.lights)
+        self._calibration = calibration
+
+    def values(self, name: str) -> FloatArray:
+        return np.array([self._calibration.quantity(n, name).value for n in self.names])
+
+    def both(self, name: str) -> tuple[FloatArray, FloatArray]:
+        rows = [self._calibration.quantity(n, name) for n in self.names]
+        errors = [np.zeros_like(q.value) if q.stderr is None else q.stderr for q in rows]
+        return np.array([q.value for q in rows]), np.array(errors)
+
+
+def _calibration(
+    kind: str,
+    values: Mapping[str, Mapping[str, Quantity]],
+    rig: str,
+    source: Source,
+    created: date,
+    notes: Mapping[str, str],
+    about: Mapping[str, Any],
+) -> Calibration:
+    return Calibration(
+        kind=kind,
+        rig=rig,
+        serials=tuple(values),
+        created=created,
+        valid_until=about.get("valid_until") or default_validity(created),
+        source=source,
+        values=values,
+        notes={**notes, **(about.get("notes") or {})},
+        inputs=dict(about.get("inputs") or {}),
+        versions=dict(about.get("versions") or {}),
+    )
+
+
+def _one(value: float, stderr: float) -> Quantity:
+    return Quantity(np.array(value), np.array(stderr))
+
+
+def _pair(quantity: Quantity) -> tuple[float, float]:
+    return float(quantity.value), 0.0 if quantity.stderr is None else float(quantity.stderr)
+
+
+def _freeze(
+    row: Any, count: int, names: tuple[str, ...], shape: tuple[int, ...], kind: Any
+) -> None:
+    for name in names:
+        array = np.array(getattr(row, name), dtype=kind)
+        if array.shape != shape or not np.isfinite(array).all():
+            raise ValueError(
+                f"{type(row).__name__}.{name}: got shape {array.shape}, expected finite numbers of"
+                f" shape {shape} for {count} lights"
+            )
+        array.setflags(write=False)
+        object.__setattr__(row, name, array)

@@ -1,0 +1,290 @@
+"""Light of small bright spots: exposures put together, middles, and sums over apertures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.raw import RawFrame
+
+__all__ = ["Flux", "RateImage", "Shot", "measure_flux", "measure_middles", "rate_image", "shot"]
+
+FloatArray = NDArray[np.float64]
+
+CLIP_SIGMAS = 3.0  # pixels of the background further off than this belong to something else
+CENTERING = 4
+CENTERED_PX = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    """One exposure, linear.
+
+    Attributes
+    ----------
+    signal : ndarray of float32, shape (H, W)
+        Fraction of full scale, dark subtracted; negative values are kept.
+    variance : ndarray of float32, shape (H, W)
+    valid : ndarray of bool, shape (H, W)
+        False where saturated.
+    amount_s : float
+        Exposure time x level of the lights, s, > 0.
+    reading_deg : float
+        Reading of the analyser, degrees.
+    """
+
+    signal: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    amount_s: float
+    reading_deg: float
+
+    def __post_init__(self) -> None:
+        """Check the fields against each other."""
+        shape = self.signal.shape
+        if len(shape) != 2 or self.variance.shape != shape or self.valid.shape != shape:
+            raise ValueError(
+                f"Shot: got signal {shape}, variance {self.variance.shape} and valid"
+                f" {self.valid.shape}, expected one shape (H, W)"
+            )
+        if not (0 < self.amount_s < np.inf and np.isfinite(self.reading_deg)):
+            raise ValueError(
+                f"Shot: got amount {self.amount_s} s and reading {self.reading_deg} degrees,"
+                " expected an amount > 0 and a finite angle"
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RateImage:
+    """Several exposures of one scene as one image.
+
+    Attributes
+    ----------
+    rate, variance : ndarray of float32, shape (H, W)
+        Signal per second at level 1; where every exposure is saturated the least it can be.
+    valid : ndarray of bool, shape (H, W)
+        False where every exposure is saturated.
+    """
+
+    rate: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Flux:
+    """Sums over the spots of one exposure.
+
+    Attributes
+    ----------
+    value, variance : ndarray of float64, shape (L,)
+        Signal x px^2 above the local background; 0 and 0 where not `whole`.
+    saturated : ndarray of bool, shape (L,)
+        A pixel of the aperture is saturated: `value` is only the least it can be.
+    whole : ndarray of bool, shape (L,)
+        Aperture and background lie in the image.
+    """
+
+    value: FloatArray
+    variance: FloatArray
+    saturated: NDArray[np.bool_]
+    whole: NDArray[np.bool_]
+
+
+def shot(
+    frame: RawFrame,
+    *,
+    amount_s: float,
+    reading_deg: float,
+    dark: NDArray[np.float32] | float = 0.0,
+    dark_variance: float = 0.0,
+    flat: NDArray | float = 1.0,
+) -> Shot:
+    """Return an exposure of a monochrome camera.
+
+    Parameters
+    ----------
+    frame : RawFrame
+        "MONO", with a noise profile.
+    amount_s, reading_deg
+        As in `Shot`.
+    dark : ndarray of float32, shape (H, W), or float
+        What a frame without light shows above black, fraction of full scale.
+    dark_variance : float
+        Of that, per pixel.
+    flat : ndarray, shape (H, W), or float
+        Response of the pixels, 1 in the middle: signals are divided by it.
+
+    Raises
+    ------
+    ValueError
+        If the frame is not monochrome or does not say how noisy it is.
+    """
+    if frame.pattern != "MONO" or frame.noise_profile is None:
+        raise ValueError(
+            f"frame: got pattern {frame.pattern!r} and noise profile {frame.noise_profile},"
+            " expected a monochrome frame that says how noisy it is"
+        )
+    span = np.float32(1.0 / (frame.white - frame.black[0]))
+    x = (frame.cfa.astype(np.float32) - np.float32(frame.black[0])) * span
+    scale, offset = frame.noise_profile
+    response = np.asarray(flat, np.float32)
+    variance = np.float32(scale) * np.maximum(x, 0) + np.float32(offset + dark_variance)
+    return Shot(
+        np.asarray((x - np.asarray(dark, np.float32)) / response, np.float32),
+        np.asarray(variance / response**2, np.float32),
+        frame.cfa < frame.white,
+        amount_s,
+        reading_deg,
+    )
+
+
+def rate_image(shots: Sequence[Shot]) -> RateImage:
+    """Put exposures of one scene together, each pixel from those in which it is not saturated.
+
+    Parameters
+    ----------
+    shots : sequence of Shot
+        Of one reading of the analyser.
+
+    Examples
+    --------
+    >>> dim = Shot(np.full((1, 1), 0.2, np.float32), np.ones((1, 1), np.float32),
+    ...            np.ones((1, 1), bool), 0.1, 0.0)
+    >>> bright = Shot(np.ones((1, 1), np.float32), np.ones((1, 1), np.float32),
+    ...               np.zeros((1, 1), bool), 1.0, 0.0)
+    >>> round(float(rate_image([dim, bright]).rate[0, 0]), 6)
+    2.0
+    """
+    if not shots:
+        raise ValueError("shots: got none, expected at least one")
+    signal = np.zeros(shots[0].signal.shape, np.float32)
+    variance, amount = np.zeros_like(signal), np.zeros_like(signal)
+    for part in shots:
+        signal += np.where(part.valid, part.signal, 0)
+        variance += np.where(part.valid, part.variance, 0)
+        amount += np.float32(part.amount_s) * part.valid
+    valid = amount > 0
+    if not valid.all():
+        # where all are saturated the shortest says most
+        short = min(shots, key=lambda part: part.amount_s)
+        signal[~valid], variance[~valid] = short.signal[~valid], short.variance[~valid]
+        amount[~valid] = short.amount_s
+    return RateImage(signal / amount, variance / amount**2, valid)
+
+
+def measure_middles(
+    image: RateImage, pixels: FloatArray, *, aperture_px: float
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return the middles of spots, their intensity-weighted mean places.
+
+    Parameters
+    ----------
+    image : RateImage
+    pixels : ndarray of float64, shape (L, 2)
+        About where they are; NaN: nowhere.
+    aperture_px : float
+        Radius of the disc that holds a spot, px.
+
+    Returns
+    -------
+    middle : ndarray of float64, shape (L, 2)
+        NaN where a spot is not whole within the image or holds no light.
+    stderr : ndarray of float64, shape (L,)
+        Standard error of a coordinate by the noise, px; NaN likewise.
+    saturated : ndarray of bool, shape (L,)
+    """
+    middle = np.full(pixels.shape, np.nan)
+    stderr = np.full(len(pixels), np.nan)
+    saturated = np.zeros(len(pixels), bool)
+    for k, start in enumerate(pixels):
+        at = start
+        for _ in range(CENTERING):
+            window = _window(at, image.rate.shape, aperture_px, pixels)
+            if window is None:
+                break
+            rows, columns, weight, around, dx, dy = window
+            values = image.rate[rows, columns].astype(np.float64)
+            noise = image.variance[rows, columns].astype(np.float64)
+            level, _ = _background(values[around], noise[around])
+            light = weight * (values - level)
+            total = light.sum()
+            spread = np.sqrt(np.sum(weight**2 * noise))
+            if not total > CLIP_SIGMAS * spread:
+                break
+            step = np.array([np.sum(light * dx), np.sum(light * dy)]) / total
+            if np.hypot(*step) > aperture_px:
+                break
+            at = at + step
+            if np.hypot(*step) < CENTERED_PX or _ == CENTERING - 1:
+                square = 0.5 * (dx**2 + dy**2)
+                middle[k] = at
+                stderr[k] = np.sqrt(np.sum(weight**2 * noise * square)) / total
+                saturated[k] = not image.valid[rows, columns][weight > 0].all()
+                break
+    return middle, stderr, saturated
+
+
+def measure_flux(part: Shot, pixels: FloatArray, *, aperture_px: float) -> Flux:
+    """Sum the light of spots over discs, above the median of rings around them.
+
+    Parameters
+    ----------
+    part : Shot
+    pixels : ndarray of float64, shape (L, 2)
+        Their middles, px; NaN: none.
+    aperture_px : float
+        Radius of the discs; the rings reach from 1.3 to 1.8 of it.
+    """
+    count = len(pixels)
+    value, variance = np.zeros(count), np.zeros(count)
+    saturated, whole = np.zeros(count, bool), np.zeros(count, bool)
+    for k, at in enumerate(pixels):
+        window = _window(at, part.signal.shape, aperture_px, pixels)
+        if window is None:
+            continue
+        rows, columns, weight, around, _, _ = window
+        values = part.signal[rows, columns].astype(np.float64)
+        noise = part.variance[rows, columns].astype(np.float64)
+        level, level_variance = _background(values[around], noise[around])
+        value[k] = np.sum(weight * (values - level))
+        variance[k] = np.sum(weight**2 * noise) + weight.sum() ** 2 * level_variance
+        saturated[k] = not part.valid[rows, columns][weight > 0].all()
+        whole[k] = True
+    return Flux(value, variance, saturated, whole)
+
+
+def _window(
+    at: FloatArray, shape: tuple[int, ...], aperture_px: float, every: FloatArray
+) -> tuple[slice, slice, FloatArray, NDArray[np.bool_], FloatArray, FloatArray] | None:
+    """Return slices, weights of the disc, the ring, and offsets; None where it is not whole."""
+    if not np.isfinite(at).all():
+        return None
+    outer = 1.8 * aperture_px
+    low = np.floor(at - outer).astype(int)
+    high = np.ceil(at + outer).astype(int) + 1
+    if (low < 0).any() or high[0] > shape[1] or high[1] > shape[0]:
+        return None
+    dx, dy = np.meshgrid(np.arange(low[0], high[0]) - at[0], np.arange(low[1], high[1]) - at[1])
+    distance = np.hypot(dx, dy)
+    weight = np.clip(aperture_px + 0.5 - distance, 0.0, 1.0)
+    around = (distance > 1.3 * aperture_px) & (distance < outer)
+    gaps = np.hypot(*(every - at).T)
+    for other in every[(gaps > aperture_px) & (gaps < outer + 1.3 * aperture_px)] - at:
+        around &= np.hypot(dx - other[0], dy - other[1]) > 1.3 * aperture_px
+    if around.sum() < 8:
+        return None
+    rows, columns = slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
+    return rows, columns, weight, around, dx, dy
+
+
+def _background(values: FloatArray, noise: FloatArray) -> tuple[float, float]:
+    """Return the mean of a ring without what sticks out of it, and its variance."""
+    usual = float(np.median(values))
+    near = np.abs(values - usual) <= CLIP_SIGMAS * np.sqrt(noise)
+    if not near.any():
+        return usual, float(noise.mean())
+    return float(values[near].mean()), float(noise[near].mean() / near.sum())
