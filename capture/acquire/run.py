@@ -9,12 +9,16 @@ from typing import Any
 
 from capture.acquire.dome import run_dome
 from capture.acquire.flash import run_flash
+from capture.acquire.gradient import run_gradient
 from capture.acquire.outcome import Acquired, AcquisitionError, Operator
 from capture.devices.camera import Camera, check_serials
 from capture.devices.dome import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session
+
+KINDS = ("gradient_sphere", "dome", "flash")
+"""Boxes by which a rig is known."""
 
 
 def run_plan(
@@ -30,6 +34,7 @@ def run_plan(
     clock: Callable[[], float] = time.time,
     run_id: str = "",
     eyes: Eyes = "open",
+    force_limit_n: float | None = None,
 ) -> Acquired:
     """Capture what the session still lacks of a plan.
 
@@ -40,15 +45,17 @@ def run_plan(
     rig
         The rig that the plan is for.
     boxes, cameras
-        Open drivers by name: the box of the rig ("flash" or "dome"), and a camera for each view.
+        Open drivers by name: the box of the rig ("flash", "dome" or "gradient_sphere", and
+        "caliper" where skin is stretched), and a camera for each view.
     session
         Open for writing.
     progress
         Called with one line a step, or a second of a sequence.
     prompt
-        Called before the first step that needs it with the state ("smile"), or with the place of
-        the target on the dome ("pose 3"); returns when the subject or the target is ready. Called
-        too with what to press when only a hand can release a camera.
+        Called before the first step that needs it with the state ("smile"), with the place of the
+        target on the dome ("pose 3"), or with how skin is to be taped ("tape the skin at 45
+        degrees"); returns when the subject or the target is ready. Called too with what to press
+        when only a hand can release a camera.
     interrupted
         Asked before each step, or each sequence; True stops in good order.
     clock
@@ -58,7 +65,10 @@ def run_plan(
         that no two bear one token, also after a resume.
     eyes
         What a person says of the subject's eyes: "open", "closed" or "shielded". Light that
-        flickers too much for open eyes is refused.
+        flickers too much for open eyes is refused; so are patterns on skin with open eyes.
+    force_limit_n
+        Greatest force of the caliper on the skin, N; there is no default, and nothing moves
+        without.
 
     Returns
     -------
@@ -75,7 +85,7 @@ def run_plan(
         When ``interrupted`` said so.
     """
     plan.check(rig)
-    kind = "dome" if "dome" in rig.boxes else "flash"
+    kind = next(name for name in KINDS if name in rig.boxes or name == "flash")
     if kind not in boxes:
         raise AcquisitionError(f"box {kind!r}: no port was given; add --port {kind}=URL")
     check_serials(cameras, [(view.name, view.serial) for view in rig.views])
@@ -86,6 +96,11 @@ def run_plan(
         clock=clock,
         run_id=run_id or secrets.token_hex(4),
     )
+    if kind == "gradient_sphere":
+        return run_gradient(
+            plan, rig, boxes=boxes, cameras=cameras, session=session, operator=operator, eyes=eyes,
+            force_limit_n=force_limit_n,
+        )  # fmt: skip
     box = boxes[kind]
     if kind == "dome":
         return run_dome(

@@ -14,7 +14,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from capture.plan.rows import led_rows
+from capture.plan.rows import led_rows, passes
 from capture.plan.steps import PATTERNS, POLARIZERS, Kind, Plan, Step, Value, require
 from capture.rig import Caliper, LedLimits, Rig
 
@@ -29,6 +29,9 @@ SCAN_ORDER = ("full", "z", "x", "-x", "y", "-y", "-z", "dark")
 """From bright to dark for an eye beside the patch."""
 BALL_LEVEL = 0.03
 """A ball of black glass shows the LEDs themselves: 4 % of what is far brighter than lit skin."""
+FLAT_EXPOSURE_S = 0.03
+"""Of the photon transfer series, which is to come near full scale."""
+FLAT_DWELL_S = 0.042
 FLAT_LEVELS = (0.03, 0.06, 0.12, 0.19, 0.25, 0.38, 0.5, 0.63, 0.75, 1.0)
 """Levels of the photon transfer series: dense in the shadows, up to full scale."""
 
@@ -152,8 +155,8 @@ def gradient_calibration_plan(
     repeats: int | None = None,
     darks: int = 2,
     level: float = BALL_LEVEL,
-    exposure_s: float = EXPOSURE_S,
-    dwell_s: float = DWELL_S,
+    exposure_s: float | None = None,
+    dwell_s: float | None = None,
     iso: int = 100,
 ) -> Plan:
     """Plan the frames of one calibration of the gradient sphere; no caliper takes part.
@@ -164,15 +167,17 @@ def gradient_calibration_plan(
         With LEDs.
     target : {"ball", "dark", "flat"}
         "ball": a ball of black glass under "full" and "dark", parallel and crossed, at ``level``;
-        "flat": an even white field at 10 levels (photon transfer pairs); "dark": the cap on.
+        "flat": an even white field at 10 levels, once after the other (photon transfer pairs);
+        "dark": the cap on.
     repeats : int, optional
         Frames per condition: by default 4 of the ball, 2 (>= 2) of the flat, 16 of the dark.
     darks : int
         Frames without light before the flats, >= 0.
     level : float
         Of the LEDs that the ball shows, 0 < level <= 1.
-    exposure_s, dwell_s, iso
-        As for `gradient_plan`.
+    exposure_s, dwell_s : float, optional
+        As for `gradient_plan`; longer by default for the flats.
+    iso : int
 
     Examples
     --------
@@ -189,15 +194,22 @@ def gradient_calibration_plan(
     require(count >= least, "repeats", count, f">= {least}")
     require(darks >= 0, "darks", darks, ">= 0")
     require(0 < level <= 1, "level", level, "0 < level <= 1")
-    series = _Series(rig, exposure_s=exposure_s, dwell_s=dwell_s, iso=iso)
+    flat = target == "flat"
+    series = _Series(
+        rig,
+        exposure_s=exposure_s or (FLAT_EXPOSURE_S if flat else EXPOSURE_S),
+        dwell_s=dwell_s or (FLAT_DWELL_S if flat else DWELL_S),
+        iso=iso,
+    )
     if target == "dark":
         series.darks(count)
     elif target == "flat":
         series.darks(darks)
-        for number, power in enumerate(FLAT_LEVELS):
-            for repeat in range(count):
+        for repeat in range(count):
+            for number, power in enumerate(FLAT_LEVELS):
                 series.add(
-                    f"F{number}-{repeat:02d}", "flat", {"level": power, "repeat": repeat},
+                    f"F{number}-{repeat:02d}", "flat",
+                    {"level": power, "repeat": repeat, "pass": repeat},
                     pattern="full", polarizer="parallel", level=power,
                 )  # fmt: skip
     else:
@@ -307,8 +319,7 @@ class _Series:
         """Return the plan; a piece of it that asks too much of an LED is refused."""
         limits = self._limits
         judged: dict[tuple[object, ...], float] = {}
-        for _, group in groupby(self._steps, key=lambda step: state_of(step) or step.kind):
-            piece = list(group)
+        for piece in passes(self._steps):
             key = tuple((s.settings["pattern"], s.settings["level"]) for s in piece)
             if key not in judged:
                 judged[key] = scan_duty(piece, self._rig)
