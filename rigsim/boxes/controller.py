@@ -47,6 +47,7 @@ _TEXTS = {
     Code.RECYCLE: "Recycling",
     Code.LIGHT_DOSE: "Light dose",
     Code.FLICKER: "Flicker; SAFE:EYES says whether eyes are safe",
+    Code.FORCE: "Force limit",
     Code.INTERLOCK: "Interlock open",
     Code.WATCHDOG_TRIPPED: "Watchdog tripped; SYST:ARM first",
     Code.BOOT_CHANGED: "Boot changed; SYST:HELLO? first",
