@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -90,6 +90,7 @@ class Reflection:
         *,
         to_light: FloatArray,
         to_camera: FloatArray,
+        facing: FloatArray | None = None,
     ) -> Self:
         """Return the reflection by facets that mirror each light into the camera.
 
@@ -104,6 +105,8 @@ class Reflection:
             Refractive index, > 1.
         to_light, to_camera : ndarray of float64, shape (L, 3)
             Unit vectors from the facets.
+        facing : ndarray of float64, shape (L, 3), optional
+            Directions from the rig's origin to the lights, whose films face it; None: nominal.
 
         Raises
         ------
@@ -113,7 +116,8 @@ class Reflection:
         bare = [light.name for light in lights if light.polarizer_axis_deg is None]
         if bare:
             raise PolarizationError(f"lights: {', '.join(bare)} have no polarizer")
-        beam = np.array([light.position_mm for light in lights], np.float64)
+        place = [light.position_mm for light in lights] if facing is None else facing
+        beam = np.array(place, np.float64)
         beam /= np.linalg.norm(beam, axis=1, keepdims=True)
         right = np.cross([0.0, 1.0, 0.0], beam)
         right /= np.linalg.norm(right, axis=1, keepdims=True)
@@ -130,6 +134,19 @@ class Reflection:
             float(np.radians(analyser_deg)),
             eta,
         )
+
+    def moved(self, to_light: FloatArray, eta: float) -> Self:
+        """Return the reflection with lights in other directions, and of another index.
+
+        Parameters
+        ----------
+        to_light : ndarray of float64, shape (L, 3)
+            From the facets, any length; films face the facets as before.
+        eta : float
+        """
+        light = _unit(to_light)
+        normal = _unit(light + self.to_camera)
+        return replace(self, to_light=light, normal=normal, eta=eta)
 
     def fields(self, turn_rad: ArrayLike = 0.0) -> FloatArray:
         """Return the reflected fields, shape (L, 2, 2).
