@@ -165,6 +165,7 @@ def blur(
     *,
     depth_mm: Float32Array | None = None,
     subpixels: int = 1,
+    averaged: bool = False,
 ) -> Float32Array:
     """Blur pictures as the lens and the pixels do.
 
@@ -179,6 +180,8 @@ def blur(
         Height of each sample above the plane in focus, mm, shape (H s, W s); None: in focus.
     subpixels
         The s above.
+    averaged
+        Whether the samples are means over pixels already, so that only the lens blurs.
 
     Returns
     -------
@@ -204,6 +207,8 @@ def blur(
     fx = np.fft.rfftfreq(coarse[1], pixel_mm)
     radius = np.hypot(fy[:, None], fx[None, :])
     pixel = np.sinc(fy * pixel_mm)[:, None] * np.sinc(fx * pixel_mm)[None, :]
+    if averaged:
+        pixel = np.ones_like(pixel)
     # the samples' grid begins so many pixels before the pixels' middles
     offset = 0.5 * (1.0 - 1.0 / subpixels)
     turn = np.exp(2j * np.pi * offset * pixel_mm * fy)[:, None] * np.exp(

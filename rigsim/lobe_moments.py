@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigsim import shading
 from rigsim.mesh import Float32Array
-from rigsim.sphere_build import BuiltSphere
+from rigsim.sphere_build import REFERENCE_MM, BuiltSphere
 
 FloatArray = NDArray[np.float64]
 
@@ -109,10 +109,6 @@ def irradiance_share(
     lobe = 1.0 if half_deg is None else off ** (math.log(0.5) / math.log(math.cos(
         math.radians(half_deg))))  # fmt: skip
     return to_light, sphere.intensity[led] * lobe * REFERENCE_MM**2 / square
-
-
-REFERENCE_MM: Final = 600.0
-"""Distance at which an LED of intensity 1 gives unit irradiance."""
 
 
 def led_moments(

@@ -10,6 +10,8 @@ from typing import Final
 
 import numpy as np
 
+from rigsim.mesh import Float32Array
+
 DRIFT_HZ: Final = (0.11, 0.23, 0.37)
 """Frequencies of slow drift: breath and muscle tone."""
 
@@ -80,3 +82,44 @@ class PatchMotion:
         waves = np.sin(2.0 * math.pi * np.array(DRIFT_HZ) * t_s + phase)
         x, y = size * waves.sum(axis=1)
         return float(x), float(y)
+
+
+def shifted(
+    image: Float32Array, shift_mm: tuple[float, float], *, pixel_um: float, border_px: int
+) -> Float32Array:
+    """Return a picture without its border after what it shows has moved.
+
+    Parameters
+    ----------
+    image
+        Shape (H + 2 b, W + 2 b), row 0 is the top.
+    shift_mm
+        Shift in x and y, y up, mm.
+    pixel_um
+        Side of a pixel on the subject, um.
+    border_px
+        The b above; the shift must be 3 pixels smaller.
+
+    Returns
+    -------
+    ndarray of float32
+        Shape (H, W); interpolated by polynomials through six pixels along each axis, which a
+        picture that a lens has blurred to 3 pixels a period bears to 1 %.
+    """
+    dx, dy = 1e3 * shift_mm[0] / pixel_um, -1e3 * shift_mm[1] / pixel_um
+    reach = border_px - 3
+    if max(abs(dx), abs(dy)) > reach:
+        raise MotionError(f"drift: got {dx:.1f}, {dy:.1f} px, expected at most {reach}")
+    out = image
+    for axis, shift in ((0, dy), (1, dx)):
+        whole = math.floor(-shift)
+        part = -shift - whole
+        nodes = np.arange(-2, 4)
+        taps = [math.prod((part - k) / (n - k) for k in nodes if k != n) for n in nodes]
+        size = out.shape[axis] - 2 * border_px
+        moved = np.zeros([size if a == axis else n for a, n in enumerate(out.shape)], np.float32)
+        for tap, n in zip(taps, nodes, strict=True):
+            at = np.arange(size) + border_px + whole + int(n)
+            moved += np.float32(tap) * np.take(out, at, axis=axis)
+        out = moved
+    return out

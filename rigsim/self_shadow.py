@@ -59,23 +59,6 @@ def horizon_tangent(
     return np.ascontiguousarray(out.T if steep else out)
 
 
-def hidden_part(tangent: Float32Array, *, elevation_rad: float, radius_rad: float) -> Float32Array:
-    """Return which part of a round light stands below a horizon, 0 to 1.
-
-    Parameters
-    ----------
-    tangent
-        Tangent of the horizon's elevation, any shape.
-    elevation_rad
-        Elevation of the light's middle.
-    radius_rad
-        Its angular radius, > 0; the part is taken as linear over the disc.
-    """
-    angle = np.arctan(tangent)
-    part = np.float32(0.5) + (angle - np.float32(elevation_rad)) * np.float32(0.5 / radius_rad)
-    return np.clip(part, np.float32(0.0), np.float32(1.0))
-
-
 @njit(parallel=True, cache=True)
 def _sweep(field, step, drift, out):  # type: ignore[no-untyped-def]
     """Walk over the columns, from the light's side; each line drifts over the rows."""

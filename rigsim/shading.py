@@ -348,25 +348,24 @@ def _smith(cosine, alpha):  # type: ignore[no-untyped-def]
     return 2.0 / (1.0 + math.sqrt(1.0 + alpha * alpha * tangent2))
 
 
-@njit(parallel=True, cache=True)
-def _specular(normal, light, camera, alpha, eta, absorbs, right, leak, metal):  # type: ignore[no-untyped-def]
-    out = np.zeros((normal.shape[0], 3), np.float32)
-    for i in prange(normal.shape[0]):
-        n0, n1, n2 = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
-        l0, l1, l2 = float(light[i, 0]), float(light[i, 1]), float(light[i, 2])
-        v0, v1, v2 = float(camera[i, 0]), float(camera[i, 1]), float(camera[i, 2])
-        nl = n0 * l0 + n1 * l1 + n2 * l2
-        nv = n0 * v0 + n1 * v1 + n2 * v2
-        if nl <= 0.0 or nv <= 0.0:
-            continue
+@njit(cache=True, inline="always")
+def specular_one(n0, n1, n2, l0, l1, l2, v0, v1, v2, alpha, eta, absorbs, right, leak, metal):  # type: ignore[no-untyped-def]
+    """Return the Stokes vector of `specular_stokes` for one element, for compiled callers.
+
+    All numbers are float64; ``leak`` is 1 over the extinction, ``metal`` the root of its argument.
+    """
+    s0_sum, s1_sum, s2_sum = 0.0, 0.0, 0.0
+    nl = n0 * l0 + n1 * l1 + n2 * l2
+    nv = n0 * v0 + n1 * v1 + n2 * v2
+    if nl > 0.0 and nv > 0.0:
         h0, h1, h2 = l0 + v0, l1 + v1, l2 + v2
         length = math.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
         h0, h1, h2 = h0 / length, h1 / length, h2 / length
         hn = min(1.0, n0 * h0 + n1 * h1 + n2 * h2)
         hl = min(1.0, h0 * l0 + h1 * l1 + h2 * l2)
-        a2 = float(alpha[i]) * float(alpha[i])
+        a2 = alpha * alpha
         d = hn * hn * (a2 - 1.0) + 1.0
-        lobe = a2 / (math.pi * d * d) * _smith(nl, alpha[i]) * _smith(nv, alpha[i]) / (4.0 * nv)
+        lobe = a2 / (math.pi * d * d) * _smith(nl, alpha) * _smith(nv, alpha) / (4.0 * nv)
         inside = math.sqrt(max(0.0, 1.0 - (1.0 - hl * hl) / (eta * eta)))
         rs = (hl - eta * inside) / (hl + eta * inside)
         rp = (eta * hl - inside) / (eta * hl + inside)
@@ -407,21 +406,18 @@ def _specular(normal, light, camera, alpha, eta, absorbs, right, leak, metal):  
                 ep = rp * (f0 * i0 + f1 * i1 + f2 * i2)
                 weight = 0.5 * lobe * leak
             fx, fy = es * sx + ep * ox, es * sy + ep * oy
-            out[i, 0] += weight * (fx * fx + fy * fy)
-            out[i, 1] += weight * (fx * fx - fy * fy)
-            out[i, 2] += weight * 2.0 * fx * fy
-    return out
+            s0_sum += weight * (fx * fx + fy * fy)
+            s1_sum += weight * (fx * fx - fy * fy)
+            s2_sum += weight * 2.0 * fx * fy
+    return s0_sum, s1_sum, s2_sum
 
 
-@njit(parallel=True, cache=True)
-def _entry(normal, light, eta, absorbs, leak):  # type: ignore[no-untyped-def]
-    out = np.zeros(normal.shape[0], np.float32)
-    for i in prange(normal.shape[0]):
-        n0, n1, n2 = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
-        l0, l1, l2 = float(light[i, 0]), float(light[i, 1]), float(light[i, 2])
-        nl = min(1.0, n0 * l0 + n1 * l1 + n2 * l2)
-        if nl <= 0.0:
-            continue
+@njit(cache=True, inline="always")
+def entry_one(n0, n1, n2, l0, l1, l2, eta, absorbs, leak):  # type: ignore[no-untyped-def]
+    """Return `entry_transmittance` for one element, for compiled callers; float64."""
+    entered = 0.0
+    nl = min(1.0, n0 * l0 + n1 * l1 + n2 * l2)
+    if nl > 0.0:
         ts, tp = _transmitted(nl, eta)
         s0, s1, s2 = n1 * l2 - n2 * l1, n2 * l0 - n0 * l2, n0 * l1 - n1 * l0
         e0 = absorbs[1] * l2 - absorbs[2] * l1
@@ -432,7 +428,30 @@ def _entry(normal, light, eta, absorbs, leak):  # type: ignore[no-untyped-def]
         c2 = min(1.0, dot * dot / both) if both > 1e-20 else 0.5  # ts = tp at normal incidence
         passed = ts * c2 + tp * (1.0 - c2)
         leaked = ts * (1.0 - c2) + tp * c2
-        out[i] = 0.5 * (passed + leak * leaked)
+        entered = 0.5 * (passed + leak * leaked)
+    return entered
+
+
+@njit(parallel=True, cache=True)
+def _specular(normal, light, camera, alpha, eta, absorbs, right, leak, metal):  # type: ignore[no-untyped-def]
+    out = np.zeros((normal.shape[0], 3), np.float32)
+    for i in prange(normal.shape[0]):
+        n0, n1, n2 = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
+        l0, l1, l2 = float(light[i, 0]), float(light[i, 1]), float(light[i, 2])
+        v0, v1, v2 = float(camera[i, 0]), float(camera[i, 1]), float(camera[i, 2])
+        out[i, 0], out[i, 1], out[i, 2] = specular_one(
+            n0, n1, n2, l0, l1, l2, v0, v1, v2, float(alpha[i]), eta, absorbs, right, leak, metal
+        )
+    return out
+
+
+@njit(parallel=True, cache=True)
+def _entry(normal, light, eta, absorbs, leak):  # type: ignore[no-untyped-def]
+    out = np.zeros(normal.shape[0], np.float32)
+    for i in prange(normal.shape[0]):
+        n0, n1, n2 = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
+        l0, l1, l2 = float(light[i, 0]), float(light[i, 1]), float(light[i, 2])
+        out[i] = entry_one(n0, n1, n2, l0, l1, l2, eta, absorbs, leak)
     return out
 
 

@@ -177,3 +177,45 @@ def _power(light: Light) -> float:
     if light.power_w is None:
         raise SphereError(f"light {light.name!r}: is no LED, it has no power_w")
     return light.power_w
+
+
+REFERENCE_MM: Final = 600.0
+"""Distance at which an LED of intensity 1 gives unit irradiance."""
+
+
+def diffuser_radiance(
+    sphere: BuiltSphere, x_mm: FloatArray, y_mm: FloatArray, *, extinction: float = math.inf
+) -> FloatArray:
+    """Return the radiance of a perfect white diffuser at z = 0 that faces +z, for each moment.
+
+    Parameters
+    ----------
+    sphere
+        The LEDs; they shine at the origin.
+    x_mm, y_mm
+        Places, any shape, mm.
+    extinction
+        Of the LEDs' films, > 1; what a film passes of unpolarized light is at least half.
+
+    Returns
+    -------
+    ndarray
+        Shape (4, ...), in the unit of `rigsim.lobe_moments`.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> white = diffuser_radiance(as_drawn(load_rig("gradient")), np.zeros(1), np.zeros(1))
+    >>> bool(abs(white[1, 0] / white[0, 0]) < 0.01), bool(white[3, 0] > 0.5 * white[0, 0])
+    (True, True)
+    """
+    x, y = np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64)
+    out = np.zeros((4, *np.broadcast_shapes(x.shape, y.shape)))
+    film = 0.5 * (1.0 + 1.0 / extinction)
+    for led, (place, weight) in enumerate(zip(sphere.position_mm, sphere.weights, strict=True)):
+        if place[2] <= 0.0:
+            continue
+        square = (place[0] - x) ** 2 + (place[1] - y) ** 2 + place[2] ** 2
+        light = film / math.pi * sphere.intensity[led] * REFERENCE_MM**2 * place[2] / square**1.5
+        out += weight.reshape(4, *[1] * (out.ndim - 1)) * light
+    return out

@@ -10,7 +10,7 @@ the parallel analyser as behind the crossed one.
 
 from __future__ import annotations
 
-import math
+import dataclasses
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Final, Literal, Protocol, TypeAlias
@@ -23,28 +23,19 @@ from model.skin import SkinAppearance
 from rigsim import shading
 from rigsim.films import Films, films_of
 from rigsim.lens_blur import Lens, blur, lens_of
-from rigsim.lobe_moments import Surface, build_table
+from rigsim.lobe_moments import Surface
 from rigsim.mesh import Float32Array
-from rigsim.microrelief import BAND_NM, MicroSkin
-from rigsim.patch_motion import PatchMotion, Pose
-from rigsim.pigment import MELANIN_PRESETS
-from rigsim.scenes.gradient_patch import (
-    SHADOW_MARGIN_PX,
-    Grip,
-    Lighting,
-    PatchSurface,
-    sample_grid,
-    stand,
-)
-from rigsim.scenes.skin_glow import SIGMAS_MM
+from rigsim.microrelief import MicroSkin
+from rigsim.patch_motion import PatchMotion, Pose, shifted
+from rigsim.scenes.glass_ball import ball_center_mm, ball_stokes
+from rigsim.scenes.gradient_lighting import Lighting, light_skin
+from rigsim.scenes.gradient_patch import SHADOW_MARGIN_PX, Grip, PatchSurface, sample_grid, stand
 from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.skin_layers import ETA
 from rigsim.skin_stretch import StretchedSkin, deform
-from rigsim.skin_table import SkinTable
-from rigsim.sphere_build import PATTERN_WEIGHTS, BuiltSphere, as_drawn
+from rigsim.sphere_build import PATTERN_WEIGHTS, BuiltSphere, as_drawn, diffuser_radiance
 
-FloatArray = NDArray[np.float64]
-TargetName: TypeAlias = Literal["flat", "dark"]
+TargetName: TypeAlias = Literal["ball", "flat", "dark"]
 
 METER_RATE_PER_S: Final = 60.0
 """Full scales per second of white under all LEDs at level 1: in 30 ms pale skin gets 0.5 to 0.7 of
@@ -53,15 +44,15 @@ full scale."""
 POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of the LEDs' common energy from pattern to pattern."""
 
-BLOOD: Final = 0.035
-"""Volume fraction of blood that decides how far light spreads in the patch."""
-
 DRIFT_MARGIN_PX: Final = 8
 """Pixels around the picture that may drift into it."""
 
 KEPT_BYTES: Final = 2**29
 """Pictures of states that are kept; one at least."""
 
+
+KEPT_LIGHTINGS: Final = 2
+"""Tables of light that are kept: LEDs may change by gains and failures."""
 
 KEPT_RELIEFS: Final = 4
 """Stretched patches that are kept."""
@@ -94,6 +85,10 @@ class Pattern(Protocol):
     def analyser_deg(self) -> float:
         """Reading of the analyser's rotator, degrees."""
 
+    @property
+    def led_shares(self) -> tuple[float, ...]:
+        """What each LED gave of what the pattern asks of it; empty: all of it."""
+
 
 class GradientScene:
     """One patch of skin or one target in the gradient rig.
@@ -103,8 +98,8 @@ class GradientScene:
     rig
         The drawing.
     subject
-        A patch of skin, or "flat" (a white diffuser in the patch's place) or "dark" (a cap on the
-        lens).
+        A patch of skin, or "ball" (12 mm of black glass), "flat" (a white diffuser in the patch's
+        place) or "dark" (a cap on the lens).
     compensation
         How stretched skin narrows, see `rigsim.skin_stretch.deform`.
     films
@@ -148,8 +143,8 @@ class GradientScene:
     ) -> None:
         if len(rig.views) != 1:
             raise SceneError(f"views: got {len(rig.views)}, expected 1")
-        if isinstance(subject, str) and subject not in ("flat", "dark"):
-            raise SceneError(f"subject: got {subject!r}, expected flat, dark or skin")
+        if isinstance(subject, str) and subject not in ("ball", "flat", "dark"):
+            raise SceneError(f"subject: got {subject!r}, expected ball, flat, dark or skin")
         if subpixels < 1:
             raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
         if sectors < 4 or sectors % 4:
@@ -162,8 +157,10 @@ class GradientScene:
         self.sectors, self.subpixels, self.table_size = sectors, subpixels, table_size
         self._view = rig.views[0]
         self._sensor = sensor_of(self._view) if sensor is None else sensor
-        self._lighting: Lighting | None = None
-        self._unit = METER_RATE_PER_S / _white_radiance(rig)
+        self._lighting: OrderedDict[tuple[float, ...], Lighting] = OrderedDict()
+        # behind two ideal films, one of which the unit of radiance holds already
+        white = float(diffuser_radiance(as_drawn(rig), np.zeros(1), np.zeros(1))[0, 0])
+        self._unit = METER_RATE_PER_S / (0.5 * white)
         self._pictures: OrderedDict[tuple[object, ...], Float32Array] = OrderedDict()
         self._reliefs: OrderedDict[tuple[float, float], StretchedSkin] = OrderedDict()
         self._frames: dict[tuple[float, int], tuple[Float32Array, Float32Array]] = {}
@@ -220,7 +217,7 @@ class GradientScene:
             level 1 (behind an analyser half of it comes through, see `moments`); without drift.
         """
         h, w = self._view.height_px, self._view.width_px
-        wide = self._picture(grip, (0.0, 0.0))
+        wide = self._picture(grip)
         border = (wide.shape[1] - h) // 2
         return wide[:, border : border + h, border : border + w].reshape(4, 3, h, w)
 
@@ -251,6 +248,7 @@ class GradientScene:
         grip: Grip | None = None,
         analyser_deg: float = 0.0,
         t_s: float | None = None,
+        led_shares: tuple[float, ...] = (),
     ) -> Float32Array:
         """Return the light on the sensor under a pattern, without noise and vignetting.
 
@@ -264,6 +262,8 @@ class GradientScene:
             Reading of the analyser's rotator, degrees.
         t_s
             World time, s, which decides drift and jumps; None: neither.
+        led_shares
+            What each LED gives of what the sphere says; empty: all of it.
 
         Returns
         -------
@@ -277,7 +277,7 @@ class GradientScene:
         jump, drift = (0.0, 0.0), (0.0, 0.0)
         if self.motion is not None and t_s is not None and isinstance(self.subject, MicroSkin):
             jump, drift = self.motion.jump_mm(t_s), self.motion.drift_mm(t_s)
-        wide = self._picture(grip, jump)
+        wide = self._picture(grip, jump_mm=jump, shares=led_shares)
         border = (wide.shape[1] - shape[0]) // 2
         reach = border if any(drift) else 0
         part = slice(border - reach, wide.shape[1] - border + reach)
@@ -288,7 +288,8 @@ class GradientScene:
             stokes += weights[m] * wide[3 * m : 3 * m + 3, part, column]
         image = self._analysed(stokes, analyser_deg, border_px=reach)
         if reach:
-            image = _shifted(image, drift, self.lens.pixel_on_subject_um, reach)
+            pixel_um = self.lens.pixel_on_subject_um
+            image = shifted(image, drift, pixel_um=pixel_um, border_px=reach)
         # light taken away LED by LED leaves rounding errors where none is left
         return np.maximum(image, np.float32(0.0))
 
@@ -340,6 +341,7 @@ class GradientScene:
                     grip=grip,
                     analyser_deg=pop.analyser_deg,
                     t_s=0.5 * (pop.t_on_s + pop.t_off_s),
+                    led_shares=pop.led_shares,
                 )
         return expose(light, sensor=self._sensor, rng=rng, exposure_s=exposure_s)
 
@@ -433,22 +435,28 @@ class GradientScene:
             )
         return self._frames[key]
 
-    def _picture(self, grip: Grip | None, jump_mm: tuple[float, float]) -> Float32Array:
+    def _picture(
+        self,
+        grip: Grip | None,
+        *,
+        jump_mm: tuple[float, float] = (0.0, 0.0),
+        shares: tuple[float, ...] = (),
+    ) -> Float32Array:
         """Return the twelve images with a border, shape (12, H + 2 b, W + 2 b)."""
+        if all(share == 1.0 for share in shares):
+            shares = ()
         if isinstance(self.subject, MicroSkin):
             if grip is None:
                 raise SceneError("grip: got none, expected what the caliper holds")
-            key: tuple[object, ...] = (
-                grip.angle_deg, grip.step, grip.aperture_mm, grip.stretch, grip.attached,
-                grip.buckled, *jump_mm,
-            )  # fmt: skip
+            held = (grip.angle_deg, grip.step, grip.aperture_mm, grip.stretch)
+            key: tuple[object, ...] = (*held, grip.attached, grip.buckled, *jump_mm, shares)
         else:
-            key = (self.subject,)
+            key = (self.subject, shares)
         if key not in self._pictures:
             if isinstance(self.subject, MicroSkin) and grip is not None:
-                picture = self._render(grip, jump_mm)
+                picture = self._render(grip, jump_mm, shares)
             else:
-                picture = self._target()
+                picture = self._target(shares)
             picture *= np.float32(self._unit)
             while self._pictures and (len(self._pictures) + 1) * picture.nbytes > KEPT_BYTES:
                 self._pictures.popitem(last=False)
@@ -456,49 +464,52 @@ class GradientScene:
         self._pictures.move_to_end(key)
         return self._pictures[key]
 
-    def _render(self, grip: Grip, jump_mm: tuple[float, float]) -> Float32Array:
+    def _render(
+        self, grip: Grip, jump_mm: tuple[float, float], shares: tuple[float, ...]
+    ) -> Float32Array:
         s = self.subpixels
         margin = SHADOW_MARGIN_PX if self.shadows else 0
         wide = self.surface(grip, subpixels=s, border_px=DRIFT_MARGIN_PX + margin, jump_mm=jump_mm)
-        inner = slice(s * margin, -s * margin or None)
-        patch = _cut(wide, inner)
-        pitch_um = self.lens.pixel_on_subject_um / s
-        raw = self.lighting().stokes(
-            patch, wide.relief_um + wide.bulge_um, margin=s * margin, pitch_um=pitch_um
+        patch = wide.inner(s * margin)
+        raw = self.lighting(shares).stokes(
+            patch,
+            wide.relief_um + wide.bulge_um,
+            margin=s * margin,
+            pitch_um=self.lens.pixel_on_subject_um / s,
         )
         if self.optics:
             return blur(raw, self.lens, depth_mm=patch.height_mm, subpixels=s)
         k, h, w = raw.shape
         return np.asarray(raw.reshape(k, h // s, s, w // s, s).mean(axis=(2, 4)), np.float32)
 
-    def lighting(self) -> Lighting:
-        """Return what the light does to this skin in any state."""
-        if self._lighting is None:
-            skin = self.skin
-            rough = float(np.median(skin.alpha))
-            half_mm = 0.5 * max(self._view.field_mm) + 0.1
-            surface = self.optical_surface(rough)
-            leds = tuple(
-                k
-                for k, (_, _, z) in enumerate(self.sphere.position_mm)
-                if not self.shadows or z > 0.0
+    def lighting(self, shares: tuple[float, ...] = ()) -> Lighting:
+        """Return what the light does to this skin in any state.
+
+        Parameters
+        ----------
+        shares
+            What each LED gives of what the sphere says; empty: all of it.
+        """
+        if shares not in self._lighting:
+            while len(self._lighting) >= KEPT_LIGHTINGS:
+                self._lighting.popitem(last=False)
+            self._lighting[shares] = light_skin(
+                self.skin,
+                self._lit(shares),
+                self.optical_surface(float(np.median(self.skin.alpha))),
+                half_field_mm=0.5 * max(self._view.field_mm) + 0.1,
+                sectors=self.sectors if self.shadows else 0,
+                table_size=self.table_size,
             )
-            size = self.table_size or (65 if skin.alpha.min() >= 0.15 else 129)
-            table = build_table(
-                self.sphere,
-                surface,
-                half_field_mm=half_mm,
-                alpha_range=(float(skin.alpha.min()), float(skin.alpha.max())),
-                size=size,
-                fields=2 if half_mm < 1.6 else 3,
-                leds=leds,
-            )
-            sigmas, weights = _lateral(skin)
-            self._lighting = Lighting(
-                self.sphere, surface, table, leds, self.sectors if self.shadows else 0,
-                sigmas, weights,
-            )  # fmt: skip
-        return self._lighting
+        self._lighting.move_to_end(shares)
+        return self._lighting[shares]
+
+    def _lit(self, shares: tuple[float, ...]) -> BuiltSphere:
+        if not shares:
+            return self.sphere
+        if len(shares) != len(self.sphere.intensity) or min(shares) < 0.0:
+            raise SceneError(f"led_shares: got {len(shares)} numbers, expected one >= 0 per LED")
+        return dataclasses.replace(self.sphere, intensity=self.sphere.intensity * np.array(shares))
 
     def optical_surface(self, alpha: float) -> Surface:
         """Return how a surface of a roughness reflects, and who looks at it."""
@@ -506,13 +517,22 @@ class GradientScene:
             alpha, ETA, self._view.position_mm, self._view.axes[0], self.films.light_extinction
         )
 
-    def _target(self) -> Float32Array:
-        shape = (self._view.height_px, self._view.width_px)
-        out = np.zeros((12, *shape), np.float32)
+    def _target(self, shares: tuple[float, ...]) -> Float32Array:
+        sphere = self._lit(shares)
+        if self.subject == "ball":
+            raw = ball_stokes(
+                self._view,
+                sphere,
+                extinction=self.films.light_extinction,
+                center_mm=ball_center_mm(self.seed),
+            )
+            return blur(raw, self.lens, averaged=True) if self.optics else raw
+        out = np.zeros((12, self._view.height_px, self._view.width_px), np.float32)
         if self.subject == "flat":
             x, y = sample_grid(self._view, subpixels=1, border_px=0)
-            for m, light in enumerate(_diffuser(self.sphere, self.films, x, y)):
-                out[3 * m] = light
+            out[::3] = diffuser_radiance(
+                sphere, x[None, :], y[:, None], extinction=self.films.light_extinction
+            )
         return out
 
 
@@ -520,77 +540,3 @@ def _weights(pattern: str) -> tuple[float, float, float, float]:
     if pattern not in PATTERN_WEIGHTS:
         raise SceneError(f"pattern: got {pattern!r}, expected one of {', '.join(PATTERN_WEIGHTS)}")
     return PATTERN_WEIGHTS[pattern]
-
-
-def _white_radiance(rig: Rig) -> float:
-    """Return what an ideal white sends through ideal films under the sphere as drawn."""
-    drawn = as_drawn(rig)
-    place = drawn.position_mm
-    distance = np.linalg.norm(place, axis=1)
-    axis = np.array(rig.views[0].axes[2])
-    cosine = np.maximum(place @ axis / distance, 0.0)
-    share = drawn.intensity * (600.0 / distance) ** 2 * cosine
-    total = float(share.sum())
-    if not total > 0.0:
-        raise SceneError("lights: none shines on a plate at the origin that faces the camera")
-    return total / math.pi * 0.5 * 0.5
-
-
-def _diffuser(sphere: BuiltSphere, films: Films, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    """Return the radiance of a white diffuser at z = 0 for each moment, shape (4, H, W)."""
-    x, y = np.meshgrid(x_mm, y_mm)
-    film = 0.5 * (1.0 + 1.0 / films.light_extinction)
-    out = np.zeros((4, *x.shape))
-    for place, power, weight in zip(
-        sphere.position_mm, sphere.intensity, sphere.weights, strict=True
-    ):
-        if place[2] <= 0.0:
-            continue
-        square = (place[0] - x) ** 2 + (place[1] - y) ** 2 + place[2] ** 2
-        light = film / math.pi * power * 600.0**2 * place[2] / square**1.5
-        out += weight[:, None, None] * light
-    return out
-
-
-def _lateral(skin: MicroSkin) -> tuple[FloatArray, FloatArray]:
-    """Return the lateral kernel of the camera's band as a sum of Gaussians."""
-    table = SkinTable.load()
-    band = (table.wavelength_nm >= BAND_NM[0]) & (table.wavelength_nm <= BAND_NM[1])
-    weights = (band / band.sum())[:, None]
-    kernels = table.lateral_kernels(MELANIN_PRESETS[skin.preset], BLOOD, weights)
-    gaussians = kernels.gaussians(SIGMAS_MM)
-    return gaussians.sigmas_mm, gaussians.weights[0]
-
-
-def _cut(patch: PatchSurface, inner: slice) -> PatchSurface:
-    return PatchSurface(
-        *(
-            np.ascontiguousarray(getattr(patch, name)[inner, inner])
-            for name in (
-                "x_mm", "y_mm", "relief_um", "bulge_um", "normals", "albedo", "alpha", "skin"
-            )
-        )
-    )  # fmt: skip
-
-
-def _shifted(
-    image: Float32Array, shift_mm: tuple[float, float], pixel_um: float, border: int
-) -> Float32Array:
-    """Return a picture without its border after what it shows has moved (Lagrange, 6 points)."""
-    dx, dy = 1e3 * shift_mm[0] / pixel_um, -1e3 * shift_mm[1] / pixel_um
-    reach = border - 3
-    if max(abs(dx), abs(dy)) > reach:
-        raise SceneError(f"drift: got {dx:.1f}, {dy:.1f} px, expected at most {reach}")
-    out = image
-    for axis, shift in ((0, dy), (1, dx)):
-        whole = math.floor(-shift)
-        part = -shift - whole
-        nodes = np.arange(-2, 4)
-        taps = [math.prod((part - k) / (n - k) for k in nodes if k != n) for n in nodes]
-        size = out.shape[axis] - 2 * border
-        moved = np.zeros([size if a == axis else n for a, n in enumerate(out.shape)], np.float32)
-        for tap, n in zip(taps, nodes, strict=True):
-            at = np.arange(size) + border + whole + int(n)
-            moved += np.float32(tap) * np.take(out, at, axis=axis)
-        out = moved
-    return out

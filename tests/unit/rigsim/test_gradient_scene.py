@@ -24,6 +24,7 @@ class Light:
     t_on_s: float = 0.0
     t_off_s: float = 0.03
     analyser_deg: float = 0.0
+    led_shares: tuple[float, ...] = ()
 
 
 @pytest.fixture(scope="module")
