@@ -283,6 +283,7 @@ class _Skin:
         self._force_limit_n = force_limit_n
         self._states = list(_states(session.plan))
         self._attachment = _attachments_so_far(session)
+        self._position = 0
         self._reading_mm = self._force_n = 0.0
 
     def run(self) -> None:
@@ -351,6 +352,7 @@ class _Skin:
 
     def _scan_angle(self, angle_deg: float) -> None:
         """Scan neutral, then compression, then stretching, of what is missing."""
+        self._position = 0
         self._settle(self._drawn.reading_mm(0))
         for state in self._states:
             if (state.angle_deg, state.position) != (angle_deg, 0):
@@ -371,6 +373,8 @@ class _Skin:
         }
         if not wanted:
             return
+        if self._position != 0:
+            self._move(0)
         watch = ForceWatch(self._drawn, direction, at_rest_n=self._force_n)
         farthest = max(wanted, key=abs)
         for position in range(direction, farthest + direction, direction):
@@ -383,11 +387,8 @@ class _Skin:
             except EndOfSkin as end:
                 self._leave_out(angle_deg, direction, end)
                 break
-        if not self._caliper.attached():
-            if self._missing(angle_deg):
-                raise _LetGo("the skin came off")
-            return
-        self._move(0)
+        if not self._caliper.attached() and self._missing(angle_deg):
+            raise _LetGo("the skin came off")
 
     def _move(self, position: int) -> MoveReport:
         """Move, and let the skin creep; raise `_LetGo` where it was let go for another reason."""
@@ -400,6 +401,7 @@ class _Skin:
             raise _LetGo(str(error)) from error
         if report.ended in ("stopped", "stall", "no_home"):
             raise _LetGo(f"position {position}: the move ended as {report.ended!r}")
+        self._position = report.step
         if report.ended == "reached":
             self._settle(report.reading_mm)
         return report

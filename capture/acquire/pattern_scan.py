@@ -25,7 +25,7 @@ from capture.session import Session
 
 log = logging.getLogger(__name__)
 
-LISTEN_S = 0.2
+LISTEN_S = 0.1
 CALM_S = 1.1
 """Darkness after which no window of duty, and no second of flashes, holds an earlier scan."""
 CALM_TRIES = 5
@@ -266,7 +266,6 @@ class Scanner:
             frames = {name: some[number] for name, some in found.items() if number in some}
             if len(frames) == len(streams):
                 taken.append(Taken(step, frames, times[number], attempt, token))
-            self._sphere.ping()
             self._keep_alive()
         for name, camera in chosen.items():
             camera.abort()
