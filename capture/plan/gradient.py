@@ -29,11 +29,8 @@ SCAN_ORDER = ("full", "z", "x", "-x", "y", "-y", "-z", "dark")
 """From bright to dark for an eye beside the patch."""
 BALL_LEVEL = 0.03
 """A ball of black glass shows the LEDs themselves: 4 % of what is far brighter than lit skin."""
-FLAT_EXPOSURE_S = 0.03
-"""Of the photon transfer series, which is to come near full scale."""
-FLAT_DWELL_S = 0.042
-FLAT_LEVELS = (0.03, 0.06, 0.12, 0.19, 0.25, 0.38, 0.5, 0.63, 0.75, 1.0)
-"""Levels of the photon transfer series: dense in the shadows, up to full scale."""
+FLAT_LEVELS = (0.03, 0.06, 0.11, 0.17, 0.23, 0.34, 0.45, 0.57, 0.7, 0.85)
+"""Levels of the photon transfer series: dense in the shadows, and near full scale at the end."""
 
 _Index = dict[str, str | int | float]
 
@@ -155,8 +152,8 @@ def gradient_calibration_plan(
     repeats: int | None = None,
     darks: int = 2,
     level: float = BALL_LEVEL,
-    exposure_s: float | None = None,
-    dwell_s: float | None = None,
+    exposure_s: float = EXPOSURE_S,
+    dwell_s: float = DWELL_S,
     iso: int = 100,
 ) -> Plan:
     """Plan the frames of one calibration of the gradient sphere; no caliper takes part.
@@ -175,9 +172,8 @@ def gradient_calibration_plan(
         Frames without light before the flats, >= 0.
     level : float
         Of the LEDs that the ball shows, 0 < level <= 1.
-    exposure_s, dwell_s : float, optional
-        As for `gradient_plan`; longer by default for the flats.
-    iso : int
+    exposure_s, dwell_s, iso
+        As for `gradient_plan`.
 
     Examples
     --------
@@ -194,13 +190,7 @@ def gradient_calibration_plan(
     require(count >= least, "repeats", count, f">= {least}")
     require(darks >= 0, "darks", darks, ">= 0")
     require(0 < level <= 1, "level", level, "0 < level <= 1")
-    flat = target == "flat"
-    series = _Series(
-        rig,
-        exposure_s=exposure_s or (FLAT_EXPOSURE_S if flat else EXPOSURE_S),
-        dwell_s=dwell_s or (FLAT_DWELL_S if flat else DWELL_S),
-        iso=iso,
-    )
+    series = _Series(rig, exposure_s=exposure_s, dwell_s=dwell_s, iso=iso)
     if target == "dark":
         series.darks(count)
     elif target == "flat":
