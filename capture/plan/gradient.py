@@ -27,7 +27,7 @@ EXPOSURE_S = 0.018
 """Fits into it with the read-out."""
 SCAN_ORDER = ("full", "z", "x", "-x", "y", "-y", "-z", "dark")
 """From bright to dark for an eye beside the patch."""
-BALL_LEVEL = 0.03
+BALL_LEVEL = 0.018
 """A ball of black glass shows the LEDs themselves: 4 % of what is far brighter than lit skin."""
 FLAT_LEVELS = (0.03, 0.06, 0.11, 0.17, 0.23, 0.34, 0.45, 0.57, 0.7, 0.85)
 """Levels of the photon transfer series: dense in the shadows, and near full scale at the end."""

@@ -37,9 +37,12 @@ from rigsim.sphere_build import PATTERN_WEIGHTS, BuiltSphere, as_drawn, diffuser
 
 TargetName: TypeAlias = Literal["ball", "flat", "dark"]
 
-METER_RATE_PER_S: Final = 60.0
-"""Full scales per second of white under all LEDs at level 1: in 30 ms pale skin gets 0.5 to 0.7 of
+METER_RATE_PER_S: Final = 100.0
+"""Full scales per second of white under all LEDs at level 1: in 18 ms pale skin gets 0.4 to 0.8 of
 full scale."""
+
+FLAT_REFLECTANCE: Final = 0.3
+"""Of the diffuser in the patch's place: 30 ms at level 1 give 0.9 of full scale."""
 
 POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of the LEDs' common energy from pattern to pattern."""
@@ -98,8 +101,8 @@ class GradientScene:
     rig
         The drawing.
     subject
-        A patch of skin, or "ball" (12 mm of black glass), "flat" (a white diffuser in the patch's
-        place) or "dark" (a cap on the lens).
+        A patch of skin, or "ball" (12 mm of black glass), "flat" (a gray diffuser in the
+        patch's place) or "dark" (a cap on the lens).
     compensation
         How stretched skin narrows, see `rigsim.skin_stretch.deform`.
     films
@@ -530,7 +533,7 @@ class GradientScene:
         out = np.zeros((12, self._view.height_px, self._view.width_px), np.float32)
         if self.subject == "flat":
             x, y = sample_grid(self._view, subpixels=1, border_px=0)
-            out[::3] = diffuser_radiance(
+            out[::3] = FLAT_REFLECTANCE * diffuser_radiance(
                 sphere, x[None, :], y[:, None], extinction=self.films.light_extinction
             )
         return out

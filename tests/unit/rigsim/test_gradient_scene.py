@@ -9,7 +9,12 @@ from capture.rig import load_rig
 from rigsim.films import IDEAL
 from rigsim.microrelief import make_micro_skin
 from rigsim.patch_motion import PatchMotion
-from rigsim.scenes.gradient import METER_RATE_PER_S, GradientScene, SceneError
+from rigsim.scenes.gradient import (
+    FLAT_REFLECTANCE,
+    METER_RATE_PER_S,
+    GradientScene,
+    SceneError,
+)
 from rigsim.sphere_build import PATTERN_WEIGHTS, build_sphere
 from rigsim.taped_skin import GripState
 
@@ -22,7 +27,7 @@ class Light:
     pattern: str
     level: float = 1.0
     t_on_s: float = 0.0
-    t_off_s: float = 0.03
+    t_off_s: float = 0.018
     analyser_deg: float = 0.0
     led_shares: tuple[float, ...] = ()
 
@@ -50,12 +55,12 @@ def scene(rig, skin):
     return GradientScene(rig, skin)
 
 
-def test_a_white_diffuser_gets_the_meter_rate_behind_either_analyser(rig):
+def test_a_diffuser_gets_its_part_of_the_meter_rate_behind_either_analyser(rig):
     """Tolerance: the corner of the field, and what the sphere as drawn is off its unit (none)."""
     flat = GradientScene(rig, "flat", films=IDEAL)
     for reading in (0.0, 90.0, 37.0):
         image = flat.radiance("full", analyser_deg=reading)
-        np.testing.assert_allclose(image, METER_RATE_PER_S, rtol=1e-4)
+        np.testing.assert_allclose(image, FLAT_REFLECTANCE * METER_RATE_PER_S, rtol=1e-4)
 
 
 def test_every_pattern_is_the_sum_of_its_leds(rig, flat_skin):
@@ -130,7 +135,7 @@ def test_exposures_have_the_sensor_s_noise_and_no_other(scene):
         for k in (1, 2)
     ]
     sensor = scene.sensor()
-    light = scene.radiance("full", grip=NEUTRAL) * 0.03
+    light = scene.radiance("full", grip=NEUTRAL) * 0.018
     slope, offset = sensor.noise_profile(0.04)
     span = sensor.white - sensor.black
     # energies differ by 0.1 % each; a common gain is fitted out
