@@ -15,6 +15,7 @@ from rigsim.scenes.gradient import (
     GradientScene,
     SceneError,
 )
+from rigsim.sensor import fixed_pattern
 from rigsim.sphere_build import PATTERN_WEIGHTS, build_sphere
 from rigsim.taped_skin import GripState
 
@@ -135,7 +136,8 @@ def test_exposures_have_the_sensor_s_noise_and_no_other(scene):
         for k in (1, 2)
     ]
     sensor = scene.sensor()
-    light = scene.radiance("full", grip=NEUTRAL) * 0.018
+    response = fixed_pattern(sensor, frames[0].shape).response
+    light = scene.radiance("full", grip=NEUTRAL) * 0.018 * response
     slope, offset = sensor.noise_profile(0.04)
     span = sensor.white - sensor.black
     # energies differ by 0.1 % each; a common gain is fitted out
