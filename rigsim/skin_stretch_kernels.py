@@ -1,0 +1,251 @@
+"""Compiled kernels of a stretched surface layer: energy and forces on a periodic grid of nodes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+# Energies are sums over nodes; the caller divides by their number. Rows grow with y. Every square
+# of four nodes is covered by its four corner triangles with weight one quarter each (flat finite
+# elements over both diagonals): no mode of the grid is free of energy.
+
+
+@njit(cache=True, inline="always")
+def _corner(a1, a2, a3, b1, b2, b3, p, q):  # type: ignore[no-untyped-def]
+    """Return energy of a unit membrane and its derivatives by the two edge vectors.
+
+    Incompressible neo-Hookean: (tr C + 1 / det C - 3) / 2 per reference area, C the metric
+    (a, b) against that of the neutral slopes (p, q).
+    """
+    aa = a1 * a1 + a2 * a2 + a3 * a3
+    bb = b1 * b1 + b2 * b2 + b3 * b3
+    ab = a1 * b1 + a2 * b2 + a3 * b3
+    g = 1.0 + p * p + q * q
+    det = aa * bb - ab * ab
+    area = math.sqrt(g)
+    pp = (1.0 + q * q) / g
+    pq = -p * q / g
+    qq = (1.0 + p * p) / g
+    ratio = g / det
+    energy = 0.5 * area * (pp * aa + 2.0 * pq * ab + qq * bb + ratio - 3.0)
+    falling = ratio / det
+    caa = area * (pp - falling * bb)
+    cab = area * (pq + falling * ab)
+    cbb = area * (qq - falling * aa)
+    return energy, caa, cab, cbb
+
+
+@njit(parallel=True, cache=True, fastmath=True)
+def membrane(v, neutral, stiffness, f, bulk, texel, force):  # type: ignore[no-untyped-def]
+    """Add the forces of the stretched membrane to ``force``; return its energy, summed over nodes.
+
+    Parameters
+    ----------
+    v : ndarray (3, N, M)
+        In-plane displacement (x, y) from the affine state and height, um; N is even.
+    neutral : ndarray (N, M)
+        Height of the neutral state, um.
+    stiffness : ndarray (N, M)
+        Shear modulus times thickness in units of the foundation's modulus times um.
+    f : ndarray (2, 2)
+        Mean deformation gradient.
+    bulk : float
+        Stiffness of the tissue's skin against losing area: bulk (J - 1 - log J) per area, J the
+        projected area over that of the affine state; 1e300 is returned where J <= 0.
+    texel : float
+        Distance of nodes, um.
+    force : ndarray (3, N, M)
+        Derivative of the energy by ``v`` is added.
+    """
+    rows, columns = neutral.shape
+    part = np.zeros(rows)
+    h = 1.0 / texel
+    fxx, fxy, fyx, fyy = f[0, 0], f[0, 1], f[1, 0], f[1, 1]
+    whole = fxx * fyy - fxy * fyx
+    # Rows of squares touch two rows of nodes: even ones first, then odd ones, never two at once.
+    for parity in range(2):
+        for half in prange(rows // 2):
+            i = 2 * half + parity
+            k = (i + 1) % rows
+            total = 0.0
+            for j in range(columns):
+                m = j + 1 if j + 1 < columns else 0
+                x00, x10, x01, x11 = v[0, i, j], v[0, i, m], v[0, k, j], v[0, k, m]
+                y00, y10, y01, y11 = v[1, i, j], v[1, i, m], v[1, k, j], v[1, k, m]
+                z00, z10, z01, z11 = v[2, i, j], v[2, i, m], v[2, k, j], v[2, k, m]
+                n00, n10 = neutral[i, j], neutral[i, m]
+                n01, n11 = neutral[k, j], neutral[k, m]
+                weight = 0.0625 * (
+                    stiffness[i, j] + stiffness[i, m] + stiffness[k, j] + stiffness[k, m]
+                )
+                # Edges along x below and above, along y left and right, in the deformed state.
+                b1, b2, b3 = fxx + h * (x10 - x00), fyx + h * (y10 - y00), h * (z10 - z00)
+                t1, t2, t3 = fxx + h * (x11 - x01), fyx + h * (y11 - y01), h * (z11 - z01)
+                l1, l2, l3 = fxy + h * (x01 - x00), fyy + h * (y01 - y00), h * (z01 - z00)
+                r1, r2, r3 = fxy + h * (x11 - x10), fyy + h * (y11 - y10), h * (z11 - z10)
+                pb, pt = h * (n10 - n00), h * (n11 - n01)
+                ql, qr = h * (n01 - n00), h * (n11 - n10)
+                e1, a1, c1, d1 = _corner(b1, b2, b3, l1, l2, l3, pb, ql)
+                e2, a2, c2, d2 = _corner(b1, b2, b3, r1, r2, r3, pb, qr)
+                e3, a3, c3, d3 = _corner(t1, t2, t3, l1, l2, l3, pt, ql)
+                e4, a4, c4, d4 = _corner(t1, t2, t3, r1, r2, r3, pt, qr)
+                total += weight * (e1 + e2 + e3 + e4)
+                j1, j2 = b1 * l2 - b2 * l1, b1 * r2 - b2 * r1
+                j3, j4 = t1 * l2 - t2 * l1, t1 * r2 - t2 * r1
+                if min(min(j1, j2), min(j3, j4)) <= 1e-9 * whole:
+                    total += 1e300
+                    continue
+                total += (
+                    0.25
+                    * bulk
+                    * (
+                        (j1 + j2 + j3 + j4) / whole
+                        - 4.0
+                        - math.log(j1 * j2 * (j3 * j4) / (whole * whole * whole * whole))
+                    )
+                )
+                w = 0.25 * bulk * h
+                g1, g2 = w * (1.0 / whole - 1.0 / j1), w * (1.0 / whole - 1.0 / j2)
+                g3, g4 = w * (1.0 / whole - 1.0 / j3), w * (1.0 / whole - 1.0 / j4)
+                w = weight * h
+                ab, at, al, ar = w * (a1 + a2), w * (a3 + a4), w * (d1 + d3), w * (d2 + d4)
+                c1, c2, c3, c4 = w * c1, w * c2, w * c3, w * c4
+                for axis in range(3):
+                    if axis == 0:
+                        b, t, e, r = b1, t1, l1, r1
+                    elif axis == 1:
+                        b, t, e, r = b2, t2, l2, r2
+                    else:
+                        b, t, e, r = b3, t3, l3, r3
+                    db = ab * b + c1 * e + c2 * r
+                    dt = at * t + c3 * e + c4 * r
+                    dl = al * e + c1 * b + c3 * t
+                    dr = ar * r + c2 * b + c4 * t
+                    if axis == 0:
+                        db += g1 * l2 + g2 * r2
+                        dt += g3 * l2 + g4 * r2
+                        dl -= g1 * b2 + g3 * t2
+                        dr -= g2 * b2 + g4 * t2
+                    elif axis == 1:
+                        db -= g1 * l1 + g2 * r1
+                        dt -= g3 * l1 + g4 * r1
+                        dl += g1 * b1 + g3 * t1
+                        dr += g2 * b1 + g4 * t1
+                    force[axis, i, j] -= db + dl
+                    force[axis, i, m] += db - dr
+                    force[axis, k, j] += dl - dt
+                    force[axis, k, m] += dt + dr
+            part[i] = total
+    return part.sum()
+
+
+@njit(parallel=True, cache=True, fastmath=True)
+def bending(height, neutral, stiffness, texel, moment, force):  # type: ignore[no-untyped-def]
+    """Add the forces against a change of curvature to ``force``; return the energy's sum.
+
+    Parameters
+    ----------
+    height, neutral : ndarray (N, M)
+        um.
+    stiffness : ndarray (N, M)
+        Bending stiffness in units of the foundation's modulus times um^3.
+    texel : float
+        um.
+    moment : ndarray (N, M)
+        Work space.
+    force : ndarray (N, M)
+        Derivative by ``height`` is added.
+    """
+    rows, columns = height.shape
+    part = np.zeros(rows)
+    h2 = 1.0 / (texel * texel)
+    for i in prange(rows):
+        up, down = (i + 1) % rows, i - 1 if i > 0 else rows - 1
+        total = 0.0
+        for j in range(columns):
+            right, left = j + 1 if j + 1 < columns else 0, j - 1 if j > 0 else columns - 1
+            curved = h2 * (
+                (height[up, j] - neutral[up, j])
+                + (height[down, j] - neutral[down, j])
+                + (height[i, right] - neutral[i, right])
+                + (height[i, left] - neutral[i, left])
+                - 4.0 * (height[i, j] - neutral[i, j])
+            )
+            moment[i, j] = stiffness[i, j] * curved
+            total += 0.5 * moment[i, j] * curved
+        part[i] = total
+    for i in prange(rows):
+        up, down = (i + 1) % rows, i - 1 if i > 0 else rows - 1
+        for j in range(columns):
+            right, left = j + 1 if j + 1 < columns else 0, j - 1 if j > 0 else columns - 1
+            force[i, j] += h2 * (
+                moment[up, j]
+                + moment[down, j]
+                + moment[i, right]
+                + moment[i, left]
+                - 4.0 * moment[i, j]
+            )
+    return part.sum()
+
+
+@njit(parallel=True, cache=True)
+def spline(coefficients, row, column, want_slope, value, along_row, along_column):  # type: ignore[no-untyped-def]
+    """Evaluate a cubic B-spline and its derivatives at points inside the grid.
+
+    Parameters
+    ----------
+    coefficients : ndarray (N, M)
+        Of `scipy.ndimage.spline_filter` with mode "mirror".
+    row, column : ndarray (P,)
+        Places in texels; a place outside gives NaN.
+    want_slope : bool
+        False leaves the derivatives alone.
+    value, along_row, along_column : ndarray (P,)
+        Results, derivatives per texel.
+    """
+    rows, columns = coefficients.shape
+    for n in prange(row.size):
+        y, x = row[n], column[n]
+        if not (0.0 <= y <= rows - 1.0 and 0.0 <= x <= columns - 1.0):
+            value[n] = np.nan
+            if want_slope:
+                along_row[n], along_column[n] = np.nan, np.nan
+            continue
+        i, j = min(int(y), rows - 2), min(int(x), columns - 2)
+        s, t = y - i, x - j
+        total, by_row, by_column = 0.0, 0.0, 0.0
+        for a in range(4):
+            if a == 0:
+                wy, dy = (1.0 - s) ** 3 / 6.0, -0.5 * (1.0 - s) ** 2
+            elif a == 1:
+                wy, dy = (4.0 - 6.0 * s * s + 3.0 * s**3) / 6.0, -2.0 * s + 1.5 * s * s
+            elif a == 2:
+                r = 1.0 - s
+                wy, dy = (4.0 - 6.0 * r * r + 3.0 * r**3) / 6.0, 2.0 * r - 1.5 * r * r
+            else:
+                wy, dy = s**3 / 6.0, 0.5 * s * s
+            k = i + a - 1
+            k = -k if k < 0 else (2 * rows - 2 - k if k >= rows else k)
+            line, slope = 0.0, 0.0
+            for b in range(4):
+                if b == 0:
+                    wx, dx = (1.0 - t) ** 3 / 6.0, -0.5 * (1.0 - t) ** 2
+                elif b == 1:
+                    wx, dx = (4.0 - 6.0 * t * t + 3.0 * t**3) / 6.0, -2.0 * t + 1.5 * t * t
+                elif b == 2:
+                    r = 1.0 - t
+                    wx, dx = (4.0 - 6.0 * r * r + 3.0 * r**3) / 6.0, 2.0 * r - 1.5 * r * r
+                else:
+                    wx, dx = t**3 / 6.0, 0.5 * t * t
+                m = j + b - 1
+                m = -m if m < 0 else (2 * columns - 2 - m if m >= columns else m)
+                line += wx * coefficients[k, m]
+                slope += dx * coefficients[k, m]
+            total += wy * line
+            by_row += dy * line
+            by_column += wy * slope
+        value[n] = total
+        if want_slope:
+            along_row[n], along_column[n] = by_row, by_column
