@@ -27,6 +27,7 @@ GOOD, DIM, LOST, HORIZON = 0.0, 1.0, 2.0, 3.0
 
 _PASSES = 24
 _STEPS_BACK = 8
+_TOLERATED = 2e-3  # distance between what is seen and what the place found shows
 _LEAST_FACING = 0.1  # cosine to the view, which tables end at
 
 
@@ -206,59 +207,156 @@ def smooth(image, taps, mask, out, line):  # type: ignore[no-untyped-def]
                 out[i, j] += tap * line[i, j + k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def lookup(table, least, step, u0, u1, x, y, value, by0, by1, spread):  # type: ignore[no-untyped-def]
-    """Put the place seen of a normal at (u0, u1), and its derivatives, into arrays of 2.
-
-    ``spread`` takes the other layers: scale, concentration, systematic covariance.
-    """
-    q0, q1 = (u0 - least) / step, (u1 - least) / step
-    i0, i1 = math.floor(q0), math.floor(q1)
-    size = table.shape[0]
-    i0 = min(max(i0, 1), size - 3)
-    i1 = min(max(i1, 1), size - 3)
-    f, g = q0 - i0, q1 - i1
-    near = table.shape[2] > 7
-    for k in range(2):
-        value[k] = 0.0
-        by0[k] = 0.0
-        by1[k] = 0.0
-    for k in range(5):
-        spread[k] = 0.0
-    for m in range(4):
-        wy, dy = _spline(m, g)
-        for n in range(4):
-            wx, dx = _spline(n, f)
-            cell = table[i1 - 1 + m, i0 - 1 + n]
-            for k in range(2):
-                c = cell[k]
-                if near:
-                    c += x * cell[7 + k] + y * cell[9 + k]
-                value[k] += wx * wy * c
-                by0[k] += dx * wy * c
-                by1[k] += wx * dy * c
-            for k in range(5):
-                spread[k] += wx * wy * cell[2 + k]
-    for k in range(2):
-        by0[k] /= step
-        by1[k] /= step
-    value[0] += u0
-    value[1] += u1
-    by0[0] += 1.0
-    by1[1] += 1.0
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def _cell(least, step, size, u):  # type: ignore[no-untyped-def]
+    """Return the first of the four grid lines about a place, and the place between them."""
+    q = (u - least) / step
+    i = min(max(math.floor(q), 1), size - 3)
+    return i - 1, q - i
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def _spline(m, f):  # type: ignore[no-untyped-def]
-    """Return weight and derivative of the m-th of four cubic B-splines about a cell."""
+def _weights(f):  # type: ignore[no-untyped-def]
+    """Return the weights of four cubic B-splines."""
     e = 1.0 - f
-    if m == 0:
-        return e * e * e / 6.0, -0.5 * e * e
-    if m == 1:
-        return (4.0 - 6.0 * f * f + 3.0 * f * f * f) / 6.0, 1.5 * f * f - 2.0 * f
-    if m == 2:
-        return (4.0 - 6.0 * e * e + 3.0 * e * e * e) / 6.0, 2.0 * e - 1.5 * e * e
-    return f * f * f / 6.0, 0.5 * f * f
+    a, d = e * e * e / 6.0, f * f * f / 6.0
+    b = (4.0 - 6.0 * f * f + 3.0 * f * f * f) / 6.0
+    return a, b, 1.0 - a - b - d, d
+
+
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def _slopes(f):  # type: ignore[no-untyped-def]
+    """Return the derivatives of :func:`_weights`."""
+    e = 1.0 - f
+    a, d = -0.5 * e * e, 0.5 * f * f
+    b = 1.5 * f * f - 2.0 * f
+    return a, b, -a - b - d, d
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lookup(table, least, step, u0, u1, x, y):  # type: ignore[no-untyped-def]
+    """Return the place seen of a normal at (u0, u1), from (x, y), and its derivatives.
+
+    In the order v0, v1, dv0/du0, dv0/du1, dv1/du0, dv1/du1.
+    """
+    i0, f = _cell(least, step, table.shape[0], u0)
+    i1, g = _cell(least, step, table.shape[0], u1)
+    a0, a1, a2, a3 = _weights(f)
+    d0, d1, d2, d3 = _slopes(f)
+    wy, dy = _weights(g), _slopes(g)
+    near = table.shape[2] > 7
+    v0, v1, j00, j01, j10, j11 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for m in range(4):
+        row = table[i1 + m]
+        p0, p1, p2, p3 = row[i0, 0], row[i0 + 1, 0], row[i0 + 2, 0], row[i0 + 3, 0]
+        q0, q1, q2, q3 = row[i0, 1], row[i0 + 1, 1], row[i0 + 2, 1], row[i0 + 3, 1]
+        if near:
+            p0 += x * row[i0, 7] + y * row[i0, 9]
+            p1 += x * row[i0 + 1, 7] + y * row[i0 + 1, 9]
+            p2 += x * row[i0 + 2, 7] + y * row[i0 + 2, 9]
+            p3 += x * row[i0 + 3, 7] + y * row[i0 + 3, 9]
+            q0 += x * row[i0, 8] + y * row[i0, 10]
+            q1 += x * row[i0 + 1, 8] + y * row[i0 + 1, 10]
+            q2 += x * row[i0 + 2, 8] + y * row[i0 + 2, 10]
+            q3 += x * row[i0 + 3, 8] + y * row[i0 + 3, 10]
+        along = a0 * p0 + a1 * p1 + a2 * p2 + a3 * p3
+        w, d = wy[m], dy[m]
+        v0 += w * along
+        j01 += d * along
+        j00 += w * (d0 * p0 + d1 * p1 + d2 * p2 + d3 * p3)
+        along = a0 * q0 + a1 * q1 + a2 * q2 + a3 * q3
+        v1 += w * along
+        j11 += d * along
+        j10 += w * (d0 * q0 + d1 * q1 + d2 * q2 + d3 * q3)
+    return u0 + v0, u1 + v1, 1.0 + j00 / step, j01 / step, j10 / step, 1.0 + j11 / step
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _others(table, least, step, u0, u1, spread):  # type: ignore[no-untyped-def]
+    """Put scale, concentration and systematic covariance (3) at a place into ``spread``."""
+    i0, f = _cell(least, step, table.shape[0], u0)
+    i1, g = _cell(least, step, table.shape[0], u1)
+    wx, wy = _weights(f), _weights(g)
+    spread[:] = 0.0
+    for m in range(4):
+        for n in range(4):
+            w = wy[m] * wx[n]
+            for k in range(5):
+                spread[k] += w * table[i1 + m, i0 + n, 2 + k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _settle(table, least, step, s0, s1, u0, u1, x, y, close):  # type: ignore[no-untyped-def]
+    """Find the place whose normal shows (s0, s1), by Newton's method from (u0, u1).
+
+    Return the place, what it still lacks, and the derivatives there.
+    """
+    v0, v1, j00, j01, j10, j11 = lookup(table, least, step, u0, u1, x, y)
+    e0, e1 = s0 - v0, s1 - v1
+    off = math.sqrt(e0 * e0 + e1 * e1)
+    for _ in range(_PASSES):
+        if off < close:
+            break
+        det = j00 * j11 - j01 * j10
+        # where the table folds: a step as if nothing were skewed
+        d0 = (j11 * e0 - j01 * e1) / det if det > 0.02 else e0
+        d1 = (j00 * e1 - j10 * e0) / det if det > 0.02 else e1
+        stride = math.sqrt(d0 * d0 + d1 * d1)
+        if stride > 0.3:
+            d0, d1 = 0.3 * d0 / stride, 0.3 * d1 / stride
+        part, better = 1.0, False
+        for _ in range(_STEPS_BACK):
+            t0, t1 = u0 + part * d0, u1 + part * d1
+            if t0 * t0 + t1 * t1 < 2.0 * (1.0 - _LEAST_FACING):
+                v0, v1, k00, k01, k10, k11 = lookup(table, least, step, t0, t1, x, y)
+                f0, f1 = s0 - v0, s1 - v1
+                now = math.sqrt(f0 * f0 + f1 * f1)
+                if now < off:
+                    u0, u1, e0, e1, off, better = t0, t1, f0, f1, now, True
+                    j00, j01, j10, j11 = k00, k01, k10, k11
+                    break
+            part *= 0.5
+        if not better:
+            break
+    return u0, u1, off, j00, j01, j10, j11
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def starts(table, least, step, out):  # type: ignore[no-untyped-def]
+    """Put the places that show those of a grid into ``out`` (G, G, 2): where Newton may begin.
+
+    The grid covers -sqrt(2) to sqrt(2); where nothing shows a place, it is given itself.
+    """
+    size = out.shape[0]
+    reach = math.sqrt(2.0)
+    for i in range(size):
+        s1 = reach * (2.0 * i / (size - 1) - 1.0)
+        for j in range(size):
+            s0 = reach * (2.0 * j / (size - 1) - 1.0)
+            out[i, j, 0], out[i, j, 1] = s0, s1
+            if s0 * s0 + s1 * s1 < 2.0 * (1.0 - _LEAST_FACING):
+                u0, u1, off, _, _, _, _ = _settle(
+                    table, least, step, s0, s1, s0, s1, 0.0, 0.0, 1e-6
+                )
+                if off < _TOLERATED:
+                    out[i, j, 0], out[i, j, 1] = u0, u1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _start(grid, s0, s1):  # type: ignore[no-untyped-def]
+    """Return the place to begin at, by the bilinear grid of :func:`starts`."""
+    size = grid.shape[0]
+    scale = (size - 1) / (2.0 * math.sqrt(2.0))
+    q0, q1 = (s0 + math.sqrt(2.0)) * scale, (s1 + math.sqrt(2.0)) * scale
+    i0, i1 = min(max(math.floor(q0), 0), size - 2), min(max(math.floor(q1), 0), size - 2)
+    f, g = q0 - i0, q1 - i1
+    a, b = (1.0 - f) * (1.0 - g), f * (1.0 - g)
+    c, d = (1.0 - f) * g, f * g
+    u0 = a * grid[i1, i0, 0] + b * grid[i1, i0 + 1, 0]
+    u0 += c * grid[i1 + 1, i0, 0] + d * grid[i1 + 1, i0 + 1, 0]
+    u1 = a * grid[i1, i0, 1] + b * grid[i1, i0 + 1, 1]
+    u1 += c * grid[i1 + 1, i0, 1] + d * grid[i1 + 1, i0 + 1, 1]
+    return u0, u1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -282,8 +380,8 @@ def _exit_ratio(nx, ny, nz, a0, a1, eta):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def invert(  # type: ignore[no-untyped-def]
-    parallel, crossed, frame, mirror, table, least, step, analyser, eta, view, place, told,
-    needed, out,
+    parallel, crossed, frame, mirror, table, least, step, grid, analyser, eta, view, place, told,
+    needed, close, out,
 ):  # fmt: skip
     """Turn moments into normals, per pixel.
 
@@ -299,6 +397,8 @@ def invert(  # type: ignore[no-untyped-def]
     table, least, step
         See :class:`reconstruction.lobe_response.Response`; a table of size 0: the vector points
         where it should.
+    grid : ndarray, shape (G, G, 2)
+        Of :func:`starts`; not read without a table.
     analyser : ndarray, shape (2,)
         Passing axis in the frame; zeros: diffuse light is taken to be unpolarized.
     eta : float
@@ -310,12 +410,15 @@ def invert(  # type: ignore[no-untyped-def]
         Whether variances are known.
     needed : float
         Length of the vector over its standard error below which there is no signal.
+    close : float
+        How near to what is seen the search ends.
     out : ndarray, shape (P, NORMAL_COLUMNS)
     """
     two = crossed.shape[1] > 0
     tabled = table.size > 0
     polarized = two and tabled and (analyser[0] != 0.0 or analyser[1] != 0.0)
-    value, by0, by1, spread = np.empty(2), np.empty(2), np.empty(2), np.empty(5)
+    last = 2 if polarized else 0  # normals as the grid has them tell the polarization
+    spread = np.empty(5)
     c, cov, turned = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     half, slope = np.empty((3, 3)), np.empty((2, 3))
     rows = ((V_XX, V_XY, V_XZ), (V_XY, V_YY, V_YZ), (V_XZ, V_YZ, V_ZZ))
@@ -353,7 +456,8 @@ def invert(  # type: ignore[no-untyped-def]
         u0, u1 = 0.0, 0.0
         status = GOOD
         x, y = (place[p, 0], place[p, 1]) if place.shape[0] else (0.0, 0.0)
-        for turn in range(3 if polarized else 1):
+        j00, j01, j10, j11 = 1.0, 0.0, 0.0, 1.0
+        for turn in range(last + 1):
             for i in range(3):
                 s = 0.0
                 for k in range(3):
@@ -405,52 +509,18 @@ def invert(  # type: ignore[no-untyped-def]
             s0, s1 = n0 * scale, n1 * scale
             if not tabled:
                 u0, u1 = s0, s1
-                value[0], value[1] = s0, s1
-                by0[0], by0[1], by1[0], by1[1] = 1.0, 0.0, 0.0, 1.0
-                for k in range(5):
-                    spread[k] = 0.0
-                spread[0] = 1.0
                 break
-            if turn == 0:
-                u0, u1 = s0, s1
-            lookup(table, least, step, u0, u1, x, y, value, by0, by1, spread)
-            off0, off1 = s0 - value[0], s1 - value[1]
-            off = math.sqrt(off0 * off0 + off1 * off1)
-            for _ in range(_PASSES):
-                if off < 1e-7:
-                    break
-                det = by0[0] * by1[1] - by1[0] * by0[1]
-                # where the table folds: a step as if nothing were skewed
-                d0 = (by1[1] * off0 - by1[0] * off1) / det if det > 0.02 else off0
-                d1 = (by0[0] * off1 - by0[1] * off0) / det if det > 0.02 else off1
-                stride = math.sqrt(d0 * d0 + d1 * d1)
-                if stride > 0.3:
-                    d0, d1 = 0.3 * d0 / stride, 0.3 * d1 / stride
-                part, better = 1.0, False
-                for _ in range(_STEPS_BACK):
-                    t0, t1 = u0 + part * d0, u1 + part * d1
-                    if t0 * t0 + t1 * t1 < 2.0 * (1.0 - _LEAST_FACING):
-                        lookup(table, least, step, t0, t1, x, y, value, by0, by1, spread)
-                        e0, e1 = s0 - value[0], s1 - value[1]
-                        e = math.sqrt(e0 * e0 + e1 * e1)
-                        if e < off:
-                            u0, u1, off0, off1, off, better = t0, t1, e0, e1, e, True
-                            break
-                    part *= 0.5
-                if not better:
-                    lookup(table, least, step, u0, u1, x, y, value, by0, by1, spread)
-                    break
-            if off > 2e-3:
-                status = HORIZON
+            u0, u1 = _start(grid, s0, s1)
+            if turn == last:
+                u0, u1, off, j00, j01, j10, j11 = _settle(
+                    table, least, step, s0, s1, u0, u1, x, y, close
+                )
+                if off > _TOLERATED:
+                    status = HORIZON
                 break
-            if not polarized:
-                break
-            square = u0 * u0 + u1 * u1
+            square = min(u0 * u0 + u1 * u1, 1.9)
             m = math.sqrt(1.0 - 0.25 * square)
-            fresh = _exit_ratio(u0 * m, u1 * m, 1.0 - 0.5 * square, analyser[0], analyser[1], eta)
-            if abs(fresh - ratio) < 1e-6:
-                break
-            ratio = fresh
+            ratio = _exit_ratio(u0 * m, u1 * m, 1.0 - 0.5 * square, analyser[0], analyser[1], eta)
         if status != GOOD:
             out[p, STATUS] = status
             continue
@@ -462,13 +532,18 @@ def invert(  # type: ignore[no-untyped-def]
                     e00 += slope[0, i] * cov[i, j] * slope[0, j]
                     e01 += slope[0, i] * cov[i, j] * slope[1, j]
                     e11 += slope[1, i] * cov[i, j] * slope[1, j]
+        if tabled:
+            _others(table, least, step, u0, u1, spread)
+        else:
+            spread[:] = 0.0
+            spread[0] = 1.0
         e00, e01, e11 = e00 + spread[2], e01 + spread[3], e11 + spread[4]
-        det = by0[0] * by1[1] - by1[0] * by0[1]
+        det = j00 * j11 - j01 * j10
         square = u0 * u0 + u1 * u1
         m = math.sqrt(1.0 - 0.25 * square)
         error = math.pi
         if told and abs(det) > 1e-6:
-            i00, i01, i10, i11 = by1[1] / det, -by1[0] / det, -by0[1] / det, by0[0] / det
+            i00, i01, i10, i11 = j11 / det, -j01 / det, -j10 / det, j00 / det
             a00 = i00 * i00 * e00 + 2.0 * i00 * i01 * e01 + i01 * i01 * e11
             a11 = i10 * i10 * e00 + 2.0 * i10 * i11 * e01 + i11 * i11 * e11
             a01 = i00 * i10 * e00 + (i00 * i11 + i01 * i10) * e01 + i01 * i11 * e11

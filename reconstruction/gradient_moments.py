@@ -12,10 +12,18 @@ from numpy.typing import NDArray
 from reconstruction import gradient_kernels as kernels
 from reconstruction.gradient_noise import SensorNoise, estimate_noise
 from reconstruction.gradient_patterns import GradientError, MissingPatterns, Stack, require
+from reconstruction.gradient_wiener import filtered
 
 Floating = NDArray[np.floating]
 
 TILE_PIXELS = 65_536
+_VALUES = slice(kernels.C_0, kernels.V_0)
+_SPREAD = slice(kernels.V_0, kernels.CHI)
+_VARIANCES = (
+    (kernels.V_0, 0, 0), (kernels.V_XX, 1, 1), (kernels.V_YY, 2, 2), (kernels.V_ZZ, 3, 3),
+    (kernels.V_XY, 1, 2), (kernels.V_XZ, 1, 3), (kernels.V_YZ, 2, 3),
+)  # fmt: skip
+"""Rows of variances, and which moments they are of."""
 REACH_SIGMA = 3.5
 """Where a smoothing kernel ends, in its standard deviations."""
 
@@ -42,6 +50,11 @@ class Reflection:
         Standard deviations of the Gaussians, parallel and crossed, px.
     kind : dtype
         float32 or float64.
+    clean : tuple of ndarray, shape (4, H, W), or None
+        Filtered moments, parallel and crossed, that replace the pictures' own.
+    shares : tuple of ndarray, shape (2, 4), or None
+        Variance of what is to be inverted, over that of the pictures' own parallel and crossed
+        moments, with `clean`.
     """
 
     component: Literal["specular", "diffuse"]
@@ -53,6 +66,8 @@ class Reflection:
     leakage: float
     smooth_px: tuple[float, float]
     kind: Any
+    clean: tuple[Floating, Floating] | None = None
+    shares: tuple[Floating, Floating] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -73,16 +88,36 @@ class Reflection:
         """
         crossed = self._of(self.crossed, rows, self.smooth_px[1])
         if self.parallel is None:
+            if self.clean is not None:
+                self._replace(crossed, crossed, rows)
             return crossed, crossed[:, :0]
         parallel = self._of(self.parallel, rows, self.smooth_px[0])
         if self.component == "specular":
+            if self.clean is not None:
+                self._replace(parallel, crossed, rows)
             return parallel, crossed
         k = self.leakage / (1.0 - self.leakage)
-        values, spread = slice(kernels.C_0, kernels.V_0), slice(kernels.V_0, kernels.CHI)
         cleaned = crossed.copy()
-        cleaned[values] -= k * (parallel[values] - crossed[values])
-        cleaned[spread] = (1.0 + k) ** 2 * crossed[spread] + k**2 * parallel[spread]
+        cleaned[_VALUES] -= k * (parallel[_VALUES] - crossed[_VALUES])
+        cleaned[_SPREAD] = (1.0 + k) ** 2 * crossed[_SPREAD] + k**2 * parallel[_SPREAD]
+        if self.clean is not None:
+            self._replace(cleaned, cleaned, rows)
         return cleaned, crossed[:, :0]
+
+    def _replace(self, first: Floating, second: Floating, rows: slice) -> None:
+        """Put filtered moments in, and all of their variance into the first."""
+        if self.clean is None or self.shares is None:
+            return
+        lost = ~np.isfinite(first[0]) | ~np.isfinite(second[0])
+        a, b = (np.sqrt(share) for share in self.shares)
+        for row, i, j in _VARIANCES:
+            first[row] *= a[i] * a[j]
+            if second is not first:
+                first[row] += b[i] * b[j] * second[row]
+                second[row] = 0.0
+        for moments, clean in ((first, self.clean[0]), (second, self.clean[1])):
+            moments[_VALUES] = clean[:, rows].reshape(4, -1)
+            moments[:, lost] = np.nan
 
     def _of(self, stack: Stack, rows: slice, sigma: float) -> Floating:
         taps = _taps(sigma).astype(self.kind)
@@ -190,6 +225,47 @@ def prepare(
         (smooth_px, smooth_px if smooth_crossed_px is None else smooth_crossed_px),
         np.float64 if np.dtype(np.float64) in kinds else np.float32,
     )  # fmt: skip
+
+
+def with_filter(reflection: Reflection) -> Reflection:
+    """Return the reflection with its moments filtered by what share of each frequency is signal.
+
+    Diffuse moments are filtered first, and what is left of the parallel ones without them next:
+    skin glows with less detail than it mirrors.
+
+    Raises
+    ------
+    GradientError
+        Where the noise is not known.
+    """
+    if not reflection.told:
+        raise GradientError(
+            "wiener: noise is unknown, as no patterns are redundant; give variance, or smooth_px"
+        )
+    height, width = reflection.shape
+    two = reflection.component == "specular"
+    raw = [np.empty((4, height, width), reflection.kind) for _ in range(2 if two else 1)]
+    noise = np.zeros((2, 4))
+    count = 0
+    for rows in reflection.tiles():
+        for number, moments in enumerate(reflection.moments(rows)[: len(raw)]):
+            raw[number][:, rows] = moments[_VALUES].reshape(4, -1, width)
+            good = np.isfinite(moments[0])
+            noise[number] += moments[kernels.V_0 : kernels.V_ZZ + 1][:, good].sum(axis=1)
+            count += int(good.sum()) if number == 0 else 0
+    noise /= max(count, 1)
+    valid = np.isfinite(raw[0][0]) & np.isfinite(raw[-1][0])
+    shares = np.ones((2, 4))
+    for m in range(4):
+        base = raw[-1][m]
+        glow, kept = filtered(base, noise[len(raw) - 1, m], valid)
+        if not two:
+            raw[0][m], shares[0, m] = glow, kept
+            continue
+        spark, left = filtered(raw[0][m] - glow, noise[0, m] + kept * noise[1, m], valid)
+        raw[0][m], raw[1][m] = spark + glow, glow
+        shares[:, m] = left, left * kept
+    return replace(reflection, clean=(raw[0], raw[-1]), shares=(shares[0], shares[1]))
 
 
 def with_shared_dark(stacks: Mapping[str, Stack]) -> dict[str, Stack]:

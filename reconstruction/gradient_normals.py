@@ -26,7 +26,7 @@ from model.fresnel import ETA_SKIN
 from reconstruction import gradient_kernels as kernels
 from reconstruction import lobe_response
 from reconstruction.gradient_channels import channel_count, joined, sliced, summed
-from reconstruction.gradient_moments import Reflection, prepare, with_shared_dark
+from reconstruction.gradient_moments import Reflection, prepare, with_filter, with_shared_dark
 from reconstruction.gradient_noise import SensorNoise
 from reconstruction.gradient_patterns import GradientError, Key, MissingPatterns, collect
 from reconstruction.lobe_response import Response, SphereLights, SphereLightsError, frame_of
@@ -88,6 +88,7 @@ def from_patterns(
     points_mm: ArrayLike | None = None,
     smooth_px: float = 0.0,
     smooth_crossed_px: float | None = None,
+    wiener: bool = False,
     executor: Executor | None = None,
 ) -> NormalMaps:
     """Compute normals from pictures under a sphere's patterns.
@@ -128,6 +129,10 @@ def from_patterns(
         as 1 / (3.5 smooth_px).
     smooth_crossed_px : float, optional
         The same of the crossed pictures, where skin glows with less detail; default `smooth_px`.
+    wiener : bool
+        Filter the moments, instead, by what share of each spatial frequency is signal
+        (:mod:`reconstruction.gradient_wiener`): as much as noise and optics ask for. Standard
+        errors then hold the detail that is lost, too.
     executor : Executor, optional
         Threads to map tiles of rows over; default one thread a core, at most 8.
 
@@ -171,7 +176,7 @@ def from_patterns(
     settings: dict[str, Any] = {
         "component": component, "view": view, "lights": lights, "alpha": alpha, "eta": eta,
         "points_mm": points_mm, "smooth_px": smooth_px, "smooth_crossed_px": smooth_crossed_px,
-        "executor": executor,
+        "wiener": wiener, "executor": executor,
     }  # fmt: skip
     channels = channel_count(patterns)
     if channels is not None and component == "specular":
@@ -207,6 +212,8 @@ def from_patterns(
             lights, view=middle, alpha=known.alpha, eta=eta, near=places is not None,
             alpha_stderr=known.stderr,
         )  # fmt: skip
+    if wiener:
+        reflection = with_filter(reflection)
     return _maps(reflection, table, _analyser(lights, table), eta, each_view, places, executor)
 
 
@@ -332,10 +339,21 @@ def _analyser(lights: SphereLights | None, table: Response) -> Floating:
     return np.asarray(table.frame[:2] @ np.asarray(lights.analyser))
 
 
+def _grid(table: Response) -> NDArray[np.float64]:
+    """Return places for the search to begin at, see :func:`gradient_kernels.starts`."""
+    if table.coefficients.size == 0:
+        return np.zeros((2, 2, 2))
+    lines = int(np.clip(3.0 / table.step, 65, 257))
+    grid = np.empty((lines, lines, 2))
+    kernels.starts(table.coefficients, table.least, table.step, grid)
+    return grid
+
+
 def _inverted(
     reflection: Reflection,
     moments: tuple[Floating, Floating],
     table: Response,
+    grid: Floating,
     analyser: Floating,
     eta: float,
     view: Floating,
@@ -344,7 +362,8 @@ def _inverted(
     out = np.empty((moments[0].shape[1], kernels.NORMAL_COLUMNS))
     kernels.invert(
         *moments, table.frame, reflection.component == "specular", table.coefficients, table.least,
-        table.step, analyser, eta, view, place, reflection.told > 0, NEEDED, out,
+        table.step, grid, analyser, eta, view, place, reflection.told > 0, NEEDED,
+        1e-5 if reflection.kind == np.float32 else 1e-9, out,
     )  # fmt: skip
     return out
 
@@ -372,8 +391,8 @@ def _roughness(
         """Return how much longer the vectors are than this roughness makes them, each and all."""
         table = lobe_response.specular(lights, view=middle, alpha=float(np.exp(log_alpha)), eta=eta)
         found = _inverted(
-            reflection, moments, table, _analyser(lights, table), eta, np.zeros((0, 3)),
-            np.zeros((0, 2)),
+            reflection, moments, table, _grid(table), _analyser(lights, table), eta,
+            np.zeros((0, 3)), np.zeros((0, 2)),
         )  # fmt: skip
         good = found[:, kernels.STATUS] == kernels.GOOD
         light = found[good, kernels.ALBEDO]
@@ -420,13 +439,13 @@ def _maps(
     normals = np.zeros((height, width, 3), kind)
     flats = [np.zeros((height, width), kind) for _ in range(4)]
     valid, used = np.zeros((height, width), bool), np.zeros((height, width), np.int32)
-    contradiction = []
+    grid = _grid(table)
 
     def solve(rows: slice) -> tuple[float, float]:
         span = slice(rows.start * width, rows.stop * width)
         moments = reflection.moments(rows)
         found = _inverted(
-            reflection, moments, table, analyser, eta, view[span] if len(view) else view,
+            reflection, moments, table, grid, analyser, eta, view[span] if len(view) else view,
             np.zeros((0, 2)) if places is None else places[span],
         ).reshape(-1, width, kernels.NORMAL_COLUMNS)  # fmt: skip
         good = found[..., kernels.STATUS] == kernels.GOOD
