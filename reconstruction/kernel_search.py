@@ -1,0 +1,340 @@
+"""The search of eq. (7): the kernel on a grid whose relief has normals distributed as a target.
+
+Slopes are linear in alpha, so one convolution and one pass serve all alphas of one sigma. The
+exhaustive search passes over all of the grid. The hierarchical one evaluates the grid on growing
+random samples of pixels, drops what is shown to be worse than a kernel already evaluated on all
+pixels, and evaluates what is left on all pixels.
+
+Why a drop is right: for numbers ``s_b`` within [-1, 1] the distance ``sum |H_b - h_b|`` is at least
+``sum s_b (H_b - h_b)``, and ``sum s_b h_b`` is the mean over pixels of ``s`` at the pixel's bucket.
+With s chosen before they are drawn, a mean over m pixels drawn without replacement out of M is
+above the mean of all by more than ``sqrt(2 ln(1/p) (1 - (m - 1) / M) / m)`` with a chance of at
+most p (Serfling 1974). s is the sign of H - h, of the kernel itself on the pixels drawn before, or
+of a nearby kernel on all pixels. p is so small that over all tests of a search the chance of
+dropping the best kernel is at most `MISS`.
+
+References
+----------
+Nagano et al. 2015, ACM Trans. Graph. 34(4), 109. doi:10.1145/2766894
+Serfling 1974, Probability Inequalities for the Sum in Sampling without Replacement, Ann. Statist.
+2(1), 39. doi:10.1214/aos/1176342611
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.microstructure import gaussian_weights
+from reconstruction import kernel_fit_kernels as kernels
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+MISS = 1e-6
+"""Chance at most that a hierarchical search drops the exhaustive search's result."""
+ROUNDING = 2e-4
+"""Distance granted to rounding: on samples, sums of single precision are taken in another order."""
+TIE = 1e-12
+"""Distances that differ by less are tied."""
+FIRST_SAMPLE = 32_768
+GROWTH = 4
+LARGEST_SAMPLE = 0.35
+"""Share of all pixels from which all are taken."""
+WINDOW_BYTES = 300_000_000
+"""Most memory for the neighbourhoods of sampled pixels; beyond, whole maps are convolved."""
+ANCHORS = 6
+"""Kernels evaluated on all pixels between two samples."""
+
+
+@dataclass(frozen=True, slots=True)
+class Relief:
+    """A neutral relief with its axis of strain along the rows, and the samples of its slopes.
+
+    Attributes
+    ----------
+    height_um : ndarray of float32, shape (H, W)
+        About its mean; holes filled along the rows.
+    code : ndarray of uint8, shape (H, W)
+        Where slopes are taken, of `normal_histogram.stencil`.
+    right_um, down_um : float
+        Deformed distance to the next column and row along the histogram's axes, signed.
+    pixel_um : float
+        Neutral side of a pixel along the rows, for sigma.
+    """
+
+    height_um: Float32
+    code: NDArray[np.uint8]
+    right_um: float
+    down_um: float
+    pixel_um: float
+    places: NDArray[np.int64] = field(init=False)
+    """(N,) pixels with slopes, y * W + x."""
+    starts: NDArray[np.int64] = field(init=False)
+    """(H,) samples in the rows before."""
+    along: Float32 = field(init=False)
+    """(N,) minus the neutral relief's slopes after stretching."""
+    across: Float32 = field(init=False)
+
+    def __post_init__(self) -> None:
+        """List the samples and their slopes."""
+        known = self.code > 0
+        a, b = np.cumsum(known.sum(axis=1)), known.sum(axis=1)
+        object.__setattr__(self, "places", np.flatnonzero(known))
+        object.__setattr__(self, "starts", (a - b).astype(np.int64))
+        along, across = self._leans(self.height_um)
+        object.__setattr__(self, "along", along)
+        object.__setattr__(self, "across", across)
+
+    def _leans(self, height: Float32) -> tuple[Float32, Float32]:
+        a, b = np.empty(self.places.size, np.float32), np.empty(self.places.size, np.float32)
+        right, down = np.float32(self.right_um), np.float32(self.down_um)
+        kernels.leans(height, self.code, self.starts, right, down, a, b)
+        return a, b
+
+    def weights(self, sigma_um: float) -> Float32:
+        """Return the discrete Gaussian's right half."""
+        return gaussian_weights(sigma_um / self.pixel_um).astype(np.float32)
+
+    def change(self, sigma_um: float) -> tuple[Float32, Float32]:
+        """Return what a Gaussian of sigma changes the samples' slopes by: (N,), (N,)."""
+        moved = np.empty_like(self.height_um)
+        kernels.blurred_less_itself(self.height_um, self.weights(sigma_um), moved)
+        return self._leans(moved)
+
+
+@dataclass(frozen=True, slots=True)
+class Buckets:
+    """The target of a search.
+
+    Attributes
+    ----------
+    target : ndarray of float64, shape (bins ** 2 + 1,)
+        Shares, axes (across, along) made flat, then the share beyond the limit.
+    bins, limit
+        As of `normal_histogram.histogram`.
+    """
+
+    target: Floats
+    bins: int
+    limit: float
+
+    def count(
+        self, start: tuple[Float32, Float32], change: tuple[Float32, Float32], alphas: Floats
+    ) -> NDArray[np.int32]:
+        """Count the samples of each alpha, in parts: (parts, A, bins ** 2 + 1)."""
+        given = alphas.astype(np.float32)
+        parts = kernels.threads()
+        return kernels.count_kernels(*start, *change, given, self.bins, self.limit, parts)
+
+    def distances(
+        self, start: tuple[Float32, Float32], change: tuple[Float32, Float32], alphas: Floats
+    ) -> Floats:
+        """Return eq. (7)'s sum for each alpha."""
+        return kernels.distances(self.count(start, change, alphas), self.target)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What a search knows of its grid; arrays have the shape (sigmas, alphas).
+
+    Attributes
+    ----------
+    distance : ndarray
+        Of eq. (7): exact over all pixels where `exact`, elsewhere from the largest sample that
+        the kernel was evaluated on, less the best kernel's excess on the same sample.
+    exact : ndarray of bool
+    best : tuple of int
+        Indices (sigma, alpha) of the least exact distance. Ties go to the gentlest kernel: least
+        |alpha|, then least sigma, then the blurring one.
+    passes : float
+        Kernels evaluated, in units of all pixels.
+    """
+
+    distance: Floats
+    exact: Bools
+    best: tuple[int, int]
+    passes: float
+
+
+def gentlest(distance: Floats, alphas: Floats, sigmas_um: Floats) -> tuple[int, int]:
+    """Return the indices of the least distance, ties by the rule of :class:`Found`."""
+    i, j = np.nonzero(distance <= distance.min() + TIE)
+    order = np.lexsort((-alphas[j], sigmas_um[i], np.abs(alphas[j])))
+    return int(i[order[0]]), int(j[order[0]])
+
+
+def exhaustive(relief: Relief, buckets: Buckets, alphas: Floats, sigmas_um: Floats) -> Found:
+    """Evaluate all kernels of the grid on all pixels."""
+    start = relief.along, relief.across
+    distance = np.empty((sigmas_um.size, alphas.size))
+    for i, sigma in enumerate(sigmas_um):
+        distance[i] = buckets.distances(start, relief.change(float(sigma)), alphas)
+    best = gentlest(distance, alphas, sigmas_um)
+    return Found(distance, np.ones(distance.shape, bool), best, float(distance.size))
+
+
+def hierarchical(
+    relief: Relief,
+    buckets: Buckets,
+    alphas: Floats,
+    sigmas_um: Floats,
+    *,
+    first_sample: int = FIRST_SAMPLE,
+    rng: np.random.Generator,
+) -> Found:
+    """Find what :func:`exhaustive` does, but for a chance of `MISS`; see the module's text.
+
+    Parameters
+    ----------
+    relief, buckets
+        What is convolved, and what it shall come to.
+    alphas, sigmas_um : ndarray, shapes (A,), (S,)
+        The grid.
+    first_sample : int
+        Pixels that all kernels are evaluated on; grows by `GROWTH` from one round to the next.
+    rng
+        Draws the pixels. The result does not depend on it, but for the chance `MISS`.
+    """
+    pixels = relief.places.size
+    if first_sample >= LARGEST_SAMPLE * pixels:
+        return exhaustive(relief, buckets, alphas, sigmas_um)
+    sizes = [first_sample]
+    while sizes[-1] * GROWTH < LARGEST_SAMPLE * pixels:
+        sizes.append(sizes[-1] * GROWTH)
+    return _Race(relief, buckets, alphas, sigmas_um).run(sizes, rng)
+
+
+class _Race:
+    """State of a hierarchical search."""
+
+    def __init__(self, relief: Relief, buckets: Buckets, alphas: Floats, sigmas: Floats) -> None:
+        shape = (sigmas.size, alphas.size)
+        self.relief, self.buckets, self.alphas, self.sigmas = relief, buckets, alphas, sigmas
+        self.low = np.zeros(shape)  # distances are at least this
+        self.guess = np.full(shape, np.inf)  # on the largest sample so far
+        self.level = np.zeros(shape, int)  # which sample that was
+        self.exact = np.zeros(shape, bool)
+        self.distance = np.full(shape, np.inf)  # exact ones
+        self.signs: list[Floats] = []  # of target - histogram, of kernels evaluated on all pixels
+        self.passes = 0.0
+
+    def run(self, sizes: list[int], rng: np.random.Generator) -> Found:
+        pixels = self.relief.places.size
+        order = rng.permutation(pixels)[: sizes[-1]]
+        tests = self.low.size * len(sizes) * (1 + ANCHORS)
+        log = math.log(tests / MISS)
+        before = sizes[0] // 2
+        for number, size in enumerate(sizes):
+            if not self._open.any():
+                break
+            self._sample(order[:size], before, log, number)
+            before = size
+            self._anchor()
+        self._finish()
+        best = gentlest(self.distance, self.alphas, self.sigmas)
+        # a sample's distance is larger than that of all, alike for kernels that are alike
+        excess = np.zeros(len(sizes))
+        for number in range(len(sizes)):
+            both = self.exact & (self.level == number)
+            if both.any():
+                excess[number] = np.median((self.guess - self.distance)[both])
+            elif number:
+                excess[number] = excess[number - 1] / math.sqrt(GROWTH)
+        distance = np.where(self.exact, self.distance, self.guess - excess[self.level])
+        distance[~self.exact] = np.maximum(distance[~self.exact], self.distance[best])
+        return Found(distance, self.exact, best, self.passes)
+
+    @property
+    def _open(self) -> Bools:
+        """Kernels that may still be the best, and are not evaluated on all pixels."""
+        return ~self.exact & (self.low <= self.distance.min())
+
+    def _sample(self, chosen: NDArray[np.int64], before: int, log: float, number: int) -> None:
+        relief, target = self.relief, self.buckets.target
+        pixels, m = relief.places.size, chosen.size
+        rest, fresh = pixels - before, m - before
+        # Serfling's bound, of the mean over what was not drawn before
+        slack = math.sqrt(2.0 * log * (1.0 - (fresh - 1) / rest) / fresh) * rest / pixels + ROUNDING
+        signs = np.array(self.signs).reshape(-1, target.size)
+        start = relief.along[chosen], relief.across[chosen]
+        old = start[0][:before], start[1][:before]
+        new = start[0][before:], start[1][before:]
+        change = _SampledChange(relief, chosen, self.sigmas[self._open.any(axis=1)].max())
+        for i in np.flatnonzero(self._open.any(axis=1)):
+            j = np.flatnonzero(self._open[i])
+            da, db = change.at(float(self.sigmas[i]))
+            first = self.buckets.count(old, (da[:before], db[:before]), self.alphas[j])
+            second = self.buckets.count(new, (da[before:], db[before:]), self.alphas[j])
+            found = kernels.bounds(first, second, target, before, fresh, pixels, signs)
+            self.guess[i, j], low = found.T
+            self.level[i, j] = number
+            self.low[i, j] = np.maximum(self.low[i, j], low - slack)
+            self.passes += j.size * m / pixels
+
+    def _anchor(self) -> None:
+        """Evaluate the best guess with its neighbours, and the best at sigmas spread over all."""
+        self.signs = []
+        best = int(np.argmin(np.where(self.exact, np.inf, self.guess)))
+        i, j = divmod(best, self.alphas.size)
+        self._evaluate(i, np.arange(max(j - 4, 0), min(j + 5, self.alphas.size)), j)
+        rows = np.flatnonzero(self._open.any(axis=1))
+        if rows.size == 0:
+            return
+        spread = np.linspace(0, rows.size - 1, ANCHORS - 1).round().astype(int)
+        for i in np.unique(rows[spread]).tolist():
+            if self._open[i].any():
+                j = int(np.argmin(np.where(self._open[i], self.guess[i], np.inf)))
+                self._evaluate(i, np.array([j]), j)
+
+    def _evaluate(self, i: int, j: NDArray[np.int64], keep: int | None = None) -> None:
+        relief = self.relief
+        counts = self.buckets.count(
+            (relief.along, relief.across), relief.change(float(self.sigmas[i])), self.alphas[j]
+        )
+        self.distance[i, j] = kernels.distances(counts, self.buckets.target)
+        self.exact[i, j] = True
+        self.passes += j.size
+        if keep is not None:
+            shares = counts[:, list(j).index(keep)].sum(axis=0) / relief.places.size
+            self.signs.append(np.sign(self.buckets.target - shares))
+
+    def _finish(self) -> None:
+        """Evaluate the open ones, most promising sigma first."""
+        while self._open.any():
+            hope = np.where(self._open, self.guess, np.inf).min(axis=1)
+            i = int(np.argmin(hope))
+            self._evaluate(i, np.flatnonzero(self._open[i]))
+
+
+class _SampledChange:
+    """What Gaussians change the slopes of some pixels by."""
+
+    SIZE = 1024
+
+    def __init__(self, relief: Relief, chosen: NDArray[np.int64], most_um: float) -> None:
+        self.relief, self.chosen = relief, chosen
+        reach = relief.weights(float(most_um)).size - 1
+        blocks = -(-chosen.size // self.SIZE)
+        self.small = 8 * blocks * reach * self.SIZE <= WINDOW_BYTES
+        if self.small:
+            self.along = np.zeros((blocks, reach, self.SIZE), np.float32)
+            self.across = np.zeros_like(self.along)
+            right, down = np.float32(relief.right_um), np.float32(relief.down_um)
+            kernels.windows(
+                relief.height_um, relief.code, relief.places[chosen], right, down,
+                self.along, self.across,
+            )  # fmt: skip
+
+    def at(self, sigma_um: float) -> tuple[Float32, Float32]:
+        """Return both changes, in the order of the chosen pixels."""
+        if not self.small:
+            a, b = self.relief.change(sigma_um)
+            return a[self.chosen], b[self.chosen]
+        da, db = np.empty(self.chosen.size, np.float32), np.empty(self.chosen.size, np.float32)
+        kernels.weighed(self.along, self.across, self.relief.weights(sigma_um), da, db)
+        return da, db

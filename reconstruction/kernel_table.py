@@ -1,0 +1,340 @@
+"""A table of kernels over the stretch ratio, fitted to kernels of single states of strain.
+
+alpha: connected lines through the neutral kernel (r = 1, alpha = 0), held within [-2, 1] as the
+kernel's definition is; how many lines, up to a given number, is decided by the Bayesian information
+criterion, where they meet by least squares. sigma: one line for compression and one for stretching,
+which do not meet (Nagano2015, section 5, "Kernel Table Construction", done there by hand).
+
+References
+----------
+Nagano et al. 2015, ACM Trans. Graph. 34(4), 109. doi:10.1145/2766894
+Schwarz 1978, Estimating the Dimension of a Model, Ann. Statist. 6(2), 461.
+doi:10.1214/aos/1176344136
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.microstructure import ALPHA_LIMITS, KernelTable, kernel_parameters
+
+Floats = NDArray[np.float64]
+
+LEAST_POINTS = 2
+"""Points that inform a line of alpha, at least; its ends and the neutral kernel count."""
+BREAK_GRID = 24
+"""Places tried for a break, beside the points', before it is moved in finer steps."""
+NEUTRAL = 1e-6
+"""Stretch ratios nearer to 1 are neutral: they tell nothing of either branch."""
+
+
+class KernelTableFitError(ValueError):
+    """Points that no table can be fitted to."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableFit:
+    """A table with what is known about it.
+
+    Attributes
+    ----------
+    table : KernelTable
+    segments : int
+        Lines of alpha, without the parts held at the limits.
+    criterion : dict of int to float
+        Bayesian information criterion of each number of lines that was tried; the least is taken.
+    alpha_rms : float
+        Root mean square of alpha's weighted residuals.
+    sigma_rms_um : tuple of float
+        The same of sigma, um, in compression and in stretching; NaN without that branch.
+    alpha_stderr : tuple of float
+        Standard errors of the slopes of alpha's lines at these breaks; infinite where the points
+        leave none over.
+    break_stderr : tuple of float
+        Half of the way that each break can move until the sum of squares has grown by one
+        residual's (a break's likelihood has corners at the points).
+    sigma_compression_stderr_um, sigma_stretch_stderr_um : (slope, intercept)
+        Standard errors of sigma's lines, um.
+    sigma_compression_covariance_um2, sigma_stretch_covariance_um2 : float
+        Covariance of slope and intercept, um^2.
+    alpha_covariance : ndarray, shape (segments, segments)
+        Of the slopes at these breaks.
+    """
+
+    table: KernelTable
+    segments: int
+    criterion: Mapping[int, float]
+    alpha_rms: float
+    sigma_rms_um: tuple[float, float]
+    alpha_stderr: tuple[float, ...]
+    break_stderr: tuple[float, ...]
+    sigma_compression_stderr_um: tuple[float, float]
+    sigma_stretch_stderr_um: tuple[float, float]
+    sigma_compression_covariance_um2: float
+    sigma_stretch_covariance_um2: float
+    alpha_covariance: Floats
+
+
+def fit_table(
+    stretch: ArrayLike,
+    alpha: ArrayLike,
+    sigma_um: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    max_segments: int = 2,
+    least_points: int = LEAST_POINTS,
+    source: str = "fitted",
+) -> TableFit:
+    """Fit a table of kernels to kernels fitted at single stretch ratios.
+
+    Parameters
+    ----------
+    stretch, alpha, sigma_um : array_like, shape (N,)
+        Ratios r > 0, strengths in [-2, 1], standard deviations > 0 in um.
+    weights : array_like, shape (N,) or (N, 2), optional
+        Inverse variances of the points, up to a common factor that the residuals tell: of both
+        parameters, or of alpha and of sigma. Equal by default; 0 leaves a point out.
+    max_segments : int
+        Most lines of alpha, 1...4. Two are as many as eq. (8) has within its limits.
+    least_points : int
+        Points that each line of alpha must be informed by: on it or its ends, the neutral kernel
+        among them, and not held at a limit.
+    source : str
+        Goes into the table.
+
+    Returns
+    -------
+    TableFit
+        Its table covers the stretch ratios of the points, and 1.
+
+    Raises
+    ------
+    KernelTableFitError
+        For fewer than two points on a side that has any, or values beyond their ranges.
+    """
+    r, a, s = (np.asarray(v, np.float64).reshape(-1) for v in (stretch, alpha, sigma_um))
+    if not r.size == a.size == s.size:
+        raise KernelTableFitError(f"alpha, sigma_um: got {a.size}, {s.size}, expected {r.size}")
+    w = np.ones((r.size, 2)) if weights is None else np.asarray(weights, np.float64)
+    w = np.broadcast_to(w[:, None] if w.ndim == 1 else w, (w.shape[0], 2))
+    if w.shape != (r.size, 2) or not np.isfinite(w).all() or (w < 0).any():
+        raise KernelTableFitError(f"weights: got shape {w.shape}, expected {r.size} numbers >= 0")
+    if not 1 <= max_segments <= 4 or least_points < 1:
+        raise KernelTableFitError(
+            f"max_segments, least_points: got {max_segments}, {least_points}, expected 1...4, >= 1"
+        )
+    good = np.isfinite(np.stack([r, a, s])).all(axis=0) & (r > 0) & (s > 0)
+    good &= (a >= ALPHA_LIMITS[0]) & (a <= ALPHA_LIMITS[1])
+    if not good.all():
+        raise KernelTableFitError(
+            f"point {int(np.argmin(good))}: got NaN, or a value beyond r > 0, "
+            f"{ALPHA_LIMITS[0]} <= alpha <= {ALPHA_LIMITS[1]}, sigma > 0"
+        )
+    told = (np.abs(r - 1.0) > NEUTRAL) & (w > 0).all(axis=1)
+    r, a, s, w = r[told], a[told], s[told], w[told]
+    low, high = r < 1.0, r > 1.0
+    for name, side in (("compression", low), ("stretching", high)):
+        if side.any() and np.unique(r[side]).size < 2:
+            raise KernelTableFitError(f"{name}: got one stretch ratio, expected at least two")
+    if r.size == 0:
+        raise KernelTableFitError("stretch: got no point beside the neutral one")
+    order = np.argsort(r)
+    r, a, s, w, low, high = r[order], a[order], s[order], w[order], low[order], high[order]
+    fits: dict[int, tuple[Floats, float]] = {}
+    criterion = {}
+    n = r.size
+    for segments in range(1, max_segments + 1):
+        fit = _fit_alpha(r, a, w[:, 0], segments, least_points)
+        if fit is None or n <= 2 * segments - 1:
+            continue
+        fits[segments] = fit
+        # mean of the squares, with a floor for points that lie on lines
+        mean = max(fit[1] / w[:, 0].sum(), 1e-12)
+        criterion[segments] = n * math.log(mean) + (2 * segments - 1) * math.log(n)
+    if not fits:
+        raise KernelTableFitError(f"alpha: got {n} points, expected more than a line's one slope")
+    segments = min(criterion, key=lambda k: criterion[k])
+    theta, rss = fits[segments]
+    slopes, breaks = theta[:segments], theta[segments:]
+    covariance = _alpha_covariance(r, a, w[:, 0], theta, segments, rss)
+    lines = _lines(slopes, breaks)
+    branches = [_fit_sigma(r[side], s[side], w[side, 1]) for side in (low, high)]
+    table = KernelTable(
+        alpha_breaks=tuple(breaks.tolist()),
+        alpha_lines=lines,
+        sigma_compression_um=branches[0][0],
+        sigma_stretch_um=branches[1][0],
+        stretch_range=(min(float(r[0]), 1.0), max(float(r[-1]), 1.0)),
+        source=source,
+    )
+    return TableFit(
+        table=table,
+        segments=segments,
+        criterion=criterion,
+        alpha_rms=math.sqrt(rss / w[:, 0].sum()),
+        sigma_rms_um=(branches[0][3], branches[1][3]),
+        alpha_stderr=tuple(np.sqrt(np.diag(covariance)).tolist()),
+        break_stderr=_break_stderr(r, a, w[:, 0], theta, segments, rss),
+        sigma_compression_stderr_um=branches[0][1],
+        sigma_stretch_stderr_um=branches[1][1],
+        sigma_compression_covariance_um2=branches[0][2],
+        sigma_stretch_covariance_um2=branches[1][2],
+        alpha_covariance=covariance,
+    )
+
+
+def _design(r: Floats, breaks: Floats) -> Floats:
+    """Return how much of the way from 1 to r lies on each line, signed: alpha = design @ slopes."""
+    edges = np.concatenate([[-np.inf], breaks, [np.inf]])
+    low, high = np.minimum(r, 1.0)[:, None], np.maximum(r, 1.0)[:, None]
+    overlap = np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1])
+    return np.maximum(overlap, 0.0) * np.sign(r - 1.0)[:, None]
+
+
+def _lines(slopes: Floats, breaks: Floats) -> tuple[tuple[float, float], ...]:
+    """Return (slope, intercept) of each line."""
+    values = _design(breaks, breaks) @ slopes if breaks.size else np.zeros(0)
+    lines = []
+    for k, m in enumerate(slopes):
+        if breaks.size == 0:
+            r0, v0 = 1.0, 0.0
+        else:
+            r0, v0 = breaks[max(k - 1, 0)], values[max(k - 1, 0)]
+        # the line that holds the neutral kernel goes through it to the last digit
+        edges = np.concatenate([[-np.inf], breaks, [np.inf]])
+        if edges[k] < 1.0 <= edges[k + 1]:
+            r0, v0 = 1.0, 0.0
+        lines.append((float(m), float(v0 - m * r0)))
+    return tuple(lines)
+
+
+def _fit_slopes(
+    r: Floats, a: Floats, w: Floats, breaks: Floats
+) -> tuple[Floats, NDArray[np.bool_], float]:
+    """Return slopes of least squares, which points inform them, and the sum of squares.
+
+    A point on a limit where the lines go beyond it is met exactly, and says nothing more.
+    """
+    X, root = _design(r, breaks), np.sqrt(w)
+    used = np.ones(r.size, bool)
+    best: tuple[Floats, NDArray[np.bool_], float] | None = None
+    for _ in range(8):
+        slopes = np.linalg.lstsq(root[used, None] * X[used], root[used] * a[used])[0]
+        line = X @ slopes
+        beyond = ((a <= ALPHA_LIMITS[0]) & (line < a)) | ((a >= ALPHA_LIMITS[1]) & (line > a))
+        rss = float(np.sum(w * (np.clip(line, *ALPHA_LIMITS) - a) ** 2))
+        if best is None or rss < best[2]:
+            best = slopes, ~beyond, rss
+        if (used == ~beyond).all() or beyond.all():
+            break
+        used = ~beyond
+    assert best is not None  # noqa: S101
+    return best
+
+
+def _fit_alpha(
+    r: Floats, a: Floats, w: Floats, segments: int, least_points: int
+) -> tuple[Floats, float] | None:
+    """Return slopes, then breaks, of least squares, and the sum of squares; None without room."""
+
+    def tried(breaks: Floats) -> tuple[float, Floats]:
+        if (np.diff(breaks) <= 0).any():
+            return math.inf, breaks
+        slopes, informing, rss = _fit_slopes(r, a, w, breaks)
+        edges = np.concatenate([[-np.inf], breaks, [np.inf]])
+        points = np.append(r[informing], 1.0)
+        for first, last in pairwise(edges):
+            if np.count_nonzero((points >= first) & (points <= last)) < least_points:
+                return math.inf, breaks
+        return rss, np.concatenate([slopes, breaks])
+
+    span = r[0], max(r[-1], 1.0)
+    places = np.union1d(np.linspace(min(span[0], 1.0), span[1], BREAK_GRID), r)
+    found = [tried(np.array(chosen)) for chosen in combinations(places, segments - 1)]
+    rss, theta = min(found, key=lambda pair: pair[0])
+    if not math.isfinite(rss):
+        return None
+    step = (span[1] - min(span[0], 1.0)) / BREAK_GRID
+    for _ in range(3):  # finer around the best, one break at a time
+        for k in range(segments, 2 * segments - 1):
+            for place in np.linspace(theta[k] - step, theta[k] + step, 41):
+                breaks = theta[segments:].copy()
+                breaks[k - segments] = place
+                other = tried(breaks)
+                if other[0] < rss - 1e-15:
+                    rss, theta = other
+        step /= 10.0
+    return theta, rss
+
+
+def _alpha_covariance(
+    r: Floats, a: Floats, w: Floats, theta: Floats, segments: int, rss: float
+) -> Floats:
+    """Return the covariance of the slopes at these breaks; infinite where no point is left over."""
+    slopes, informing, _ = _fit_slopes(r, a, w, theta[segments:])
+    X = _design(r, theta[segments:])[informing]
+    free = r.size - theta.size
+    if free <= 0 or np.linalg.matrix_rank(X) < slopes.size:
+        return np.diag(np.full(segments, np.inf))
+    return np.asarray(np.linalg.inv((X * w[informing, None]).T @ X) * rss / free)
+
+
+def _break_stderr(
+    r: Floats, a: Floats, w: Floats, theta: Floats, segments: int, rss: float
+) -> tuple[float, ...]:
+    """Return half of the ways that breaks can move until the misfit grows by one residual's."""
+    free = r.size - theta.size
+    if free <= 0:
+        return (math.inf,) * (segments - 1)
+    widths = []
+    places = np.linspace(r[0], r[-1], 400)
+    for k in range(segments - 1):
+        near = [float(theta[segments + k])]
+        for place in places:
+            breaks = theta[segments:].copy()
+            breaks[k] = place
+            if (np.diff(breaks) > 0).all() and _fit_slopes(r, a, w, breaks)[2] <= rss * (
+                1.0 + 1.0 / free
+            ):
+                near.append(float(place))
+        widths.append(0.5 * (max(near) - min(near)))
+    return tuple(widths)
+
+
+def _fit_sigma(
+    r: Floats, s: Floats, w: Floats
+) -> tuple[tuple[float, float] | None, tuple[float, float], float, float]:
+    """Return line, standard errors, covariance and weighted RMS residual of one branch, um."""
+    if r.size == 0:
+        return None, (math.inf, math.inf), math.inf, math.nan
+    X = np.stack([r, np.ones(r.size)], axis=1)
+    N = (X * w[:, None]).T @ X
+    C = np.linalg.inv(N)
+    line = C @ (X.T @ (w * s))
+    rss = float(np.sum(w * (X @ line - s) ** 2))
+    rms = math.sqrt(rss / w.sum())
+    pair = (float(line[0]), float(line[1]))
+    if r.size < 3:
+        return pair, (math.inf, math.inf), math.inf, rms
+    C = C * rss / (r.size - 2)
+    return pair, (math.sqrt(C[0, 0]), math.sqrt(C[1, 1])), float(C[0, 1]), rms
+
+
+def alpha_rms(table: KernelTable, stretch: ArrayLike, alpha: ArrayLike) -> float:
+    """Return the root mean square residual of a table's alpha at points in its range.
+
+    Examples
+    --------
+    >>> from model.microstructure import FOREHEAD, forehead_points
+    >>> points = forehead_points()
+    >>> round(alpha_rms(FOREHEAD, points.stretch, points.alpha), 3)  # eq. (8) on fig. 11
+    0.199
+    """
+    found, _ = kernel_parameters(stretch, table)
+    return float(np.sqrt(np.mean((found - np.asarray(alpha, np.float64)) ** 2)))
