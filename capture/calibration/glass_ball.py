@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.spatial import cKDTree
 
@@ -29,6 +29,7 @@ __all__ = [
     "light_directions",
     "locate_ball",
     "mirrored",
+    "pupil_shift",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -43,6 +44,7 @@ GATE_MM = 0.3  # of a spot from its predicted place, at first; spots lie 0.4 mm 
 LEAST_SPOTS = 12
 LEAST_SHARE = 0.5  # of the lights: with fewer, the nominal places do not hold the ball's
 HUBER = 2.5
+PUPIL_POINTS = 37
 STEPS = 12
 DERIVATIVE_MM = 0.01
 MEDIAN_CHI2_2 = 1.3863  # median of chi-square with two degrees of freedom, 2 ln 2
@@ -230,14 +232,65 @@ def mirrored(
     )
 
 
+def pupil_shift(
+    camera: CameraPose,
+    ball_mm: FloatArray,
+    radius_mm: float,
+    lights_mm: FloatArray,
+    *,
+    pupil_mm: float,
+    focus_mm: float,
+) -> FloatArray:
+    """Return how far spots' middles lie from where the lens's middle sees them.
+
+    Each point of the pupil sees a spot in another place of the ball, and outside the plane in focus
+    these do not fall together; their mean is not the middle's own.
+
+    Parameters
+    ----------
+    camera : CameraPose
+    ball_mm, radius_mm
+        The ball.
+    lights_mm : ndarray of float64, shape (L, 3)
+    pupil_mm : float
+        Diameter of the lens's pupil, mm.
+    focus_mm : float
+        Distance of the plane in focus from the pupil, along the camera's axis, mm.
+
+    Returns
+    -------
+    ndarray of float64, shape (L, 2)
+        Column and row, px.
+    """
+    lights = np.asarray(lights_mm, np.float64)
+    right, down, forward = camera.rotation
+    centers = np.broadcast_to(ball_mm, lights.shape)
+
+    def seen(eye: FloatArray) -> FloatArray:
+        eyes = np.broadcast_to(eye, lights.shape)
+        point, _ = reflection_points(eyes, centers, radius_mm, lights)
+        ray = point - eye
+        return camera.project(eye + ray * (focus_mm / (ray @ forward))[:, None])
+
+    middle = seen(camera.center_mm)
+    total = np.zeros_like(middle)
+    for k in range(PUPIL_POINTS):
+        # even per area: a sunflower's seeds
+        radius = 0.5 * pupil_mm * np.sqrt((k + 0.5) / PUPIL_POINTS)
+        angle = np.pi * (1 + np.sqrt(5)) * k
+        total += seen(camera.center_mm + radius * (np.cos(angle) * right + np.sin(angle) * down))
+    return total / PUPIL_POINTS - middle
+
+
 def locate_ball(
     spots: FloatArray,
     camera: CameraPose,
     lights_mm: FloatArray,
     *,
+    center_mm: ArrayLike = (0.0, 0.0, 0.0),
     radius_mm: float = 6.0,
     radius_stderr_mm: float = 0.02,
-    depth_stderr_mm: float = 0.5,
+    depth_stderr_mm: float = 1.0,
     margin_mm: float = 0.1,
     lit: NDArray[np.bool_] | None = None,
 ) -> BallFit:
@@ -250,10 +303,12 @@ def locate_ball(
     camera : CameraPose
     lights_mm : ndarray of float64, shape (L, 3)
         Nominal places of the lights; what they have wrong in common becomes the ball's.
+    center_mm : array_like, shape (3,)
+        About where the ball's middle stands, rig frame.
     radius_mm, radius_stderr_mm : float
         The ball's, and how well it is known.
     depth_stderr_mm : float
-        How well the ball's middle stands at the origin along the camera's axis.
+        How well the ball's middle stands there along the camera's axis.
     margin_mm : float
         A spot's own size: closer to the image's border it is not whole.
     lit : ndarray of bool, shape (L,), optional
@@ -273,7 +328,8 @@ def locate_ball(
     found = np.asarray(spots, np.float64).reshape(-1, 2)
     shows = np.ones(len(lights), bool) if lit is None else lit
     pixel_mm = float(np.linalg.norm(camera.center_mm)) / float(camera.matrix[0, 0])
-    nominal = reflection_pixels(camera, np.zeros(3), radius_mm, lights)
+    about = np.array(center_mm, np.float64)
+    nominal = reflection_pixels(camera, about, radius_mm, lights)
     _require_field(nominal[shows], camera, pixel_mm, radius_mm)
     if len(found) == 0:
         raise BallError(
@@ -289,9 +345,10 @@ def locate_ball(
             " the middle"
         )
     right, down = camera.rotation[0], camera.rotation[1]
-    start = pixel_mm * (shift[0] * right + shift[1] * down)
+    start = about + pixel_mm * (shift[0] * right + shift[1] * down)
     return _refine(
         found, camera, lights, shows, np.append(start, radius_mm), pixel_mm,
+        expected=np.append(about, radius_mm),
         prior=np.array([REACH_MM, REACH_MM, depth_stderr_mm, radius_stderr_mm]),
         margin_px=margin_mm / pixel_mm,
     )  # fmt: skip
@@ -386,11 +443,11 @@ def _refine(
     place: FloatArray,
     pixel_mm: float,
     *,
+    expected: FloatArray,
     prior: FloatArray,
     margin_px: float,
 ) -> BallFit:
     """Fit centre and radius by Gauss and Newton, each light free about its nominal place."""
-    expected = np.append(np.zeros(3), place[3])
     tree = cKDTree(found)
     scatter_mm, gate_px = 2.0, GATE_MM / pixel_mm
     spot = np.full(len(lights), -1)

@@ -19,24 +19,28 @@ from capture.calibration.glass_ball import (
     light_directions,
     locate_ball,
     mirrored,
+    pupil_shift,
 )
 from capture.calibration.polarized_reflection import Reflection
 from capture.calibration.sphere_lights import SphereFilms, SphereLightTable
 from capture.calibration.sphere_polarization import FilmFit, fit_films, leakage
 from capture.calibration.spot_photometry import (
+    RING,
     RateImage,
     Shot,
     measure_flux,
     measure_middles,
     rate_image,
+    share_within,
 )
-from capture.rig import Rig
+from capture.rig import Rig, View
 
 __all__ = ["GlassBall", "SphereSurvey", "survey_sphere"]
 
 FloatArray = NDArray[np.float64]
 
-APERTURE_MM = 0.12  # at the ball: a spot of 0.06 mm, blurred by the lens and by lack of focus
+MARGIN_MM = 0.06  # around a spot as geometry draws it, for what the lens and the pixels blur
+WAVELENGTH_MM = 5.5e-4
 FLOOR_PX = 0.03  # of a spot's middle, whatever its light: the pixels' own responses, the polish
 EXPOSURE_SHARE = 1e-3  # how well an exposure's light repeats
 RESPONSE_SHARE = 1e-3  # how well pixels' responses are known over a spot
@@ -54,13 +58,16 @@ SKIN_ETA = 1.4
 class GlassBall:
     """The target: a polished ball of black glass."""
 
+    center_mm: tuple[float, float, float] = (0.0, 0.0, -3.0)
+    """About where its middle stands, mm, rig frame: half a radius behind the origin, where the
+    camera is focused, spots near the axis are sharp."""
     radius_mm: float = 6.0
     radius_stderr_mm: float = 0.02
     eta: float = 1.52
     """Refractive index, > 1."""
     eta_stderr: float = 0.002
-    depth_stderr_mm: float = 0.5
-    """How well its middle stands at the rig's origin along the camera's axis, mm."""
+    depth_stderr_mm: float = 1.0
+    """How well it stands there along the camera's axis, mm."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -145,26 +152,39 @@ def survey_sphere(
                 " a session of this rig?"
             )
     pixel_mm = float(np.linalg.norm(camera.center_mm)) / float(camera.matrix[0, 0])
-    aperture_px = max(APERTURE_MM / pixel_mm, 2.5)
     place = np.array([light.position_mm for light in rig.lights], np.float64)
     distance = np.linalg.norm(place, axis=1)
+    about = mirrored(camera, np.array(what.center_mm), what.radius_mm, place)
+    spot_mm = _spot_radius(about, camera, what, rig, view)
+    aperture_px = np.maximum(spot_mm / pixel_mm, 2.5)
     total = _both_states(shots)
     spots = find_spots(total.rate, pixel_mm=pixel_mm)
     fit = _locate(spots, camera, place, what)
     start = np.where((fit.spot >= 0)[:, None], spots[fit.spot], np.nan)
     middle, noise_px, clipped = measure_middles(total, start, aperture_px=aperture_px)
     measured = np.asarray(np.isfinite(middle).all(axis=1), bool)
+    seen_at = middle
+    middle = middle - pupil_shift(
+        camera,
+        fit.ball.center_mm,
+        fit.ball.radius_mm,
+        place,
+        pupil_mm=_pupil_mm(rig.view(view)),
+        focus_mm=rig.view(view).distance_mm,
+    )
     fit = _again(fit, spots, middle, measured, camera, place, what)
     errors = np.hypot(np.where(measured, noise_px, 0.0), np.where(clipped, 0.5, FLOOR_PX))
     found = light_directions(camera, fit.ball, middle, errors, distance)
     direction = np.where(measured[:, None], found.direction, place / distance[:, None])
     stderr = np.where(measured[:, None], found.stderr, fit.light_scatter_mm / distance[:, None])
     shown = mirrored(camera, fit.ball.center_mm, fit.ball.radius_mm, direction * distance[:, None])
-    at = np.where(measured[:, None], middle, shown.pixels)
+    at = np.where(measured[:, None], seen_at, shown.pixels)
 
     glass = _reflection(rig, camera, view, what.eta, shown.to_light, shown.to_camera, direction)
     readings = np.array([shot.reading_deg for shot in shots])
-    rates, variance, good = _fluxes(shots, at, aperture_px)
+    airy_px = WAVELENGTH_MM * float(camera.matrix[0, 0]) / _pupil_mm(rig.view(view))
+    within = share_within(aperture_px, airy_px)
+    rates, variance, good = _fluxes(shots, at, aperture_px, within)
     films = fit_films(np.radians(readings), rates, variance, good, glass)
     films = _with_geometry(films, glass, what, np.linalg.norm(stderr, axis=1) / np.sqrt(2))
     intensity, intensity_stderr = _intensities(rig, camera, fit.ball, films, shown, direction)
@@ -217,12 +237,40 @@ def _locate(
         spots,
         camera,
         place,
+        center_mm=what.center_mm,
         radius_mm=what.radius_mm,
         radius_stderr_mm=what.radius_stderr_mm,
         depth_stderr_mm=what.depth_stderr_mm,
-        margin_mm=1.8 * APERTURE_MM,
+        margin_mm=RING[1] * MARGIN_MM,
         lit=lit,
     )
+
+
+def _pupil_mm(view: View) -> float:
+    """Return the diameter of the lens's pupil, mm."""
+    magnification = view.focal_mm / view.distance_mm
+    return view.focal_mm / (view.f_number * (1.0 + magnification))
+
+
+def _spot_radius(
+    shown: Mirrored, camera: CameraPose, what: GlassBall, rig: Rig, view: str
+) -> FloatArray:
+    """Return the radius of a disc that holds each spot, mm at the plane in focus, shape (L,).
+
+    A ball shows a distant light where its rays seem to cross, R cos / 2 behind its surface in the
+    plane of incidence and R / (2 cos) across it: far from the axis both lie out of focus, one
+    far.
+    """
+    cosine = np.sum(shown.normal * shown.to_light, axis=1)
+    back = np.asarray(rig.view(view).axes[2])
+    surface = float(np.dot(what.center_mm, back)) + what.radius_mm * (shown.normal @ back)
+    cone = _pupil_mm(rig.view(view)) / rig.view(view).distance_mm
+    defocus = [np.abs(surface - what.radius_mm * f) for f in (0.5 * cosine, 0.5 / cosine)]
+    lamps = np.array([2 * light.radius_mm for light in rig.lights])
+    lamp_px = lamps * np.linalg.norm(shown.px_per_mm, ord=2, axis=(1, 2))
+    pixel_mm = rig.view(view).distance_mm / float(camera.matrix[0, 0])
+    wide = lamp_px * pixel_mm + cone * np.maximum(*defocus)
+    return np.asarray(0.5 * wide + MARGIN_MM)
 
 
 def _again(
@@ -283,14 +331,15 @@ def _to(camera: CameraPose) -> FloatArray:
 
 
 def _fluxes(
-    shots: Sequence[Shot], at: FloatArray, aperture_px: float
+    shots: Sequence[Shot], at: FloatArray, aperture_px: FloatArray, within: FloatArray
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Return rates, variances and whether they may be used, shapes (E, L)."""
     rows = []
     for shot in shots:
         flux = measure_flux(shot, at, aperture_px=aperture_px)
-        rate = flux.value / shot.amount_s
-        variance = flux.variance / shot.amount_s**2 + (EXPOSURE_SHARE * rate) ** 2
+        scale = 1.0 / (within * shot.amount_s)
+        rate = flux.value * scale
+        variance = flux.variance * scale**2 + (EXPOSURE_SHARE * rate) ** 2
         rows.append((rate, variance, flux.whole & ~flux.saturated))
     rates, variances, good = (np.array(part) for part in zip(*rows, strict=True))
     return rates, variances, good

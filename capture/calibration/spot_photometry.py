@@ -6,17 +6,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from capture.raw import RawFrame
 
-__all__ = ["Flux", "RateImage", "Shot", "measure_flux", "measure_middles", "rate_image", "shot"]
+__all__ = [
+    "Flux",
+    "RateImage",
+    "Shot",
+    "measure_flux",
+    "measure_middles",
+    "rate_image",
+    "share_within",
+    "shot",
+]
 
 FloatArray = NDArray[np.float64]
 
 CLIP_SIGMAS = 3.0  # pixels of the background further off than this belong to something else
-CENTERING = 4
-CENTERED_PX = 1e-3
+LEAST_RING = 8
+PLANE_SHARE = 0.02  # how far the background, bright spots' wings, may differ from a plane
+CENTERING = 12
+CENTERED_PX = 0.01
+RING = (1.3, 1.8)  # inner and outer radius of the background, of the disc's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,7 +189,7 @@ def rate_image(shots: Sequence[Shot]) -> RateImage:
 
 
 def measure_middles(
-    image: RateImage, pixels: FloatArray, *, aperture_px: float
+    image: RateImage, pixels: FloatArray, *, aperture_px: FloatArray
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Return the middles of spots, their intensity-weighted mean places.
 
@@ -186,8 +198,8 @@ def measure_middles(
     image : RateImage
     pixels : ndarray of float64, shape (L, 2)
         About where they are; NaN: nowhere.
-    aperture_px : float
-        Radius of the disc that holds a spot, px.
+    aperture_px : ndarray of float64, shape (L,)
+        Radius of the disc that holds each spot, px.
 
     Returns
     -------
@@ -202,33 +214,33 @@ def measure_middles(
     saturated = np.zeros(len(pixels), bool)
     for k, start in enumerate(pixels):
         at = start
-        for _ in range(CENTERING):
-            window = _window(at, image.rate.shape, aperture_px, pixels)
+        for _step in range(CENTERING):
+            window = _window(at, image.rate.shape, float(aperture_px[k]), pixels)
             if window is None:
                 break
             rows, columns, weight, around, dx, dy = window
-            values = image.rate[rows, columns].astype(np.float64)
             noise = image.variance[rows, columns].astype(np.float64)
-            level, _ = _background(values[around], noise[around])
+            values = image.rate[rows, columns].astype(np.float64)
+            level, _ = _background(values, noise, around, dx, dy)
             light = weight * (values - level)
             total = light.sum()
-            spread = np.sqrt(np.sum(weight**2 * noise))
-            if not total > CLIP_SIGMAS * spread:
+            if not total > CLIP_SIGMAS * np.sqrt(np.sum(weight**2 * noise)):
                 break
             step = np.array([np.sum(light * dx), np.sum(light * dy)]) / total
-            if np.hypot(*step) > aperture_px:
-                break
             at = at + step
-            if np.hypot(*step) < CENTERED_PX or _ == CENTERING - 1:
-                square = 0.5 * (dx**2 + dy**2)
+            if not np.hypot(*(at - start)) <= aperture_px[k]:
+                break
+            if np.hypot(*step) < CENTERED_PX:
                 middle[k] = at
-                stderr[k] = np.sqrt(np.sum(weight**2 * noise * square)) / total
+                square = 0.5 * (dx**2 + dy**2)
+                bent = PLANE_SHARE * np.abs(np.sum(weight * level)) * aperture_px[k] / 4
+                stderr[k] = np.hypot(np.sqrt(np.sum(weight**2 * noise * square)), bent) / total
                 saturated[k] = not image.valid[rows, columns][weight > 0].all()
                 break
     return middle, stderr, saturated
 
 
-def measure_flux(part: Shot, pixels: FloatArray, *, aperture_px: float) -> Flux:
+def measure_flux(part: Shot, pixels: FloatArray, *, aperture_px: FloatArray) -> Flux:
     """Sum the light of spots over discs, above the median of rings around them.
 
     Parameters
@@ -236,25 +248,53 @@ def measure_flux(part: Shot, pixels: FloatArray, *, aperture_px: float) -> Flux:
     part : Shot
     pixels : ndarray of float64, shape (L, 2)
         Their middles, px; NaN: none.
-    aperture_px : float
+    aperture_px : ndarray of float64, shape (L,)
         Radius of the discs; the rings reach from 1.3 to 1.8 of it.
     """
     count = len(pixels)
     value, variance = np.zeros(count), np.zeros(count)
     saturated, whole = np.zeros(count, bool), np.zeros(count, bool)
     for k, at in enumerate(pixels):
-        window = _window(at, part.signal.shape, aperture_px, pixels)
+        window = _window(at, part.signal.shape, float(aperture_px[k]), pixels)
         if window is None:
             continue
-        rows, columns, weight, around, _, _ = window
+        rows, columns, weight, around, dx, dy = window
         values = part.signal[rows, columns].astype(np.float64)
         noise = part.variance[rows, columns].astype(np.float64)
-        level, level_variance = _background(values[around], noise[around])
+        level, level_variance = _background(values, noise, around, dx, dy)
         value[k] = np.sum(weight * (values - level))
         variance[k] = np.sum(weight**2 * noise) + weight.sum() ** 2 * level_variance
+        variance[k] += (PLANE_SHARE * np.sum(weight * level)) ** 2
         saturated[k] = not part.valid[rows, columns][weight > 0].all()
         whole[k] = True
     return Flux(value, variance, saturated, whole)
+
+
+def share_within(aperture_px: ArrayLike, airy_px: float) -> FloatArray:
+    """Return the share of a spot's light that `measure_flux` finds behind a perfect lens.
+
+    Parameters
+    ----------
+    aperture_px : array_like
+        Radius of the disc, px, wide against the spot and against `airy_px`.
+    airy_px : float
+        Wavelength times the working f-number, px.
+
+    Notes
+    -----
+    Far out, the light beyond r falls as 0.2026 airy_px / r, the mean of the rings' (Born and Wolf,
+    Principles of Optics, section 8.5.2): some falls beyond the disc, some into the ring that the
+    background is taken from.
+
+    Examples
+    --------
+    >>> share_within([20.0, 40.0], 3.0).round(4).tolist()
+    [0.9654, 0.9827]
+    """
+    beyond = 2 / np.pi**2 * airy_px / np.asarray(aperture_px, np.float64)
+    near, far = RING
+    in_ring = (1 / near - 1 / far) / (far**2 - near**2)
+    return 1.0 - (1.0 + in_ring) * beyond
 
 
 def _window(
@@ -263,7 +303,7 @@ def _window(
     """Return slices, weights of the disc, the ring, and offsets; None where it is not whole."""
     if not np.isfinite(at).all():
         return None
-    outer = 1.8 * aperture_px
+    near, outer = RING[0] * aperture_px, RING[1] * aperture_px
     low = np.floor(at - outer).astype(int)
     high = np.ceil(at + outer).astype(int) + 1
     if (low < 0).any() or high[0] > shape[1] or high[1] > shape[0]:
@@ -271,20 +311,28 @@ def _window(
     dx, dy = np.meshgrid(np.arange(low[0], high[0]) - at[0], np.arange(low[1], high[1]) - at[1])
     distance = np.hypot(dx, dy)
     weight = np.clip(aperture_px + 0.5 - distance, 0.0, 1.0)
-    around = (distance > 1.3 * aperture_px) & (distance < outer)
+    around = (distance > near) & (distance < outer)
     gaps = np.hypot(*(every - at).T)
-    for other in every[(gaps > aperture_px) & (gaps < outer + 1.3 * aperture_px)] - at:
-        around &= np.hypot(dx - other[0], dy - other[1]) > 1.3 * aperture_px
-    if around.sum() < 8:
+    for other in every[(gaps > aperture_px) & (gaps < outer + near)] - at:
+        around &= np.hypot(dx - other[0], dy - other[1]) > near
+    if around.sum() < LEAST_RING:
         return None
     rows, columns = slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
     return rows, columns, weight, around, dx, dy
 
 
-def _background(values: FloatArray, noise: FloatArray) -> tuple[float, float]:
-    """Return the mean of a ring without what sticks out of it, and its variance."""
-    usual = float(np.median(values))
-    near = np.abs(values - usual) <= CLIP_SIGMAS * np.sqrt(noise)
-    if not near.any():
-        return usual, float(noise.mean())
-    return float(values[near].mean()), float(noise[near].mean() / near.sum())
+def _background(
+    values: FloatArray, noise: FloatArray, around: NDArray[np.bool_], dx: FloatArray, dy: FloatArray
+) -> tuple[FloatArray, float]:
+    """Return a plane through a ring without what sticks out of it, and its middle's variance."""
+    basis = np.stack([np.ones(int(around.sum())), dx[around], dy[around]], axis=1)
+    ring, sigma = values[around], np.sqrt(noise[around])
+    near = np.abs(ring - np.median(ring)) <= CLIP_SIGMAS * sigma
+    plane = np.array([float(np.median(ring)), 0.0, 0.0])
+    for _ in range(2):
+        if near.sum() < LEAST_RING:
+            break
+        plane = np.linalg.lstsq(basis[near], ring[near], rcond=None)[0]
+        near = np.abs(ring - basis @ plane) <= CLIP_SIGMAS * sigma
+    level = plane[0] + plane[1] * dx + plane[2] * dy
+    return level, float(noise[around].mean() / max(near.sum(), 1))
