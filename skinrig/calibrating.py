@@ -15,7 +15,7 @@ from capture import raw
 from capture.calibration import chart, color, colorimetry, polarization, sensor, store, white
 from capture.calibration.photon_transfer import FlatPair
 from capture.session import FrameRecord, Session
-from skinrig import calibrating_dome
+from skinrig import calibrating_dome, calibrating_gradient
 
 KINDS = ("sensor", "color", "polarization", "white", *calibrating_dome.KINDS)
 
@@ -73,7 +73,10 @@ def calibrate(
         raise CalibratingError("sessions: got none, expected at least one folder")
     made_on = created or max(s.manifest.created_at.date() for s in opened)
     findings: tuple[str, ...] = ()
-    if kind in calibrating_dome.KINDS:
+    if calibrating_gradient.of_a_gradient_sphere(opened):
+        found = calibrating_gradient.calibrate_gradient(kind, opened, out, made_on)
+        calibration, summary, findings = found.calibration, found.summary, found.findings
+    elif kind in calibrating_dome.KINDS:
         made = calibrating_dome.calibrate_dome(kind, opened, out, made_on, targets=targets)
         calibration, summary, findings = made.calibration, made.summary, made.findings
     else:

@@ -1,0 +1,284 @@
+"""Sessions of the gradient sphere's targets to its calibrations: sensor, lights, polarization."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration import sensor, store
+from capture.calibration.photon_transfer import FlatPair
+from capture.calibration.record import Quantity
+from capture.calibration.sphere_survey import GlassBall, SphereSurvey, survey_sphere
+from capture.calibration.spot_photometry import Shot, shot
+from capture.raw import RawFrame
+from capture.session import FrameRecord, Session
+
+KINDS = ("sensor", "lights", "polarization")
+READING_DEG = {"parallel": 0.0, "crossed": 90.0}
+"""Reading of the analyser in each of its named states."""
+
+
+class GradientCalibratingError(ValueError):
+    """Sessions that do not hold what a calibration of the gradient sphere needs."""
+
+
+@dataclass(frozen=True, slots=True)
+class GradientCalibration:
+    """A calibration of the gradient sphere and what to say of it."""
+
+    calibration: store.Calibration
+    summary: tuple[tuple[str, str], ...]
+    findings: tuple[str, ...]
+    """What is wrong with the rig: dead lights, an analyser that is off."""
+
+
+def of_a_gradient_sphere(sessions: Sequence[Session]) -> bool:
+    """Return whether any session was captured in a gradient sphere."""
+    return any("gradient_sphere" in session.rig.boxes for session in sessions)
+
+
+def calibrate_gradient(
+    kind: str,
+    sessions: Sequence[Session],
+    folder: str | Path,
+    created: date,
+    *,
+    target: GlassBall | None = None,
+) -> GradientCalibration:
+    """Make the calibration "sensor", "lights" or "polarization" of a gradient sphere.
+
+    Parameters
+    ----------
+    kind
+        One of :data:`KINDS`.
+    sessions
+        For "sensor" of the flat field; for the others of the ball of black glass, one session.
+    folder
+        The CALIBRATION/ folder: lights are corrected by its sensor's flat field.
+    created
+        Date of the calibration.
+    target
+        The ball; None: the usual one.
+
+    Raises
+    ------
+    GradientCalibratingError
+        When the frames that are needed are missing, or are of several rigs or cameras.
+    BallError, PolarizationError
+        When the ball's frames do not tell what is wanted.
+    """
+    rigs = {session.rig.name for session in sessions}
+    serials = {view.serial for session in sessions for view in session.rig.views}
+    if len(rigs) != 1 or len(serials) != 1:
+        raise GradientCalibratingError(
+            f"sessions: got rigs {sorted(rigs)} with cameras {sorted(serials)}, expected one rig"
+            " with one camera"
+        )
+    if kind not in KINDS:
+        raise GradientCalibratingError(
+            f"kind: got {kind!r}, expected one of {', '.join(KINDS)} of rig {rigs.pop()!r}"
+        )
+    if kind == "sensor":
+        return _sensor(sessions, created)
+    survey, notes = _survey(sessions, Path(folder), created, target or GlassBall())
+    rig, view = sessions[0].rig, sessions[0].rig.views[0]
+    findings = (*survey.findings, *notes)
+    told = {f"finding {k}": text for k, text in enumerate(findings)}
+    inputs = {session.id: session.content_hash for session in sessions}
+    source = sessions[0].source
+    if kind == "lights":
+        made = survey.lights.to_calibration(
+            rig=rig.name,
+            source=source,
+            created=created,
+            notes=told,
+            inputs=inputs,
+            ball=_ball_quantities(survey),
+        )
+        return GradientCalibration(made, _lights_summary(survey), findings)
+    made = survey.films.to_calibration(
+        serial=view.serial, rig=rig.name, source=source, created=created, notes=told, inputs=inputs
+    )
+    return GradientCalibration(made, _films_summary(survey), findings)
+
+
+def _frames(
+    sessions: Sequence[Session], kind: str, need: bool = True
+) -> list[tuple[FrameRecord, Session]]:
+    found = [(record, session) for session in sessions for record in session.frames(kind)]
+    if need and not found:
+        raise GradientCalibratingError(
+            f"sessions: hold no frames of kind {kind!r}; capture that target (`skinrig simulate"
+            f" gradient --target {kind}`, or `skinrig capture gradient --target {kind}`)"
+        )
+    return found
+
+
+def _survey(
+    sessions: Sequence[Session], folder: Path, created: date, target: GlassBall
+) -> tuple[SphereSurvey, tuple[str, ...]]:
+    with_ball = {session.id for _, session in _frames(sessions, "ball")}
+    if len(with_ball) > 1:
+        raise GradientCalibratingError(
+            f"sessions: got {len(with_ball)} of the ball, expected one; between two the ball has"
+            " moved, so calibrate from each alone"
+        )
+    rig = sessions[0].rig
+    flat, notes = _flat_field(folder, sessions[0], created)
+    shots = tuple(_shots(sessions, flat))
+    if not shots:
+        raise GradientCalibratingError(
+            "sessions: hold no frames of the ball under pattern 'full' at a level above 0"
+        )
+    return survey_sphere(shots, rig, view=rig.views[0].name, target=target), notes
+
+
+def _shots(sessions: Sequence[Session], flat: NDArray[np.float64] | float) -> Iterator[Shot]:
+    """Yield the exposures of the lit ball, the dark of their own exposure time taken off."""
+    darks: dict[float, list[NDArray[np.float32]]] = defaultdict(list)
+    lit: list[tuple[FrameRecord, Session]] = []
+    for record, session in _frames(sessions, "ball"):
+        if record.settings.get("pattern") == "dark":
+            darks[float(record.settings["exposure_s"])].append(_above_black(session.read(record)))
+        elif record.settings.get("pattern") == "full" and float(record.settings["level"]) > 0:
+            lit.append((record, session))
+    means = {time: np.mean(stack, axis=0, dtype=np.float32) for time, stack in darks.items()}
+    for record, session in lit:
+        frame = session.read(record)
+        exposure_s = float(record.settings["exposure_s"])
+        dark = means.get(exposure_s, 0.0)
+        count = len(darks[exposure_s])
+        offset = 0.0 if frame.noise_profile is None else frame.noise_profile[1]
+        yield shot(
+            frame,
+            amount_s=exposure_s * float(record.settings["level"]),
+            reading_deg=_reading_deg(record),
+            dark=dark,
+            dark_variance=offset / count if count else 0.0,
+            flat=flat,
+        )
+
+
+def _above_black(frame: RawFrame) -> NDArray[np.float32]:
+    black = np.float32(frame.black[0])
+    return (frame.cfa.astype(np.float32) - black) / (np.float32(frame.white) - black)
+
+
+def _reading_deg(record: FrameRecord) -> float:
+    asked = record.settings.get("analyser_deg")
+    return float(asked) if asked is not None else READING_DEG[str(record.settings["polarizer"])]
+
+
+def _flat_field(
+    folder: Path, session: Session, created: date
+) -> tuple[NDArray[np.float64] | float, tuple[str, ...]]:
+    """Return the camera's flat field, from the folder's sensor calibration where there is one."""
+    view = session.rig.views[0]
+    try:
+        found = store.load(folder, "sensor")
+        store.require(
+            found, rig=session.rig.name, serials=[view.serial], on_date=created, kind="sensor"
+        )
+    except store.CalibrationMissing:
+        return 1.0, (
+            "the folder holds no sensor calibration: intensities hold the lens's own shading;"
+            " calibrate sensor first",
+        )
+    known = sensor.SensorCalibration.from_calibration(found, view.serial)
+    return known.flat_mosaic(view.height_px, view.width_px), ()
+
+
+def _sensor(sessions: Sequence[Session], created: date) -> GradientCalibration:
+    by_light: dict[float, list[NDArray[np.uint16]]] = defaultdict(list)
+    frames = _frames(sessions, "flat")
+    first = frames[0][1].read(frames[0][0])
+    for record, session in frames:
+        light = float(record.settings["level"]) * float(record.settings["exposure_s"])
+        by_light[light].append(session.read(record).cfa)
+    pairs = [
+        FlatPair(stack[k], stack[k + 1], light)
+        for light, stack in sorted(by_light.items())
+        for k in range(0, len(stack) - 1, 2)
+    ]
+    darks = _frames(sessions, "dark")
+    result = sensor.photon_transfer(
+        pairs,
+        [session.read(record).cfa for record, session in darks],
+        white_dn=first.white,
+        pattern=first.pattern,
+        dark_exposures_s=[float(record.settings["exposure_s"]) for record, _ in darks],
+        block=max(4, min(16, min(first.cfa.shape) // 32)),
+    )
+    rig = sessions[0].rig
+    made = result.to_calibration(
+        serial=rig.views[0].serial,
+        rig=rig.name,
+        source=sessions[0].source,
+        created=created,
+        inputs={session.id: session.content_hash for session in sessions},
+    )
+    rows = []
+    for name, quantity, scale, unit in (
+        ("gain", result.gain_e_per_dn, 1.0, "e/DN"),
+        ("read noise", result.read_noise_e, 1.0, "e"),
+        ("full well", result.full_well_e, 1.0, "e"),
+        ("spread of the pixels' responses", result.prnu, 100.0, "%"),
+    ):
+        error = 0.0 if quantity.stderr is None else scale * float(quantity.stderr[0])
+        rows.append((name, f"{scale * float(quantity.value[0]):.4g} ± {error:.2g} {unit}"))
+    return GradientCalibration(made, tuple(rows), ())
+
+
+def _ball_quantities(survey: SphereSurvey) -> dict[str, Quantity]:
+    error = np.sqrt(np.diag(survey.ball.covariance_mm2))
+    return {
+        "center_mm": Quantity(survey.ball.center_mm, error[:3]),
+        "radius_mm": Quantity(np.array(survey.ball.radius_mm), np.array(error[3])),
+    }
+
+
+def _lights_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
+    table, ball = survey.lights, survey.ball
+    error = np.sqrt(np.diag(ball.covariance_mm2))
+    center = ", ".join(f"{c:+.3f} ± {e:.3f}" for c, e in zip(ball.center_mm, error, strict=False))
+    angle = np.degrees(np.linalg.norm(table.directions_stderr, axis=1))[table.seen]
+    shining = table.valid & ~table.dead
+    share = 100 * (table.intensities_stderr / np.maximum(table.intensities, 1e-9))[shining]
+    return (
+        ("ball's middle", f"{center} mm"),
+        ("ball's radius", f"{ball.radius_mm:.3f} ± {error[3]:.3f} mm"),
+        ("lights seen", f"{int(table.seen.sum())} of {len(table.names)}"),
+        ("lights off their places", f"{survey.light_scatter_mm:.2f} mm"),
+        (
+            "standard error of a direction",
+            f"{np.median(angle):.3f} degrees, worst {angle.max():.3f}",
+        ),
+        ("intensities measured", f"{int(shining.sum())}, scatter"
+         f" {100 * np.std(table.intensities[shining]):.1f} %"),
+        ("standard error of an intensity", f"{np.median(share):.2f} %, worst {share.max():.1f} %"),
+    )  # fmt: skip
+
+
+def _films_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
+    films = survey.films
+    zero, error = np.degrees([films.misalignment_rad, films.misalignment_stderr_rad])
+    leaked, glass = films.leakage, films.glass_leakage[films.valid]
+    return (
+        ("analyser's misalignment", f"{zero:+.3f} ± {error:.3f} degrees"),
+        ("extinction of the lights' films", f"{1 / films.light_leak:.0f} : 1 (leak"
+         f" {films.light_leak:.2e} ± {films.light_leak_stderr:.0e})"),
+        ("extinction of the analyser", f"{1 / films.analyser_leak:.0f} : 1 (leak"
+         f" {films.analyser_leak:.2e} ± {films.analyser_leak_stderr:.0e})"),
+        ("lights' polarizers off their axes", f"{np.degrees(survey.turn_scatter_rad):.2f} degrees"),
+        ("glass leaks crossed", f"median {100 * np.median(glass):.2f} %, most"
+         f" {100 * glass.max():.1f} % of parallel"),
+        (f"skin (eta {films.eta:g}) will leak", f"median {100 * np.median(leaked):.3f} %, 9 of 10"
+         f" lights below {100 * np.quantile(leaked, 0.9):.2f} %"),
+        ("readings of the analyser", ", ".join(f"{r:g}" for r in survey.readings_deg)),
+    )  # fmt: skip
