@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from reconstruction import slope_fields
+from reconstruction.height_filters import denoise_slopes
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.slope_fields import Perspective, SlopeField
 from reconstruction.weighted_poisson import Convergence, Hierarchy, IntegrationError, solve
@@ -95,6 +96,7 @@ def integrate(
     y_up: bool = True,
     camera: Perspective | None = None,
     method: Method = "auto",
+    denoise: float = 0.0,
     settings: Settings | None = None,
 ) -> Floating:
     """Return the height whose slopes fit those of the normals best.
@@ -120,6 +122,9 @@ def integrate(
         None: parallel rays.
     method : {"auto", "multigrid", "dct"}
         "dct" needs a full rectangle without standard errors, which "auto" solves that way.
+    denoise : float
+        Strength of `height_filters.denoise_slopes` before integration, 0: none, 1: by the
+        stated noise; needs standard errors.
     settings : Settings, optional
 
     Returns
@@ -153,7 +158,7 @@ def integrate(
     """
     found = integrate_map(
         normals, pixel=pixel, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera,
-        method=method, settings=settings,
+        method=method, denoise=denoise, settings=settings,
     )  # fmt: skip
     if not found.convergence.converged:
         raise NotConverged(
@@ -172,13 +177,14 @@ def integrate_map(
     y_up: bool = True,
     camera: Perspective | None = None,
     method: Method = "auto",
+    denoise: float = 0.0,
     settings: Settings | None = None,
 ) -> HeightMap:
     """Return the height as `integrate` does, with mask, parts and how well it was solved.
 
     Parameters
     ----------
-    normals, pixel, valid, stderr_rad, y_up, camera, method, settings
+    normals, pixel, valid, stderr_rad, y_up, camera, method, denoise, settings
         As of `integrate`.
 
     Returns
@@ -196,6 +202,8 @@ def integrate_map(
     slopes = slope_fields.from_normals(
         normals, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera
     )
+    if denoise:
+        slopes = denoise_slopes(slopes, strength=denoise)
     plain = slopes.variance_x.size == 1 and bool(slopes.valid.all())
     if method == "dct" and not plain:
         raise IntegrationError(
