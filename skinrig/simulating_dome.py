@@ -34,7 +34,7 @@ def simulate_dome(order: Order) -> Simulated:
     targets = get_args(DomeTarget)
     if order.target is not None and order.target not in targets:
         raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
-    order.refuse("dome", states=("neutral",), repeats=1)
+    order.refuse("dome", states=("neutral",), repeats=1, site=None, angles=None, steps=None)
     rig = small_dome(
         load_rig("dome"),
         lights=order.lights or LIGHTS[order.size],
@@ -66,7 +66,7 @@ def simulate_dome(order: Order) -> Simulated:
     # nobody sits in front of a target; a face is asked to close its eyes where that is needed
     safe = order.target is not None or figures["open_eyes"] != "allowed"
     rig_seconds = drive(
-        session, rig, "dome", scene, order.seed, prompt, order.progress,
+        session, rig, scene, order.seed, prompt, order.progress,
         eyes="closed" if safe else "open",
     )  # fmt: skip
     truth = None

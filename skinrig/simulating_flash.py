@@ -24,7 +24,7 @@ def simulate_flash(order: Order) -> Simulated:
     target, states, seed = order.target, order.states, order.seed
     if target is not None and target not in TARGETS:
         raise SimulationError(f"target: got {target!r}, expected one of {', '.join(TARGETS)}")
-    order.refuse("flash", lights=None, views=None, move=False)
+    order.refuse("flash", lights=None, views=None, move=False, site=None, angles=None, steps=None)
     if target is None:
         from rigsim.perfusion import STATES
 
@@ -46,7 +46,7 @@ def simulate_flash(order: Order) -> Simulated:
         world.scene = scenes[state]
 
     first = next(iter(scenes.values()))
-    rig_seconds = drive(session, rig, "flash", first, seed, prompt, order.progress)
+    rig_seconds = drive(session, rig, first, seed, prompt, order.progress)
     truth = None
     if target is None:
         truth = truth_folder(order.out)

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from capture.acquire import run_plan
+from capture.devices.box import Box
+from capture.devices.caliper import CaliperBox
 from capture.devices.camera import open_camera
 from capture.devices.dome import DomeBox, Eyes
 from capture.devices.flash import FlashBox
+from capture.devices.gradient_sphere import GradientSphereBox
 from capture.devices.port import Port
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject
 
-RIGS = ("flash", "dome")
+RIGS = ("flash", "dome", "gradient")
+BOXES: Mapping[str, type[Box]] = {
+    "flash": FlashBox, "dome": DomeBox, "gradient_sphere": GradientSphereBox, "caliper": CaliperBox,
+}  # fmt: skip
+"""Driver of each kind of box."""
 SIZES = ("small", "full")
 USES = ("research", "publication")
 """What may be done with a face that is nobody's, unless said otherwise."""
@@ -41,7 +48,7 @@ class Simulated:
     blur_mm: tuple[float, ...] = ()
     """Width from 10 to 90 % of an edge that light spreading in the skin blurs, R, G, B, mm."""
     light: Mapping[str, float | str] = field(default_factory=dict)
-    """Figures of the dome's light, see `skinrig.light_safety`; empty for the flash rig."""
+    """Figures of the LEDs' light, see `skinrig.light_safety`; empty for the flash rig."""
 
     def document(self) -> Mapping[str, Any]:
         """Return this as JSON values."""
@@ -86,6 +93,9 @@ class Order:
     lights: int | None
     views: int | None
     move: bool
+    site: str | None
+    angles: tuple[float, ...] | None
+    steps: tuple[int, int] | None
     created: datetime | None
     person: Subject | None
     progress: Callable[[str], None] | None
@@ -119,6 +129,9 @@ def simulate_session(
     lights: int | None = None,
     views: int | None = None,
     move: bool = False,
+    site: str | None = None,
+    angles: Sequence[float] | None = None,
+    steps: tuple[int, int] | None = None,
     created: datetime | None = None,
     person: Subject | None = None,
     progress: Callable[[str], None] | None = None,
@@ -133,7 +146,8 @@ def simulate_session(
         The session's folder. The truth goes to ``truth-NAME`` beside ``session-NAME``.
     size
         "small" or "full": of the flash rig 768 pixels across or the camera's own 3024; of the dome
-        6 cameras, 200 pixels across, and 48 lights, or all that it has.
+        6 cameras, 200 pixels across, and 48 lights, or all that it has; of the gradient sphere the
+        middle 320 pixels and one angle of the caliper, or all 2048 and all angles.
     seed
         Of the subject, the sensor and the boxes.
     subject
@@ -142,7 +156,8 @@ def simulate_session(
         A face mesh to wear the skin instead of the procedural head.
     target
         Something else instead of a face: of the flash rig "white", "chart", "flat", "dark" or
-        "malus"; of the dome "charuco", "mirror", "white" or "dark".
+        "malus"; of the dome "charuco", "mirror", "white" or "dark"; of the gradient sphere "ball",
+        "flat" or "dark".
     states
         Expressions and physiological states, captured one after the other by the flash rig.
     repeats
@@ -155,6 +170,12 @@ def simulate_session(
         So many lights and cameras of the dome, spread evenly; None: as many as ``size`` says.
     move
         Whether the face in the dome drifts and twitches during the capture.
+    site
+        Where the skin in the gradient sphere is from: "forehead" (the default), "cheek", "chin".
+    angles
+        Angles of the caliper, degrees; None: as ``size`` says.
+    steps
+        Its first and last position; None: all. Where the skin ends is found out.
     created
         Date of the session; None: now.
     person
@@ -172,12 +193,17 @@ def simulate_session(
     order = Order(
         out=Path(out), size=size, seed=seed, subject=subject, mesh=mesh, target=target,
         states=tuple(states), repeats=repeats, resume=resume, width_px=width_px, lights=lights,
-        views=views, move=move, created=created, person=person, progress=progress,
+        views=views, move=move, site=site, angles=None if angles is None else tuple(angles),
+        steps=steps, created=created, person=person, progress=progress,
     )  # fmt: skip
     if rig_name == "dome":
         from skinrig.simulating_dome import simulate_dome
 
         return simulate_dome(order)
+    if rig_name == "gradient":
+        from skinrig.simulating_gradient import simulate_gradient
+
+        return simulate_gradient(order)
     from skinrig.simulating_flash import simulate_flash
 
     return simulate_flash(order)
@@ -215,13 +241,14 @@ def open_session(order: Order, plan: Plan, rig: Rig, asked: Mapping[str, Any]) -
 def drive(
     session: Session,
     rig: Rig,
-    kind: str,
     scene: Any,
     seed: int,
     prompt: Callable[[Any, str], None],
     progress: Callable[[str], None] | None,
     *,
     eyes: Eyes = "open",
+    force_limit_n: float | None = None,
+    run_id: str = "",
 ) -> float:
     """Run a session's plan through the drivers, on a world registered under its id, and close it.
 
@@ -229,8 +256,6 @@ def drive(
     ----------
     session, rig
         Open for writing; the rig as it is drawn.
-    kind
-        Of the box: "flash" or "dome".
     scene
         What the cameras see first.
     seed
@@ -241,6 +266,10 @@ def drive(
         Called with one line now and then.
     eyes
         What is said of the subject's eyes.
+    force_limit_n
+        Of a caliper, N.
+    run_id
+        Begins the tokens of this run.
 
     Returns
     -------
@@ -251,19 +280,23 @@ def drive(
 
     world = World(rig, seed=seed, clock="virtual", scene=scene)
     name = world.register(session.id)
-    port = Port(f"sim://{kind}?world={name}", clock=world.clock)
-    box = DomeBox(port) if kind == "dome" else FlashBox(port)
+    boxes = {
+        kind: BOXES[kind](Port(f"sim://{kind}?world={name}", clock=world.clock))
+        for kind in rig.boxes
+    }
     cameras = {view.name: open_camera(f"sim://{name}/{view.name}") for view in rig.views}
     try:
         run_plan(
-            session.plan, rig, boxes={kind: box}, cameras=cameras, session=session,
+            session.plan, rig, boxes=boxes, cameras=cameras, session=session,
             progress=progress, prompt=lambda text: prompt(world, text), eyes=eyes,
+            force_limit_n=force_limit_n, run_id=run_id,
         )  # fmt: skip
         session.close()
         return float(world.now)
     finally:
         for camera in cameras.values():
             camera.close()
-        box.close()
+        for box in boxes.values():
+            box.close()
         world.unregister()
         session.release()
