@@ -225,7 +225,7 @@ def _look(view: View, sampler: str = "independent") -> dict[str, Any]:
     }
 
 
-def _plastic_scale(eta: float) -> float:
+def plastic_scale(eta: float) -> float:
     """Return eta^2 (1 - F_inner) with the polynomial that Mitsuba takes for the latter.
 
     References
@@ -302,7 +302,7 @@ def _skin(surface: SkinSurface, subject: Subject) -> dict[str, Any]:
 
 def _matt(surface: SkinSurface, subject: Subject) -> dict[str, Any]:
     """Return the diffuse term behind the boundary, without the mirror that stands on it."""
-    r_d = surface.r_d * np.float32(_plastic_scale(ETA))
+    r_d = surface.r_d * np.float32(plastic_scale(ETA))
     return {
         "type": "plastic",
         "int_ior": ETA,

@@ -117,6 +117,8 @@ class GradientScene:
         Seeds what differs from exposure to exposure.
     shadows
         Whether the relief hides LEDs from itself.
+    lateral
+        Whether light spreads inside the skin.
     optics
         Whether lens and pixels blur; without, every pixel is the mean of its samples.
     sectors
@@ -140,6 +142,7 @@ class GradientScene:
         seed: int = 0,
         shadows: bool = True,
         optics: bool = True,
+        lateral: bool = True,
         sectors: int = 32,
         subpixels: int = 1,
         table_size: int | None = None,
@@ -156,14 +159,15 @@ class GradientScene:
         self.films = films_of(rig) if films is None else films
         self.sphere = as_drawn(rig) if sphere is None else sphere
         self.motion, self.seed = motion, seed
-        self.shadows, self.optics = shadows, optics
+        self.shadows, self.optics, self.lateral = shadows, optics, lateral
         self.sectors, self.subpixels, self.table_size = sectors, subpixels, table_size
         self._view = rig.views[0]
         self._sensor = sensor_of(self._view) if sensor is None else sensor
         self._lighting: OrderedDict[tuple[float, ...], Lighting] = OrderedDict()
         # behind two ideal films, one of which the unit of radiance holds already
         white = float(diffuser_radiance(as_drawn(rig), np.zeros(1), np.zeros(1))[0, 0])
-        self._unit = METER_RATE_PER_S / (0.5 * white)
+        # full scales per second for a unit of radiance of `rigsim.lobe_moments`
+        self.unit = METER_RATE_PER_S / (0.5 * white)
         self._pictures: OrderedDict[tuple[object, ...], Float32Array] = OrderedDict()
         self._reliefs: OrderedDict[tuple[float, float], StretchedSkin] = OrderedDict()
         self._frames: dict[tuple[float, int], tuple[Float32Array, Float32Array]] = {}
@@ -187,6 +191,8 @@ class GradientScene:
             ]
             if not self.shadows:
                 out.append(("shadows of the relief on itself", "shadows=False asks for it"))
+            if not self.lateral:
+                out.append(("light spreading sideways in skin", "lateral=False asks for it"))
             if self.motion is None:
                 out.append(("movement of the patch", "motion=None asks for it"))
         if not self.optics:
@@ -460,7 +466,7 @@ class GradientScene:
                 picture = self._render(grip, jump_mm, shares)
             else:
                 picture = self._target(shares)
-            picture *= np.float32(self._unit)
+            picture *= np.float32(self.unit)
             while self._pictures and (len(self._pictures) + 1) * picture.nbytes > KEPT_BYTES:
                 self._pictures.popitem(last=False)
             self._pictures[key] = picture
@@ -503,6 +509,7 @@ class GradientScene:
                 half_field_mm=0.5 * max(self._view.field_mm) + 0.1,
                 sectors=self.sectors if self.shadows else 0,
                 table_size=self.table_size,
+                lateral=self.lateral,
             )
         self._lighting.move_to_end(shares)
         return self._lighting[shares]

@@ -173,6 +173,7 @@ def light_skin(
     half_field_mm: float,
     sectors: int,
     table_size: int | None,
+    lateral: bool = True,
 ) -> Lighting:
     """Tabulate the light on a patch of skin.
 
@@ -191,6 +192,8 @@ def light_skin(
         plane too where the relief leans that way.
     table_size
         Nodes along each axis of the normals; None chooses by roughness.
+    lateral
+        Whether light spreads inside the skin.
     """
     leds = tuple(k for k, (_, _, z) in enumerate(sphere.position_mm) if not sectors or z > 0.0)
     alphas = (float(skin.alpha.min()), float(skin.alpha.max()))
@@ -203,7 +206,7 @@ def light_skin(
         fields=2 if half_field_mm < 1.6 else 3,
         leds=leds,
     )
-    sigmas, weights = _lateral(skin)
+    sigmas, weights = _lateral(skin) if lateral else (np.zeros(0), np.zeros(0))
     return Lighting(sphere, surface, table, leds, sectors, sigmas, weights)
 
 

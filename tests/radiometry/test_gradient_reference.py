@@ -1,0 +1,62 @@
+"""The gradient rig's moments against shadow rays, and against Mitsuba."""
+
+import numpy as np
+import pytest
+
+from rigsim.scenes.gradient_reference import (
+    judge,
+    picture,
+    plain_scene,
+    plain_skin,
+    rendered,
+    traced,
+)
+from rigsim.sphere_build import PATTERN_WEIGHTS
+
+pytestmark = pytest.mark.render
+
+WIDTH = 48
+
+
+@pytest.fixture(scope="module")
+def skin():
+    return plain_skin(WIDTH * 0.006 + 0.9)
+
+
+@pytest.fixture(scope="module")
+def pixels():
+    return np.sort(np.random.default_rng(0).choice(WIDTH**2, 300, replace=False))
+
+
+@pytest.fixture(scope="module")
+def reference(skin, pixels):
+    return traced(plain_scene(skin, width_px=WIDTH), pixels, subpixels=3)[0]
+
+
+def test_moments_with_horizons_are_what_shadow_rays_say(skin, pixels, reference):
+    """All four moments; horizons in 32 directions, table and samples err by less than 1 %."""
+    scene = plain_scene(skin, width_px=WIDTH)
+    for moment in range(4):
+        error = picture(scene, pixels)[:, moment] - reference[:, moment]
+        assert np.sqrt(np.mean(error**2)) < 0.01 * reference[:, 0].mean()
+
+
+def test_leaving_shadows_out_is_worse(skin, pixels, reference):
+    with_shadows, without = (
+        judge(picture(plain_scene(skin, width_px=WIDTH, shadows=on), pixels), reference, 0.0)
+        for on in (True, False)
+    )
+    assert without.error > 3.0 * with_shadows.error
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("pattern", ["full", "-x", "z"])
+def test_mitsuba_s_mean_is_ours(skin, pixels, pattern):
+    """z-test of the mean over blocks of pixels: false alarm 1e-4 a pattern (|z| < 3.9)."""
+    scene = plain_scene(skin, width_px=WIDTH)
+    every = np.arange(WIDTH**2)
+    ours = picture(scene, every) @ np.array(PATTERN_WEIGHTS[pattern])
+    image, _ = rendered(scene, pattern, samples=64)
+    way = judge(image.reshape(-1).astype(float), ours, 0.0)
+    assert abs(way.mean_ratio - 1.0) < 3.9 * way.mean_ratio_stderr
+    assert way.mean_ratio_stderr < 0.01
