@@ -148,18 +148,20 @@ def _shots(sessions: Sequence[Session], flat: NDArray[np.float64] | float) -> It
             darks[float(record.settings["exposure_s"])].append(_above_black(session.read(record)))
         elif record.settings.get("pattern") == "full" and float(record.settings["level"]) > 0:
             lit.append((record, session))
-    means = {time: np.mean(stack, axis=0, dtype=np.float32) for time, stack in darks.items()}
+    means: dict[float, NDArray[np.float32]] = {
+        time: np.mean(stack, axis=0, dtype=np.float32) for time, stack in darks.items()
+    }
     for record, session in lit:
         frame = session.read(record)
         exposure_s = float(record.settings["exposure_s"])
-        dark = means.get(exposure_s, 0.0)
+        dark = means.get(exposure_s)
         count = len(darks[exposure_s])
         offset = 0.0 if frame.noise_profile is None else frame.noise_profile[1]
         yield shot(
             frame,
             amount_s=exposure_s * float(record.settings["level"]),
             reading_deg=_reading_deg(record),
-            dark=dark,
+            dark=0.0 if dark is None else dark,
             dark_variance=offset / count if count else 0.0,
             flat=flat,
         )

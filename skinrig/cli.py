@@ -27,6 +27,14 @@ app = typer.Typer(
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything that is drawn.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder to write.")]
+Site = Annotated[
+    str | None,
+    typer.Option(help="Where the gradient rig's skin is from: forehead (default), cheek or chin."),
+]
+Angles = Annotated[
+    str | None, typer.Option(help="Angles of the caliper, degrees, joined by commas: 0,90.")
+]
+Steps = Annotated[str | None, typer.Option(help="First and last position of the caliper: -2..3.")]
 Consent = Annotated[
     list[str] | None,
     typer.Option("--consent", help="Use that the subject agreed to; repeatable, or by commas."),
@@ -78,7 +86,7 @@ def demo(
 
 @app.command()
 def simulate(
-    rig: Annotated[str, typer.Argument(help="Name of a rig: flash or dome.")],
+    rig: Annotated[str, typer.Argument(help="Name of a rig: flash, dome or gradient.")],
     out: Out,
     size: Annotated[str, typer.Option(help="Of the pictures: small or full.")] = "small",
     lights: Annotated[
@@ -95,9 +103,12 @@ def simulate(
         str | None,
         typer.Option(
             help="A target instead of a face: white, dark; of the flash rig chart, flat, malus; "
-            "of the dome charuco, mirror."
+            "of the dome charuco, mirror; of the gradient rig ball, flat."
         ),
     ] = None,
+    site: Site = None,
+    angles: Angles = None,
+    steps: Steps = None,
     state: Annotated[
         list[str] | None,
         typer.Option(help="State of the face before the flash rig; repeatable."),
@@ -111,6 +122,7 @@ def simulate(
 
     Example: skinrig simulate flash --out session-flash --subject IV
     """
+    from skinrig.acquisition import numbers_of, range_of
     from skinrig.consent import subject_of
     from skinrig.simulation import USES, simulate_session
 
@@ -118,6 +130,7 @@ def simulate(
     done = simulate_session(
         rig, out, size=size, seed=seed, subject=subject, mesh=mesh, target=target,
         states=tuple(state or ("neutral",)), resume=resume, lights=lights, views=views, move=move,
+        site=site, angles=numbers_of(angles, "--angles"), steps=range_of(steps, "--steps"),
         progress=console.progress,
         person=subject_of(f"simulated-{subject}-{seed}", consent or USES, consent_expires),
     )  # fmt: skip
@@ -133,12 +146,18 @@ def _next_step(rig: str, session: Path, target: str | None) -> str:
              "malus": "polarization"}  # fmt: skip
     if rig == "dome":
         kinds = {"charuco": "geometry", "mirror": "lights", "white": "lights"}
+    if rig == "gradient":
+        kinds = {"ball": "lights", "flat": "sensor", "dark": "sensor"}
     if target is None:
+        if rig == "gradient":
+            want = "normals,height,histograms,kernels --calibration calibration"
+            return f"skinrig reconstruct {session} --want {want} --out appearance"
         want = "normals,r_d --calibration calibration" if rig == "dome" else "melanin,hemoglobin"
         return f"skinrig reconstruct {session} --want {want} --out appearance"
     if target not in kinds:
         return f"skinrig verify {session}"
-    named = f"SESSION-MIRROR {session}" if kinds[target] == "lights" else f"{session}"
+    pair = kinds[target] == "lights" and rig == "dome"
+    named = f"SESSION-MIRROR {session}" if pair else f"{session}"
     named = f"{session} SESSION-WHITE" if target == "mirror" else named  # one calibration of both
     return f"skinrig calibrate {kinds[target]} {named} --out calibration"
 
@@ -159,8 +178,14 @@ def capture(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print the plan.")] = False,
     plan_out: Annotated[Path | None, typer.Option(help="New file for the plan, JSON.")] = None,
     eyes: Annotated[
-        str, typer.Option(help="The subject's eyes in the dome: open, closed or shielded.")
+        str, typer.Option(help="The subject's eyes among LEDs: open, closed or shielded.")
     ] = "open",
+    force_limit: Annotated[
+        float | None,
+        typer.Option(help="Greatest force of the caliper on this skin, newton; no default."),
+    ] = None,
+    angles: Angles = None,
+    steps: Steps = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
     json: Json = False,
 ) -> None:
@@ -169,7 +194,7 @@ def capture(
     Example: skinrig capture flash --port flash=/dev/ttyUSB0 --camera cam=hotfolder:incoming
     --out session
     """
-    from skinrig.acquisition import capture_session, eyes_of
+    from skinrig.acquisition import capture_session, eyes_of, numbers_of, range_of
     from skinrig.consent import subject_of
 
     console = Console(json)
@@ -177,19 +202,22 @@ def capture(
         rig, out, ports=port or [], cameras=camera or [], plan=plan, target=target,
         subject=subject_of(subject, consent, consent_expires), dry_run=dry_run,
         plan_out=plan_out, resume=resume, console=console, eyes=eyes_of(eyes),
+        force_limit_n=force_limit, angles=numbers_of(angles, "--angles"),
+        steps=range_of(steps, "--steps"),
     )  # fmt: skip
     console.document("skinrig.capture/1", done)
 
 
 @app.command()
 def serve(
-    rig: Annotated[str, typer.Argument(help="Name of a rig: flash or dome.")],
+    rig: Annotated[str, typer.Argument(help="Name of a rig: flash, dome or gradient.")],
     pty: Annotated[bool, typer.Option("--pty", help="Boxes on a pseudo terminal.")] = False,
     tcp: Annotated[str, typer.Option(help="Address for boxes and cameras.")] = "127.0.0.1:0",
     anywhere: Annotated[
         bool, typer.Option("--allow-remote", help="Let other machines connect.")
     ] = False,
     subject: Annotated[str, typer.Option(help="Preset of the simulated face.")] = "III",
+    site: Site = None,
     size: Annotated[str, typer.Option(help="small or full.")] = "small",
     seed: Seed = 0,
 ) -> None:
@@ -199,7 +227,10 @@ def serve(
     """
     from skinrig.serving import serve_rig
 
-    serve_rig(rig, pty=pty, tcp=tcp, allow_remote=anywhere, subject=subject, size=size, seed=seed)
+    serve_rig(
+        rig, pty=pty, tcp=tcp, allow_remote=anywhere, subject=subject, size=size, seed=seed,
+        site=site,
+    )  # fmt: skip
 
 
 @app.command()
@@ -208,7 +239,7 @@ def calibrate(
         str,
         typer.Argument(
             help="Of the flash rig sensor, color, polarization, white; of the dome geometry, "
-            "lights."
+            "lights; of the gradient sphere sensor, lights, polarization."
         ),
     ],
     sessions: Annotated[list[Path], typer.Argument(help="Sessions of the target.")],

@@ -27,8 +27,17 @@ EXPOSURE_S = 0.018
 """Fits into it with the read-out."""
 SCAN_ORDER = ("full", "z", "x", "-x", "y", "-y", "-z", "dark")
 """From bright to dark for an eye beside the patch."""
-BALL_LEVEL = 0.018
-"""A ball of black glass shows the LEDs themselves: 4 % of what is far brighter than lit skin."""
+BALL_SERIES: dict[int, tuple[float, ...]] = {
+    0: (0.007, 0.03, 0.12, 0.5),
+    80: (0.08, 0.5),
+    90: (0.08, 0.5),
+    100: (0.08, 0.5),
+}
+"""Levels of the LEDs that a ball of black glass shows, by the analyser's reading, degrees. It
+mirrors 4 % of what is far brighter than lit skin, but near Brewster's angle a thousandth of that;
+and readings on both sides of 90 tell which way an LED's polarizer is turned."""
+BALL_DARK_S = 0.4
+"""Darkness between two readings: eyes nearby then see fewer than three flashes a second."""
 FLAT_LEVELS = (0.03, 0.06, 0.11, 0.17, 0.23, 0.34, 0.45, 0.57, 0.7, 0.85)
 """Levels of the photon transfer series: dense in the shadows, and near full scale at the end."""
 
@@ -151,7 +160,7 @@ def gradient_calibration_plan(
     *,
     repeats: int | None = None,
     darks: int = 2,
-    level: float = BALL_LEVEL,
+    level: float = 1.0,
     exposure_s: float = EXPOSURE_S,
     dwell_s: float = DWELL_S,
     iso: int = 100,
@@ -163,15 +172,16 @@ def gradient_calibration_plan(
     rig : Rig
         With LEDs.
     target : {"ball", "dark", "flat"}
-        "ball": a ball of black glass under "full" and "dark", parallel and crossed, at ``level``;
+        "ball": a ball of black glass under "full" at the readings and levels of `BALL_SERIES`, and
+        under "dark";
         "flat": an even white field at 10 levels, once after the other (photon transfer pairs);
         "dark": the cap on.
     repeats : int, optional
-        Frames per condition: by default 4 of the ball, 2 (>= 2) of the flat, 16 of the dark.
+        Frames per condition: by default 1 of the ball, 2 (>= 2) of the flat, 16 of the dark.
     darks : int
         Frames without light before the flats, >= 0.
     level : float
-        Of the LEDs that the ball shows, 0 < level <= 1.
+        Of the LEDs that the ball shows, over that of the series, 0 < level <= 1.
     exposure_s, dwell_s, iso
         As for `gradient_plan`.
 
@@ -181,11 +191,11 @@ def gradient_calibration_plan(
     >>> rig = load_rig("gradient")
     >>> plan = gradient_calibration_plan(rig, "ball")
     >>> len(plan.steps), plan.steps[0].kind, dict(plan.steps[-1].index)
-    (16, 'ball', {'pattern': 'dark', 'polarizer': 'crossed', 'repeat': 3})
+    (14, 'ball', {'pattern': 'dark', 'polarizer': 'crossed', 'reading': 100, 'repeat': 0})
     """
     targets = get_args(GradientTarget)
     require(target in targets, "target", target, f"one of {', '.join(targets)}")
-    count = {"ball": 4, "flat": 2, "dark": 16}[target] if repeats is None else repeats
+    count = {"ball": 1, "flat": 2, "dark": 16}[target] if repeats is None else repeats
     least = 2 if target == "flat" else 1
     require(count >= least, "repeats", count, f">= {least}")
     require(darks >= 0, "darks", darks, ">= 0")
@@ -203,13 +213,18 @@ def gradient_calibration_plan(
                     pattern="full", polarizer="parallel", level=power,
                 )  # fmt: skip
     else:
-        for polarizer in POLARIZERS:
-            for pattern in ("full", "dark"):
+        for reading, levels in BALL_SERIES.items():
+            polarizer = POLARIZERS[round(reading / 90)]
+            every: dict[str, Value] = {} if reading in (0, 90) else {"analyser_deg": reading}
+            for number, share in enumerate((*levels, 0.0)):
+                pattern = "full" if share else "dark"
+                more = every if share else {**every, "dwell_s": max(dwell_s, BALL_DARK_S)}
                 for repeat in range(count):
                     series.add(
-                        f"B-{polarizer[:3]}-{pattern}-{repeat:02d}", "ball",
-                        {"pattern": pattern, "polarizer": polarizer, "repeat": repeat},
-                        pattern=pattern, polarizer=polarizer, level=level,
+                        f"B{reading:03d}-{pattern}{number}-{repeat:02d}", "ball",
+                        {"pattern": pattern, "polarizer": polarizer, "reading": reading,
+                         "repeat": repeat},
+                        pattern=pattern, polarizer=polarizer, level=level * share, **more,
                     )  # fmt: skip
     return series.plan()
 
@@ -295,7 +310,7 @@ class _Series:
         self._steps: list[Step] = []
 
     def add(self, identity: str, kind: Kind, index: _Index, **settings: Value) -> None:
-        step = Step(identity, kind, index, {**settings, **self._every}, self._cameras)
+        step = Step(identity, kind, index, {**self._every, **settings}, self._cameras)
         self._steps.append(step)
 
     def darks(self, count: int) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from capture import raw
 from capture.acquire import AcquisitionError, Interrupted, run_plan
+from capture.acquire.pattern_scan import reading_deg
 from capture.acquire.skin_end import EndOfSkin, ForceWatch
 from capture.devices.caliper import CaliperBox, MoveReport
 from capture.devices.camera import CameraError, Trigger, open_camera
@@ -130,7 +131,7 @@ def check_frames(session):
         assert cfa[0, 0] == 64 + lit, record.step_id
         if lit:
             assert cfa[1, 0] == 1 + PATTERNS.index(settings["pattern"]), record.step_id
-            assert cfa[1, 1] == (90 if settings["polarizer"] == "crossed" else 0), record.step_id
+            assert cfa[1, 1] == reading_deg(record.step), record.step_id
             assert cfa[1, 2] == round(1000 * settings["level"])
             assert cfa[1, 3] == round(1e5 * settings["exposure_s"])
         if (state := state_of(record.step)) is not None:

@@ -10,7 +10,7 @@ from capture.plan import Plan, PlanError
 from capture.plan.dose import dose_report
 from capture.plan.flicker import flicker_report
 from capture.plan.gradient import (
-    BALL_LEVEL,
+    BALL_SERIES,
     FLAT_LEVELS,
     SCAN_ORDER,
     gradient_calibration_plan,
@@ -194,13 +194,19 @@ def test_flats_are_pairs_at_levels_up_to_full():
     assert sum(s.kind == "dark" for s in plan.steps) == 2
 
 
-def test_the_ball_is_lit_faintly_and_by_nothing_parallel_and_crossed():
+def test_the_ball_is_lit_from_faintly_to_brightly_on_both_sides_of_crossed():
     plan = gradient_calibration_plan(RIG, "ball", repeats=3)
-    counts = Counter((s.index["pattern"], s.index["polarizer"]) for s in plan.steps)
-    pairs = [(a, b) for a in ("full", "dark") for b in ("parallel", "crossed")]
-    assert counts == dict.fromkeys(pairs, 3)
-    assert {s.settings["level"] for s in plan.steps} == {BALL_LEVEL}
+    lit = [s for s in plan.steps if s.index["pattern"] == "full"]
+    seen = Counter((s.index["reading"], s.settings["level"]) for s in lit)
+    assert seen == {(r, v): 3 for r, levels in BALL_SERIES.items() for v in levels}
+    turned = {s.settings.get("analyser_deg") for s in lit if s.index["polarizer"] == "crossed"}
+    assert turned == {80, None, 100}
+    assert {s.settings["polarizer"] for s in lit if s.index["reading"] == 0} == {"parallel"}
+    dark = [s for s in plan.steps if s.index["pattern"] == "dark"]
+    assert len(dark) == 3 * len(BALL_SERIES)
     assert {s.kind for s in plan.steps} == {"ball"}
+    half = gradient_calibration_plan(RIG, "ball", level=0.5)
+    assert max(s.settings["level"] for s in half.steps) == 0.25
 
 
 def test_the_dark_has_no_light():
