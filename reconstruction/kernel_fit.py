@@ -24,12 +24,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.microstructure import ALPHA_LIMITS
+from reconstruction import kernel_fit_kernels as kernels
 from reconstruction import kernel_search, normal_histogram
 from reconstruction.kernel_search import Buckets, Relief
 
@@ -296,6 +297,104 @@ def fit_kernel(
     )  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True)
+class TwoAxisFit:
+    """Kernels along and across the jaws, which the paper fits one at a time.
+
+    Attributes
+    ----------
+    along, across : KernelFit
+        Each is the best with the other as it is; their `distance` is that of both together,
+        `distance_before` that of the other alone.
+    distance : float
+        Eq. (7)'s sum with both kernels.
+    rounds : int
+        Pairs of fits that were made.
+    settled : bool
+        Neither kernel changed in the last round; the pair is then best along both axes, though
+        another pair far away may be better.
+    """
+
+    along: KernelFit
+    across: KernelFit
+    distance: float
+    rounds: int
+    settled: bool
+
+
+def fit_two_axes(
+    neutral_height_um: NDArray[np.floating],
+    target_histogram: NDArray[np.floating],
+    *,
+    stretch: float,
+    stretch_across: float,
+    axis: Axis,
+    pixel_um: float | tuple[float, float],
+    valid: ArrayLike | None = None,
+    most_rounds: int = 6,
+    **settings: Any,
+) -> TwoAxisFit:
+    """Fit (alpha, sigma) along the jaws and across them, in turn until neither changes.
+
+    Parameters
+    ----------
+    neutral_height_um, target_histogram, stretch, stretch_across, axis, pixel_um, valid
+        As of :func:`fit_kernel`; the axis is that of the jaws.
+    most_rounds : int
+        Rounds of one fit along and one across, at least 1.
+    settings
+        Others of :func:`fit_kernel`.
+    """
+    if most_rounds < 1:
+        raise KernelFitError(f"most_rounds: got {most_rounds}, expected at least 1")
+    other: Axis = "x" if axis in ("y", 0) else "y"
+    kernels_: list[tuple[float, float]] = [(0.0, 1.0), (0.0, 1.0)]
+    fits: list[KernelFit] = []
+    before: list[tuple[float, float]] = []
+    rounds = 0
+    while rounds < most_rounds and kernels_ != before:
+        before = list(kernels_)
+        rounds += 1
+        fits = []
+        for turn, (own, across) in enumerate(((axis, other), (other, axis))):
+            ratios = (stretch, stretch_across) if turn == 0 else (stretch_across, stretch)
+            relief = convolved(
+                neutral_height_um, *kernels_[1 - turn], axis=across, pixel_um=pixel_um, valid=valid
+            )
+            fit = fit_kernel(
+                relief, target_histogram, stretch=ratios[0], stretch_across=ratios[1], axis=own,
+                pixel_um=pixel_um, valid=valid, **settings,
+            )  # fmt: skip
+            kernels_[turn] = fit.alpha, fit.sigma_um
+            fits.append(fit)
+    return TwoAxisFit(fits[0], fits[1], fits[1].distance, rounds, kernels_ == before)
+
+
+def convolved(
+    height_um: NDArray[np.floating],
+    alpha: float,
+    sigma_um: float,
+    *,
+    axis: Axis,
+    pixel_um: float | tuple[float, float],
+    valid: ArrayLike | None = None,
+) -> NDArray[np.floating]:
+    """Return a map convolved along one axis with eq. (6)'s kernel, as the search does it.
+
+    Not-valid and not finite heights come back as they were.
+    """
+    relief = relief_of(height_um, stretch=1.0, axis=axis, pixel_um=pixel_um, valid=valid)
+    moved = np.empty_like(relief.height_um)
+    kernels.blurred_less_itself(relief.height_um, relief.weights(sigma_um), moved)
+    if axis in ("y", 0):
+        moved = moved.T
+    good = np.isfinite(height_um)
+    if valid is not None:
+        good &= np.asarray(valid, bool)
+    height = np.asarray(height_um, np.float64)
+    return np.where(good, height + alpha * moved.astype(np.float64), height)
+
+
 def _grid(name: str, values: ArrayLike, low: float, high: float) -> Floats:
     grid = np.array(values, np.float64).reshape(-1)
     if grid.size == 0 or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():
@@ -341,7 +440,7 @@ def fit_relief(
     before = float(buckets.distances(start, (still, still), np.zeros(1))[0])
     i, j = found.best
     alpha, sigma, distance = float(alphas[j]), float(sigmas_um[i]), float(found.distance[i, j])
-    counts = _block_counts(relief, buckets, sigma, np.array([alpha]))[:, 0].astype(np.float64)
+    counts = _block_counts(relief, buckets, alpha, sigma)
     effective = normal_histogram.effective_number(counts, samples)
     occupied = max(1, int(np.count_nonzero(counts.sum(axis=0))))
     theirs = effective if target_samples is None else float(target_samples)
@@ -426,25 +525,15 @@ def _finer(grid: Floats, i: int) -> Floats:
     return np.linspace(low, high, steps + 1)
 
 
-def _block_counts(
-    relief: Relief, buckets: Buckets, sigma_um: float, alphas: Floats
-) -> NDArray[np.int64]:
-    """Return counts in blocks of the map: (blocks, A, buckets)."""
-    shape = relief.code.shape
-    rows, columns = normal_histogram.block_edges((shape[0], shape[1]), normal_histogram.BLOCKS)
-    y, x = np.divmod(relief.places, shape[1])
-    block = (np.searchsorted(rows, y, "right") - 1) * (len(columns) - 1)
-    block += np.searchsorted(columns, x, "right") - 1
-    change = relief.change(sigma_um)
-    parts = []
-    for k in np.unique(block):
-        own = block == k
-        parts.append(
-            buckets.count(
-                (relief.along[own], relief.across[own]), (change[0][own], change[1][own]), alphas
-            ).sum(axis=0, dtype=np.int64)
-        )
-    return np.array(parts)
+def _block_counts(relief: Relief, buckets: Buckets, alpha: float, sigma_um: float) -> Floats:
+    """Return counts in blocks of the map: (blocks, buckets)."""
+    shape = (relief.code.shape[0], relief.code.shape[1])
+    group, groups = normal_histogram.block_of(relief.places, shape, normal_histogram.BLOCKS)
+    da, db = relief.change(sigma_um)
+    a, b = relief.along + np.float32(alpha) * da, relief.across + np.float32(alpha) * db
+    return np.asarray(
+        kernels.count_in_groups(-a, -b, group, groups, buckets.bins, buckets.limit), np.float64
+    )
 
 
 def _stderr(

@@ -49,23 +49,37 @@ def slopes(height: Any, code: Any, right: Any, down: Any) -> Any:
     return a, b
 
 
+@njit(inline="always")
+def _bucket(p, q, bins, limit, scale):  # type: ignore[no-untyped-def]
+    """Return the bucket of the normal (-p, -q, 1) / length; bins^2 beyond the limit."""
+    w = 1.0 / math.sqrt(1.0 + p * p + q * q)
+    u = (limit - p * w) * scale
+    v = (limit - q * w) * scale
+    if u >= 0.0 and u <= bins and v >= 0.0 and v <= bins:
+        return min(int(v), bins - 1) * bins + min(int(u), bins - 1)
+    return bins * bins
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
 def count_slopes(p: Any, q: Any, bins: Any, limit: Any, parts: Any) -> Any:
     """Return the counts of normals (-p, -q, 1) / length, (parts, bins^2 + 1); last: outside."""
     n = p.size
-    cells = bins * bins
-    counts = np.zeros((parts, cells + 1), np.int64)
+    counts = np.zeros((parts, bins * bins + 1), np.int64)
     scale = bins / (2.0 * limit)
     for part in prange(parts):
         own = counts[part]
         for i in range(part * n // parts, (part + 1) * n // parts):
-            w = 1.0 / math.sqrt(1.0 + p[i] * p[i] + q[i] * q[i])
-            u = (limit - p[i] * w) * scale
-            v = (limit - q[i] * w) * scale
-            if u >= 0.0 and u <= bins and v >= 0.0 and v <= bins:
-                own[min(int(v), bins - 1) * bins + min(int(u), bins - 1)] += 1
-            else:
-                own[cells] += 1
+            own[_bucket(p[i], q[i], bins, limit, scale)] += 1
+    return counts
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def count_in_groups(p: Any, q: Any, group: Any, groups: Any, bins: Any, limit: Any) -> Any:
+    """Return counts as of `count_slopes` of each group of samples: (groups, bins^2 + 1)."""
+    counts = np.zeros((groups, bins * bins + 1), np.int64)
+    scale = bins / (2.0 * limit)
+    for i in range(p.size):
+        counts[group[i], _bucket(p[i], q[i], bins, limit, scale)] += 1
     return counts
 
 

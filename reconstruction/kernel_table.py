@@ -225,7 +225,8 @@ def _fit_slopes(
     used = np.ones(r.size, bool)
     best: tuple[Floats, NDArray[np.bool_], float] | None = None
     for _ in range(8):
-        slopes = np.linalg.lstsq(root[used, None] * X[used], root[used] * a[used])[0]
+        solved = np.linalg.lstsq(root[used, None] * X[used], root[used] * a[used])[0]
+        slopes = np.asarray(solved, np.float64)
         line = X @ slopes
         beyond = ((a <= ALPHA_LIMITS[0]) & (line < a)) | ((a >= ALPHA_LIMITS[1]) & (line > a))
         rss = float(np.sum(w * (np.clip(line, *ALPHA_LIMITS) - a) ** 2))

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -293,12 +292,16 @@ class NormalStatistics:
     stderr_y: float
 
 
-def block_edges(shape: tuple[int, int], blocks: int) -> tuple[list[int], list[int]]:
-    """Return where a map is cut along each axis: blocks of at least 4 pixels."""
+def block_of(
+    places: NDArray[np.int64], shape: tuple[int, int], blocks: int
+) -> tuple[NDArray[np.int64], int]:
+    """Return the block of pixels ``y * W + x``, and how many blocks there are.
+
+    A map is cut into ``blocks`` along each axis, fewer where they would be below 4 pixels.
+    """
     across = [max(1, min(blocks, side // 4)) for side in shape]
-    rows = np.linspace(0, shape[0], across[0] + 1).round().astype(int)
-    columns = np.linspace(0, shape[1], across[1] + 1).round().astype(int)
-    return rows.tolist(), columns.tolist()
+    y, x = np.divmod(places, shape[1])
+    return y * across[0] // shape[0] * across[1] + x * across[1] // shape[1], across[0] * across[1]
 
 
 def effective_number(counts: Floats, samples: int) -> float:
@@ -386,21 +389,18 @@ def measure_normals(
 def _measured(
     a: Floats, b: Floats, known: Bools, bins: int, limit: float, blocks: int
 ) -> NormalStatistics:
-    rows, columns = block_edges((known.shape[0], known.shape[1]), blocks)
-    parts, moments, outside = [], [], 0
-    for y0, y1 in pairwise(rows):
-        for x0, x1 in pairwise(columns):
-            some = known[y0:y1, x0:x1]
-            p, q = a[y0:y1, x0:x1][some], b[y0:y1, x0:x1][some]
-            counts, beyond = bucket_counts(p, q, bins=bins, limit=limit)
-            w = 1.0 / np.sqrt(1.0 + p * p + q * q)
-            x, y = -p * w, -q * w
-            parts.append(counts.reshape(-1))
-            moments.append([p.size, x.sum(), (x * x).sum(), y.sum(), (y * y).sum()])
-            outside += beyond
-    counts = np.array(parts)
+    group, groups = block_of(np.flatnonzero(known), (known.shape[0], known.shape[1]), blocks)
+    p, q = a[known], b[known]
+    check_buckets(bins, limit)
+    counts = kernels.count_in_groups(p, q, group, groups, bins, float(limit))
+    outside = int(counts[:, -1].sum())
+    counts = counts[:, :-1]
     shares = _shares(counts.sum(axis=0)).reshape(bins, bins)
-    sums = np.array(moments)
+    w = 1.0 / np.sqrt(1.0 + p * p + q * q)
+    x, y = -p * w, -q * w
+    sums = np.stack(
+        [np.bincount(group, moment, groups) for moment in (np.ones_like(x), x, x * x, y, y * y)], 1
+    )
     whole = _variances(sums.sum(axis=0))
     sums = sums[sums[:, 0] > 0]
     n = len(sums)
