@@ -14,6 +14,12 @@ from typing import Any, Literal, cast, get_args
 from capture.devices.dome import Eyes
 from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
+from capture.plan.gradient import (
+    GradientTarget,
+    gradient_calibration_plan,
+    gradient_plan,
+    state_of,
+)
 from capture.rig import Rig, load_rig
 from capture.session import Session, Subject
 from skinrig.addresses import addresses, patiently, require_addresses
@@ -40,10 +46,82 @@ def eyes_of(text: str) -> Eyes:
     return cast(Eyes, text)
 
 
-def choose_plan(rig: Rig, file: Path | None, target: str | None) -> Plan:
-    """Return the plan in ``file``, or the rig's own for a target, or for a subject."""
+def numbers_of(text: str | None, option: str) -> tuple[float, ...] | None:
+    """Return numbers joined by commas; None for None.
+
+    Examples
+    --------
+    >>> numbers_of("0,90", "--angles")
+    (0.0, 90.0)
+
+    Raises
+    ------
+    UsageError
+    """
+    if text is None:
+        return None
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError as exc:
+        raise UsageError(f"{option}: got {text!r}, expected numbers joined by commas") from exc
+
+
+def range_of(text: str | None, option: str) -> tuple[int, int] | None:
+    """Return the first and last number of ``FIRST..LAST``; None for None.
+
+    Examples
+    --------
+    >>> range_of("-2..3", "--steps")
+    (-2, 3)
+
+    Raises
+    ------
+    UsageError
+    """
+    if text is None:
+        return None
+    first, dots, last = text.partition("..")
+    try:
+        if not dots:
+            raise ValueError(text)
+        return int(first), int(last)
+    except ValueError as exc:
+        raise UsageError(f"{option}: got {text!r}, expected FIRST..LAST, such as -2..3") from exc
+
+
+def choose_plan(
+    rig: Rig,
+    file: Path | None,
+    target: str | None,
+    *,
+    angles: Sequence[float] | None = None,
+    steps: tuple[int, int] | None = None,
+) -> Plan:
+    """Return the plan in ``file``, or the rig's own for a target, or for a subject.
+
+    Parameters
+    ----------
+    rig
+    file
+        A plan, JSON.
+    target
+        What stands in the rig; None: a subject.
+    angles, steps
+        Of a caliper; None: all.
+
+    Raises
+    ------
+    CaptureError
+        For an unknown target.
+    UsageError
+        For angles or steps where there is no caliper, or that a plan in a file has already.
+    """
+    if (angles or steps) and (rig.caliper is None or file is not None or target is not None):
+        raise UsageError("--angles, --steps: are for the gradient rig's own plan of skin")
     if file is not None:
         return Plan.from_json(file.read_text(encoding="utf-8"), where=str(file))
+    if "gradient_sphere" in rig.boxes:
+        return _gradient_plan(rig, target, angles, steps)
     if "dome" in rig.boxes:
         return _dome_plan(rig, target)
     if target is None:
@@ -63,6 +141,26 @@ def _dome_plan(rig: Rig, target: str | None) -> Plan:
         expected = ", ".join(get_args(DomeTarget))
         raise CaptureError(f"target: got {target!r}, expected one of {expected}")
     return dome_calibration_plan(rig, cast(DomeTarget, target))
+
+
+def _gradient_plan(
+    rig: Rig,
+    target: str | None,
+    angles: Sequence[float] | None,
+    steps: tuple[int, int] | None,
+) -> Plan:
+    if target is None:
+        return gradient_plan(rig, angles=angles, steps=steps)
+    if target not in get_args(GradientTarget):
+        expected = ", ".join(get_args(GradientTarget))
+        raise CaptureError(f"target: got {target!r}, expected one of {expected}")
+    return gradient_calibration_plan(rig, cast(GradientTarget, target))
+
+
+def needed_boxes(rig: Rig, plan: Plan) -> tuple[str, ...]:
+    """Return the boxes of a rig that a plan uses: a caliper only where it holds skin."""
+    skin = any(state_of(step) is not None for step in plan.steps)
+    return tuple(name for name in rig.boxes if skin or name != "caliper")
 
 
 def write_plan(plan: Plan, file: Path) -> None:
@@ -95,13 +193,16 @@ def capture_session(
     resume: bool,
     console: Console,
     eyes: Eyes = "open",
+    force_limit_n: float | None = None,
+    angles: Sequence[float] | None = None,
+    steps: tuple[int, int] | None = None,
 ) -> Mapping[str, Any]:
     """Capture into ``out`` and return the command's document.
 
     Raises
     ------
     UsageError
-        For an address that is none, or a missing one.
+        For an address that is none, or a missing one, or a missing force limit.
     CaptureError
         For an unknown target, or a plan file that exists.
     DeviceError
@@ -109,15 +210,21 @@ def capture_session(
     """
     box_urls, camera_urls = addresses(ports, "--port"), addresses(cameras, "--camera")
     rig = load_rig(rig_name)
-    chosen = choose_plan(rig, plan, target)
+    chosen = choose_plan(rig, plan, target, angles=angles, steps=steps)
     seconds = chosen.estimated_s(rig)
+    needed = needed_boxes(rig, chosen)
     if not dry_run:
-        require_addresses(rig, box_urls, camera_urls)
+        require_addresses(rig, box_urls, camera_urls, needed=needed)
+        if "caliper" in needed and force_limit_n is None:
+            raise UsageError(
+                "a capture with the caliper needs --force-limit N: how much force this skin may "
+                "bear is for a person to decide, and there is no default"
+            )
     if out is None and not dry_run:
         raise UsageError("a capture needs --out SESSION")
     console.say(f"{len(chosen.steps)} steps, about {seconds:.0f} s")
     light: Mapping[str, Any] = {}
-    if "dome" in rig.boxes:
+    if rig.leds is not None:
         light = light_figures(chosen, rig)
         for line in light_lines(chosen, rig):
             console.say(line)
@@ -133,7 +240,10 @@ def capture_session(
         return {
             "steps": len(chosen.steps), "estimated_s": seconds, "captured": 0, "light": light,
         }  # fmt: skip
-    return _run(rig, chosen, out, box_urls, camera_urls, subject, resume, console, eyes)
+    box_urls = {name: box_urls[name] for name in needed}
+    return _run(
+        rig, chosen, out, box_urls, camera_urls, subject, resume, console, eyes, force_limit_n
+    )
 
 
 def _run(
@@ -146,22 +256,30 @@ def _run(
     resume: bool,
     console: Console,
     eyes: Eyes,
+    force_limit_n: float | None,
 ) -> Mapping[str, Any]:
     from capture.acquire import run_plan
+    from capture.devices.box import Box
+    from capture.devices.caliper import CaliperBox
     from capture.devices.camera import open_camera
     from capture.devices.dome import DomeBox
     from capture.devices.flash import FlashBox
+    from capture.devices.gradient_sphere import GradientSphereBox
     from capture.devices.port import Port
 
-    kind: Literal["dome", "flash"] = "dome" if "dome" in rig.boxes else "flash"
+    drivers: Mapping[str, type[Box]] = {
+        "flash": FlashBox, "dome": DomeBox, "gradient_sphere": GradientSphereBox,
+        "caliper": CaliperBox,
+    }  # fmt: skip
 
-    def open_box() -> DomeBox | FlashBox:
-        port = Port(box_urls[kind])
-        return DomeBox(port) if kind == "dome" else FlashBox(port)
+    def open_box(kind: str) -> Box:
+        return drivers[kind](Port(box_urls[kind]))
 
     with contextlib.ExitStack() as stack:
-        box = patiently(open_box, console.progress)
-        stack.callback(box.close)
+        boxes: dict[str, Box] = {}
+        for kind in box_urls:
+            boxes[kind] = patiently(partial(open_box, kind), console.progress)
+            stack.callback(boxes[kind].close)
         opened = {}
         for view in rig.views:
             url = camera_urls[view.name]
@@ -171,7 +289,7 @@ def _run(
         width, _ = next(iter(sizes))
         if width != rig.views[0].width_px:
             # a served simulation may run smaller than the rig file's camera
-            rig = rig.resized(width)
+            rig = rig.resized(width) if rig.caliper is None else rig.cropped(width)
         if resume:
             session = Session.resume(out)
             plan = session.plan
@@ -179,32 +297,36 @@ def _run(
             fresh = not out.exists()
             session = Session.create(
                 out, plan=plan, rig=rig,
-                devices={kind: box_urls[kind],
+                devices={**box_urls,
                          **{name: camera.info.serial for name, camera in opened.items()}},
-                subject=subject, source=_source(box.identify()),
+                subject=subject, source=_source(next(iter(boxes.values())).identify()),
             )  # fmt: skip
             stack.enter_context(_unless_used(session, fresh, console))
         stack.callback(session.release)
         with _stop_on_signal() as stopped:
             done = run_plan(
-                plan, rig, boxes={kind: box}, cameras=opened, session=session,
+                plan, rig, boxes=boxes, cameras=opened, session=session,
                 progress=console.progress, prompt=partial(ask, console.progress),
-                interrupted=stopped, eyes=eyes,
+                interrupted=stopped, eyes=eyes, force_limit_n=force_limit_n,
             )  # fmt: skip
         session.close()
+        left_out = dict(session.left_out())
     if done.dead_lights:
         console.say(f"dead lights: {', '.join(done.dead_lights)}; their frames are dark")
+    for reason in dict.fromkeys(left_out.values()):
+        console.say(f"left out: {reason}")
     console.say(f"{out}: {done.frames} frames in {done.steps} steps, {done.retakes} retaken")
     console.say(f"next: skinrig verify {out}")
     return {
         "session": out, "captured": done.frames, "retakes": done.retakes,
         "stale_frames": done.stale, "steps": len(plan.steps), "dead_lights": done.dead_lights,
+        "left_out": left_out,
     }  # fmt: skip
 
 
 def ask(progress: Callable[[str], None], what: str) -> None:
     """Say what the operator has to make ready, and wait for Enter where there is a keyboard."""
-    what = what if what.startswith("step ") else f"make ready: {what}"
+    what = what if what.startswith(("step ", "tape ")) else f"make ready: {what}"
     if sys.stdin is None or not sys.stdin.isatty():
         progress(what)
         return

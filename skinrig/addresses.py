@@ -35,14 +35,28 @@ def addresses(given: Sequence[str], option: str) -> dict[str, str]:
     return found
 
 
-def require_addresses(rig: Rig, boxes: Mapping[str, str], cameras: Mapping[str, str]) -> None:
+def require_addresses(
+    rig: Rig,
+    boxes: Mapping[str, str],
+    cameras: Mapping[str, str],
+    *,
+    needed: Sequence[str] | None = None,
+) -> None:
     """Raise, naming all that is missing, unless each box and each camera has an address.
+
+    Parameters
+    ----------
+    rig
+    boxes, cameras
+        Addresses by name.
+    needed
+        Boxes that are used; None: all of the rig.
 
     Raises
     ------
     UsageError
     """
-    missing = [f"--port {name}=URL" for name in rig.boxes if name not in boxes]
+    missing = [f"--port {name}=URL" for name in needed or rig.boxes if name not in boxes]
     missing += [f"--camera {v.name}=URL" for v in rig.views if v.name not in cameras]
     if missing:
         raise UsageError(

@@ -1,4 +1,4 @@
-"""What the dome's light will be for the subject, said before it is given."""
+"""What the light of LEDs will be for the subject, said before it is given."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from collections.abc import Mapping
 from capture.plan import Plan
 from capture.plan.dose import dose_report
 from capture.plan.flicker import flicker_report
+from capture.plan.gradient import scan_duty, states
 from capture.rig import LedLimits, Rig
 
 
 def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
-    """Return flicker and dose of a plan of the dome as JSON values, units in the names.
+    """Return flicker and dose of a plan as JSON values, units in the names.
+
+    Of patterns on skin also the light of a state, and the most mean level of an LED; open eyes are
+    refused whatever the figures say, because the patch may lie beside an eye.
 
     Examples
     --------
@@ -23,15 +27,21 @@ def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
     """
     flicker, dose = flicker_report(plan, rig), dose_report(plan, rig)
     limits = rig.leds or LedLimits()
+    skin: dict[str, float | str] = {}
+    for _, steps in states(plan):  # one is like the other
+        light_s = sum(float(step.settings["dwell_s"]) for step in steps)
+        skin = {"state_s": light_s, "duty": scan_duty(steps, rig)}
+        break
     return {
         "flashes_per_s": flicker.flashes_per_s,
         "flicker_rms": flicker.rms,
-        "open_eyes": "allowed" if flicker.within(limits) else "refused",
+        "open_eyes": "allowed" if flicker.within(limits) and not skin else "refused",
         "led": dose.led,
         "led_ws": dose.led_ws,
         "limit_ws": dose.limit_ws,
         "blue_share": dose.blue_share,
         "eye_j_m2": dose.eye_j_m2,
+        **skin,
     }
 
 
@@ -48,10 +58,19 @@ def light_lines(plan: Plan, rig: Rig) -> list[str]:
     limits = rig.leds or LedLimits()
     figures = light_figures(plan, rig)
     verdict = "may be open" if figures["open_eyes"] == "allowed" else "must be closed or shielded"
+    more = []
+    if "state_s" in figures:
+        verdict += ": the patch may lie beside one"
+        more = [
+            f"patterns: {figures['state_s']:.2f} s of light a state of the skin, mean level of an "
+            f"LED at most {figures['duty']:.3f} over {limits.duty_window_s:g} s, "
+            f"{limits.max_duty:g} allowed"
+        ]
     return [
         f"flicker at the eyes: {figures['flashes_per_s']:.1f} flashes in the worst second, rms "
         f"{figures['flicker_rms']:.2f} of 3 to 65 Hz; eyes {verdict}",
         f"light dose: at most {figures['led_ws']:.3g} Ws from one LED ({figures['led']}), "
         f"{limits.dose_ws:g} Ws allowed; under {100 * float(figures['blue_share']):.2g} % of the "
         f"blue-light limit of one that is stared at; {figures['eye_j_m2']:.2g} J/m2 at the eyes",
+        *more,
     ]

@@ -6,8 +6,11 @@ import sys
 from typing import Any
 
 from capture.rig import Rig, load_rig
-from skinrig import simulating_dome, simulating_flash
+from skinrig import simulating_dome, simulating_flash, simulating_gradient
 from skinrig.simulation import SIZES, SimulationError
+
+GRADIENT_WIDTH_PX = 128
+"""Pixels across the served camera of the gradient rig."""
 
 
 def serve_rig(
@@ -19,12 +22,14 @@ def serve_rig(
     subject: str,
     size: str,
     seed: int,
+    site: str | None = None,
     seconds: float | None = None,
 ) -> None:
     """Print the addresses of boxes and cameras, one ``NAME URL`` a line, and serve.
 
     A dome is served with all its lights and cameras at either size: who captures from it uses the
-    rig file, which must fit.
+    rig file, which must fit. Skin in the gradient sphere is served small only: its pictures are
+    made while its caliper waits for the host.
 
     Parameters
     ----------
@@ -36,7 +41,7 @@ def serve_rig(
         HOST:PORT; port 0 chooses a free one.
     allow_remote
         Permit an address that other machines reach.
-    subject, size, seed
+    subject, size, seed, site
         As for a simulation.
     seconds
         How long; None serves until Ctrl-C.
@@ -46,17 +51,30 @@ def serve_rig(
     if size not in SIZES:
         raise SimulationError(f"size: got {size!r}, expected one of {', '.join(SIZES)}")
     rig = load_rig(rig_name)
-    dome = "dome" in rig.boxes
-    width = (simulating_dome if dome else simulating_flash).WIDTHS_PX[size]
-    rig = rig.resized(width) if width != rig.views[0].width_px else rig
-    scene = _dome_scene(rig, subject, seed) if dome else _flash_scene(rig, subject, seed)
+    if site is not None and rig.caliper is None:
+        raise SimulationError("site: only the gradient rig knows of it; leave it out")
+    if "gradient_sphere" in rig.boxes:
+        if size != "small":
+            raise SimulationError(
+                f"size: got {size!r}, expected small: larger pictures take longer to make than the "
+                "caliper waits for its host; skinrig simulate gradient makes them"
+            )
+        rig = rig.cropped(GRADIENT_WIDTH_PX)
+        scene = simulating_gradient.make_scene(rig, site=site, preset=subject, seed=seed)
+    else:
+        dome = "dome" in rig.boxes
+        width = (simulating_dome if dome else simulating_flash).WIDTHS_PX[size]
+        rig = rig.resized(width) if width != rig.views[0].width_px else rig
+        scene = _dome_scene(rig, subject, seed) if dome else _flash_scene(rig, subject, seed)
     with serve(rig, pty=pty, tcp=tcp, allow_remote=allow_remote, seed=seed, scene=scene) as served:
         for name, url in served.addresses.items():
             print(f"{name} {url}", flush=True)
         boxes = " ".join(f"--port {n}={served.addresses[n]}" for n in rig.boxes)
         cameras = " ".join(f"--camera {v.name}={served.addresses[v.name]}" for v in rig.views)
+        more = "" if rig.caliper is None else " --force-limit 2 --eyes closed"
         print(
-            f"next: skinrig capture {rig_name} {boxes} {cameras} --out session\nCtrl-C ends it",
+            f"next: skinrig capture {rig_name} {boxes} {cameras}{more} --out session\n"
+            "Ctrl-C ends it",
             file=sys.stderr,
         )
         try:

@@ -22,7 +22,7 @@ from model import store
 from skinrig.light_safety import light_figures, light_lines
 from skinrig.simulation import Order, Simulated, SimulationError, drive, open_session, truth_folder
 
-WIDTHS_PX = {"small": 320, "full": 2048}
+WIDTHS_PX = {"small": 256, "full": 2048}
 ANGLES_DEG: dict[str, tuple[float, ...] | None] = {"small": (0.0,), "full": None}
 SITE = "forehead"
 FORCE_LIMIT_N = 2.0
@@ -44,7 +44,9 @@ def simulate_gradient(order: Order) -> Simulated:
     )
     if order.target is not None:
         order.refuse("gradient's targets", site=None, angles=None, steps=None)
-    rig = load_rig("gradient").cropped(order.width_px or WIDTHS_PX[order.size])
+    # a ball of 12 mm fills the whole sensor, however small all else is kept
+    width_px = WIDTHS_PX["full" if order.target == "ball" else order.size]
+    rig = load_rig("gradient").cropped(order.width_px or width_px)
     plan = plan_of(rig, order)
     figures = light_figures(plan, rig)
     if order.progress is not None:

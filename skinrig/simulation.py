@@ -147,7 +147,8 @@ def simulate_session(
     size
         "small" or "full": of the flash rig 768 pixels across or the camera's own 3024; of the dome
         6 cameras, 200 pixels across, and 48 lights, or all that it has; of the gradient sphere the
-        middle 320 pixels and one angle of the caliper, or all 2048 and all angles.
+        middle 256 pixels and one angle of the caliper, or all 2048, which the ball always takes,
+        and all angles.
     seed
         Of the subject, the sensor and the boxes.
     subject

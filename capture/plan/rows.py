@@ -128,7 +128,7 @@ def passes(steps: Sequence[Step]) -> list[list[Step]]:
         key = (
             settings["exposure_s"], settings.get("iso", 100), step.cameras,
             index.get("pose"), index.get("sphere"), index.get("pass"), step.kind == "dark",
-            index.get("angle"), index.get("caliper"),
+            index.get("angle"), index.get("caliper"), index.get("reading"),
         )  # fmt: skip
         if not pieces or key != before:
             pieces.append([])
