@@ -28,6 +28,10 @@ GOOD, DIM, LOST, HORIZON = 0.0, 1.0, 2.0, 3.0
 _PASSES = 24
 _STEPS_BACK = 8
 _TOLERATED = 2e-3  # distance between what is seen and what the place found shows
+_ROUGHLY = 1e-2
+_UNSETTLED = 1e-2  # relative changes of the moment vector by the polarization of diffuse light
+_EXACT_TURNS = 8
+_STEEP, _UNLIKE = 0.866, 0.03
 _LEAST_FACING = 0.1  # cosine to the view, which tables end at
 
 
@@ -417,7 +421,7 @@ def invert(  # type: ignore[no-untyped-def]
     two = crossed.shape[1] > 0
     tabled = table.size > 0
     polarized = two and tabled and (analyser[0] != 0.0 or analyser[1] != 0.0)
-    last = 2 if polarized else 0  # normals as the grid has them tell the polarization
+    last = 16 if polarized else 0
     spread = np.empty(5)
     c, cov, turned = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     half, slope = np.empty((3, 3)), np.empty((2, 3))
@@ -457,6 +461,7 @@ def invert(  # type: ignore[no-untyped-def]
         status = GOOD
         x, y = (place[p, 0], place[p, 1]) if place.shape[0] else (0.0, 0.0)
         j00, j01, j10, j11 = 1.0, 0.0, 0.0, 1.0
+        rough = polarized  # normals as the grid has them, until the polarization settles
         for turn in range(last + 1):
             for i in range(3):
                 s = 0.0
@@ -510,17 +515,29 @@ def invert(  # type: ignore[no-untyped-def]
             if not tabled:
                 u0, u1 = s0, s1
                 break
-            u0, u1 = _start(grid, s0, s1)
-            if turn == last:
+            if rough or not polarized:
+                u0, u1 = _start(grid, s0, s1)
+            if not rough:
                 u0, u1, off, j00, j01, j10, j11 = _settle(
                     table, least, step, s0, s1, u0, u1, x, y, close
                 )
                 if off > _TOLERATED:
                     status = HORIZON
+                    break
+            if not polarized:
                 break
             square = min(u0 * u0 + u1 * u1, 1.9)
             m = math.sqrt(1.0 - 0.25 * square)
-            ratio = _exit_ratio(u0 * m, u1 * m, 1.0 - 0.5 * square, analyser[0], analyser[1], eta)
+            fresh = _exit_ratio(u0 * m, u1 * m, 1.0 - 0.5 * square, analyser[0], analyser[1], eta)
+            # what the change does to the vector's direction
+            change = abs(fresh - ratio) * abs(crossed[C_0, p]) / c0
+            ratio = fresh
+            if rough:
+                rough = change > _ROUGHLY and turn < last - _EXACT_TURNS
+            elif change < max(10.0 * close, 1e-7):
+                break
+            elif turn == last and change > _UNSETTLED:
+                status = HORIZON
         if status != GOOD:
             out[p, STATUS] = status
             continue
@@ -565,6 +582,16 @@ def invert(  # type: ignore[no-untyped-def]
                 out[p, STATUS] = HORIZON
                 continue
             g0, g1, g2 = r0 / size, r1 / size, r2 / size
+        longer = length
+        if told:
+            # noise across the vector makes it longer
+            longer -= 0.5 * (cov[0, 0] + cov[1, 1] + cov[2, 2] - wide * wide) / length
+        if mirror and tabled and n2 < _STEEP:
+            # near Brewster's angle another normal shows the same vector, but not as long
+            doubt = 3.0 * math.sqrt(max(var0, 0.0) + wide * wide) / c0 if told else 0.0
+            if abs(longer / c0 - spread[1]) > _UNLIKE + doubt:
+                out[p, STATUS] = HORIZON
+                continue
         out[p, N_X], out[p, N_Y], out[p, N_Z] = g0, g1, g2
         out[p, ALBEDO] = c0 / spread[0] if spread[0] > 0.0 else 0.0
         out[p, STDERR] = error
@@ -572,9 +599,4 @@ def invert(  # type: ignore[no-untyped-def]
             math.sqrt(max(var0, 0.0)) / spread[0] if told and spread[0] > 0.0 else np.inf
         )
         out[p, CONCENTRATION] = spread[1]
-        if told:
-            # noise across the vector makes it longer
-            across = cov[0, 0] + cov[1, 1] + cov[2, 2] - wide * wide
-            out[p, CONCENTRATION_SEEN] = (length - 0.5 * across / length) / c0
-        else:
-            out[p, CONCENTRATION_SEEN] = length / c0
+        out[p, CONCENTRATION_SEEN] = longer / c0

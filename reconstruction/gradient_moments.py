@@ -117,7 +117,7 @@ class Reflection:
                 second[row] = 0.0
         for moments, clean in ((first, self.clean[0]), (second, self.clean[1])):
             moments[_VALUES] = clean[:, rows].reshape(4, -1)
-            moments[:, lost] = np.nan
+            moments[: kernels.CHI, lost] = np.nan
 
     def _of(self, stack: Stack, rows: slice, sigma: float) -> Floating:
         taps = _taps(sigma).astype(self.kind)

@@ -60,9 +60,10 @@ def filtered(image: Floating, variance: float, valid: NDArray[np.bool_]) -> tupl
     wide = np.pad(flat, pads, mode="symmetric")
     window = np.outer(*(np.hanning(side).astype(kind) for side in wide.shape))
     power = np.abs(fft.rfft2(wide * window)) ** 2 / float(np.sum(window.astype(np.float64) ** 2))
-    power = _averaged(power, wide.shape)
+    power = _averaged(power.astype(np.float64), wide.shape)
     keep = np.maximum(power - variance, 0.0) / np.maximum(power, 1e-300)
-    share = float(_full_mean(keep, wide.shape[1]))
+    # the mean is kept whole, with its own noise
+    share = min(_full_mean(keep, wide.shape[1]) + 1.0 / float(valid.sum()), 1.0)
     out = fft.irfft2(fft.rfft2(wide) * keep.astype(kind), s=wide.shape)
     (top, _), (left, _) = pads
     inner = out[top : top + height, left : left + width]
@@ -76,7 +77,7 @@ def _pads(side: int) -> tuple[int, int]:
 
 def _averaged(power: Floating, shape: tuple[int, ...]) -> Floating:
     """Average the half spectrum of a real picture over bands of frequencies, periodically."""
-    rows, columns = (max(1, side // BAND) | 1 for side in shape)
+    rows, columns = (max(3, side // BAND) | 1 for side in shape)
     half = columns
     # the missing half is the other one's mirror image, rows turned too
     turned = np.roll(power[::-1], 1, axis=0)

@@ -4,16 +4,24 @@ The pictures come from direct sums of a microfacet lobe over single lights, writ
 (sin and tan forms of Fresnel's equations, slope form of the lobe), with no table.
 """
 
+import logging
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
 from model.metrics import angular_error_rad
+from reconstruction import gradient_kernels as kernels
 from reconstruction.gradient_normals import (
+    GradientError,
+    MissingPatterns,
+    SensorNoise,
     SphereLights,
+    SphereLightsError,
     estimate_roughness,
     from_patterns,
 )
+from reconstruction.gradient_patterns import design
 
 VIEW = np.array([0.0, 0.0, 1.0])
 NAMES = ("full", "x", "y", "z", "-x", "-y", "-z", "dark")
@@ -64,7 +72,7 @@ def pictures(
     a = np.array([0.0, 1.0, 0.0])
     gain = 1.0 / ((s @ a / r_s) ** 2 + (np.cross(s, VIEW) @ a / r_p) ** 2)
     off = np.radians(off_deg)
-    through, not_through = np.cos(off) ** 2, np.sin(off) ** 2 + leak
+    through, not_through = np.cos(off) ** 2, np.sin(off) ** 2 + np.asarray(leak)
     h = unit(ways + view)
     nl, nv, nh = normals @ ways.T, normals @ view, normals @ h.T
     tan2 = np.tan(np.arccos(np.clip(nh, 1e-6, 1.0))) ** 2
@@ -94,9 +102,10 @@ def pictures(
             c = coordinates[:, "xyz".index(name[-1])]
             p = (1.0 - c) / 2.0 if name[0] == "-" else (1.0 + c) / 2.0
         glow = (matte * p).sum(axis=-1)
-        spark = (each * p).sum(axis=-1)
-        found[name, "parallel"] = dark + (through * spark + w * glow) / white
-        found[name, "crossed"] = dark + (not_through * spark + (2.0 - w) * glow) / white
+        spark = (each * through * p).sum(axis=-1)
+        leaked = (each * not_through * p).sum(axis=-1)
+        found[name, "parallel"] = dark + (spark + w * glow) / white
+        found[name, "crossed"] = dark + (leaked + (2.0 - w) * glow) / white
     return found
 
 
@@ -192,3 +201,380 @@ def test_any_patterns_that_tell_the_vector_give_the_same_normals(scene, names):
     other = from_patterns(only(images, names, NAMES), lights=SphereLights(lights), alpha=0.2)
     np.testing.assert_allclose(other.normals, found.normals, atol=1e-6)
     assert matte.valid.all()
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_moments_are_the_weighted_least_squares_of_all_samples(rng, dark):
+    """The closed form of the kernel beside a dense fit, with samples missing at random."""
+    checked = 0
+    for _ in range(60):
+        there = rng.random(8) < 0.8
+        there[7] &= dark
+        y, v = rng.standard_normal(8), np.exp(rng.standard_normal(8))
+        names = [name for name, here in zip(NAMES, there, strict=True) if here]
+        A = design(names, dark=dark)
+        out = np.empty((kernels.MOMENT_ROWS, 1))
+        kernels.moments(np.where(there, y, np.nan)[:, None], v[:, None], 0.0, 1.0, 1, dark, out)
+        if len(names) == 0 or np.linalg.matrix_rank(A) < A.shape[1]:
+            assert np.isnan(out[kernels.C_0, 0])
+            continue
+        checked += 1
+        W = np.diag(1.0 / v[there])
+        cov = np.linalg.inv(A.T @ W @ A)
+        fit = cov @ A.T @ W @ y[there]
+        np.testing.assert_allclose(out[:4, 0], fit[:4], rtol=1e-8, atol=1e-8)
+        for row, i, j in ((4, 0, 0), (5, 1, 1), (6, 2, 2), (7, 3, 3), (8, 1, 2), (9, 1, 3),
+                          (10, 2, 3)):  # fmt: skip
+            np.testing.assert_allclose(out[row, 0], cov[i, j], rtol=1e-8, atol=1e-9)
+        r = y[there] - A @ fit
+        np.testing.assert_allclose(out[kernels.CHI, 0], r @ W @ r, rtol=1e-7, atol=1e-9)
+        assert out[kernels.FREE, 0] == len(names) - A.shape[1]
+    assert checked > 10
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (("x", "y", "z"), "full"),
+        (("full", "x", "y"), "z or -z"),
+        (("full", "x", "-x", "dark"), "y or -y and z or -z"),
+        ((), "full"),
+    ],
+)
+def test_too_few_patterns_are_refused_by_name_with_what_would_do(scene, names, words):
+    _, _, images = scene
+    with pytest.raises(MissingPatterns, match=words):
+        from_patterns(only(images, NAMES, names) if names else only(images, NAMES, ("dark",)))
+
+
+def test_specular_normals_need_both_polarizers_and_diffuse_ones_crossed(scene):
+    _, normals, images = scene
+    with pytest.raises(MissingPatterns, match="no crossed"):
+        from_patterns(only(images, NAMES, ()))
+    with pytest.raises(MissingPatterns, match="no parallel"):
+        from_patterns(only(images, (), NAMES))
+    with pytest.raises(MissingPatterns, match="no crossed"):
+        from_patterns(only(images, NAMES, ()), component="diffuse")
+    found = from_patterns(only(images, (), NAMES), component="diffuse")
+    # on a nearly whole sphere of lights, a matte surface's vector is its normal
+    assert error_deg(found, normals).mean() < 1.0
+
+
+def test_dark_frames_are_subtracted_also_where_one_polarizer_has_them(scene):
+    lights, normals, clean = scene
+    images = pictures(normals, lights, dark=0.03)
+    one = {key: image for key, image in images.items() if key != ("dark", "crossed")}
+    for given in (images, one):
+        found = from_patterns(given)
+        np.testing.assert_allclose(found.normals, from_patterns(clean).normals, atol=1e-9)
+    # without complements a dark level is part of every gradient
+    four = only(images, ("full", "x", "y", "z"))
+    apart = error_deg(from_patterns(four, component="diffuse"), normals).mean()
+    assert apart > 2 * error_deg(from_patterns(images, component="diffuse"), normals).mean()
+
+
+@pytest.mark.parametrize("patterns", [NAMES, ("full", "x", "y", "z"), ("x", "-x", "y", "z")])
+@pytest.mark.parametrize("given", ["model", "arrays"])
+def test_errors_are_as_large_as_the_standard_errors_say(rng, patterns, given):
+    """Mean of squared error over squared standard error is 1.
+
+    Its standard deviation is at most sqrt(2 / pixels); false alarm at four of these: 6e-5.
+    """
+    lights, normals = sphere(), relief(40, tilt=0.15)
+    clean = only(pictures(normals, lights, alpha=0.3), patterns)
+    noise = SensorNoise(2e-7, 2e-8)
+    variance = (
+        noise
+        if given == "model"
+        else {key: noise.read_variance + noise.gain * image for key, image in clean.items()}
+    )
+    found = from_patterns(
+        noisy(clean, noise, rng), lights=SphereLights(lights), alpha=0.3, variance=variance
+    )
+    assert found.valid.all()
+    ratio = (np.radians(error_deg(found, normals)) / found.stderr_rad.ravel()) ** 2
+    assert abs(ratio.mean() - 1.0) < 4 * np.sqrt(2.0 / ratio.size)
+
+
+def test_four_patterns_cost_error_as_announced(rng):
+    """Full, x, y, z alone: a moment has 4 V + V_full instead of 2 V and less."""
+    lights, normals = sphere(), relief(40, tilt=0.15)
+    images = noisy(pictures(normals, lights, alpha=0.3), SensorNoise(1e-7, 1e-7), rng)
+    errors, told = {}, {}
+    for label, names in (("all", NAMES), ("four", ("full", "x", "y", "z"))):
+        found = from_patterns(
+            only(images, names), lights=SphereLights(lights), alpha=0.3,
+            variance=SensorNoise(1e-7, 1e-7),
+        )  # fmt: skip
+        errors[label], told[label] = error_deg(found, normals).mean(), found.stderr_rad.mean()
+    assert errors["four"] > 1.3 * errors["all"]
+    np.testing.assert_allclose(errors["four"] / errors["all"], told["four"] / told["all"], rtol=0.1)
+
+
+def test_noise_is_found_from_patterns_that_contradict_each_other(rng):
+    lights, normals = sphere(), relief(64)
+    noise = SensorNoise(1e-6, 2e-7)
+    images = noisy(pictures(normals, lights, alpha=0.3), noise, rng)
+    kwargs = {"lights": SphereLights(lights), "alpha": 0.3}
+    told = from_patterns(images, variance=noise, **kwargs)
+    found = from_patterns(images, **kwargs)
+    np.testing.assert_allclose(found.stderr_rad.mean(), told.stderr_rad.mean(), rtol=0.1)
+    four = from_patterns(only(images, ("full", "x", "y", "z")), **kwargs)
+    assert (four.stderr_rad == np.float32(np.pi)).all()  # nothing to find it from
+
+
+def test_unequal_lights_are_corrected_and_cost_where_they_are_not(rng):
+    lights, normals = sphere(), relief(32)
+    strength = np.exp(0.3 * rng.standard_normal(len(lights)))
+    images = pictures(normals, lights, strength=strength)
+    right = from_patterns(images, lights=SphereLights(lights, strength), alpha=0.2)
+    wrong = from_patterns(images, lights=SphereLights(lights), alpha=0.2)
+    assert error_deg(right, normals).mean() < 0.05
+    assert error_deg(wrong, normals).mean() > 0.5
+
+
+def test_what_is_not_known_about_the_lights_is_in_the_standard_errors():
+    """Squared errors over what is announced, by drawn sphere; false alarm at 4 sigma: 6e-5."""
+    lights, normals = sphere(), relief(16)
+    rng = np.random.default_rng(7)
+    told = SphereLights(lights, intensity_stderr=np.full(len(lights), 0.05))
+    ratios = []
+    for _ in range(24):
+        strength = 1.0 + 0.05 * rng.standard_normal(len(lights))
+        found = from_patterns(
+            pictures(normals, lights, strength=strength, alpha=0.3), lights=told, alpha=0.3,
+            variance=1e-18,
+        )  # fmt: skip
+        announced = np.mean(found.stderr_rad**2)
+        ratios.append(np.mean(np.radians(error_deg(found, normals)) ** 2) / announced)
+    ratios = np.array(ratios)
+    assert abs(ratios.mean() - 1.0) < 4 * ratios.std(ddof=1) / np.sqrt(len(ratios))
+
+
+def test_leakage_by_direction_is_corrected():
+    lights, normals = sphere(), relief(32)
+    leak = 0.25 * (1.0 + lights[:, 0]) * (1.0 - 0.5 * lights[:, 2])
+    images = pictures(normals, lights, leak=leak)
+    right = from_patterns(images, lights=SphereLights(lights, leakage=leak), alpha=0.2)
+    wrong = from_patterns(images, lights=SphereLights(lights), alpha=0.2)
+    assert error_deg(right, normals).mean() < 0.05
+    assert error_deg(wrong, normals).mean() > 0.2
+
+
+def test_an_analyser_ten_degrees_off_costs_signal_and_turns_no_normal(rng, caplog):
+    """Signal falls to cos 20 degrees, with the diffuse light's own polarization turned as well."""
+    lights, normals = sphere(), relief(32)
+    images = pictures(normals, lights, off_deg=10.0)
+    straight = from_patterns(pictures(normals, lights), lights=SphereLights(lights), alpha=0.2)
+    unaware = from_patterns(images, lights=SphereLights(lights), alpha=0.2)
+    np.testing.assert_allclose(
+        np.median(unaware.albedo / straight.albedo), np.cos(np.radians(20.0)), rtol=0.02
+    )
+    assert error_deg(unaware, normals).mean() < 0.3
+    leak = np.full(len(lights), np.tan(np.radians(10.0)) ** 2)
+    with caplog.at_level(logging.WARNING):
+        aware = from_patterns(images, lights=SphereLights(lights, leakage=leak), alpha=0.2)
+    assert "polarizers leak" in caplog.text
+    assert "10 degrees" in caplog.text
+    assert error_deg(aware, normals).mean() < 0.3
+    assert 0.9 < np.median(aware.albedo / straight.albedo) < 1.0
+
+
+def test_patterns_that_were_programmed_for_other_directions_are_taken_as_programmed(rng):
+    drawn, normals = sphere(), relief(24)
+    built = unit(drawn + 0.02 * rng.standard_normal(drawn.shape))
+    images = pictures(normals, built, programmed=drawn)
+    right = from_patterns(images, lights=SphereLights(built, programmed=drawn), alpha=0.2)
+    wrong = from_patterns(images, lights=SphereLights(drawn), alpha=0.2)
+    assert error_deg(right, normals).mean() < 0.05
+    assert error_deg(wrong, normals).mean() > 2 * error_deg(right, normals).mean()
+
+
+@pytest.mark.parametrize("component", ["specular", "diffuse"])
+def test_points_away_from_the_middle_see_lights_and_camera_elsewhere(component):
+    """A point 6 mm off the middle, lights at 600 mm and a camera at 300 mm."""
+    lights, normals = sphere(400), relief(16)
+    point = np.array([6.0, -4.0, 0.0])
+    view = unit(np.array([0.0, 0.0, 300.0]) - point)
+    images = pictures(normals, lights, view=view, point_mm=point, distance_mm=600.0, alpha=0.3)
+    kwargs = {"lights": SphereLights(lights, distance_mm=600.0), "component": component}
+    if component == "specular":
+        kwargs["alpha"] = 0.3
+    there = from_patterns(
+        images, view=np.broadcast_to(view, (16, 16, 3)),
+        points_mm=np.broadcast_to(point, (16, 16, 3)), **kwargs,
+    )  # fmt: skip
+    offset = (there.normals - normals).mean(axis=(0, 1))
+    middle = from_patterns(images, **kwargs)
+    before = (middle.normals - normals).mean(axis=(0, 1))
+    assert np.linalg.norm(offset) < 0.3 * np.linalg.norm(before)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 23.0, 90.0])
+@pytest.mark.parametrize("tilt_deg", [0.0, 30.0, 45.0, 60.0])
+def test_a_flat_patch_has_its_normal_or_none_up_to_steep_tilts(tilt_deg, turn_deg):
+    """Across the analyser's axis, light mirrored beyond Brewster's angle tells nothing."""
+    lights = sphere()
+    tilt, turn = np.radians(tilt_deg), np.radians(turn_deg)
+    n = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
+    normals = np.broadcast_to(n, (3, 3, 3))
+    found = from_patterns(
+        pictures(normals, lights, alpha=0.25), lights=SphereLights(lights), alpha=0.25
+    )
+    assert found.valid.all() or tilt_deg >= 45.0
+    assert error_deg(found, normals).max(initial=0.0) < 0.3
+    assert_clean(found)
+
+
+def test_black_skin_has_specular_normals_and_no_diffuse_ones(rng):
+    lights, normals = sphere(), relief(24)
+    images = noisy(pictures(normals, lights, diffuse=0.0, alpha=0.3), SensorNoise(1e-7, 1e-8), rng)
+    kwargs = {"lights": SphereLights(lights), "variance": SensorNoise(1e-7, 1e-8)}
+    found = from_patterns(images, alpha=0.3, **kwargs)
+    assert found.valid.all()
+    assert error_deg(found, normals).mean() < 0.5
+    matte = from_patterns(images, component="diffuse", **kwargs)
+    assert matte.valid.mean() < 0.1  # a signal of three standard errors by chance
+    assert_clean(matte)
+
+
+def test_pictures_without_light_give_no_normals(rng):
+    lights = sphere()
+    dark = {key: np.zeros((5, 4), np.float32) for key in pictures(relief(4), lights)}
+    for images in (dark, noisy(dark, SensorNoise(0.0, 1e-6), rng)):
+        found = from_patterns(images, lights=SphereLights(lights))
+        assert_clean(found)
+        assert found.valid.mean() < 0.3
+    with pytest.raises(GradientError, match="no pixel"):
+        estimate_roughness(dark, lights=SphereLights(lights))
+
+
+def test_saturated_samples_are_left_out_and_the_others_tell_the_normal(scene):
+    lights, normals, images = scene
+    clipped = {key: np.minimum(image, 0.9) for key, image in images.items()}
+    clipped["x", "parallel"][5:9, 5:9] = 0.9  # one pattern: seven are left
+    for name in ("full", "-y", "y"):  # no full, no y: nothing is left
+        clipped[name, "parallel"][20:22, 20] = 0.9
+    clipped["z", "crossed"][30, 30] = np.nan
+    kept = {key: image.copy() for key, image in clipped.items()}
+    found = from_patterns(clipped, lights=SphereLights(lights), alpha=0.2, saturation=0.9)
+    assert_clean(found)
+    assert not found.valid[20:22, 20].any()
+    assert found.valid.sum() == found.valid.size - 2
+    assert error_deg(found, normals).mean() < 0.05
+    assert found.used[6, 6] == 15
+    wrong = from_patterns(clipped, lights=SphereLights(lights), alpha=0.2)
+    patch = (slice(5, 9), slice(5, 9))
+    near = np.sum(wrong.normals[patch] * normals[patch], axis=-1) > np.cos(np.radians(5.0))
+    assert not near.any()
+    for key, image in kept.items():
+        np.testing.assert_array_equal(clipped[key], image)
+
+
+@pytest.mark.parametrize("options", [{}, {"smooth_px": 1.5}, {"wiener": True}])
+def test_a_mask_of_one_pixel_and_pictures_full_of_nan_are_survived(scene, options):
+    lights, normals, images = scene
+    valid = np.zeros((48, 48), bool)
+    valid[7, 9] = True
+    images = {key: image.astype(np.float32) for key, image in images.items()}
+    found = from_patterns(
+        images, lights=SphereLights(lights), alpha=0.2, valid=valid, variance=1e-9, **options
+    )
+    assert_clean(found)
+    np.testing.assert_array_equal(found.valid, valid)
+    assert error_deg(found, normals)[0] < 0.5
+    nothing = {key: np.full((6, 6), np.nan, np.float32) for key in images}
+    found = from_patterns(nothing, lights=SphereLights(lights), variance=1e-9, **options)
+    assert_clean(found)
+    assert not found.valid.any()
+
+
+def test_lobes_beyond_the_horizon_are_no_normals():
+    """What comes back from behind the surface, as from a neighbour's flank, has no normal."""
+    images = {(n, p): np.full((2, 2), 0.5) for n in ("full", "x", "y", "z")
+              for p in ("parallel", "crossed")}  # fmt: skip
+    behind = unit(np.array([0.05, 0.0, -1.0]))
+    for name, w in zip(("full", "x", "y", "z"), (1.0, *(1 + behind) / 2), strict=True):
+        images[name, "parallel"] = images[name, "parallel"] + 0.1 * w
+    found = from_patterns(images, variance=1e-8)
+    assert not found.valid.any()
+    assert_clean(found)
+
+
+@pytest.mark.parametrize("options", [{"smooth_px": 1.5}, {"wiener": True}])
+def test_filters_lower_noise_as_they_say_and_keep_smooth_relief(rng, options):
+    lights = sphere()
+    h = gaussian_filter(rng.standard_normal((96, 96)), 18.0, mode="wrap")
+    down, right = np.gradient(h)
+    slope = 0.12 / np.hypot(down, right).mean()
+    normals = unit(np.stack([-slope * right, slope * down, np.ones_like(h)], axis=-1))
+    noise = SensorNoise(2e-6, 2e-7)
+    images = noisy(pictures(normals, lights, alpha=0.3), noise, rng)
+    kwargs = {"lights": SphereLights(lights), "alpha": 0.3, "variance": noise}
+    plain, found = from_patterns(images, **kwargs), from_patterns(images, **options, **kwargs)
+    inner = (slice(8, -8), slice(8, -8))
+
+    def rms(maps):
+        error = angular_error_rad(maps.normals[inner], normals[inner])
+        return float(np.sqrt(np.mean(error**2)))
+
+    assert rms(found) < 0.35 * rms(plain)
+    announced = float(np.sqrt(np.mean(found.stderr_rad[inner] ** 2)))
+    # neighbours share their noise: some 6000 pixels / 30 of them are free; 4 sigma is 0.4
+    assert abs((rms(found) / announced) ** 2 - 1.0) < 0.4
+
+
+def test_tiles_of_rows_make_no_seams(scene, monkeypatch):
+    lights, _, images = scene
+    kwargs = {"lights": SphereLights(lights), "alpha": 0.2, "smooth_px": 1.0, "variance": 1e-8}
+    whole = from_patterns(images, **kwargs)
+    monkeypatch.setattr("reconstruction.gradient_moments.TILE_PIXELS", 48 * 7)
+    tiled = from_patterns(images, **kwargs)
+    np.testing.assert_array_equal(whole.normals, tiled.normals)
+    np.testing.assert_array_equal(whole.stderr_rad, tiled.stderr_rad)
+
+
+def test_channels_are_added_for_mirrored_light_and_kept_apart_for_diffuse(scene):
+    lights, _, images = scene
+    weights = np.array([0.5, 1.0, 0.2])
+    color = {key: image[..., None] * weights for key, image in images.items()}
+    one = from_patterns(images, lights=SphereLights(lights), alpha=0.2, variance=1e-8)
+    found = from_patterns(color, lights=SphereLights(lights), alpha=0.2, variance=1e-8)
+    np.testing.assert_allclose(found.normals, one.normals, atol=1e-6)
+    matte = from_patterns(color, component="diffuse")
+    assert matte.normals.shape == (48, 48, 3, 3)
+    assert matte.valid.shape == (48, 48, 3)
+    single = from_patterns({k: v[..., 1] for k, v in color.items()}, component="diffuse")
+    np.testing.assert_array_equal(matte.normals[:, :, 1], single.normals)
+
+
+def test_types_are_kept(scene):
+    _, _, images = scene
+    assert from_patterns(images).normals.dtype == np.float64
+    small = {key: image.astype(np.float32) for key, image in images.items()}
+    assert from_patterns(small).normals.dtype == np.float32
+
+
+def test_what_does_not_fit_is_refused_by_name(scene):
+    lights, _, images = scene
+    told = SphereLights(lights)
+    with pytest.raises(GradientError, match="did you mean full"):
+        from_patterns({**images, ("ful", "parallel"): images["full", "parallel"]})
+    with pytest.raises(GradientError, match="shape"):
+        from_patterns({**images, ("full", "parallel"): np.zeros((2, 2))})
+    with pytest.raises(GradientError, match="variance"):
+        from_patterns(images, variance={("full", "parallel"): 1.0})
+    with pytest.raises(GradientError, match="without lights"):
+        from_patterns(images, alpha=0.2)
+    with pytest.raises(SphereLightsError, match="alpha"):
+        from_patterns(images, lights=told, alpha=0.0)
+    with pytest.raises(GradientError, match="finite distance"):
+        from_patterns(images, lights=told, points_mm=np.zeros((48, 48, 2)))
+    with pytest.raises(GradientError, match="noise is unknown"):
+        from_patterns(only(images, ("full", "x", "y", "z")), wiener=True)
+    with pytest.raises(SphereLightsError, match="exchanged"):
+        SphereLights(lights, leakage=np.full(len(lights), 1.2))
+    with pytest.raises(SphereLightsError, match=r"directions\[2\]"):
+        SphereLights(np.diag([1.0, 1.0, 3.0]))
+    with pytest.raises(SphereLightsError, match="own ray"):
+        SphereLights(lights, polarizers=lights)
