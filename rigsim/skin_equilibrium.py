@@ -26,6 +26,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from numba import get_num_threads, set_num_threads
 from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import brentq
@@ -33,13 +34,19 @@ from scipy.optimize import brentq
 from rigsim.skin_stretch_kernels import bending, membrane
 
 Float64Array = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
 ComplexArray = NDArray[np.complex128]
+Pairs = deque[tuple[Float32Array, Float32Array, float]]
 
 
 SQUEEZED_UM: Final = 10.0
 """Depth of tissue that resists the squeeze of a furrow beyond the linear half-space, um. As in a
 compressible neo-Hookean solid, -log J keeps neighbouring points from changing sides; this project's
 choice, small beside the wavelengths of the relief."""
+
+
+PARALLEL_NODES: Final = 400_000
+"""Patches with fewer nodes are computed by one thread."""
 
 
 class EquilibriumError(RuntimeError):
@@ -100,7 +107,6 @@ class LayerProblem:
     """Mean deformation gradient F, (2, 2)."""
     poisson: float
     """Of the tissue, 0 to 0.5."""
-    workers: int = 2
     rise: float = field(init=False)
     """Factor z of a relief without a layer."""
     _scale: tuple[Float64Array, Float64Array, Float64Array] = field(init=False, repr=False)
@@ -109,9 +115,10 @@ class LayerProblem:
     )
     _unit: tuple[Float64Array, Float64Array] = field(init=False, repr=False)
     _weight: Float64Array = field(init=False, repr=False)
-    _pull: Float64Array = field(init=False, repr=False)
+    _traction: Float64Array = field(init=False, repr=False)
     _moment: Float64Array = field(init=False, repr=False)
     _bulk: float = field(init=False, repr=False)
+    _workers: int = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         shape = self.neutral_um.shape
@@ -120,12 +127,20 @@ class LayerProblem:
         if np.linalg.det(self.gradient) <= 0.0:
             raise ValueError("gradient: expected a positive determinant")
         self._moment = np.empty(shape)
+        # Small patches are quicker without waiting for other threads.
+        self._workers = 1 if self.neutral_um.size < PARALLEL_NODES else min(2, get_num_threads())
         left, stretches, right = np.linalg.svd(self.gradient)
         self.rise = surface_rise(float(stretches[0]), float(stretches[1]), self.poisson)
         shear = 0.5 / (1.0 + self.poisson)
         self._bulk = shear * SQUEEZED_UM
         nominal = shear * (stretches - self.rise**2 / stretches)
-        self._pull = (left * nominal) @ right
+        pull = (left * nominal) @ right
+        h = self.neutral_um
+        slope_x = (np.roll(h, -1, 1) - np.roll(h, 1, 1)) / (2.0 * self.texel_um)
+        slope_y = (np.roll(h, -1, 0) - np.roll(h, 1, 0)) / (2.0 * self.texel_um)
+        self._traction = np.stack(
+            [pull[axis, 0] * slope_x + pull[axis, 1] * slope_y for axis in range(2)]
+        )
         self._prepare(shear)
 
     def _prepare(self, shear: float) -> None:
@@ -190,16 +205,19 @@ class LayerProblem:
 
     def _spread(self, q: ComplexArray) -> ComplexArray:
         l, t = self._scale[0] * q[0], self._scale[1] * q[1]  # noqa: E741
+        l *= 1j  # noqa: E741
+        t *= 1j
         ux, uy = self._unit
-        return np.stack([1j * (ux * l - uy * t), 1j * (uy * l + ux * t), self._scale[2] * q[2]])
+        return np.stack([ux * l - uy * t, uy * l + ux * t, self._scale[2] * q[2]])
 
     def state(self, q: ComplexArray) -> Float64Array:
         """Return the state (u, w) of scaled Fourier coefficients of its deviation from affine."""
-        field_ = fft.irfft2(
-            self._spread(q), s=self.neutral_um.shape, norm="forward", workers=self.workers
-        )
-        field_[2] += self.rise * self.neutral_um
-        return field_
+        return self._state(self._spread(q))
+
+    def _state(self, spread: ComplexArray) -> Float64Array:
+        state = fft.irfft2(spread, s=self.neutral_um.shape, norm="forward", workers=self._workers)
+        state[2] += self.rise * self.neutral_um
+        return np.asarray(state)
 
     def energy(self, state: Float64Array) -> tuple[float, Float64Array]:
         """Return mean energy per area and its derivative by every node times their number.
@@ -211,14 +229,25 @@ class LayerProblem:
         """
         local, force = self._local(state)
         deviation = state - self.affine()
-        hat = fft.rfft2(deviation, norm="forward", workers=self.workers)
+        hat = fft.rfft2(deviation, norm="forward", workers=self._workers)
         elastic, pulled = self._tissue(hat)
-        force += fft.irfft2(pulled, s=self.neutral_um.shape, norm="forward", workers=self.workers)
+        force += fft.irfft2(pulled, s=self.neutral_um.shape, norm="forward", workers=self._workers)
         return local + elastic, force
 
     def _local(self, state: Float64Array) -> tuple[float, Float64Array]:
         """Return energy and forces of the layer, and of the tissue's stress on tilted facets."""
         force = np.zeros_like(state)
+        before = get_num_threads()
+        set_num_threads(self._workers)
+        try:
+            total = self._layer(state, force)
+        finally:
+            set_num_threads(before)
+        total -= float(np.vdot(self._traction, state[:2]))
+        force[:2] -= self._traction
+        return float(total) / self.neutral_um.size, force
+
+    def _layer(self, state: Float64Array, force: Float64Array) -> float:
         total = membrane(
             state,
             self.neutral_um,
@@ -231,14 +260,7 @@ class LayerProblem:
         total += bending(
             state[2], self.neutral_um, self.bending_um3, self.texel_um, self._moment, force[2]
         )
-        h = self.neutral_um
-        slope_x = (np.roll(h, -1, 1) - np.roll(h, 1, 1)) / (2.0 * self.texel_um)
-        slope_y = (np.roll(h, -1, 0) - np.roll(h, 1, 0)) / (2.0 * self.texel_um)
-        for axis in range(2):
-            traction = self._pull[axis, 0] * slope_x + self._pull[axis, 1] * slope_y
-            total -= float(np.vdot(traction, state[axis]))
-            force[axis] -= traction
-        return float(total) / h.size, force
+        return float(total)
 
     def _tissue(self, hat: ComplexArray) -> tuple[float, ComplexArray]:
         """Return the half-space's energy and its forces, in Fourier space."""
@@ -255,9 +277,10 @@ class LayerProblem:
 
     def value(self, q: ComplexArray) -> tuple[float, ComplexArray]:
         """Return energy and its derivative by scaled coefficients (3, N, M // 2 + 1)."""
-        local, force = self._local(self.state(q))
-        elastic, pulled = self._tissue(self._spread(q))
-        hat = fft.rfft2(force, norm="forward", workers=self.workers)
+        spread = self._spread(q)
+        local, force = self._local(self._state(spread))
+        elastic, pulled = self._tissue(spread)
+        hat = fft.rfft2(force, norm="forward", workers=self._workers)
         hat += pulled
         hat *= self._weight
         ux, uy = self._unit
@@ -310,7 +333,7 @@ def find_equilibrium(
     first = _norm(slope)
     energies, residuals = [energy], [1.0]
     evaluations = 1
-    pairs: deque[tuple[NDArray[np.complex64], NDArray[np.complex64], float]] = deque(maxlen=memory)
+    pairs: Pairs = deque(maxlen=memory)
     # Below this the sum's rounding is what is left: nothing pulls.
     if first < 1e-12 * (1.0 + float(problem.membrane_um.mean())):
         return problem.state(q), Convergence(1, 0.0, (energy,), (0.0,))
@@ -340,7 +363,7 @@ def find_equilibrium(
         step, turn = length * way, then - slope
         bend = _dot(step, turn)
         if bend > 1e-12 * _norm(step) * _norm(turn):
-            pairs.append((step.astype(np.complex64), turn.astype(np.complex64), bend))
+            pairs.append((_single(step), _single(turn), bend))
         q, energy, slope = ahead, got, then
         energies.append(energy)
         residuals.append(_norm(slope) / first)
@@ -353,21 +376,25 @@ def find_equilibrium(
     )
 
 
-def _direction(
-    slope: ComplexArray, pairs: deque[tuple[NDArray[np.complex64], NDArray[np.complex64], float]]
-) -> ComplexArray:
-    way = -slope
+def _direction(slope: ComplexArray, pairs: Pairs) -> ComplexArray:
+    """Return the quasi-Newton step by the two-loop recursion, in single precision."""
+    scale = max(_norm(slope), 1e-300)
+    way = _single(slope / -scale)
     shares = []
     for step, turn, bend in reversed(pairs):
-        share = _dot(step, way) / bend
-        way -= share * turn
+        share = float(np.dot(step, way)) / bend
+        way -= np.float32(share) * turn
         shares.append(share)
     if pairs:
         _, turn, bend = pairs[-1]
-        way *= bend / _dot(turn, turn)
+        way *= np.float32(bend / float(np.dot(turn, turn)))
     for (step, turn, bend), share in zip(pairs, reversed(shares), strict=True):
-        way += (share - _dot(turn, way) / bend) * step
-    return way
+        way += np.float32(share - float(np.dot(turn, way)) / bend) * step
+    return np.asarray(way.view(np.complex64).reshape(slope.shape) * scale, np.complex128)
+
+
+def _single(a: ComplexArray) -> Float32Array:
+    return a.astype(np.complex64).reshape(-1).view(np.float32)
 
 
 def _shorter(energy: float, along: float, got: float, length: float) -> float:

@@ -24,7 +24,7 @@ Float64Array = NDArray[np.float64]
 Compensation = Literal["volume", "none"] | float
 
 STRETCH_RANGE: Final = (0.5, 2.0)
-TOLERANCE: Final = 1e-3
+TOLERANCE: Final = 5e-3
 """Out-of-balance force, relative to that of a relief without a layer, that is accepted."""
 BLEND_UM: Final = 320.0
 """Beyond its border the patch goes on as its mirror image, over so much at least; um."""
@@ -78,6 +78,7 @@ class StretchedSkin:
     """The same before the stretch."""
     convergence: Convergence
     _coefficients: Float64Array = field(repr=False)
+    _pigment: Float64Array = field(repr=False)
 
     @property
     def membrane_strain(self) -> float:
@@ -98,8 +99,8 @@ class StretchedSkin:
         Returns
         -------
         SurfaceSample
-            Height by cubic B-splines, so that slopes are continuous and exactly those of the
-            height; albedo and alpha bilinear.
+            Height and albedo by cubic B-splines, so that slopes are continuous and exactly those
+            of the height; alpha bilinear.
         """
         x, y = np.broadcast_arrays(np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64))
         count, texel = self._coefficients.shape[0], self.skin.texel_um
@@ -115,9 +116,10 @@ class StretchedSkin:
         # Rows grow downwards, Y upwards; inverse already holds texels per mm, heights are um.
         slope_x = 1e-3 * (by_column * inverse[0, 0] - by_row * inverse[1, 0])
         slope_y = 1e-3 * (by_column * inverse[0, 1] - by_row * inverse[1, 1])
-        albedo, alpha = (
-            np.where(inside, _bilinear(m, row, column), 0.0) for m in (self.albedo, self.alpha)
-        )
+        albedo = np.empty(row.size)
+        spline(self._pigment, row, column, False, albedo, albedo, albedo)
+        albedo = np.where(inside, albedo, 0.0)
+        alpha = np.where(inside, _bilinear(self.alpha, row, column), 0.0)
         maps = [
             np.asarray(values.reshape(x.shape), np.float32)
             for values in (height, slope_x, slope_y, albedo, alpha)
@@ -285,7 +287,7 @@ def deform(
         return StretchedSkin(
             skin, s, t, angle_deg, gradient, skin.height_um, skin.albedo, skin.alpha, still,
             before, before, Convergence(0, 0.0, (), ()),
-            spline_filter(skin.height_um.astype(np.float64), mode="mirror"),
+            _coefficients(skin.height_um), _coefficients(skin.albedo),
         )  # fmt: skip
     count = skin.height_um.shape[0]
     mean = float(skin.height_um.mean())
@@ -296,11 +298,12 @@ def deform(
     spline(_filtered(state[2]), row, column, False, height, height, height)
     # Rows of the equilibrium grow with y.
     height = height.reshape(count, count)[::-1] + problem.rise * mean
-    inner = (count - 1) - (row - _MARGIN), column - _MARGIN
-    albedo, alpha = (
-        np.asarray(_bilinear(m, *inner).reshape(count, count)[::-1], np.float32)
-        for m in (skin.albedo, skin.alpha)
-    )
+    last = count - 1.0
+    inner = np.clip(last - (row - _MARGIN), 0.0, last), np.clip(column - _MARGIN, 0.0, last)
+    tint = np.empty(row.size)
+    spline(_coefficients(skin.albedo), *inner, False, tint, tint, tint)
+    albedo = tint.reshape(count, count)[::-1]
+    alpha = _bilinear(skin.alpha, *inner).reshape(count, count)[::-1]
     return StretchedSkin(
         skin=skin,
         stretch_s=s,
@@ -308,13 +311,14 @@ def deform(
         angle_deg=angle_deg,
         gradient=gradient,
         height_um=np.asarray(height, np.float32),
-        albedo=albedo,
-        alpha=alpha,
+        albedo=np.asarray(albedo, np.float32),
+        alpha=np.asarray(alpha, np.float32),
         displacement_um=np.asarray(np.moveaxis(state[:2, :count, :count], 0, -1)[::-1], np.float32),
         excess_length=_excess_length(height, skin.texel_um, gradient, angle_deg),
         neutral_excess_length=before,
         convergence=convergence,
-        _coefficients=spline_filter(height, mode="mirror"),
+        _coefficients=_coefficients(height),
+        _pigment=_coefficients(albedo),
     )
 
 
@@ -372,6 +376,10 @@ def _periodic(values: Float64Array, texel_um: float) -> Float64Array:
     return np.ascontiguousarray(values)
 
 
+def _coefficients(values: NDArray[np.floating]) -> Float64Array:
+    return np.asarray(spline_filter(np.asarray(values, np.float64), mode="mirror"))
+
+
 def _filtered(values: Float64Array) -> Float64Array:
     """Return spline coefficients of a periodic field with a margin all around."""
     return np.asarray(spline_filter(np.pad(values, _MARGIN, mode="wrap"), mode="mirror"))
@@ -401,7 +409,7 @@ def _pull_back(
         spline(up, row, column, True, b, br, bc)
         miss_c, miss_r = column + a - goal_column, row + b - goal_row
         far = max(float(np.abs(miss_c).max()), float(np.abs(miss_r).max()))
-        if not far > 1e-7:
+        if not far > 1e-5:
             break
         ac += 1.0
         br += 1.0
