@@ -74,12 +74,16 @@ class EyeGuard:
 
     def rms(self, light: Iterable[Lit]) -> float:
         """Return the rms of the 3 to 65 Hz part over the mean, from first light to last; or 0."""
-        pulses = [pulse for pulse in light if pulse.off_s > pulse.on_s]
-        if not pulses:
+        # LEDs that are lit together are one light to the eye
+        lit: dict[tuple[float, float], float] = {}
+        for pulse in light:
+            if pulse.off_s > pulse.on_s:
+                when = (pulse.on_s, pulse.off_s)
+                lit[when] = lit.get(when, 0.0) + float(self.weights[pulse.led]) * pulse.level
+        if not lit:
             return 0.0
-        on = np.array([pulse.on_s for pulse in pulses])
-        off = np.array([pulse.off_s for pulse in pulses])
-        weight = np.array([self.weights[pulse.led] * pulse.level for pulse in pulses])
+        on, off = np.array(list(lit)).T
+        weight = np.array(list(lit.values()))
         start, span = float(on.min()), float(off.max() - on.min())
         mean = float((weight * (off - on)).sum()) / span
         if span < RMS_FROM_S or mean <= 0.0:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
@@ -192,26 +191,19 @@ class LedBank:
         if led in self._lit and self._lit[led][1] < now:
             # what goes on is replaced by what is asked for, but what it has given counts
             past.append(Lit(led, self._lit[led][0], self._lit[led][1], now))
-        pulses = sorted([*past, *new], key=lambda pulse: pulse.on_s)
-        ends = sorted(pulse.off_s for pulse in pulses)
+        pulses = [*past, *new]
+        on = np.array([pulse.on_s for pulse in pulses])
+        off = np.array([pulse.off_s for pulse in pulses])
+        level = np.array([pulse.level for pulse in pulses])
+        times = np.concatenate([on, off])
+        order = np.argsort(times, kind="stable")
+        times, rate = times[order], np.cumsum(np.concatenate([level, -level])[order])
+        given = np.concatenate([[0.0], np.cumsum(rate[:-1] * np.diff(times))])
         # the mean is greatest where light ends, or where a window's far edge leaves darkness
-        edges = {pulse.off_s for pulse in new}
-        edges |= {pulse.on_s + window for pulse in pulses} | {
-            pulse.off_s + window for pulse in past
-        }
-        last, first = max(pulse.off_s for pulse in new), min(pulse.on_s for pulse in new)
-        most = 0.0
-        for end in edges:
-            if not first < end <= last:
-                continue
-            begin = bisect_right(ends, end - window)
-            total = sum(
-                pulse.level * max(0.0, min(pulse.off_s, end) - max(pulse.on_s, end - window))
-                for pulse in pulses[begin:]
-                if pulse.on_s < end
-            )
-            most = max(most, total / window)
-        return most
+        ends = np.concatenate([off[len(past) :], on + window, off[: len(past)] + window])
+        ends = ends[(ends > on[len(past) :].min()) & (ends <= off[len(past) :].max())]
+        mean = np.interp(ends, times, given) - np.interp(ends - window, times, given)
+        return float(mean.max()) / window
 
     def _heat_after(self, led: int, new: Sequence[Lit], now: float) -> float:
         """Return the highest temperature that an LED will reach."""

@@ -1,0 +1,79 @@
+"""A host of sphere and caliper that is killed or freezes: dark and let go within the lease."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from capture.rig import load_rig
+from rigsim.serve import serve
+
+RIG = load_rig("gradient").cropped(16)
+LEASE_S = 0.5
+# the operating system's scheduling on a busy machine; the boxes themselves are exact
+MARGIN_S = 0.25
+
+HOST = """
+import sys
+from capture.devices.caliper import CaliperBox
+from capture.devices.gradient_sphere import GradientSphereBox, PatternRow
+from capture.devices.port import Port
+
+sphere, caliper = GradientSphereBox(Port(sys.argv[1])), CaliperBox(Port(sys.argv[2]))
+for box in (sphere, caliper):
+    box.set_lease(float(sys.argv[3]))
+sphere.set_eyes("closed")
+sphere.load([PatternRow("x", 0.0, 0.2, 0.2, 1)] * 60)
+caliper.set_force_limit(5.0)
+caliper.arm()
+caliper.home()
+caliper.attach()
+caliper.port.ask("CAL:STEP:ABS 2")
+sphere.arm()
+sphere.arm_scan(60)
+caliper.force_n()
+sphere.trigger("killed")
+while True:
+    caliper.force_n()
+    if sphere.listen(0.1):
+        print("stepping", flush=True)
+"""
+
+
+@pytest.mark.parametrize("transport", ["pty", "tcp"])
+@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])
+def test_a_host_that_dies_leaves_the_sphere_dark_and_the_skin_free_within_the_lease(
+    transport, blow
+):
+    with serve(RIG, pty=transport == "pty") as served:
+        world = served.world
+        addresses = [served.addresses[name] for name in ("gradient_sphere", "caliper")]
+        host = subprocess.Popen(
+            [sys.executable, "-c", HOST, *addresses, str(LEASE_S)],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        try:
+            for _ in range(2):
+                assert host.stdout.readline() == "stepping\n"
+            sphere, caliper = world.box("gradient_sphere"), world.box("caliper")
+            assert sphere.device.running
+            assert world.skin.state.attached
+            host.send_signal(blow)
+            struck_s = world.now
+            while world.skin.state.attached or sphere.device.lit:
+                assert world.now < struck_s + 5.0
+                served.wait(0.01)
+            for box in (sphere, caliper):
+                assert (box.armed, box.tripped) == (False, True)
+            dark_s, (free_s, state) = world.patterns[-1].t_off_s, world.grips[-1]
+            print(f"dark {1e3 * (dark_s - struck_s):.0f} ms after, free {free_s - struck_s:.3f} s")
+            assert max(dark_s, free_s) - struck_s <= LEASE_S + MARGIN_S
+            assert (state.attached, state.stretch) == (False, 1.0)
+            grips = len(world.grips)
+            served.wait(0.2)
+            assert len(world.grips) == grips
+        finally:
+            host.kill()
+            host.wait()
+            host.stdout.close()
