@@ -354,6 +354,10 @@ class GradientScene:
                 )
         return expose(light, sensor=self._sensor, rng=rng, exposure_s=exposure_s)
 
+    def forget(self) -> None:
+        """Drop the pictures that are kept, which the subject's states are made again from."""
+        self._pictures.clear()
+
     # truth --------------------------------------------------------------------------------------
 
     def surface(
