@@ -23,6 +23,7 @@ Nagano et al. 2015, ACM Trans. Graph. 34(4), 109. doi:10.1145/2766894
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -32,7 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.microstructure import ALPHA_LIMITS
 from reconstruction import kernel_fit_kernels as kernels
 from reconstruction import kernel_search, normal_histogram
-from reconstruction.kernel_search import Buckets, Relief
+from reconstruction.kernel_search import Buckets, Found, Relief
 
 Floats = NDArray[np.float64]
 Axis = Literal["x", "y", 0, 1]
@@ -47,6 +48,10 @@ DRAWS = 200
 """Histograms drawn for the standard errors."""
 MOST_DRAWN = 192
 """Nearly-as-good kernels among which each draw finds its best."""
+DRAWN_WITHIN = 3.0
+"""They are taken from within so many standard errors of the distance."""
+STARTS = ((0.0, 1.0), (0.6, 15.0), (-0.6, 15.0), (1.0, 30.0), (-1.5, 8.0))
+"""alpha and sigma_um across the jaws that fits of both axes begin with."""
 
 
 class KernelFitError(ValueError):
@@ -80,9 +85,9 @@ class KernelFit:
     alpha_refined, sigma_refined_um, distance_refined : float
         The best on a grid ten times finer around the best.
     alpha_stderr, sigma_stderr_um : float
-        Standard deviations of the best among `near_best` over histograms drawn anew: what another
-        patch of the same skin and size would change; at least a grid step over sqrt(12).
-        Infinite where not `valid`.
+        How far the best moves when both histograms are drawn anew, with the scatter that blocks
+        of the map show: what another patch of the same skin and size would change; at least a
+        grid step over sqrt(12). Infinite where not `valid`.
     alpha_interval, sigma_interval_um : tuple of float
         Least and largest of `near_best`.
     at_edge : bool
@@ -311,8 +316,8 @@ class TwoAxisFit:
     rounds : int
         Pairs of fits that were made.
     settled : bool
-        Neither kernel changed in the last round; the pair is then best along both axes, though
-        another pair far away may be better.
+        Neither kernel changed in the last round: each is the best beside the other. A pair far
+        away that no start leads to may be better.
     """
 
     along: KernelFit
@@ -332,6 +337,7 @@ def fit_two_axes(
     pixel_um: float | tuple[float, float],
     valid: ArrayLike | None = None,
     most_rounds: int = 6,
+    starts: Sequence[tuple[float, float]] = STARTS,
     **settings: Any,
 ) -> TwoAxisFit:
     """Fit (alpha, sigma) along the jaws and across them, in turn until neither changes.
@@ -341,33 +347,43 @@ def fit_two_axes(
     neutral_height_um, target_histogram, stretch, stretch_across, axis, pixel_um, valid
         As of :func:`fit_kernel`; the axis is that of the jaws.
     most_rounds : int
-        Rounds of one fit along and one across, at least 1.
+        Rounds of one fit along and one across, at least 1, from each start.
+    starts : sequence of (float, float)
+        alpha and sigma_um across the jaws to begin with, tried in turn until the distance is
+        below that of chance (`KernelFit.floor`); the least distance is taken.
     settings
         Others of :func:`fit_kernel`.
     """
-    if most_rounds < 1:
-        raise KernelFitError(f"most_rounds: got {most_rounds}, expected at least 1")
+    if most_rounds < 1 or not starts:
+        raise KernelFitError(f"most_rounds: got {most_rounds}, expected at least 1, and a start")
     other: Axis = "x" if axis in ("y", 0) else "y"
-    kernels_: list[tuple[float, float]] = [(0.0, 1.0), (0.0, 1.0)]
-    fits: list[KernelFit] = []
-    before: list[tuple[float, float]] = []
-    rounds = 0
-    while rounds < most_rounds and kernels_ != before:
-        before = list(kernels_)
-        rounds += 1
-        fits = []
-        for turn, (own, across) in enumerate(((axis, other), (other, axis))):
-            ratios = (stretch, stretch_across) if turn == 0 else (stretch_across, stretch)
-            relief = convolved(
-                neutral_height_um, *kernels_[1 - turn], axis=across, pixel_um=pixel_um, valid=valid
-            )
-            fit = fit_kernel(
-                relief, target_histogram, stretch=ratios[0], stretch_across=ratios[1], axis=own,
-                pixel_um=pixel_um, valid=valid, **settings,
-            )  # fmt: skip
-            kernels_[turn] = fit.alpha, fit.sigma_um
-            fits.append(fit)
-    return TwoAxisFit(fits[0], fits[1], fits[1].distance, rounds, kernels_ == before)
+    best: TwoAxisFit | None = None
+    for start in starts:
+        pair = [(0.0, 1.0), (float(start[0]), float(start[1]))]
+        before: list[tuple[float, float]] = []
+        fits: list[KernelFit] = []
+        rounds = 0
+        while rounds < most_rounds and pair != before:
+            before, fits = list(pair), []
+            rounds += 1
+            for turn, (own, across) in enumerate(((axis, other), (other, axis))):
+                ratios = (stretch, stretch_across) if turn == 0 else (stretch_across, stretch)
+                relief = convolved(
+                    neutral_height_um, *pair[1 - turn], axis=across, pixel_um=pixel_um, valid=valid
+                )
+                fit = fit_kernel(
+                    relief, target_histogram, stretch=ratios[0], stretch_across=ratios[1],
+                    axis=own, pixel_um=pixel_um, valid=valid, **settings,
+                )  # fmt: skip
+                pair[turn] = fit.alpha, fit.sigma_um
+                fits.append(fit)
+        found = TwoAxisFit(fits[0], fits[1], fits[1].distance, rounds, pair == before)
+        if best is None or found.distance < best.distance:
+            best = found
+        if best.distance < best.across.floor:
+            break
+    assert best is not None  # noqa: S101
+    return best
 
 
 def convolved(
@@ -428,14 +444,23 @@ def fit_relief(
 ) -> KernelFit:
     """Fit the kernel of a prepared relief; see :func:`fit_kernel`."""
     rng = np.random.default_rng(seed)
-    start = relief.along, relief.across
-    samples = relief.places.size
     if search == "exhaustive":
         found = kernel_search.exhaustive(relief, buckets, alphas, sigmas_um)
     else:
         found = kernel_search.hierarchical(
             relief, buckets, alphas, sigmas_um, first_sample=first_sample, rng=rng
         )
+    with kernels.threads_for(500 * relief.places.size):
+        return _described(relief, buckets, alphas, sigmas_um, found, search, target_samples, rng)
+
+
+def _described(
+    relief: Relief, buckets: Buckets, alphas: Floats, sigmas_um: Floats, found: Found, search: str,
+    target_samples: float | None, rng: np.random.Generator,
+) -> KernelFit:  # fmt: skip
+    """Return what a search found, with its noise, its valley and a finer minimum."""
+    start = relief.along, relief.across
+    samples = relief.places.size
     still = np.zeros(samples, np.float32)
     before = float(buckets.distances(start, (still, still), np.zeros(1))[0])
     i, j = found.best
@@ -446,8 +471,11 @@ def fit_relief(
     theirs = effective if target_samples is None else float(target_samples)
     if not theirs > 0:
         raise KernelFitError(f"target_samples: got {target_samples}, expected above 0")
-    # the sum of signs over samples has a variance of at most 1 a sample
-    noise = math.sqrt(1.0 / effective + 1.0 / theirs)
+    residuals = _block_residuals(counts)
+    signs = np.sign(counts.sum(axis=0) / samples - buckets.target)
+    # a sum of signs has a variance of at most 1 an independent sample; or what blocks show
+    own = max(1.0 / effective, float(np.sum((residuals @ signs) ** 2)))
+    noise = math.sqrt(own * (1.0 + effective / theirs))
     floor = normal_histogram.noise_floor(buckets.target, effective, theirs)
     near = _near_best(found.distance, alphas, sigmas_um, (i, j), noise)
     reason = ""
@@ -461,7 +489,9 @@ def fit_relief(
     stderr = (math.inf, math.inf)
     if not reason:
         refined = _refined(relief, buckets, alphas, sigmas_um, (i, j), distance)
-        stderr = _stderr(relief, buckets, near, effective, theirs, rng)
+        wide = _near_best(found.distance, alphas, sigmas_um, (i, j), DRAWN_WITHIN * noise)
+        scatter = residuals * math.sqrt(1.0 + effective / theirs)
+        stderr = _stderr(relief, buckets, wide, scatter, rng)
         least = [float(np.diff(g).min()) / math.sqrt(12) if g.size > 1 else 0.0
                  for g in (alphas, sigmas_um)]  # fmt: skip
         stderr = (math.hypot(stderr[0], least[0]), math.hypot(stderr[1], least[1]))
@@ -536,15 +566,23 @@ def _block_counts(relief: Relief, buckets: Buckets, alpha: float, sigma_um: floa
     )
 
 
-def _stderr(
-    relief: Relief, buckets: Buckets, near: Floats, effective: float, theirs: float,
-    rng: np.random.Generator,
-) -> tuple[float, float]:  # fmt: skip
-    """Return standard deviations of the best of `near` over histograms drawn anew.
+def _block_residuals(counts: Floats) -> Floats:
+    """Return each block's part in the error of the shares, (blocks, buckets).
 
-    Both histograms are drawn with the scatter of their effective numbers of samples; all kernels
-    of a draw share the scatter, by the buckets of the best one.
+    With independent unit normal factors on the blocks, the sum scatters as the shares do over
+    other patches of the same skin, neighbouring buckets together.
     """
+    sizes = counts.sum(axis=1)
+    counts, sizes = counts[sizes > 0], sizes[sizes > 0]
+    n = len(sizes)
+    p = counts.sum(axis=0) / sizes.sum()
+    return (counts - sizes[:, None] * p) / sizes.sum() * math.sqrt(n / max(n - 1, 1))
+
+
+def _stderr(
+    relief: Relief, buckets: Buckets, near: Floats, residuals: Floats, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Return root mean square ways of the best of `near` from its first over drawn histograms."""
     some = near[np.unique(np.linspace(0, len(near) - 1, MOST_DRAWN).round().astype(int))]
     shares = np.empty((len(some), buckets.target.size))
     for sigma in np.unique(some[:, 1]):
@@ -554,11 +592,11 @@ def _stderr(
         )
         shares[rows] = counts.sum(axis=0) / relief.places.size
     gap = shares - buckets.target
-    used = np.flatnonzero(gap.any(axis=0) | (shares[0] > 0))
-    gap = gap[:, used]
-    scale = np.sqrt(0.5 * (shares[0, used] + buckets.target[used]) * (1 / effective + 1 / theirs))
+    used = np.flatnonzero(gap.any(axis=0) | residuals.any(axis=0))
+    gap, residuals = gap[:, used], residuals[:, used]
     best = np.empty(DRAWS, int)
     for draw in range(DRAWS):
-        scatter = scale * rng.standard_normal(used.size)
+        scatter = rng.standard_normal(len(residuals)) @ residuals
         best[draw] = int(np.argmin(np.abs(gap + scatter).sum(axis=1)))
-    return float(some[best, 0].std()), float(some[best, 1].std())
+    ways = some[best, :2] - some[0, :2]
+    return float(np.sqrt(np.mean(ways[:, 0] ** 2))), float(np.sqrt(np.mean(ways[:, 1] ** 2)))

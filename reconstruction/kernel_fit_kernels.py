@@ -7,6 +7,8 @@ so that a result depends neither on the number of threads nor on where a sample 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numba
@@ -19,9 +21,25 @@ MOST_THREADS = 8
 """Each thread holds a histogram of every alpha (5 MB at 301 and 64 x 64)."""
 
 
+SMALL = 100_000_000
+"""Normals computed in all, below which one thread is sooner done than several are brought in."""
+
+
 def threads() -> int:
     """Return into how many parts the samples are cut."""
     return min(int(numba.get_num_threads()), MOST_THREADS)
+
+
+@contextmanager
+def threads_for(work: int) -> Iterator[None]:
+    """Keep to one thread while ``work`` normals are computed, if they are few."""
+    before = numba.get_num_threads()
+    if work < SMALL:
+        numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

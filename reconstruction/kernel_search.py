@@ -172,8 +172,9 @@ def exhaustive(relief: Relief, buckets: Buckets, alphas: Floats, sigmas_um: Floa
     """Evaluate all kernels of the grid on all pixels."""
     start = relief.along, relief.across
     distance = np.empty((sigmas_um.size, alphas.size))
-    for i, sigma in enumerate(sigmas_um):
-        distance[i] = buckets.distances(start, relief.change(float(sigma)), alphas)
+    with kernels.threads_for(relief.places.size * distance.size):
+        for i, sigma in enumerate(sigmas_um):
+            distance[i] = buckets.distances(start, relief.change(float(sigma)), alphas)
     best = gentlest(distance, alphas, sigmas_um)
     return Found(distance, np.ones(distance.shape, bool), best, float(distance.size))
 
@@ -206,7 +207,8 @@ def hierarchical(
     sizes = [first_sample]
     while sizes[-1] * GROWTH < LARGEST_SAMPLE * pixels:
         sizes.append(sizes[-1] * GROWTH)
-    return _Race(relief, buckets, alphas, sigmas_um).run(sizes, rng)
+    with kernels.threads_for(first_sample * alphas.size * sigmas_um.size):
+        return _Race(relief, buckets, alphas, sigmas_um).run(sizes, rng)
 
 
 class _Race:

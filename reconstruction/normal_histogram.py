@@ -103,7 +103,8 @@ def slopes(
     """
     code = stencil(height, valid)
     down, right = pixel_sides(pixel)
-    a, b = kernels.slopes(np.asarray(height, np.float64), code, right, -down if y_up else down)
+    with kernels.threads_for(100 * code.size):
+        a, b = kernels.slopes(np.asarray(height, np.float64), code, right, -down if y_up else down)
     return a, b, code > 0
 
 
@@ -134,7 +135,8 @@ def bucket_counts(
     q = np.ascontiguousarray(slope_y, np.float64).reshape(-1)
     if p.shape != q.shape:
         raise HistogramError(f"slope_y: got {q.size} slopes, expected {p.size}")
-    counts = kernels.count_slopes(p, q, bins, float(limit), kernels.threads()).sum(axis=0)
+    with kernels.threads_for(100 * p.size):
+        counts = kernels.count_slopes(p, q, bins, float(limit), kernels.threads()).sum(axis=0)
     return counts[:-1].reshape(bins, bins), int(counts[-1])
 
 

@@ -16,6 +16,8 @@ from skinrig import (
     bench_flash,
     bench_gradient_render,
     bench_hdr,
+    bench_kernels,
+    bench_integration,
     bench_light_order,
     bench_motion,
     bench_photometric,
@@ -42,6 +44,9 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "dome-geometry": bench_dome_calibration.geometry,
     "dome-lights": bench_dome_calibration.lights,
     "light-order": bench_light_order.light_order,
+    "normal-integration": bench_integration.integration,
+    "normal-histogram": bench_kernels.histograms,
+    "kernel-fit": bench_kernels.search,
 }
 
 
