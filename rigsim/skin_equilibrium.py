@@ -22,6 +22,8 @@ walls, layers below the half-space's first.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -31,7 +33,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import brentq
 
-from rigsim.skin_stretch_kernels import bending, membrane
+from rigsim.skin_stretch_kernels import bending, gather, membrane, spread, tissue
 
 Float64Array = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -109,11 +111,9 @@ class LayerProblem:
     """Of the tissue, 0 to 0.5."""
     rise: float = field(init=False)
     """Factor z of a relief without a layer."""
-    _scale: tuple[Float64Array, Float64Array, Float64Array] = field(init=False, repr=False)
-    _elastic: tuple[Float64Array, Float64Array, Float64Array, Float64Array] = field(
-        init=False, repr=False
-    )
-    _unit: tuple[Float64Array, Float64Array] = field(init=False, repr=False)
+    _scale: Float64Array = field(init=False, repr=False)
+    _elastic: Float64Array = field(init=False, repr=False)
+    _unit: Float64Array = field(init=False, repr=False)
     _weight: Float64Array = field(init=False, repr=False)
     _traction: Float64Array = field(init=False, repr=False)
     _moment: Float64Array = field(init=False, repr=False)
@@ -189,12 +189,14 @@ class LayerProblem:
         p_z = np.maximum(p_z + pulled, 0.3 * p_z)
         weight = np.full(kx.shape, 2.0)
         weight[:, [0, -1]] = 1.0
-        self._scale = tuple(
-            np.where(live, 1.0 / np.sqrt(weight * np.where(live, p, 1.0)), 0.0)
-            for p in (p_l, p_t, p_z)
-        )  # type: ignore[assignment]
-        self._elastic = (normal, across, normal, mixed)
-        self._unit = (ux, uy)
+        self._scale = np.stack(
+            [
+                np.where(live, 1.0 / np.sqrt(weight * np.where(live, p, 1.0)), 0.0)
+                for p in (p_l, p_t, p_z)
+            ]
+        )
+        self._elastic = np.stack([normal, across, mixed])
+        self._unit = np.stack([ux, uy])
         self._weight = weight
 
     def affine(self) -> Float64Array:
@@ -204,11 +206,19 @@ class LayerProblem:
         return state
 
     def _spread(self, q: ComplexArray) -> ComplexArray:
-        l, t = self._scale[0] * q[0], self._scale[1] * q[1]  # noqa: E741
-        l *= 1j  # noqa: E741
-        t *= 1j
-        ux, uy = self._unit
-        return np.stack([ux * l - uy * t, uy * l + ux * t, self._scale[2] * q[2]])
+        out = np.empty_like(q)
+        with self._threads():
+            spread(q, self._scale, self._unit, out)
+        return out
+
+    @contextmanager
+    def _threads(self) -> Iterator[None]:
+        before = get_num_threads()
+        set_num_threads(min(self._workers, before))
+        try:
+            yield
+        finally:
+            set_num_threads(before)
 
     def state(self, q: ComplexArray) -> Float64Array:
         """Return the state (u, w) of scaled Fourier coefficients of its deviation from affine."""
@@ -230,19 +240,16 @@ class LayerProblem:
         local, force = self._local(state)
         deviation = state - self.affine()
         hat = fft.rfft2(deviation, norm="forward", workers=self._workers)
-        elastic, pulled = self._tissue(hat)
+        pulled = np.zeros_like(hat)
+        elastic = tissue(hat, self._elastic, self._unit, self._weight, pulled)
         force += fft.irfft2(pulled, s=self.neutral_um.shape, norm="forward", workers=self._workers)
         return local + elastic, force
 
     def _local(self, state: Float64Array) -> tuple[float, Float64Array]:
         """Return energy and forces of the layer, and of the tissue's stress on tilted facets."""
         force = np.zeros_like(state)
-        before = get_num_threads()
-        set_num_threads(self._workers)
-        try:
+        with self._threads():
             total = self._layer(state, force)
-        finally:
-            set_num_threads(before)
         total -= float(np.vdot(self._traction, state[:2]))
         force[:2] -= self._traction
         return float(total) / self.neutral_um.size, force
@@ -262,33 +269,15 @@ class LayerProblem:
         )
         return float(total)
 
-    def _tissue(self, hat: ComplexArray) -> tuple[float, ComplexArray]:
-        """Return the half-space's energy and its forces, in Fourier space."""
-        normal, across, upright, mixed = self._elastic
-        ux, uy = self._unit
-        l = ux * hat[0] + uy * hat[1]  # noqa: E741
-        t = ux * hat[1] - uy * hat[0]
-        f_l = normal * l + 1j * mixed * hat[2]
-        f_t = across * t
-        f_z = upright * hat[2] - 1j * mixed * l
-        inner = (np.conj(l) * f_l + np.conj(t) * f_t + np.conj(hat[2]) * f_z).real
-        energy = 0.5 * float(np.sum(self._weight * inner))
-        return energy, np.stack([ux * f_l - uy * f_t, uy * f_l + ux * f_t, f_z])
-
     def value(self, q: ComplexArray) -> tuple[float, ComplexArray]:
         """Return energy and its derivative by scaled coefficients (3, N, M // 2 + 1)."""
-        spread = self._spread(q)
-        local, force = self._local(self._state(spread))
-        elastic, pulled = self._tissue(spread)
+        moved = self._spread(q)
+        local, force = self._local(self._state(moved))
         hat = fft.rfft2(force, norm="forward", workers=self._workers)
-        hat += pulled
-        hat *= self._weight
-        ux, uy = self._unit
-        slope = np.stack([
-            -1j * self._scale[0] * (ux * hat[0] + uy * hat[1]),
-            -1j * self._scale[1] * (ux * hat[1] - uy * hat[0]),
-            self._scale[2] * hat[2],
-        ])  # fmt: skip
+        slope = np.empty_like(q)
+        with self._threads():
+            elastic = tissue(moved, self._elastic, self._unit, self._weight, hat)
+            gather(hat, self._scale, self._unit, self._weight, slope)
         return local + elastic, slope
 
     def start(self) -> ComplexArray:

@@ -190,6 +190,84 @@ def bending(height, neutral, stiffness, texel, moment, force):  # type: ignore[n
     return part.sum()
 
 
+@njit(parallel=True, cache=True, fastmath=True)
+def spread(q, scale, unit, out):  # type: ignore[no-untyped-def]
+    """Turn scaled coefficients along and across each wave, and upright, into those of x, y, z.
+
+    Parameters
+    ----------
+    q : ndarray (3, N, K) of complex128
+    scale : ndarray (3, N, K)
+    unit : ndarray (2, N, K)
+        Directions of the waves.
+    out : ndarray (3, N, K) of complex128
+        Result.
+    """
+    for i in prange(q.shape[1]):
+        for j in range(q.shape[2]):
+            along = 1j * (scale[0, i, j] * q[0, i, j])
+            across = 1j * (scale[1, i, j] * q[1, i, j])
+            out[0, i, j] = unit[0, i, j] * along - unit[1, i, j] * across
+            out[1, i, j] = unit[1, i, j] * along + unit[0, i, j] * across
+            out[2, i, j] = scale[2, i, j] * q[2, i, j]
+
+
+@njit(parallel=True, cache=True, fastmath=True)
+def tissue(hat, elastic, unit, weight, pulled):  # type: ignore[no-untyped-def]
+    """Add the forces of a half-space to ``pulled``; return its energy.
+
+    Parameters
+    ----------
+    hat : ndarray (3, N, K) of complex128
+        Displacement's coefficients.
+    elastic : ndarray (3, N, K)
+        Stiffness of normal, across and mixed motion.
+    unit : ndarray (2, N, K)
+    weight : ndarray (N, K)
+        How often a coefficient counts: 2 where the other half is left out.
+    pulled : ndarray (3, N, K) of complex128
+        Forces' coefficients are added.
+    """
+    part = np.zeros(hat.shape[1])
+    for i in prange(hat.shape[1]):
+        total = 0.0
+        for j in range(hat.shape[2]):
+            ux, uy = unit[0, i, j], unit[1, i, j]
+            along = ux * hat[0, i, j] + uy * hat[1, i, j]
+            across = ux * hat[1, i, j] - uy * hat[0, i, j]
+            up = hat[2, i, j]
+            mixed = 1j * elastic[2, i, j]
+            f_along = elastic[0, i, j] * along + mixed * up
+            f_across = elastic[1, i, j] * across
+            f_up = elastic[0, i, j] * up - mixed * along
+            total += weight[i, j] * (
+                along.real * f_along.real
+                + along.imag * f_along.imag
+                + across.real * f_across.real
+                + across.imag * f_across.imag
+                + up.real * f_up.real
+                + up.imag * f_up.imag
+            )
+            pulled[0, i, j] += ux * f_along - uy * f_across
+            pulled[1, i, j] += uy * f_along + ux * f_across
+            pulled[2, i, j] += f_up
+        part[i] = total
+    return 0.5 * part.sum()
+
+
+@njit(parallel=True, cache=True, fastmath=True)
+def gather(hat, scale, unit, weight, out):  # type: ignore[no-untyped-def]
+    """Turn forces on x, y, z into the derivative by scaled coefficients (adjoint of `spread`)."""
+    for i in prange(hat.shape[1]):
+        for j in range(hat.shape[2]):
+            ux, uy, w = unit[0, i, j], unit[1, i, j], weight[i, j]
+            along = ux * hat[0, i, j] + uy * hat[1, i, j]
+            across = ux * hat[1, i, j] - uy * hat[0, i, j]
+            out[0, i, j] = -1j * (w * scale[0, i, j] * along)
+            out[1, i, j] = -1j * (w * scale[1, i, j] * across)
+            out[2, i, j] = w * scale[2, i, j] * hat[2, i, j]
+
+
 @njit(parallel=True, cache=True)
 def spline(coefficients, row, column, want_slope, value, along_row, along_column):  # type: ignore[no-untyped-def]
     """Evaluate a cubic B-spline and its derivatives at points inside the grid.
