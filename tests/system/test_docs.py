@@ -128,6 +128,32 @@ def test_the_manual_lists_every_command_of_the_domes_box():
     assert listed == expected
 
 
+@pytest.mark.parametrize(
+    ("box_name", "heading"),
+    [
+        ("gradient_sphere", "Commands of the gradient sphere's box"),
+        ("caliper", "Commands of the caliper's box"),
+    ],
+)
+def test_the_manual_lists_every_command_of_the_gradient_rigs_boxes(box_name, heading):
+    from capture.rig import load_rig
+    from rigsim.world import World
+
+    shared = World(load_rig("dome")).box("dome").device.commands()
+    box = World(load_rig("gradient").cropped(16)).box(box_name)
+    expected = {}
+    for name, command in box.device.commands().items():
+        needs = "bare" if command.bare else "" if name.endswith("?") else "frame"
+        # what the page says of the dome it does not say again
+        if name not in shared or name == "SEQ:DEF":
+            expected[name] = (command.arguments, "armed" if command.armed else needs)
+    listed = {
+        name.strip("`"): (arguments.strip("`"), needs)
+        for name, arguments, needs, _ in rows(WIRE, heading)
+    }
+    assert listed == expected
+
+
 def test_the_manual_lists_every_code():
     cells = [row[column] for row in rows(WIRE, "Codes") for column in (0, 2)]
     assert sorted(map(int, cells)) == sorted(int(code) for code in wire.Code)
