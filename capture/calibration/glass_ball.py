@@ -29,7 +29,6 @@ __all__ = [
     "light_directions",
     "locate_ball",
     "mirrored",
-    "pupil_shift",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -44,7 +43,6 @@ GATE_MM = 0.3  # of a spot from its predicted place, at first; spots lie 0.4 mm 
 LEAST_SPOTS = 12
 LEAST_SHARE = 0.5  # of the lights: with fewer, the nominal places do not hold the ball's
 HUBER = 2.5
-PUPIL_POINTS = 37
 STEPS = 12
 DERIVATIVE_MM = 0.01
 MEDIAN_CHI2_2 = 1.3863  # median of chi-square with two degrees of freedom, 2 ln 2
@@ -232,56 +230,6 @@ def mirrored(
     )
 
 
-def pupil_shift(
-    camera: CameraPose,
-    ball_mm: FloatArray,
-    radius_mm: float,
-    lights_mm: FloatArray,
-    *,
-    pupil_mm: float,
-    focus_mm: float,
-) -> FloatArray:
-    """Return how far spots' middles lie from where the lens's middle sees them.
-
-    Each point of the pupil sees a spot in another place of the ball, and outside the plane in focus
-    these do not fall together; their mean is not the middle's own.
-
-    Parameters
-    ----------
-    camera : CameraPose
-    ball_mm, radius_mm
-        The ball.
-    lights_mm : ndarray of float64, shape (L, 3)
-    pupil_mm : float
-        Diameter of the lens's pupil, mm.
-    focus_mm : float
-        Distance of the plane in focus from the pupil, along the camera's axis, mm.
-
-    Returns
-    -------
-    ndarray of float64, shape (L, 2)
-        Column and row, px.
-    """
-    lights = np.asarray(lights_mm, np.float64)
-    right, down, forward = camera.rotation
-    centers = np.broadcast_to(ball_mm, lights.shape)
-
-    def seen(eye: FloatArray) -> FloatArray:
-        eyes = np.broadcast_to(eye, lights.shape)
-        point, _ = reflection_points(eyes, centers, radius_mm, lights)
-        ray = point - eye
-        return camera.project(eye + ray * (focus_mm / (ray @ forward))[:, None])
-
-    middle = seen(camera.center_mm)
-    total = np.zeros_like(middle)
-    for k in range(PUPIL_POINTS):
-        # even per area: a sunflower's seeds
-        radius = 0.5 * pupil_mm * np.sqrt((k + 0.5) / PUPIL_POINTS)
-        angle = np.pi * (1 + np.sqrt(5)) * k
-        total += seen(camera.center_mm + radius * (np.cos(angle) * right + np.sin(angle) * down))
-    return total / PUPIL_POINTS - middle
-
-
 def locate_ball(
     spots: FloatArray,
     camera: CameraPose,
@@ -292,6 +240,7 @@ def locate_ball(
     radius_stderr_mm: float = 0.02,
     depth_stderr_mm: float = 1.0,
     margin_mm: float = 0.1,
+    noise_px: float = 0.5,
     lit: NDArray[np.bool_] | None = None,
 ) -> BallFit:
     """Find the ball by its spots and tell which light made each.
@@ -311,6 +260,8 @@ def locate_ball(
         How well the ball's middle stands there along the camera's axis.
     margin_mm : float
         A spot's own size: closer to the image's border it is not whole.
+    noise_px : float
+        Standard error of a spot's coordinate; half a pixel for brightest pixels.
     lit : ndarray of bool, shape (L,), optional
         Lights that can be expected to show; None: all.
 
@@ -351,6 +302,7 @@ def locate_ball(
         expected=np.append(about, radius_mm),
         prior=np.array([REACH_MM, REACH_MM, depth_stderr_mm, radius_stderr_mm]),
         margin_px=margin_mm / pixel_mm,
+        noise_px=noise_px,
     )  # fmt: skip
 
 
@@ -446,6 +398,7 @@ def _refine(
     expected: FloatArray,
     prior: FloatArray,
     margin_px: float,
+    noise_px: float,
 ) -> BallFit:
     """Fit centre and radius by Gauss and Newton, each light free about its nominal place."""
     tree = cKDTree(found)
@@ -471,7 +424,7 @@ def _refine(
         slope = np.stack(slopes, axis=-1)
         miss = found[spot[used]] - seen.pixels[used]
         moved = seen.px_per_mm[used]
-        noise = 0.25 * np.eye(2)  # spots were found to about half a pixel
+        noise = noise_px**2 * np.eye(2)
         spread = scatter_mm**2 * (moved @ moved.transpose(0, 2, 1)) + noise
         weight = np.linalg.inv(spread)
         distance2 = np.einsum("ki,kij,kj->k", miss, weight, miss)

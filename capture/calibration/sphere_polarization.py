@@ -31,8 +31,10 @@ STEPS = 60
 STOP = 1e-6
 DERIVATIVE = 1e-5
 MODES_REACH = 6.0  # widths of the axes' scatter within which a light may have a second answer
-MODES_GRID = 61
+MODES_FAR_RAD = np.radians(30.0)
+MODES_GRID = 41
 MODES_ROUNDS = 5
+SAME_RAD = np.radians(0.01)
 LEAST_LIGHTS = 6
 
 
@@ -323,29 +325,29 @@ class _Films:
 
     def _modes(self) -> tuple[FloatArray, FloatArray]:
         """Return the two best answers for each light's turn and their costs, shapes (2, L)."""
-        step = 2 * MODES_REACH * self.scatter / (MODES_GRID - 1)
-        grid = step * (np.arange(MODES_GRID) - MODES_GRID // 2)
+        even = np.linspace(-1.0, 1.0, MODES_GRID)
+        # closely where most axes are, coarsely where one far off may be
+        grid = np.unique(np.append(MODES_REACH * self.scatter * even, MODES_FAR_RAD * even))
+        steps = np.maximum(np.diff(grid, prepend=grid[0]), np.diff(grid, append=grid[-1]))
         cost = np.array([self._light_cost(np.full_like(self.turn, g))[0] for g in grid])
         padded = np.pad(cost, ((1, 1), (0, 0)), constant_values=np.inf)
         valley = (padded[:-2] > cost) & (cost <= padded[2:])
         order = np.argsort(np.where(valley, cost, np.inf), axis=0)[:2]
-        turns = grid[order]
         found = []
-        for turn in turns:
-            width = step
+        for turn, width in zip(grid[order], steps[order], strict=True):
             at = turn
             for _ in range(MODES_ROUNDS):
                 near = at + width * np.linspace(-1, 1, 9)[:, None]
                 costs = np.array([self._light_cost(t)[0] for t in near])
                 best = np.argmin(costs, axis=0)
                 at = np.take_along_axis(near, best[None], axis=0)[0]
-                width /= 4
+                width = width / 4
             found.append((at, self._light_cost(at)[0]))
         modes, costs = (np.array(part) for part in zip(*found, strict=True))
         first = np.argsort(costs, axis=0)
         modes, costs = (np.take_along_axis(part, first, axis=0) for part in (modes, costs))
         # one valley only, or both descents into the same
-        single = (valley.sum(axis=0) < 2) | (np.abs(modes[0] - modes[1]) < step / 4)
+        single = (valley.sum(axis=0) < 2) | (np.abs(modes[0] - modes[1]) < SAME_RAD)
         costs[1, single] = np.inf
         return modes, costs
 

@@ -19,7 +19,6 @@ from capture.calibration.glass_ball import (
     light_directions,
     locate_ball,
     mirrored,
-    pupil_shift,
 )
 from capture.calibration.polarized_reflection import Reflection
 from capture.calibration.sphere_lights import SphereFilms, SphereLightTable
@@ -42,6 +41,7 @@ FloatArray = NDArray[np.float64]
 MARGIN_MM = 0.06  # around a spot as geometry draws it, for what the lens and the pixels blur
 WAVELENGTH_MM = 5.5e-4
 FLOOR_PX = 0.03  # of a spot's middle, whatever its light: the pixels' own responses, the polish
+MIDDLE_PX = 0.1  # about how well middles are known, those of dim spots among them
 EXPOSURE_SHARE = 1e-3  # how well an exposure's light repeats
 RESPONSE_SHARE = 1e-3  # how well pixels' responses are known over a spot
 DEAD_SHARE = 0.05  # of the mean: a light dimmer than this is dead
@@ -49,6 +49,7 @@ LEAST_CERTAIN = 0.3  # relative error above which an intensity is not called mea
 OFF_ANALYSER_DEG = 2.0
 OFF_AXIS_DEG = 3.0
 OFF_PLACE_SIGMAS = 5.0
+OFF_PLACE_DEG = 0.5
 STRAY_SHARE = 0.2  # of a usual spot's peak: fainter ones are reflections of spots, or their rings
 STRAY_MM = 0.4
 SKIN_ETA = 1.4
@@ -163,28 +164,19 @@ def survey_sphere(
     start = np.where((fit.spot >= 0)[:, None], spots[fit.spot], np.nan)
     middle, noise_px, clipped = measure_middles(total, start, aperture_px=aperture_px)
     measured = np.asarray(np.isfinite(middle).all(axis=1), bool)
-    seen_at = middle
-    middle = middle - pupil_shift(
-        camera,
-        fit.ball.center_mm,
-        fit.ball.radius_mm,
-        place,
-        pupil_mm=_pupil_mm(rig.view(view)),
-        focus_mm=rig.view(view).distance_mm,
-    )
     fit = _again(fit, spots, middle, measured, camera, place, what)
     errors = np.hypot(np.where(measured, noise_px, 0.0), np.where(clipped, 0.5, FLOOR_PX))
     found = light_directions(camera, fit.ball, middle, errors, distance)
     direction = np.where(measured[:, None], found.direction, place / distance[:, None])
     stderr = np.where(measured[:, None], found.stderr, fit.light_scatter_mm / distance[:, None])
     shown = mirrored(camera, fit.ball.center_mm, fit.ball.radius_mm, direction * distance[:, None])
-    at = np.where(measured[:, None], seen_at, shown.pixels)
+    at = np.where(measured[:, None], middle, shown.pixels)
 
     glass = _reflection(rig, camera, view, what.eta, shown.to_light, shown.to_camera, direction)
     readings = np.array([shot.reading_deg for shot in shots])
     airy_px = WAVELENGTH_MM * float(camera.matrix[0, 0]) / _pupil_mm(rig.view(view))
     within = share_within(aperture_px, airy_px)
-    rates, variance, good = _fluxes(shots, at, aperture_px, within)
+    rates, variance, good, saturated = _fluxes(shots, at, aperture_px, within)
     films = fit_films(np.radians(readings), rates, variance, good, glass)
     films = _with_geometry(films, glass, what, np.linalg.norm(stderr, axis=1) / np.sqrt(2))
     intensity, intensity_stderr = _intensities(rig, camera, fit.ball, films, shown, direction)
@@ -218,7 +210,7 @@ def survey_sphere(
         tuple(sorted(set(readings.tolist()))),
         (),
     )
-    saturated = np.array([not ok.any() for ok in good.T]) & fit.in_field
+    fit = replace(fit, in_field=fit.in_field & (good.any(axis=0) | saturated))
     told = _findings(result, fit, place, saturated, films, spots, total, middle, pixel_mm)
     return SphereSurvey(
         lights, result.films, fit.ball, fit.light_scatter_mm, films.turn_scatter_rad,
@@ -232,6 +224,7 @@ def _locate(
     place: FloatArray,
     what: GlassBall,
     lit: NDArray[np.bool_] | None = None,
+    noise_px: float = 0.5,
 ) -> BallFit:
     return locate_ball(
         spots,
@@ -242,6 +235,7 @@ def _locate(
         radius_stderr_mm=what.radius_stderr_mm,
         depth_stderr_mm=what.depth_stderr_mm,
         margin_mm=RING[1] * MARGIN_MM,
+        noise_px=noise_px,
         lit=lit,
     )
 
@@ -285,7 +279,7 @@ def _again(
     """Return the ball by the spots' middles instead of their brightest pixels."""
     if not measured.any():
         raise BallError("ball: no spot lies whole within the image; centre the ball")
-    sharp = _locate(middle[measured], camera, place, what, measured)
+    sharp = _locate(middle[measured], camera, place, what, measured, MIDDLE_PX)
     return BallFit(sharp.ball, fit.spot, fit.in_field, fit.stray, sharp.light_scatter_mm)
 
 
@@ -332,17 +326,19 @@ def _to(camera: CameraPose) -> FloatArray:
 
 def _fluxes(
     shots: Sequence[Shot], at: FloatArray, aperture_px: FloatArray, within: FloatArray
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Return rates, variances and whether they may be used, shapes (E, L)."""
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return rates, variances, whether they may be used, (E, L), and always saturated, (L,)."""
     rows = []
+    saturated = np.ones(len(at), bool)
     for shot in shots:
         flux = measure_flux(shot, at, aperture_px=aperture_px)
         scale = 1.0 / (within * shot.amount_s)
         rate = flux.value * scale
         variance = flux.variance * scale**2 + (EXPOSURE_SHARE * rate) ** 2
         rows.append((rate, variance, flux.whole & ~flux.saturated))
+        saturated &= flux.saturated
     rates, variances, good = (np.array(part) for part in zip(*rows, strict=True))
-    return rates, variances, good
+    return rates, variances, good, saturated
 
 
 def _two_readings(readings: FloatArray, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -504,7 +500,7 @@ def _findings(
     nominal = place / np.linalg.norm(place, axis=1, keepdims=True)
     off = np.linalg.norm(lights.directions - nominal, axis=1)
     usual = np.sqrt(2) * survey.light_scatter_mm / np.linalg.norm(place, axis=1)
-    far = lights.seen & (off > OFF_PLACE_SIGMAS * usual)
+    far = lights.seen & (off > np.maximum(OFF_PLACE_SIGMAS * usual, np.radians(OFF_PLACE_DEG)))
     for k in np.flatnonzero(far):
         told.append(f"light {names[k]} stands {np.degrees(off[k]):.2f} degrees from its place")
     zero, error = np.degrees([films.zero_rad, films.zero_stderr_rad])
