@@ -106,7 +106,9 @@ def _pupil(view: View) -> FloatArray:
     r = radius * np.sqrt(k / PUPIL_POINTS)
     phi = math.pi * (1.0 + math.sqrt(5.0)) * k
     right, up, _ = (np.array(axis) for axis in view.axes)
-    return (r * np.cos(phi))[:, None] * right + (r * np.sin(phi))[:, None] * up
+    points = (r * np.cos(phi))[:, None] * right + (r * np.sin(phi))[:, None] * up
+    # a few points are not even about the middle, which would shift all that is out of focus
+    return np.asarray(points - points.mean(axis=0))
 
 
 def _mirrored(
