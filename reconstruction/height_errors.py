@@ -99,7 +99,7 @@ def sampled_stderr(
         _, _, ex, ey = slope_fields.edges(moved)
         x = np.zeros(ex.shape)
         solve(hierarchy, (ex - dx) / _STEP, (ey - dy) / _STEP, x, tolerance=_TOLERANCE)
-        error = to_height(x[1:-1, 1:-1], part, pixel=pixel, camera=camera) - flat
+        error: Floating = to_height(x[1:-1, 1:-1], part, pixel=pixel, camera=camera) - flat
         if cutoff is not None:
             error = high_pass(error, pixel=pixel, cutoff=cutoff, valid=base.valid)
         total += error**2
