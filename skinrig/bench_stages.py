@@ -21,6 +21,7 @@ from skinrig import (
     bench_light_order,
     bench_motion,
     bench_photometric,
+    bench_skin_stretch,
     bench_surface,
     bench_tissue,
 )
@@ -32,6 +33,7 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "render-flash": bench_flash.render,
     "render-dome": bench_dome_render.render,
     "render-gradient": bench_gradient_render.render,
+    "skin-stretch": bench_skin_stretch.stretched,
     "layered-reflectance": bench_tissue.layered_reflectance,
     "color-table": bench_tissue.table,
     "diffuse-albedo": bench_brdf.albedo,
