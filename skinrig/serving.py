@@ -9,7 +9,7 @@ from capture.rig import Rig, load_rig
 from skinrig import simulating_dome, simulating_flash, simulating_gradient
 from skinrig.simulation import SIZES, SimulationError
 
-GRADIENT_WIDTH_PX = 128
+GRADIENT_WIDTH_PX = 96
 """Pixels across the served camera of the gradient rig."""
 
 
@@ -61,6 +61,8 @@ def serve_rig(
             )
         rig = rig.cropped(GRADIENT_WIDTH_PX)
         scene = simulating_gradient.make_scene(rig, site=site, preset=subject, seed=seed)
+        # what all states share is made before anybody asks, so that no client waits for it
+        scene.lighting()
     else:
         dome = "dome" in rig.boxes
         width = (simulating_dome if dome else simulating_flash).WIDTHS_PX[size]

@@ -282,7 +282,8 @@ def drive(
     world = World(rig, seed=seed, clock="virtual", scene=scene)
     name = world.register(session.id)
     boxes = {
-        kind: BOXES[kind](Port(f"sim://{kind}?world={name}", clock=world.clock))
+        # a number of fixed length: with drawn ones the lines would take a little longer or shorter
+        kind: BOXES[kind](Port(f"sim://{kind}?world={name}", clock=world.clock, first_seq=1))
         for kind in rig.boxes
     }
     cameras = {view.name: open_camera(f"sim://{name}/{view.name}") for view in rig.views}
