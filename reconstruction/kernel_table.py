@@ -21,6 +21,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import fdtrc
 
 from model.microstructure import ALPHA_LIMITS, KernelTable, kernel_parameters
 
@@ -325,6 +326,81 @@ def _fit_sigma(
         return pair, (math.inf, math.inf), math.inf, rms
     C = C * rss / (r.size - 2)
     return pair, (math.sqrt(C[0, 0]), math.sqrt(C[1, 1])), float(C[0, 1]), rms
+
+
+@dataclass(frozen=True, slots=True)
+class DirectionDependence:
+    """How kernels of single directions of stretch depart from one table of all.
+
+    Attributes
+    ----------
+    angle_rad : tuple of float
+        Directions of the jaws.
+    alpha_offset, sigma_offset_um : tuple of float
+        Mean residual of each direction against the table.
+    alpha_stderr, sigma_stderr_um : tuple of float
+        Standard errors of the offsets, from the scatter within directions.
+    p_alpha, p_sigma : float
+        Chance of offsets that differ so much when the direction does not matter (one-way analysis
+        of variance; the table's own fit is not counted). The paper saw such a dependence on the
+        chin, and leaves it out of its model.
+    """
+
+    angle_rad: tuple[float, ...]
+    alpha_offset: tuple[float, ...]
+    sigma_offset_um: tuple[float, ...]
+    alpha_stderr: tuple[float, ...]
+    sigma_stderr_um: tuple[float, ...]
+    p_alpha: float
+    p_sigma: float
+
+
+def direction_dependence(
+    table: KernelTable,
+    stretch: ArrayLike,
+    alpha: ArrayLike,
+    sigma_um: ArrayLike,
+    angle_rad: ArrayLike,
+) -> DirectionDependence:
+    """Compare kernels fitted under several directions of stretch with one table.
+
+    Parameters
+    ----------
+    table : KernelTable
+        Of all directions together; covers the stretch ratios.
+    stretch, alpha, sigma_um, angle_rad : array_like, shape (N,)
+        One entry a state: ratio, kernel, direction of the jaws.
+
+    Raises
+    ------
+    KernelTableFitError
+        For fewer than two directions, or not more states than directions.
+    """
+    r, a, s, angle = (
+        np.asarray(v, np.float64).reshape(-1) for v in (stretch, alpha, sigma_um, angle_rad)
+    )
+    if not r.size == a.size == s.size == angle.size:
+        raise KernelTableFitError(f"angle_rad: got {angle.size} entries, expected {r.size}")
+    directions, group = np.unique(angle, return_inverse=True)
+    k = directions.size
+    if k < 2 or r.size <= k:
+        raise KernelTableFitError(
+            f"angle_rad: got {k} directions of {r.size} states, expected at least 2, and more states"
+        )
+    count = np.bincount(group, minlength=k)
+    offsets, errors, chances = [], [], []
+    for value, told in zip((a, s), kernel_parameters(r, table), strict=True):
+        residual = value - told
+        mean = np.bincount(group, residual, k) / count
+        within = float(np.sum((residual - mean[group]) ** 2)) / (r.size - k)
+        between = float(np.sum(count * (mean - residual.mean()) ** 2)) / (k - 1)
+        offsets.append(tuple(mean.tolist()))
+        errors.append(tuple(np.sqrt(within / count).tolist()))
+        ratio = between / within if within > 0 else (math.inf if between > 0 else 0.0)
+        chances.append(float(fdtrc(k - 1, r.size - k, ratio)) if math.isfinite(ratio) else 0.0)
+    return DirectionDependence(
+        tuple(directions.tolist()), offsets[0], offsets[1], errors[0], errors[1], *chances
+    )
 
 
 def alpha_rms(table: KernelTable, stretch: ArrayLike, alpha: ArrayLike) -> float:

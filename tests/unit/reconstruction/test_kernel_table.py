@@ -2,7 +2,12 @@ import numpy as np
 import pytest
 
 from model.microstructure import FOREHEAD, KernelTable, forehead_points, kernel_parameters
-from reconstruction.kernel_table import KernelTableFitError, alpha_rms, fit_table
+from reconstruction.kernel_table import (
+    KernelTableFitError,
+    alpha_rms,
+    direction_dependence,
+    fit_table,
+)
 
 
 def test_the_papers_points_give_the_papers_lines_of_sigma():
@@ -91,3 +96,18 @@ def test_table_goes_through_json():
     points = forehead_points()
     table = fit_table(points.stretch, points.alpha, points.sigma_um, source="here").table
     assert KernelTable.from_json(table.to_json()) == table
+
+
+def test_a_direction_that_differs_is_told_from_ones_that_do_not(rng):
+    r = np.tile([0.8, 0.87, 0.93, 1.07, 1.14, 1.21], 4)
+    angle = np.repeat(np.radians([0.0, 45.0, 90.0, 135.0]), 6)
+    alpha, sigma = kernel_parameters(r)
+    chances = []
+    for shift in (0.0, 0.4):
+        noisy = alpha + 0.05 * rng.standard_normal(r.size) + shift * (angle > 2.0)
+        found = direction_dependence(FOREHEAD, r, noisy, sigma, angle)
+        assert abs(found.alpha_offset[3] - shift) < 5 * found.alpha_stderr[3]
+        chances.append(found.p_alpha)
+    assert chances[0] > 1e-3 > 1e-6 > chances[1]
+    with pytest.raises(KernelTableFitError, match="directions"):
+        direction_dependence(FOREHEAD, r, alpha, sigma, np.zeros(r.size))
