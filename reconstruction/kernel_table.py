@@ -385,7 +385,7 @@ def direction_dependence(
     k = directions.size
     if k < 2 or r.size <= k:
         raise KernelTableFitError(
-            f"angle_rad: got {k} directions of {r.size} states, expected at least 2, and more states"
+            f"angle_rad: got {k} directions of {r.size} states, expected 2 or more, and more states"
         )
     count = np.bincount(group, minlength=k)
     offsets, errors, chances = [], [], []
