@@ -32,7 +32,7 @@ SLACK_S = 0.05  # a request counts when the box has read it
 
 NOISE = Faults(
     drop=0.001, flip=0.001, glue=0.01, cut=0.005, late=0.02, late_s=0.3, lose_answer=0.08,
-    duplicate=0.05, babble=0.02, jaw_stall=0.05, skin_stiff=4.0,
+    duplicate=0.05, babble=0.02, jaw_stall=0.05, skin_stiff=12.0,
 )  # fmt: skip
 
 
@@ -241,7 +241,7 @@ def keep_the_skin(monkeypatch):
     [
         (forget_answers, "begin"),
         (stop_watchdog, "fall_silent"),
-        (go_on_beyond_the_limit, "nothing_moved_that_must_not"),
+        pytest.param(go_on_beyond_the_limit, "nothing_moved_that_must_not", marks=pytest.mark.long),
         (move_unarmed, "nothing_moved_that_must_not"),
         (move_without_a_limit, "nothing_moved_that_must_not"),
         (keep_the_skin, ("disarm", "fall_silent", "skin_is_held_by_an_armed_box_only")),

@@ -41,7 +41,7 @@ while True:
 """
 
 
-@pytest.mark.parametrize("transport", ["pty", "tcp"])
+@pytest.mark.parametrize("transport", ["pty", pytest.param("tcp", marks=pytest.mark.long)])
 @pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])
 def test_a_host_that_dies_leaves_the_sphere_dark_and_the_skin_free_within_the_lease(
     transport, blow

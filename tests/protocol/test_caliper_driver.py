@@ -26,7 +26,7 @@ def quick_ring(monkeypatch):
     monkeypatch.setattr(emulated, "TURN_DEG_PER_S", 3600.0)
 
 
-@pytest.fixture(params=["sim", "pty", "tcp"])
+@pytest.fixture(params=["sim", "pty", pytest.param("tcp", marks=pytest.mark.long)])
 def bench(request):
     """A caliper's box behind one transport, and its driver."""
     if request.param == "sim":

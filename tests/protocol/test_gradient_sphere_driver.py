@@ -38,7 +38,7 @@ class Witness:
         return image
 
 
-@pytest.fixture(params=["sim", "pty", "tcp"])
+@pytest.fixture(params=["sim", "pty", pytest.param("tcp", marks=pytest.mark.long)])
 def bench(request):
     """A sphere's box behind one transport, its driver, and the rig's other addresses."""
     if request.param == "sim":
