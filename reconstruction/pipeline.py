@@ -12,7 +12,7 @@ from typing import Any
 from capture.session import Session
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from reconstruction import dome_stages, flash_stages, stack_stages, stages
+from reconstruction import dome_stages, flash_stages, gradient_stages, stack_stages, stages
 from reconstruction.evidence import Evidence, EvidenceError
 
 
@@ -27,11 +27,24 @@ class Recipe:
     """Names of what is no map and goes along: meshes, tables."""
     always: tuple[str, ...] = ()
     """What the other maps mean nothing without."""
+    products: Callable[[Session], Mapping[str, tuple[str, ...]]] | None = None
+    """Where a name stands for more than itself, as for a map of each state: what for, by name."""
+
+    def expand(self, session: Session, want: Sequence[str]) -> list[str]:
+        """Return the maps and files that the wanted names stand for."""
+        meant = {} if self.products is None else self.products(session)
+        return [product for name in want for product in meant.get(name, (name,))]
 
 
 RECIPES: Mapping[str, Recipe] = {
     "subject": Recipe(flash_stages.MAPS, flash_stages.graph),
     "olat": Recipe(dome_stages.MAPS, dome_stages.graph, dome_stages.FILES, ("position",)),
+    "gradient": Recipe(
+        gradient_stages.MAPS,
+        gradient_stages.graph,
+        gradient_stages.FILES,
+        products=gradient_stages.products,
+    ),
 }
 """By the kind of step that shows the subject."""
 LIGHT_LIST = Recipe(stack_stages.MAPS, stack_stages.graph)
@@ -122,14 +135,15 @@ def reconstruct(
     )
     evidence.progress = progress
     graph = recipe.graph(evidence)
-    want = [*want, *recipe.always]
+    kept_names = recipe.expand(opened, (*recipe.maps, *recipe.files))
+    want = recipe.expand(opened, (*want, *recipe.always))
     # a stage's other maps cost nothing more, and only whole stages can be reused
     want = [
         name
         for stage in graph
         if set(stage.makes) & set(want)
         for name in stage.makes
-        if name in (*recipe.maps, *recipe.files)
+        if name in kept_names
     ]
     previous = _previous(Path(out))
     outcome = stages.run(graph, list(want), cache=_Kept(graph, previous), progress=progress)

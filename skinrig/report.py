@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.flash_stages import NOISE_STDERR
-from skinrig import evaluation, figures, page, surface_section
+from skinrig import evaluation, figures, microrelief_section, page, surface_section
 
 
 class ReportError(ValueError):
@@ -134,10 +134,13 @@ def _appearance_section(
     if pictures:
         body += f"<div class=maps>{''.join(pictures)}</div>"
     on_mesh = "position" in appearance.maps
+    microrelief = microrelief_section.is_microrelief(appearance)
     if on_mesh:
         body += surface_section.section(name, appearance, truth, checks)
+    elif microrelief:
+        body += microrelief_section.section(name, appearance, truth, checks)
     for key, skin_map in sorted(appearance.maps.items()):
-        if skin_map.values.ndim != 2 or key.startswith("_") or on_mesh:
+        if skin_map.values.ndim != 2 or key.startswith("_") or on_mesh or microrelief:
             continue
         if key.endswith(NOISE_STDERR):
             continue

@@ -251,7 +251,11 @@ def recipes():
     """Every recipe with the heading that its maps stand under."""
     from reconstruction import pipeline
 
-    headings = {"subject": "Maps of the flash rig", "olat": "Maps of the dome"}
+    headings = {
+        "subject": "Maps of the flash rig",
+        "olat": "Maps of the dome",
+        "gradient": "Maps of the gradient rig",
+    }
     found = {headings[kind]: recipe for kind, recipe in pipeline.RECIPES.items()}
     return {**found, "Maps of pictures under listed lights": pipeline.LIGHT_LIST}
 
@@ -265,7 +269,11 @@ def test_the_maps_page_lists_every_map_of_every_recipe():
 
 
 def test_the_maps_page_lists_the_files_that_go_along():
-    listed = {SPAN.findall(row[0])[0] for row in rows(MAPS_PAGE, "Files of the dome")}
+    listed = {
+        SPAN.findall(row[0])[0]
+        for heading in ("Files of the dome", "Files of the gradient rig")
+        for row in rows(MAPS_PAGE, heading)
+    }
     assert listed == {name for recipe in recipes().values() for name in recipe.files}
 
 

@@ -1,0 +1,210 @@
+"""Slopes as they were before the lens blurred them, as far as noise allows.
+
+A macro lens at a small aperture passes waves of some tens of micrometres with half their height,
+and nothing at all below its cutoff. What lies between the cutoff and the sampling limit of the
+pixels is noise alone, so that the pictures tell their own noise; what stands above it is divided by
+the lens's transfer, and the rest is left out (Wiener 1949; Gonzalez and Woods 2018, section 5.8).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+Floats = NDArray[np.float64]
+Floating = NDArray[np.floating]
+
+MOST_GAIN = 4.0
+"""Waves are raised by this factor at most: what the lens weakens more is as good as lost."""
+SMOOTH_BINS = 2.0
+"""Standard deviation by which the spectrum is smoothed, in bins of its own grid."""
+PAD_PX = 32
+LEAST_COSINE = 0.1
+"""Normals farther from the view than this are no measurement of a slope."""
+BEYOND = 1.03
+"""Of the cutoff: frequencies from here on hold noise alone."""
+
+
+class RestorationError(ValueError):
+    """Normals or a lens that slopes cannot be restored with."""
+
+
+@dataclass(frozen=True, slots=True)
+class Aperture:
+    """A lens without aberrations and the pixels behind it, both as they are on the subject.
+
+    Attributes
+    ----------
+    cutoff_um : float
+        Shortest period that passes, um: wavelength times working f-number over magnification.
+    pixel_um : float
+        Side of a pixel, um.
+    """
+
+    cutoff_um: float
+    pixel_um: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is no lens."""
+        for name in ("cutoff_um", "pixel_um"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise RestorationError(f"Aperture.{name}: got {value}, expected above 0")
+
+    @staticmethod
+    def of(
+        *, f_number: float, magnification: float, wavelength_um: float, pixel_um: float
+    ) -> Aperture:
+        """Return the aperture of a lens that images ``magnification`` times.
+
+        Parameters
+        ----------
+        f_number
+            As engraved, for a subject far away; the working one is (1 + magnification) times it.
+        magnification
+            Size of the image over that of the subject, > 0.
+        wavelength_um
+            Mean wavelength, um.
+        pixel_um
+            Side of a pixel on the subject, um.
+
+        Examples
+        --------
+        >>> lens = Aperture.of(f_number=16, magnification=11 / 12, wavelength_um=0.535, pixel_um=6)
+        >>> round(lens.cutoff_um, 2)
+        17.9
+        """
+        working = f_number * (1.0 + magnification)
+        return Aperture(wavelength_um * working / magnification, pixel_um)
+
+    def transfer(self, per_um_x: Floating, per_um_y: Floating) -> Floats:
+        """Return the modulation transfer of lens and pixel (Goodman 2005, eq. (6-31)).
+
+        Parameters
+        ----------
+        per_um_x, per_um_y
+            Spatial frequencies on the subject, 1/um, which broadcast.
+
+        Examples
+        --------
+        >>> lens = Aperture(18.0, 6.0)
+        >>> lens.transfer(np.array([0.0, 1 / 36.0, 1 / 18.0]), np.zeros(3)).round(3).tolist()
+        [1.0, 0.374, 0.0]
+        """
+        radius = np.minimum(np.hypot(per_um_x, per_um_y) * self.cutoff_um, 1.0)
+        lens = 2 / np.pi * (np.arccos(radius) - radius * np.sqrt(1.0 - radius**2))
+        return lens * np.sinc(per_um_x * self.pixel_um) * np.sinc(per_um_y * self.pixel_um)
+
+
+@dataclass(frozen=True, slots=True)
+class Restored:
+    """Normals of the surface before the lens.
+
+    Attributes
+    ----------
+    normals : ndarray, shape (H, W, 3)
+        Unit vectors; (0, 0, 1) where not valid.
+    noise : float
+        Standard deviation of one slope's noise in a pixel, before the filter.
+    kept_noise : float
+        The same after it.
+    filter : ndarray, shape (H + 64, W + 64)
+        What waves are multiplied by, on the grid of `scipy.fft.fftfreq`.
+    """
+
+    normals: Floating
+    noise: float
+    kept_noise: float
+    filter: Floats
+
+    def noise_field(self, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """Draw the noise that is left in both slopes, each of shape (H, W)."""
+        shape = self.normals.shape[:2]
+        x, y = (filtered(self.noise * rng.standard_normal(shape), self.filter) for _ in range(2))
+        return x, y
+
+
+def restore(
+    normals: Floating,
+    *,
+    lens: Aperture,
+    valid: NDArray[np.bool_],
+    smooth_px: float = 0.0,
+) -> Restored:
+    """Undo the blur of the lens where waves stand above the noise.
+
+    Parameters
+    ----------
+    normals : ndarray, shape (H, W, 3)
+        Unit vectors towards +z, blurred by the lens.
+    lens : Aperture
+    valid : ndarray of bool, shape (H, W)
+        Where they are known.
+    smooth_px : float
+        Standard deviation of a Gaussian by which they have been smoothed besides, px.
+
+    Returns
+    -------
+    Restored
+
+    Raises
+    ------
+    RestorationError
+        Where no normal is valid, or pixels are so large that no frequency is beyond the lens.
+    """
+    known = valid & (normals[..., 2] > LEAST_COSINE)
+    if not known.any():
+        raise RestorationError("valid: got no pixel with a normal towards the view")
+    z = np.where(known, normals[..., 2], 1.0)
+    slopes = [np.where(known, -normals[..., i] / z, 0.0).astype(np.float64) for i in (0, 1)]
+    means = [float(s[known].mean()) for s in slopes]
+    slopes = [np.where(known, s - m, 0.0) for s, m in zip(slopes, means, strict=True)]
+    spectra = [fft.fft2(_padded(s), workers=-1) for s in slopes]
+    shape = spectra[0].shape
+    per_um_y = fft.fftfreq(shape[0], lens.pixel_um)[:, None]
+    per_um_x = fft.fftfreq(shape[1], lens.pixel_um)[None, :]
+    through = lens.transfer(per_um_x, per_um_y)
+    smoothing = np.exp(
+        -2.0 * (np.pi * smooth_px * lens.pixel_um) ** 2 * (per_um_x**2 + per_um_y**2)
+    )
+    power = sum(np.abs(s) ** 2 for s in spectra) / 2.0
+    beyond = np.hypot(per_um_x, per_um_y) * lens.cutoff_um > BEYOND
+    if np.count_nonzero(beyond) < 16:
+        raise RestorationError(
+            f"pixel_um: got {lens.pixel_um:g}, expected below half of the lens's cutoff period "
+            f"{lens.cutoff_um:g}: no frequency holds noise alone"
+        )
+    # in powers of the smoothing: its weakest waves are rounding errors, and are not asked
+    told = beyond & (smoothing > 0.05)
+    told = told if np.count_nonzero(told) >= 16 else beyond
+    noise_power = float(np.mean(power[told]) / np.mean(smoothing[told] ** 2))
+    even = ndimage.gaussian_filter(power, SMOOTH_BINS, mode="wrap")
+    signal = np.maximum(even - noise_power * smoothing**2, 0.0)
+    share = np.where(even > 0, signal / np.where(even > 0, even, 1.0), 0.0)
+    blur = through * smoothing
+    gain = np.minimum(1.0 / np.maximum(blur, 1e-6), MOST_GAIN)
+    wiener = np.where(beyond, 0.0, share * gain)
+    restored = [
+        np.where(known, filtered(s, wiener) + m, 0.0) for s, m in zip(slopes, means, strict=True)
+    ]
+    found = np.stack([-restored[0], -restored[1], np.ones_like(restored[0])], axis=-1)
+    found /= np.linalg.norm(found, axis=-1, keepdims=True)
+    found[~known] = (0.0, 0.0, 1.0)
+    noise = math.sqrt(noise_power / power.size)
+    applied = wiener * smoothing
+    kept = noise * math.sqrt(float(np.mean(applied**2)))
+    return Restored(found.astype(normals.dtype), noise, kept, applied)
+
+
+def _padded(values: Floats) -> Floats:
+    return np.pad(values, PAD_PX, mode="symmetric")
+
+
+def filtered(values: Floats, transfer: Floats) -> Floats:
+    """Return values whose waves were multiplied by a transfer on a grid 64 pixels larger."""
+    whole = fft.ifft2(fft.fft2(_padded(values), workers=-1) * transfer, workers=-1).real
+    return whole[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]

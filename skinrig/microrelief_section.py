@@ -1,0 +1,329 @@
+"""The report's section on microrelief: states of strain beside their truths, and their trends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.skin import SkinAppearance, SkinMap
+from reconstruction.gradient_stages import HISTOGRAM_FILE, KERNEL_FILE, STRAIN_FILE
+from skinrig import figures, page
+from skinrig import microrelief_evaluation as evaluation
+
+WIDTH_PX = 200
+SHOWN = 7
+"""States shown as pictures, spread evenly over those there are."""
+HISTOGRAM_REACH = 0.75
+"""Part of a histogram's side that is shown, from its middle."""
+
+
+def is_microrelief(appearance: SkinAppearance) -> bool:
+    """Return whether an appearance holds states of stretched skin."""
+    return bool(evaluation.states_of(appearance))
+
+
+def section(
+    name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
+) -> str:
+    """Return the states of stretched skin, their histograms, kernels and errors.
+
+    Parameters
+    ----------
+    name
+        For headings.
+    appearance
+        With maps "normals_<state>" and "height_<state>".
+    truth
+        Of the same session; None: standard errors only.
+    checks
+        Judgements are added to it.
+    """
+    body = _pictures(appearance, truth)
+    if truth is not None:
+        body += _relief_errors(name, appearance, truth, checks)
+    body += _strain(name, appearance, truth, checks)
+    body += _histograms(appearance)
+    body += _variances(appearance)
+    body += _kernels(name, appearance, checks)
+    return body
+
+
+def _pictures(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
+    states = evaluation.states_of(appearance)
+    order = sorted(states, key=_by_step)
+    first = "a000_n0" if "a000_n0" in states else order[0]
+    body = _beside_truth(first, appearance, truth)
+    one = [state for state in order if state[:4] == first[:4]]
+    chosen = [one[round(k)] for k in np.linspace(0, len(one) - 1, min(SHOWN, len(one)))]
+    series = []
+    for kind, title in (("normals", "normals"), ("height", "height")):
+        row = ""
+        for state in chosen:
+            skin_map = appearance.maps.get(f"{kind}_{state}")
+            if skin_map is not None:
+                row += _shown(f"{title}, {_words(state)}", skin_map, appearance)
+        if row:
+            series.append(f"<div class=maps>{row}</div>")
+    if len(one) > 1:
+        body += "<h3>From compressed to stretched</h3>" + "".join(series)
+    return body
+
+
+def _beside_truth(state: str, appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
+    """Return truth | estimate | error | standard error of one state's normals and height."""
+    body = ""
+    normals = appearance.maps.get(f"normals_{state}")
+    true = None if truth is None else truth.maps.get(f"normals_{state}")
+    if normals is not None:
+        parts = []
+        if true is not None:
+            parts.append(_normal_picture("truth", true))
+        parts.append(_normal_picture("estimate", normals))
+        good = _valid(normals)
+        if true is not None:
+            from model import metrics
+
+            good = good & _valid(true)
+            error = np.degrees(metrics.angular_error_rad(normals.values, true.values))
+            parts.append(_angle_picture("error", np.nan_to_num(error), good))
+        if normals.stderr is not None:
+            spread = np.degrees(normals.stderr[..., 0])
+            parts.append(_angle_picture("standard error", spread, _valid(normals)))
+        body += f"<h3>normals, {_words(state)}</h3><div class=maps>{''.join(parts)}</div>"
+    height = appearance.maps.get(f"height_{state}")
+    if height is not None:
+        relief = None
+        if truth is not None:
+            relief = evaluation.true_relief(appearance, truth, state)
+        body += page.map_panel(
+            f"height, {_words(state)}", "um", estimate=height.values, standard_error=height.stderr,
+            truth=relief, valid=_valid(height), width=280,
+        )  # fmt: skip
+    return body
+
+
+def _shown(title: str, skin_map: SkinMap, appearance: SkinAppearance) -> str:
+    if skin_map.values.ndim == 3:
+        return _normal_picture(title, skin_map, width=WIDTH_PX)
+    heights = [m.values[_valid(m)] for k, m in appearance.maps.items() if k.startswith("height_a")]
+    reach = float(np.percentile(np.abs(np.concatenate(heights)), 99)) if heights else 1.0
+    return page.scalar_picture(
+        title, skin_map.values, low=-reach, high=reach, scale="RdBu_r", valid=_valid(skin_map),
+        unit="um", width=WIDTH_PX,
+    )  # fmt: skip
+
+
+def _normal_picture(title: str, skin_map: SkinMap, *, width: int = 280) -> str:
+    image = np.rint(255.0 * np.clip(0.5 + 0.5 * skin_map.values, 0.0, 1.0)).astype(np.uint8)
+    image[~_valid(skin_map)] = 128
+    return page.plain_picture(title, page.shrink(image, width).astype(np.uint8))
+
+
+def _angle_picture(title: str, degrees: NDArray[np.floating], valid: NDArray[np.bool_]) -> str:
+    inside = degrees[valid]
+    reach = float(np.percentile(inside, 98)) if inside.size else 1.0
+    return page.scalar_picture(
+        title, degrees, low=0.0, high=reach, scale="magma", valid=valid, unit="°"
+    )
+
+
+def _relief_errors(
+    name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
+) -> str:
+    rows = evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
+    if not rows:
+        return ""
+    worst = max(rows, key=lambda row: row.mean_deg)
+    checks.append(
+        page.Check(f"{name}: specular normals, mean error of the worst state", worst.mean_deg,
+                   evaluation.NORMAL_LIMIT_DEG, "<=", "°", worst.state)
+    )  # fmt: skip
+    with_height = [row for row in rows if math.isfinite(row.height_relative)]
+    if with_height:
+        tall = max(with_height, key=lambda row: row.height_relative)
+        checks.append(
+            page.Check(f"{name}: height, error over relief of the worst state",
+                       100 * tall.height_relative, 100 * evaluation.HEIGHT_LIMIT, "<=", "%",
+                       f"{tall.state}, relief {tall.relief_um:.1f} um")
+        )  # fmt: skip
+    return "<h3>Errors of normals and height</h3>" + page.table(
+        ("state", "pixels", "masked %", "mean error °", "median °", "68 % interval",
+         "unblurred truth °", "median standard error °", "68 % coverage %", "height rms um",
+         "relief rms um", "of relief %"),
+        [
+            (
+                row.state, row.pixels, 100 * row.masked, row.mean_deg, row.median_deg,
+                f"{row.interval_deg[0]:.3g} – {row.interval_deg[1]:.3g}", row.unblurred_deg,
+                row.stderr_deg, 100 * row.coverage, row.height_um, row.relief_um,
+                100 * row.height_relative,
+            )
+            for row in rows
+        ],
+    )  # fmt: skip
+
+
+def _strain(
+    name: str, appearance: SkinAppearance, truth: SkinAppearance | None, checks: list[page.Check]
+) -> str:
+    document = evaluation.document_of(appearance, STRAIN_FILE)
+    if document is None:
+        return ""
+    true = (
+        {}
+        if truth is None
+        else {row.state: row for row in evaluation.compare_stretch(appearance, truth)}
+    )
+    if true:
+        worst = max(true.values(), key=lambda row: abs(row.error))
+        checks.append(
+            page.Check(f"{name}: stretch of the skin, largest error", abs(worst.error),
+                       evaluation.STRAIN_LIMIT, "<=", "", worst.state)
+        )  # fmt: skip
+    rows = [
+        (
+            state["name"], _value(state["reading_mm"]), _value(state["force_n"]),
+            _value(state["reading_ratio"]), _value(state["stretch_s"]),
+            _value(state["stretch_s_stderr"]),
+            true[state["name"]].truth if state["name"] in true else math.nan,
+            _value(state["slip"]), _value(state["stretch_t"]),
+            math.degrees(_value(state["shear_rad"])), math.degrees(_value(state["rotation_rad"])),
+            state["windows"], "yes" if state["valid"] else "no",
+        )
+        for state in document["states"]
+    ]  # fmt: skip
+    return "<h3>Strain of the skin, from its pigment</h3>" + page.table(
+        ("state", "jaws mm", "force N", "caliper's ratio", "skin's r", "standard error", "true r",
+         "slip", "r across", "shear °", "rotation °", "windows", "measured"),
+        rows,
+    )  # fmt: skip
+
+
+def _histograms(appearance: SkinAppearance) -> str:
+    document = evaluation.document_of(appearance, HISTOGRAM_FILE)
+    if document is None:
+        return ""
+    states = sorted(document["states"], key=lambda state: _by_step(state["name"]))
+    chosen = [states[round(k)] for k in np.linspace(0, len(states) - 1, min(SHOWN, len(states)))]
+    counts = [np.asarray(state["counts"], float) for state in chosen]
+    top = max((float(np.sqrt(count).max()) for count in counts), default=1.0)
+    panels = ""
+    for state, count in zip(chosen, counts, strict=True):
+        side = len(count)
+        cut = round(side * (1 - HISTOGRAM_REACH) / 2)
+        # rows hold n across the jaws from -1: the page shows + at the top
+        small = np.sqrt(count)[::-1][cut : side - cut, cut : side - cut]
+        shown = np.kron(small, np.ones((4, 4)))
+        panels += page.scalar_picture(
+            _words(state["name"]), shown, low=0.0, high=top, scale="magma", width=WIDTH_PX
+        )
+    aliased = [state["name"] for state in states if state["aliased"]]
+    note = (
+        f"<p class=note>Too few samples a bucket in {', '.join(aliased)}: distances between these "
+        "histograms show chance.</p>"
+        if aliased
+        else ""
+    )
+    return (
+        "<h3>Histograms of normals, root of share</h3><p class=note>Along the jaws to the right, "
+        f"across them up.</p><div class=maps>{panels}</div>{note}"
+    )
+
+
+def _variances(appearance: SkinAppearance) -> str:
+    by_angle = evaluation.variances(appearance)
+    if not by_angle:
+        return ""
+    series = [
+        figures.Curve(
+            f"jaws at {angle:.0f}°", [row[0] for row in rows], [row[2] for row in rows],
+            [row[3] for row in rows],
+        )
+        for angle, rows in by_angle.items()
+    ]  # fmt: skip
+    plot = figures.curves(
+        "roughness along the jaws", "stretch ratio r of the skin", "variance of n", series
+    )
+    return f"<div class=plots>{plot}</div>"
+
+
+def _kernels(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> str:
+    document = evaluation.document_of(appearance, KERNEL_FILE)
+    if document is None or not document["fits"]:
+        return ""
+    fits: Sequence[Mapping[str, Any]] = sorted(document["fits"], key=lambda fit: fit["stretch_s"])
+    judged = [
+        (fit["name"], _value(fit["distance"]) / _value(fit["distance_before"]))
+        for fit in fits
+        if fit["valid"] and _value(fit["distance_before"]) > 0
+    ]
+    if judged:
+        worst = max(judged, key=lambda row: row[1])
+        checks.append(
+            page.Check(f"{name}: histogram distance after the kernel over that before, worst state",
+                       worst[1], evaluation.DISTANCE_LIMIT, "<=", "", worst[0])
+        )  # fmt: skip
+    body = "<h3>Convolution kernels</h3>" + page.table(
+        ("state", "r", "alpha", "sigma um", "distance before", "after", "by chance",
+         "nearly as good", "fitted"),
+        [
+            (
+                fit["name"], fit["stretch_s"], _value(fit["alpha"]), _value(fit["sigma_um"]),
+                _value(fit["distance_before"]), _value(fit["distance"]),
+                _value(fit.get("noise_floor")), fit.get("near_best_count", 0),
+                "yes" if fit["valid"] else "no",
+            )
+            for fit in fits
+        ],
+    )  # fmt: skip
+    plots = ""
+    for key, title in (("alpha", "kernel strength alpha"), ("sigma_um", "kernel width sigma, um")):
+        points: dict[float, list[tuple[float, float]]] = {}
+        for fit in fits:
+            if fit["valid"]:
+                points.setdefault(fit["angle_deg"], []).append((fit["stretch_s"], _value(fit[key])))
+        series = [
+            figures.Curve(
+                f"jaws at {angle:.0f}°", [r for r, _ in rows], [v for _, v in rows], line=False
+            )
+            for angle, rows in points.items()
+        ]
+        for table in document.get("tables", []):
+            line = table["lines"]
+            series.append(
+                figures.Curve(f"lines, {table['name']}", line["stretch"],
+                              [_value(v) for v in line[key]], marks=False)
+            )  # fmt: skip
+        if series:
+            plots += figures.curves(title, "stretch ratio r of the skin", title, series)
+    return body + f"<div class=plots>{plots}</div>"
+
+
+def _words(state: str) -> str:
+    """Return a state's name in words.
+
+    Examples
+    --------
+    >>> _words("a045_m2"), _words("a000_n0")
+    ('45°, compressed 2', '0°, neutral')
+    """
+    angle, step = state.split("_")
+    kinds = {"n": "neutral", "m": f"compressed {step[1:]}", "p": f"stretched {step[1:]}"}
+    return f"{int(angle[1:])}°, {kinds[step[0]]}"
+
+
+def _by_step(state: str) -> tuple[str, int]:
+    angle, step = state.split("_")
+    return angle, int(step[1:]) * (-1 if step[0] == "m" else 1)
+
+
+def _value(value: object) -> float:
+    return math.nan if value is None else float(str(value))
+
+
+def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+    shape = skin_map.values.shape[:2]
+    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
