@@ -1,6 +1,7 @@
 """The gradient rig's pictures: unit of light, orientation, polarization, states, noise."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from rigsim.scenes.gradient import (
     GradientScene,
     SceneError,
 )
+from rigsim.scenes.gradient_resolution import Waves, wavy_scene
 from rigsim.sensor import fixed_pattern
 from rigsim.sphere_build import PATTERN_WEIGHTS, build_sphere
 from rigsim.taped_skin import GripState
@@ -53,7 +55,7 @@ def flat_skin(skin):
 
 @pytest.fixture(scope="module")
 def scene(rig, skin):
-    return GradientScene(rig, skin)
+    return GradientScene(rig, skin, table_size=33)
 
 
 def test_a_diffuser_gets_its_part_of_the_meter_rate_behind_either_analyser(rig):
@@ -103,7 +105,7 @@ def test_slopes_towards_the_right_and_the_top_are_bright_under_x_and_y(scene):
 def test_crossed_polarizers_remove_the_surface_reflection_of_a_flat_patch(rig, flat_skin):
     """Black skin, ideal films: what is left in the middle is what is off the central view."""
     black = dataclasses.replace(flat_skin, albedo=np.zeros_like(flat_skin.albedo))
-    scene = GradientScene(rig, black, films=IDEAL)
+    scene = GradientScene(rig, black, films=IDEAL, table_size=33)
     moments = scene.moments(NEUTRAL)
     leak = moments["crossed"][0] / moments["parallel"][0]
     assert leak.max() < 0.02
@@ -122,7 +124,7 @@ def test_crossed_pictures_show_the_pigment(scene):
 
 def test_jaws_are_dark_and_end_at_the_aperture(rig, flat_skin):
     narrow = GripState(90.0, -4, 0.24, 1.0, True, False)
-    image = GradientScene(rig, flat_skin).radiance("full", grip=narrow)
+    image = GradientScene(rig, flat_skin, table_size=33).radiance("full", grip=narrow)
     pixel_mm = 0.006
     y = -(np.arange(SIDE) - 0.5 * (SIDE - 1)) * pixel_mm
     jaw, between = np.abs(y) > 0.12 + 0.03, np.abs(y) < 0.12 - 0.03
@@ -157,7 +159,7 @@ def test_no_light_gives_a_dark_frame(scene):
 def test_a_jump_of_20_pixels_moves_the_picture_by_20_pixels(rig, skin):
     still = PatchMotion(0, angle_um=0.0, angle_turn_deg=0.0, state_um=0.0, state_turn_deg=0.0,
                         drift_um=0.0, jumps_um={1.0: (120.0, 0.0)})  # fmt: skip
-    scene = GradientScene(rig, skin, motion=still)
+    scene = GradientScene(rig, skin, motion=still, table_size=33)
     before = scene.radiance("full", grip=NEUTRAL, t_s=0.5)
     after = scene.radiance("full", grip=NEUTRAL, t_s=1.5)
     inner = slice(8, -8)
@@ -174,7 +176,9 @@ def test_drift_moves_the_picture_as_it_says(rig, skin):
     assert np.hypot(dx, dy) > 1e-3
     lying = PatchMotion(4, drift_um=0.0, jumps_um={0.0: (1e3 * dx, 1e3 * dy)}, **still)
     drifted, lain, still_there = (
-        GradientScene(rig, skin, motion=motion).radiance("full", grip=NEUTRAL, t_s=t_s)
+        GradientScene(rig, skin, motion=motion, table_size=33).radiance(
+            "full", grip=NEUTRAL, t_s=t_s
+        )
         for motion in (drifting, lying, PatchMotion(4, drift_um=0.0, **still))
     )
     error = np.abs(drifted / lain - 1.0).max()
@@ -210,3 +214,46 @@ def test_nonsense_is_refused(rig, skin, scene):
         GradientScene(rig, skin, sectors=7)
     with pytest.raises(SceneError, match="subject"):
         GradientScene(rig, "cube")
+
+
+def test_cliffs_of_75_degrees_are_dark_but_finite():
+    """Steeper than the table goes, and in their own shadow; waves 0.12 mm long, 70 um high."""
+    scene = wavy_scene(optics=False)
+    scene.show(Waves(120.0, math.tan(math.radians(75.0))))
+    light = scene.moments(NEUTRAL)
+    normals = scene.surface(NEUTRAL).normals
+    full = light["parallel"][0] + light["crossed"][0]
+    assert np.isfinite(full).all()
+    assert full.min() > -1e-4 * full.max()
+    cliff, ridge = normals[..., 2] < 0.35, normals[..., 2] > 0.8
+    height = scene.surface(NEUTRAL).relief_um
+    valley = ridge & (height < 0.0)
+    crest = ridge & (height > 0.0)
+    assert cliff.any()
+    # the surface's reflection, which does not spread inside the skin
+    specular = light["parallel"][0] - light["crossed"][0]
+    assert specular[cliff].mean() < 0.5 * specular[crest].mean()
+    assert specular[valley].mean() < 0.8 * specular[crest].mean()  # their normals are alike
+
+
+def test_buckled_and_detached_skin_are_drawn_as_what_they_are(scene):
+    """A fold tilts normals by up to 15 degrees; skin that came off does not even bulge."""
+    buckled = GripState(0.0, -3, 5.6, 0.72, True, True)
+    loose = GripState(0.0, 5, 12.0, 1.0, False, False)
+    surfaces = {grip: scene.surface(grip) for grip in (NEUTRAL, buckled, loose)}
+    bulges = {grip: float(np.ptp(surface.bulge_um)) for grip, surface in surfaces.items()}
+    assert bulges[loose] == 0.0
+    assert 0.0 < bulges[NEUTRAL] < 2.0  # of 100 um over 8 mm, in 0.4 mm
+    assert bulges[buckled] > 10.0
+    for grip in (buckled, loose):
+        image = scene.radiance("full", grip=grip)
+        assert np.isfinite(image).all()
+        assert image.min() > 0.0
+
+
+def test_a_level_patch_mirrors_the_sphere_evenly(rig, flat_skin):
+    """No furrow, no shadow: one value over the field but for its own tilt of 0.05 degrees."""
+    level = GradientScene(rig, flat_skin, table_size=33)
+    moments = level.moments(NEUTRAL)
+    specular = (moments["parallel"] - moments["crossed"])[0, 6:-6, 6:-6]
+    assert np.ptp(specular) < 0.03 * specular.mean()
