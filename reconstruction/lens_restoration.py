@@ -93,7 +93,7 @@ class Aperture:
         --------
         >>> lens = Aperture(18.0, 6.0)
         >>> lens.transfer(np.array([0.0, 1 / 36.0, 1 / 18.0]), np.zeros(3)).round(3).tolist()
-        [1.0, 0.374, 0.0]
+        [1.0, 0.373, 0.0]
         """
         radius = np.minimum(np.hypot(per_um_x, per_um_y) * self.cutoff_um, 1.0)
         lens = 2 / np.pi * (np.arccos(radius) - radius * np.sqrt(1.0 - radius**2))
