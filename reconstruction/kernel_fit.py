@@ -42,7 +42,7 @@ ALPHAS = np.round(np.linspace(*ALPHA_LIMITS, 301), 2)
 """The paper's grid of strengths, by 0.01."""
 SIGMAS_UM = np.linspace(1.0, 100.0, 199)
 """The paper's grid of standard deviations, by 0.5 um."""
-FINER = 10
+FINER_ALPHA, FINER_SIGMA = 10, 5
 """The refinement's steps are so much smaller than the grid's, within one step to either side."""
 DRAWS = 200
 """Histograms drawn for the standard errors."""
@@ -83,7 +83,7 @@ class KernelFit:
     distance_before : float
         Eq. (7)'s sum for the neutral relief, only stretched.
     alpha_refined, sigma_refined_um, distance_refined : float
-        The best on a grid ten times finer around the best.
+        The best on a grid finer by ten in alpha and five in sigma, a step to either side.
     alpha_stderr, sigma_stderr_um : float
         How far the best moves when both histograms are drawn anew, with the scatter that blocks
         of the map show: what another patch of the same skin and size would change; at least a
@@ -539,8 +539,8 @@ def _refined(
     """Return the best of a finer grid that spans one step to either side, within the grid."""
     i, j = best
     result = (float(alphas[j]), float(sigmas[i]), distance)
-    fine_alpha = _finer(alphas, j)
-    for sigma in _finer(sigmas, i):
+    fine_alpha = _finer(alphas, j, FINER_ALPHA)
+    for sigma in _finer(sigmas, i, FINER_SIGMA):
         change = relief.change(float(sigma))
         found = buckets.distances((relief.along, relief.across), change, fine_alpha)
         k = int(np.argmin(found))
@@ -549,9 +549,9 @@ def _refined(
     return result
 
 
-def _finer(grid: Floats, i: int) -> Floats:
+def _finer(grid: Floats, i: int, finer: int) -> Floats:
     low, high = grid[max(i - 1, 0)], grid[min(i + 1, grid.size - 1)]
-    steps = FINER * (int(i > 0) + int(i < grid.size - 1))
+    steps = finer * (int(i > 0) + int(i < grid.size - 1))
     return np.linspace(low, high, steps + 1)
 
 
