@@ -28,6 +28,10 @@ Floats = NDArray[np.float64]
 SERIES = (0.73, 0.8, 0.9, 1.0, 1.12, 1.28)
 
 
+ONE_NOW = ["cheek", *(pytest.param(s, marks=pytest.mark.long) for s in SITES if s != "cheek")]
+"""Every site, all but one in the long tests."""
+
+
 def patch(height: Floats, *, layer_um: float = 8.0, texel_um: float = 10.0) -> MicroSkin:
     """Return a bare patch of uniform layer."""
     even = np.full(height.shape, 1.0, np.float32)
@@ -246,7 +250,7 @@ def test_stretch_one_is_the_neutral_relief_exactly() -> None:
     assert np.abs(force).max() < 1e-10
 
 
-@pytest.mark.parametrize("site", SITES)
+@pytest.mark.parametrize("site", ONE_NOW)
 def test_stretching_smooths_and_compressing_roughens_along_the_jaws(site: str) -> None:
     skin = make_micro_skin(site, seed=1, size_mm=0.8)
     states = [deform(skin, stretch=r, angle_deg=0.0) for r in SERIES]
@@ -352,10 +356,7 @@ def test_a_single_furrow_across_the_jaws_opens_and_one_along_them_stays() -> Non
 
 
 @pytest.mark.parametrize("stretch", [0.5, 2.0])
-@pytest.mark.parametrize(
-    "site",
-    ["cheek", *(pytest.param(site, marks=pytest.mark.long) for site in ("forehead", "chin"))],
-)
+@pytest.mark.parametrize("site", ONE_NOW)
 def test_half_and_twice_the_length_have_an_equilibrium(site: str, stretch: float) -> None:
     skin = make_micro_skin(site, seed=1, size_mm=0.5)
     state = deform(skin, stretch=stretch, angle_deg=90.0, tolerance=0.02)
@@ -374,6 +375,7 @@ def test_finer_and_coarser_texels_tell_the_same_change(texel_um: float) -> None:
     assert got[1] == pytest.approx(got[0], rel=0.08)
 
 
+@pytest.mark.long
 def test_a_stiffer_layer_keeps_its_length_better() -> None:
     skin = make_micro_skin("forehead", seed=2, size_mm=0.5)
     strain = []
