@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import get_num_threads, set_num_threads
 from numpy.typing import NDArray
 
 from reconstruction import integration_kernels as kernels
@@ -21,6 +22,8 @@ Float32 = NDArray[np.float32]
 COARSEST = 6
 """Nodes a side at which a grid is not made coarser any more."""
 _COARSEST_SWEEPS = 12
+_SMALL = 1 << 16
+"""Nodes of a level below which one thread does it."""
 _REDUCTION = 1e-4
 """Of the residual by float32 steps, before it is computed anew."""
 
@@ -103,6 +106,14 @@ class Hierarchy:
 
     def _coarse_cycle(self, depth: int) -> None:
         level = self.levels[depth]
+        threads = get_num_threads()
+        if threads > 1 and level.b.size < _SMALL:
+            set_num_threads(1)  # waiting for one another would take longer than the work
+            try:
+                self._coarse_cycle(depth)
+            finally:
+                set_num_threads(threads)
+            return
         A, b, x = level.A, level.b, level.x
         x.fill(0.0)
         last = depth + 1 == len(self.levels)
