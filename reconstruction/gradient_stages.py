@@ -41,8 +41,8 @@ FILES = (STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE)
 
 CUTOFF_UM = 1000.0
 """What is longer is bulge, not relief (Nagano et al. 2015, section 4)."""
-SMOOTH_PX = 0.85
-"""Of the pictures before normals are computed: the lens resolves three pixels."""
+SMOOTH_PX = 1.0
+"""Of the pictures before the roughness of facets is estimated: the lens resolves three pixels."""
 CROSSED_SMOOTH_PX = 2.0
 """Of the crossed pictures, which hold half the noise and less detail."""
 DIFFUSE_SMOOTH_PX = 2.0
@@ -187,13 +187,17 @@ def _lights(evidence: Evidence, serial: str) -> SphereLights:
     )
     leakage = np.zeros(len(names))
     leakage_stderr = np.zeros(len(names))
+    axis_deg = rig.views[0].analyser_axis_deg
+    axis_rad = math.radians(90.0 if axis_deg is None else axis_deg)
     if leak is not None:
         films = SphereFilms.from_calibration(leak, rig, serial)
         leakage, leakage_stderr = films.leakage, films.leakage_stderr
+        axis_rad += films.misalignment_rad
     return SphereLights(
         table.directions,
         intensities=table.intensities,
         leakage=leakage,
+        analyser=(math.cos(axis_rad), math.sin(axis_rad), 0.0),
         programmed=nominal.directions,
         distance_mm=float(np.mean(np.linalg.norm(place, axis=1))),
         intensity_stderr=table.intensities_stderr,
@@ -253,7 +257,9 @@ def _patterns_normals(
     rig: Rig,
     patterns: Patterns,
     component: Literal["specular", "diffuse"],
-    smooth_px: float,
+    *,
+    smooth_px: float = 0.0,
+    wiener: bool = False,
     alpha: Roughness | None = None,
 ) -> NormalMaps:
     shape = patterns.valid.shape
@@ -266,7 +272,8 @@ def _patterns_normals(
         lights=rig.lights,
         points_mm=rig.points_mm((shape[0], shape[1])),
         smooth_px=smooth_px,
-        smooth_crossed_px=CROSSED_SMOOTH_PX if component == "specular" else smooth_px,
+        smooth_crossed_px=None if wiener or component == "diffuse" else CROSSED_SMOOTH_PX,
+        wiener=wiener,
         alpha=alpha,
     )
 
@@ -287,8 +294,9 @@ def _normals(rig: Rig, state: SkinState, **made: Any) -> Mapping[str, Any]:
     """Return normals as the lens shows them, and the slopes of the surface before the lens."""
     patterns = rig.images.of(state)
     skin = skin_mask(patterns.crossed())
-    smooth = _patterns_normals(rig, patterns, "specular", SMOOTH_PX, made["_facets"])
-    sharp = _patterns_normals(rig, patterns, "specular", 0.0, made["_facets"])
+    facets: Roughness = made["_facets"]
+    smooth = _patterns_normals(rig, patterns, "specular", wiener=True, alpha=facets)
+    sharp = _patterns_normals(rig, patterns, "specular", alpha=facets)
     restored = restore(sharp.normals, lens=rig.lens, valid=sharp.valid & skin)
     return {
         f"normals_{state.name}": _normal_map(smooth, skin, "of the surface's reflection"),
@@ -299,7 +307,7 @@ def _normals(rig: Rig, state: SkinState, **made: Any) -> Mapping[str, Any]:
 def _diffuse(rig: Rig) -> Mapping[str, SkinMap]:
     state = rig.images.neutral
     patterns = rig.images.of(state)
-    found = _patterns_normals(rig, patterns, "diffuse", DIFFUSE_SMOOTH_PX)
+    found = _patterns_normals(rig, patterns, "diffuse", smooth_px=DIFFUSE_SMOOTH_PX)
     skin = skin_mask(patterns.crossed())
     what = "of the light from inside the skin, which spreads over tenths of a millimetre"
     return {f"diffuse_normals_{state.name}": _normal_map(found, skin, what)}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from model.skin import SkinMap
-from reconstruction.kernel_fit import KernelFit, fit_kernel
+from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, KernelFit, fit_kernel
 from reconstruction.kernel_table import KernelTableFitError, fit_table
 from reconstruction.normal_histogram import NormalStatistics, measure
 from reconstruction.skin_strain import StateStrain
@@ -21,6 +21,9 @@ LEAST_SAMPLES = 1000
 LEAST_STRAIN = 0.01
 """A state nearer to neutral than this has no kernel of its own: it would be that of the noise."""
 LINE_POINTS = 61
+FULL_GRID_PX = 1_000_000
+"""Patches of fewer pixels tell kernels no finer than by `COARSER` steps of the paper's grid."""
+COARSER = 3
 
 Float32 = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -163,10 +166,11 @@ def fit_kernels(
         if np.count_nonzero(inside) < LEAST_SAMPLES:
             continue
         target = statistics[each.state.name]
+        every = 1 if np.count_nonzero(inside) >= FULL_GRID_PX else COARSER
         fit = fit_kernel(
             turned, target.histogram, stretch=each.stretch_s[0], axis="x", pixel_um=pixel_um,
-            valid=inside, stretch_across=each.stretch_t[0],
-            target_samples=target.effective_samples,
+            valid=inside, stretch_across=each.stretch_t[0], alphas=ALPHAS[::every],
+            sigmas_um=SIGMAS_UM[::every], target_samples=target.effective_samples,
         )  # fmt: skip
         fits.append(_entry(each, fit))
     angles = sorted({fit["angle_deg"] for fit in fits})
