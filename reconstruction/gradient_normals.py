@@ -16,6 +16,7 @@ import os
 from collections.abc import Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -47,7 +48,7 @@ Valid = NDArray[np.bool_] | Mapping[Key, NDArray[np.bool_]] | None
 NEEDED = 3.0
 """Length of the moment vector over its standard error, below which a pixel has no normal."""
 LEAKY = 0.02
-"""Mean leakage from which polarizers do not cross well: 8 degrees off."""
+"""Median leakage from which polarizers do not cross well: 8 degrees off."""
 CONTRADICTION = 3.0
 """Mean square of residuals over their variance from which pictures are said not to fit together."""
 ALPHAS = (0.03, 0.06, 0.12, 0.24, 0.48, 0.9)
@@ -276,18 +277,25 @@ def _reflection(
     )
     leakage = 0.0
     if lights is not None:
-        leakage = float(np.average(lights.leakage, weights=lights.intensities))
+        # lights near Brewster's angle reflect next to nothing, most of it crossed: not a mean
+        leakage = float(np.median(lights.leakage[lights.intensities > 0]))
         if leakage > LEAKY:
-            _log.warning(
-                "polarizers leak: crossed pictures hold %.1f %% of the specular reflection, as if"
-                " the analyser were %.0f degrees off; corrected, at the price of signal",
-                100.0 * leakage,
-                np.degrees(np.arctan(np.sqrt(leakage))),
-            )
+            _warn_of_leakage(round(leakage, 4))
     return prepare(
         with_shared_dark(stacks), component, noise=noise, leakage=leakage, smooth_px=smooth_px,
         smooth_crossed_px=smooth_crossed_px,
     )  # fmt: skip
+
+
+@lru_cache(maxsize=64)
+def _warn_of_leakage(leakage: float) -> None:
+    """Say once for all pictures of one sphere how much passes crossed polarizers."""
+    _log.warning(
+        "polarizers leak: crossed pictures hold %.1f %% of the specular reflection, as if the"
+        " analyser were %.0f degrees off; corrected, at the price of signal",
+        100.0 * leakage,
+        np.degrees(np.arctan(np.sqrt(leakage))),
+    )
 
 
 def _views(view: ArrayLike, shape: tuple[int, int]) -> tuple[Floating, Floating]:

@@ -70,7 +70,9 @@ def _root(
 @app.command()
 def demo(
     out: Out = Path("demo"),
-    rigs: Annotated[str, typer.Option(help="Rigs: flash, dome, or both.")] = "flash,dome",
+    rigs: Annotated[
+        str, typer.Option(help="Rigs, joined by commas: flash, dome, gradient; default all.")
+    ] = "flash,dome,gradient",
     seed: Seed = 0,
     json: Json = False,
 ) -> None:

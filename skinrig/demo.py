@@ -15,7 +15,12 @@ import numpy as np
 
 from model import store
 from reconstruction import pipeline
-from skinrig import evaluation, reflection_evaluation, surface_evaluation
+from skinrig import (
+    evaluation,
+    microrelief_evaluation,
+    reflection_evaluation,
+    surface_evaluation,
+)
 from skinrig.calibrating import calibrate
 from skinrig.console import Console, plain
 from skinrig.simulation import Simulated, simulate_session, truth_folder
@@ -32,6 +37,10 @@ DOME_WANT = (
 )  # fmt: skip
 DOME_WIDTH_PX = 320
 """Pixels across each of the dome's cameras, unless said otherwise."""
+
+
+GRADIENT_SITE = "forehead"
+GRADIENT_WANT = ("normals", "height", "crossed", "strain", "histograms", "kernels")
 
 
 class DemoError(ValueError):
@@ -143,9 +152,45 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
     )
 
 
+def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
+    """Capture a glass ball and stretched skin in the gradient sphere, down to kernels."""
+    calibration = out / "calibration-gradient"
+    ball = out / "session-gradient-ball"
+    with share("gradient: capture a ball of black glass"):
+        simulate_session("gradient", ball, target="ball", seed=seed)
+    with share("gradient: calibrate lights and films"):
+        for kind in ("lights", "polarization"):
+            calibrate(kind, [ball], calibration)
+    with share("gradient: stretch and capture a patch of skin"):
+        capture = simulate_session(
+            "gradient", out / f"session-gradient-{GRADIENT_SITE}", site=GRADIENT_SITE, seed=seed,
+            width_px=None if width_px is None else max(128, min(width_px, 256)),
+        )  # fmt: skip
+    with share("gradient: reconstruct normals, heights and kernels"):
+        appearance = out / f"appearance-gradient-{GRADIENT_SITE}"
+        pipeline.reconstruct(
+            capture.session, want=GRADIENT_WANT, out=appearance, calibration=calibration,
+            truth=capture.truth.name if capture.truth else "",
+        )  # fmt: skip
+        found.errors += _microrelief_rows(appearance, capture.truth)
+    found.tables.append(
+        {
+            "title": "Light of a state's scan in the gradient sphere",
+            "head": ["figure", "value"],
+            "rows": [[name, value] for name, value in capture.light.items()],
+        }
+    )
+    found.tables.append(_left_out("gradient sphere", capture))
+    found.next = (
+        f"skinrig reconstruct {capture.session} --calibration {calibration} "
+        "--want height,kernels --out maps"
+    )
+
+
 RIGS: Mapping[str, Callable[[Path, int, Share, int | None, Findings], None]] = {
     "flash": _flash,
     "dome": _dome,
+    "gradient": _gradient,
 }
 """What the demo does with each rig, in this order."""
 
@@ -259,6 +304,27 @@ def _surface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
     held_out = reflection_evaluation.compare(found, true, rng=np.random.default_rng(0))
     if held_out is not None:
         rows.append([name, "reflection, held out", 100 * held_out.median, "%", float("nan"), 0.0])
+    return rows
+
+
+def _microrelief_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
+    if truth is None:
+        return []
+    found, true = store.read(appearance), store.read(truth)
+    name = appearance.name.removeprefix("appearance-")
+    rows: list[list[Any]] = []
+    for row in microrelief_evaluation.compare(found, true, rng=np.random.default_rng(0)):
+        if row.state.endswith("_n0"):
+            rows.append([name, "normals, neutral", row.mean_deg, "deg", 100 * row.coverage,
+                         100 * row.masked])  # fmt: skip
+            rows.append([name, "height, neutral", 100 * row.height_relative, "%",
+                         100 * row.height_coverage, 100 * row.masked])  # fmt: skip
+    strain = microrelief_evaluation.compare_stretch(found, true)
+    if strain:
+        worst = max(strain, key=lambda row: abs(row.error))
+        rows.append(
+            [name, f"stretch, {worst.state}", 100 * abs(worst.error), "%", float("nan"), 0.0]
+        )
     return rows
 
 

@@ -48,6 +48,8 @@ class ReliefError:
     height_um, relief_um
         Root mean square error of the height, and of the true relief itself, both without what is
         wider than a millimetre; NaN where no height was asked for.
+    height_coverage
+        Share of true heights within the standard error; the relief that the lens hides is no noise.
     """
 
     state: str
@@ -61,6 +63,7 @@ class ReliefError:
     coverage: float
     height_um: float
     relief_um: float
+    height_coverage: float
 
     @property
     def height_relative(self) -> float:
@@ -128,7 +131,7 @@ def compare(
         stderr = np.degrees(_stderr(found)[good])
         middle, interval = metrics.median_with_interval(error, rng=rng)
         covered = error <= RAYLEIGH_68 * stderr
-        height_um, relief_um = _height(appearance, truth, state, pixel_um)
+        height_um, relief_um, height_coverage = _height(appearance, truth, state, pixel_um)
         rows.append(
             ReliefError(
                 state, int(skin.sum()), 1.0 - float(good.sum()) / max(int(skin.sum()), 1),
@@ -136,6 +139,7 @@ def compare(
                 float(sharp.mean()) if sharp.size else math.nan,
                 float(np.median(stderr)) if stderr.size else math.nan,
                 float(covered.mean()) if covered.size else math.nan, height_um, relief_um,
+                height_coverage,
             )
         )  # fmt: skip
     return rows
@@ -143,16 +147,19 @@ def compare(
 
 def _height(
     appearance: SkinAppearance, truth: SkinAppearance, state: str, pixel_um: float
-) -> tuple[float, float]:
+) -> tuple[float, float, float]:
     found, true = appearance.maps.get(f"height_{state}"), truth.maps.get(f"height_{state}")
     if found is None or true is None or not math.isfinite(pixel_um):
-        return math.nan, math.nan
+        return math.nan, math.nan, math.nan
     good = _valid(found) & _valid(true)
     if not good.any():
-        return math.nan, math.nan
+        return math.nan, math.nan, math.nan
     relief = true_relief(appearance, truth, state)
     error = (found.values - relief)[good]
-    return float(np.std(error)), float(np.std(relief[good]))
+    covered = math.nan
+    if found.stderr is not None:
+        covered = float(np.mean(np.abs(error) <= found.stderr[good]))
+    return float(np.std(error)), float(np.std(relief[good])), covered
 
 
 def true_relief(
