@@ -297,10 +297,14 @@ def _normals(rig: Rig, state: SkinState, **made: Any) -> Mapping[str, Any]:
     facets: Roughness = made["_facets"]
     smooth = _patterns_normals(rig, patterns, "specular", wiener=True, alpha=facets)
     sharp = _patterns_normals(rig, patterns, "specular", alpha=facets)
-    restored = restore(sharp.normals, lens=rig.lens, valid=sharp.valid & skin)
+    # noise takes single pixels of steep furrows beyond what a lobe can tell; a hole there would cut
+    # the height, so that the filtered normal stands in
+    normals = np.where(sharp.valid[..., None], sharp.normals, smooth.normals)
+    known = (sharp.valid | smooth.valid) & skin
+    restored = restore(normals, lens=rig.lens, valid=known)
     return {
         f"normals_{state.name}": _normal_map(smooth, skin, "of the surface's reflection"),
-        f"_restored_{state.name}": (restored, sharp.valid & skin),
+        f"_restored_{state.name}": (restored, known, smooth.stderr_rad),
     }
 
 
@@ -330,10 +334,12 @@ def _height(rig: Rig, state: SkinState, **made: Any) -> Mapping[str, SkinMap]:
     """Integrate what the lens's blur was taken out of; remove what is wider than a millimetre."""
     restored: Restored
     valid: Bools
-    restored, valid = made[f"_restored_{state.name}"]
+    restored, valid, stderr_rad = made[f"_restored_{state.name}"]
     shape = valid.shape
     settings: dict[str, Any] = {
-        "pixel": rig.pixel_um, "camera": rig.perspective((shape[0], shape[1]))
+        "pixel": rig.pixel_um, "camera": rig.perspective((shape[0], shape[1])),
+        # steep walls of furrows, dim and partly hidden, count less
+        "stderr_rad": stderr_rad,
     }  # fmt: skip
     found = integrate_map(restored.normals, valid=valid, **settings)
     height = high_pass(found.height, pixel=rig.pixel_um, cutoff=CUTOFF_UM, valid=found.valid)

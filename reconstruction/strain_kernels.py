@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from model.microstructure import KernelTableError
 from model.skin import SkinMap
 from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, KernelFit, fit_kernel
 from reconstruction.kernel_table import KernelTableFitError, fit_table
@@ -205,7 +206,7 @@ def _table(fits: Sequence[Mapping[str, Any]], angle: float | None) -> dict[str, 
             [fit["alpha"] for fit in chosen],
             [fit["sigma_um"] for fit in chosen],
         )
-    except KernelTableFitError:
+    except (KernelTableFitError, KernelTableError):  # too few points, or lines that reach sigma 0
         return None
     low, high = found.table.stretch_range
     r = np.linspace(low, high, LINE_POINTS)
