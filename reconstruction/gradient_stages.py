@@ -46,8 +46,8 @@ SMOOTH_PX = 1.0
 CROSSED_SMOOTH_PX = 2.0
 """Of the crossed pictures, which hold half the noise and less detail."""
 DIFFUSE_SMOOTH_PX = 2.0
-WAVELENGTH_UM = 0.55
-"""Of white light behind a monochrome sensor, about its middle."""
+WAVELENGTH_UM = 0.535
+"""Of a white LED's light behind a monochrome sensor, its mean."""
 STDERR_SAMPLES = 6
 STDERR_SIGMA_PX = 8.0
 Float32 = NDArray[np.float32]

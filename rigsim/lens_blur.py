@@ -140,7 +140,7 @@ def lens_of(view: View, illuminant: str) -> Lens:
     >>> from capture.rig import load_rig
     >>> lens = lens_of(load_rig("gradient").view("cam"), "LED-B3")
     >>> round(lens.working_f_number, 2), round(lens.cutoff_period_um, 1)
-    (30.67, 18.3)
+    (30.67, 17.9)
     """
     magnification = view.focal_mm / view.distance_mm
     wavelength = spectra.WAVELENGTH_NM

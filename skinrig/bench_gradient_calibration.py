@@ -31,7 +31,7 @@ def sphere_lights(*, toy: bool) -> StageBenchmark:
         sphere = build_sphere(rig, seed=SEED)
         scene = GradientScene(rig, "ball", sphere=sphere, seed=SEED)
         shots = _shots(scene, rig)
-        for readings in ((0, 90), (0, 80, 90, 100))[1 if toy else 0 :]:
+        for readings in ((0, 90), (0, 80, 90, 100)):
             part = [one for one in shots if one.reading_deg in readings]
 
             def call(part: Sequence[Shot] = part, rig: Rig = rig) -> SphereSurvey:

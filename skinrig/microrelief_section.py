@@ -187,10 +187,11 @@ def _strain(
         (
             state["name"], _value(state["reading_mm"]), _value(state["force_n"]),
             _value(state["reading_ratio"]), _value(state["stretch_s"]),
-            _value(state["stretch_s_stderr"]),
+            round(_value(state["stretch_s_stderr"]), 6),
             true[state["name"]].truth if state["name"] in true else math.nan,
-            _value(state["slip"]), _value(state["stretch_t"]),
-            math.degrees(_value(state["shear_rad"])), math.degrees(_value(state["rotation_rad"])),
+            round(_value(state["slip"]), 6), _value(state["stretch_t"]),
+            round(math.degrees(_value(state["shear_rad"])), 4),
+            round(math.degrees(_value(state["rotation_rad"])), 4),
             state["windows"], "yes" if state["valid"] else "no",
         )
         for state in document["states"]
@@ -272,7 +273,7 @@ def _kernels(name: str, appearance: SkinAppearance, checks: list[page.Check]) ->
         else ""
     )
     body = "<h3>Convolution kernels</h3>" + note + page.table(
-        ("state", "r", "alpha", "sigma um", "distance before", "after", "by chance",
+        ("state", "r", "alpha", "sigma um", "distance before", "after", "other skin of this size",
          "nearly as good", "fitted"),
         [
             (
@@ -285,14 +286,23 @@ def _kernels(name: str, appearance: SkinAppearance, checks: list[page.Check]) ->
         ],
     )  # fmt: skip
     plots = ""
-    for key, title in (("alpha", "kernel strength alpha"), ("sigma_um", "kernel width sigma, um")):
-        points: dict[float, list[tuple[float, float]]] = {}
+    for key, error, title in (
+        ("alpha", "alpha_stderr", "kernel strength alpha"),
+        ("sigma_um", "sigma_stderr_um", "kernel width sigma, um"),
+    ):
+        points: dict[float, list[tuple[float, float, float]]] = {}
         for fit in fits:
             if fit["valid"]:
-                points.setdefault(fit["angle_deg"], []).append((fit["stretch_s"], _value(fit[key])))
+                points.setdefault(fit["angle_deg"], []).append(
+                    (fit["stretch_s"], _value(fit[key]), _value(fit[error]))
+                )
         series = [
             figures.Curve(
-                f"jaws at {angle:.0f}°", [r for r, _ in rows], [v for _, v in rows], line=False
+                f"jaws at {angle:.0f}°",
+                [row[0] for row in rows],
+                [row[1] for row in rows],
+                [row[2] for row in rows],
+                line=False,
             )
             for angle, rows in points.items()
         ]

@@ -58,6 +58,8 @@ def discover(paths: Sequence[Path]) -> Findings:
 
 def _sort_in(entry: Path, found: Findings) -> None:
     if entry.is_file() and entry.suffix == ".json" and entry.name != store.DOCUMENT:
+        if (entry.parent / store.DOCUMENT).is_file():
+            return  # of the appearance itself, which its section shows
         text = entry.read_text(encoding="utf-8", errors="replace")
         if '"schema"' in text and '"skinrig.' in text and "session" not in entry.name:
             found.documents.append(entry)

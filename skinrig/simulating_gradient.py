@@ -43,7 +43,7 @@ def simulate_gradient(order: Order) -> Simulated:
         "gradient", states=("neutral",), repeats=1, mesh=None, lights=None, views=None, move=False
     )
     if order.target is not None:
-        order.refuse("gradient's targets", site=None, angles=None, steps=None)
+        order.refuse("target of the gradient", site=None, angles=None, steps=None)
     # a ball of 12 mm fills the whole sensor, however small all else is kept
     width_px = WIDTHS_PX["full" if order.target == "ball" else order.size]
     rig = load_rig("gradient").cropped(order.width_px or width_px)

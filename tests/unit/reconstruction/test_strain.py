@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from scipy import ndimage
+
 from reconstruction.registration import RegistrationError
 from reconstruction.strain import measure_strain
-from scipy import ndimage
 
 SIDE = 1100
 
