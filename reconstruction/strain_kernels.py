@@ -13,7 +13,7 @@ from scipy import ndimage
 from model.microstructure import KernelTableError
 from model.skin import SkinMap
 from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, KernelFit, fit_kernel
-from reconstruction.kernel_table import KernelTableFitError, fit_table
+from reconstruction.kernel_table import KernelTableFitError, direction_dependence, fit_table
 from reconstruction.normal_histogram import NormalStatistics, measure
 from reconstruction.skin_strain import StateStrain
 
@@ -176,7 +176,12 @@ def fit_kernels(
         fits.append(_entry(each, fit))
     angles = sorted({fit["angle_deg"] for fit in fits})
     tables = [table for angle in (None, *angles) if (table := _table(fits, angle)) is not None]
-    return {"schema": "skinrig.kernels/1", "fits": fits, "tables": tables}
+    return {
+        "schema": "skinrig.kernels/1",
+        "fits": fits,
+        "tables": tables,
+        "direction": _direction(fits),
+    }
 
 
 def _entry(each: StateStrain, fit: KernelFit) -> dict[str, Any]:
@@ -230,6 +235,28 @@ def _table(fits: Sequence[Mapping[str, Any]], angle: float | None) -> dict[str, 
             "stretch": r, "alpha": np.clip(found.table.unlimited_alpha(r), -2.0, 1.0),
             "sigma_um": sigma,
         },
+    }  # fmt: skip
+
+
+def _direction(fits: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Return how kernels depend on the direction of stretch; None where it cannot be told."""
+    chosen = [fit for fit in fits if fit["valid"]]
+    columns = {
+        key: [fit[key] for fit in chosen] for key in ("stretch_s", "alpha", "sigma_um", "angle_deg")
+    }
+    try:
+        table = fit_table(columns["stretch_s"], columns["alpha"], columns["sigma_um"]).table
+        found = direction_dependence(
+            table, columns["stretch_s"], columns["alpha"], columns["sigma_um"],
+            np.radians(columns["angle_deg"]),
+        )  # fmt: skip
+    except (KernelTableFitError, KernelTableError):
+        return None
+    return {
+        "angle_deg": np.degrees(found.angle_rad), "alpha_offset": found.alpha_offset,
+        "alpha_stderr": found.alpha_stderr, "sigma_offset_um": found.sigma_offset_um,
+        "sigma_stderr_um": found.sigma_stderr_um, "p_alpha": found.p_alpha,
+        "p_sigma": found.p_sigma,
     }  # fmt: skip
 
 

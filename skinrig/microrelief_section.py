@@ -314,7 +314,28 @@ def _kernels(name: str, appearance: SkinAppearance, checks: list[page.Check]) ->
             )  # fmt: skip
         if series:
             plots += figures.curves(title, "stretch ratio r of the skin", title, series)
-    return body + f"<div class=plots>{plots}</div>"
+    return body + f"<div class=plots>{plots}</div>" + _direction(document.get("direction"))
+
+
+def _direction(found: Mapping[str, Any] | None) -> str:
+    if not found:
+        return ""
+    rows = [
+        (angle, _value(alpha), _value(alpha_error), _value(sigma), _value(sigma_error))
+        for angle, alpha, alpha_error, sigma, sigma_error in zip(
+            found["angle_deg"], found["alpha_offset"], found["alpha_stderr"],
+            found["sigma_offset_um"], found["sigma_stderr_um"], strict=True,
+        )
+    ]  # fmt: skip
+    return (
+        "<h3>Kernels by the direction of stretch, less one table of all</h3>"
+        + page.table(
+            ("jaws at °", "alpha", "standard error", "sigma um", "standard error um"), rows
+        )
+        + "<p class=note>Chance of such differences where the direction does not matter: alpha "
+        f"{100 * _value(found['p_alpha']):.2g} %, sigma {100 * _value(found['p_sigma']):.2g} %."
+        "</p>"
+    )
 
 
 def _told(fit: Mapping[str, Any]) -> bool:

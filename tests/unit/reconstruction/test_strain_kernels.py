@@ -1,0 +1,135 @@
+"""Kernels of states whose relief was made from the neutral one by a known kernel and stretch."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from model.skin import SkinMap
+from reconstruction.gradient_images import SkinState, state_name
+from reconstruction.skin_strain import StateStrain, skin_mask
+from reconstruction.strain import Strain
+from reconstruction.strain_kernels import count_normals, fit_kernels, histogram_document
+
+SIDE, PIXEL_UM = 240, 6.0
+
+
+@pytest.fixture(scope="module")
+def relief():
+    rng = np.random.default_rng(3)
+    big = sum(
+        weight * ndimage.gaussian_filter(rng.standard_normal((2 * SIDE, 2 * SIDE)), sigma) * sigma
+        for weight, sigma in ((1.0, 2.0), (2.0, 5.0))
+    )
+    return 9.0 * big / big.std()
+
+
+def middle(whole):
+    edge = SIDE // 2
+    return whole[edge : edge + SIDE, edge : edge + SIDE]
+
+
+def strained(relief, angle_deg, r, alpha, sigma_um):
+    """Convolve along the jaws by SciPy, then stretch: height at x is that at x / r."""
+    axis = 1 if angle_deg == 0 else 0
+    blurred = ndimage.gaussian_filter1d(relief, sigma_um / PIXEL_UM, axis=axis, mode="reflect")
+    made = (1 - alpha) * relief + alpha * blurred
+    center = (np.array(relief.shape) - 1) / 2
+    scale = np.array([1.0, 1 / r] if axis == 1 else [1 / r, 1.0])
+    return ndimage.affine_transform(made, scale, center - scale * center, order=3)
+
+
+def state(angle_deg, step, r):
+    turn = math.radians(angle_deg)
+    axis = np.array([math.cos(turn), math.sin(turn)])
+    gradient = np.eye(2) + (r - 1) * np.outer(axis, axis)
+    described = SkinState(state_name(angle_deg, step), angle_deg, step, 8 * r, 0.1)
+    told = Strain(gradient, np.zeros(2), 1e-8 * np.eye(6), 0.05, 100, True)
+    return StateStrain(described, r, told)
+
+
+def as_map(height):
+    stderr = np.full(height.shape, 0.1, np.float32)
+    return SkinMap(height.astype(np.float32), "um", stderr, np.ones(height.shape, bool))
+
+
+KNOWN = {(0.0, 1): (1.1, 0.6, 16.0), (0.0, -1): (0.9, -0.8, 16.0), (90.0, 1): (1.1, 0.6, 16.0),
+         (90.0, -1): (0.9, -0.8, 16.0)}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def fitted(relief):
+    strains = [state(0.0, 0, 1.0)]
+    heights = {"a000_n0": as_map(middle(relief))}
+    for (angle, step), (r, alpha, sigma) in KNOWN.items():
+        strains.append(state(angle, step, r))
+        heights[strains[-1].state.name] = as_map(middle(strained(relief, angle, r, alpha, sigma)))
+    counted = count_normals(strains, heights, pixel_um=PIXEL_UM)
+    told = []
+    document = fit_kernels(strains, heights, counted, pixel_um=PIXEL_UM, tell=told.append)
+    return strains, counted, document, told
+
+
+def test_known_kernels_come_back_at_both_angles(fitted):
+    _, _, document, _ = fitted
+    for fit in document["fits"]:
+        step = 1 if "_p" in fit["name"] else -1
+        _, alpha, sigma = KNOWN[(fit["angle_deg"], step)]
+        low, high = fit["alpha_interval"]
+        assert low <= alpha <= high
+        low, high = fit["sigma_interval_um"]
+        assert low <= sigma <= high
+        assert fit["distance"] < 0.6 * fit["distance_before"]
+
+
+def test_variances_change_more_along_the_jaws_than_across(fitted):
+    strains, counted, _, _ = fitted
+    rows = {row["name"]: row for row in histogram_document(strains, counted)["states"]}
+    for angle in ("a000", "a090"):
+        along = [rows[f"{angle}_{step}"]["variance_s"] for step in ("m1", "p1")]
+        across = [rows[f"{angle}_{step}"]["variance_t"] for step in ("m1", "p1")]
+        assert along[0] / along[1] > 1.5 * max(across[0] / across[1], 1.0)
+
+
+def test_progress_is_told_and_the_direction_does_not_matter_here(fitted):
+    _, _, document, told = fitted
+    assert told == [0.0, 0.25, 0.5, 0.75]
+    if document["direction"] is not None:
+        assert document["direction"]["p_alpha"] > 1e-3
+
+
+def test_a_state_near_neutral_or_without_strain_has_no_kernel(relief):
+    lost = state(0.0, 2, 1.2)
+    lost = StateStrain(
+        lost.state, 1.2,
+        Strain(np.eye(2), np.zeros(2), np.full((6, 6), np.inf), math.inf, 0, False),
+    )  # fmt: skip
+    strains = [state(0.0, 0, 1.0), state(0.0, 1, 1.004), lost]
+    heights = {each.state.name: as_map(middle(relief)) for each in strains}
+    counted = count_normals(strains, heights, pixel_um=PIXEL_UM)
+    document = fit_kernels(strains, heights, counted, pixel_um=PIXEL_UM, tell=lambda share: None)
+    assert document["fits"] == []
+    assert document["tables"] == []
+
+
+def test_only_skin_that_both_states_show_is_counted(relief):
+    wide = state(0.0, 1, 1.25)
+    strains = [state(0.0, 0, 1.0), wide]
+    heights = {each.state.name: as_map(middle(relief)) for each in strains}
+    half = np.zeros((SIDE, SIDE), bool)
+    half[:, : SIDE // 2] = True
+    heights["a000_n0"] = SkinMap(
+        heights["a000_n0"].values, "um", heights["a000_n0"].stderr, half
+    )  # fmt: skip
+    counted = count_normals(strains, heights, pixel_um=PIXEL_UM)
+    # of the stretched state only what the left half of the neutral one has become
+    assert counted[wide.state.name].samples == pytest.approx(SIDE * SIDE / 2, rel=0.05)
+
+
+def test_jaws_are_no_skin():
+    picture = np.full((200, 200), 0.3, np.float32)
+    picture[:, :40] = 0.02
+    mask = skin_mask(picture)
+    assert not mask[:, :40].any()
+    assert mask[60:140, 70:].all()
