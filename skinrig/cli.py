@@ -91,6 +91,9 @@ def simulate(
     rig: Annotated[str, typer.Argument(help="Name of a rig: flash, dome or gradient.")],
     out: Out,
     size: Annotated[str, typer.Option(help="Of the pictures: small or full.")] = "small",
+    width: Annotated[
+        int | None, typer.Option(help="Pixels across, instead of the size; even but for gradient.")
+    ] = None,
     lights: Annotated[
         int | None, typer.Option(help="How many of the dome's lights; default 48, full all 150.")
     ] = None,
@@ -130,7 +133,7 @@ def simulate(
 
     console = Console(json)
     done = simulate_session(
-        rig, out, size=size, seed=seed, subject=subject, mesh=mesh, target=target,
+        rig, out, size=size, width_px=width, seed=seed, subject=subject, mesh=mesh, target=target,
         states=tuple(state or ("neutral",)), resume=resume, lights=lights, views=views, move=move,
         site=site, angles=numbers_of(angles, "--angles"), steps=range_of(steps, "--steps"),
         progress=console.progress,

@@ -105,6 +105,8 @@ class Order:
             raise SimulationError(f"size: got {self.size!r}, expected one of {', '.join(SIZES)}")
         if self.seed < 0:
             raise SimulationError(f"seed: got {self.seed}, expected 0 or more")
+        if self.width_px is not None and self.width_px < 16:
+            raise SimulationError(f"width: got {self.width_px}, expected 16 pixels or more")
 
     def refuse(self, rig: str, **unset: object) -> None:
         """Raise where something was asked for that the rig does not know."""
