@@ -55,10 +55,10 @@ def gaussian_weights(sigma_px: float) -> Floats:
 
     Examples
     --------
-    >>> gaussian_weights(0.7).round(4)
-    array([5.698e-01, 2.054e-01, 9.600e-03, 1.000e-04])
-    >>> gaussian_weights(0.1)
-    array([1.])
+    >>> gaussian_weights(0.7).round(4).tolist()
+    [0.5698, 0.2054, 0.0096, 0.0001]
+    >>> gaussian_weights(0.1).tolist()
+    [1.0]
     """
     if not (math.isfinite(sigma_px) and sigma_px > 0):
         raise ValueError(f"sigma_px: got {sigma_px}, expected a finite number above 0")
@@ -257,8 +257,8 @@ def kernel_parameters(
     Examples
     --------
     >>> alpha, sigma_um = kernel_parameters([0.8, 1.0, 1.2])
-    >>> alpha.round(3), sigma_um.round(2)
-    (array([-1.48 ,  0.   ,  0.618]), array([ 9.5 , 11.7 , 19.34]))
+    >>> alpha.round(3).tolist(), sigma_um.round(2).tolist()
+    ([-1.48, 0.0, 0.618], [9.5, 11.7, 19.34])
     """
     if outside not in ("refuse", "clamp"):
         raise ValueError(f'outside: got {outside!r}, expected "refuse" or "clamp"')

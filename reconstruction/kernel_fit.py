@@ -46,7 +46,7 @@ FINER_ALPHA, FINER_SIGMA = 10, 5
 """The refinement's steps are so much smaller than the grid's, within one step to either side."""
 DRAWS = 200
 """Histograms drawn for the standard errors."""
-MOST_DRAWN = 192
+MOST_DRAWN = 64
 """Nearly-as-good kernels among which each draw finds its best."""
 DRAWN_WITHIN = 3.0
 """They are taken from within so many standard errors of the distance."""
