@@ -200,6 +200,108 @@ class Caliper:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Fibre:
+    """One detection fibre of a contact probe, from the head's face to its end before the camera."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    name: str
+    position_mm: tuple[float, float]
+    """Centre on the head's face from the source fibre's centre, mm; x along the line of fibres."""
+    core_mm: float
+    """Diameter of the core, mm, > 0."""
+    numerical_aperture: float
+    """Sine of the half angle in air that the fibre takes light from, 0 < NA < 1."""
+    spot_px: tuple[float, float]
+    """Nominal centre of its end in the camera's image, pixels, x right, y down."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(f"Fibre {self.name!r}", RigError)
+        checks.that("name", self.name, is_id(self.name), ID_RULE)
+        checks.finite(position_mm=self.position_mm, spot_px=self.spot_px)
+        checks.positive(core_mm=self.core_mm, numerical_aperture=self.numerical_aperture)
+        na = self.numerical_aperture
+        checks.that("numerical_aperture", na, na < 1, "0 < NA < 1")
+        checks.close()
+
+    @property
+    def radius_mm(self) -> float:
+        """Distance from the source fibre's centre, mm."""
+        return math.hypot(*self.position_mm)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Probe:
+    """A contact probe: one source fibre and a line of detection fibres, held on by suction.
+
+    The rig's one light is what comes out of the source fibre, at the origin of the rig's frame;
+    +x is along the line of fibres and +z out of the skin.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    fibres: tuple[Fibre, ...]
+    """By growing distance from the source."""
+    source_core_mm: float
+    """Diameter of the source fibre's core, mm, > 0."""
+    source_numerical_aperture: float
+    """Sine of the half angle in air of the light that it sends out, 0 < NA < 1."""
+    suction_mbar: float
+    """Suction at which the head is held on the skin, mbar below the air's pressure, > 0."""
+    suction_tolerance_mbar: float
+    """How far from it a measurement may go on, mbar, > 0."""
+    max_suction_mbar: float
+    """The most that the pump may draw, mbar, > 0."""
+    max_suction_s: float
+    """Longest time that skin is sucked at without a rest, s, > 0."""
+    rest_s: float
+    """Rest between two such times, vented, s, >= 0."""
+    settle_s: float
+    """Time from the suction's being reached to the first exposure, s, >= 0."""
+    max_open_s: float = 30.0
+    """Longest time that the source's shutter stays open for one command, s, > 0."""
+    camera_c: float
+    """Temperature at which the camera is kept, degrees Celsius."""
+    camera_tolerance_c: float
+    """How far from it a measurement may go on, kelvin, > 0."""
+
+    def __post_init__(self) -> None:
+        checks = Checks("Probe", RigError)
+        names = tuple(fibre.name for fibre in self.fibres)
+        differ = len(set(names)) == len(names) > 0
+        checks.that("fibres", names, differ, "at least one, names that differ")
+        radii = tuple(fibre.radius_mm for fibre in self.fibres)
+        grow = all(a < b for a, b in zip((0.0, *radii), radii, strict=False))
+        checks.that("fibres", radii, grow, "growing distances > 0 from the source")
+        fields = [field.name for field in dataclasses.fields(self)]
+        free = ("fibres", "rest_s", "settle_s", "camera_c")
+        checks.positive(**{name: getattr(self, name) for name in fields if name not in free})
+        na = self.source_numerical_aperture
+        checks.that("source_numerical_aperture", na, na < 1, "0 < NA < 1")
+        for name in ("rest_s", "settle_s"):
+            seconds = getattr(self, name)
+            checks.that(name, seconds, 0 <= seconds < math.inf, "seconds >= 0")
+        most = self.max_suction_mbar
+        fits = self.suction_mbar + self.suction_tolerance_mbar <= most
+        checks.that("suction_mbar", self.suction_mbar, fits, f"with its tolerance <= {most}")
+        kept = -80.0 <= self.camera_c <= 60.0
+        checks.that("camera_c", self.camera_c, kept, "-80 to 60 degrees Celsius")
+        checks.close()
+
+    @property
+    def radius_mm(self) -> tuple[float, ...]:
+        """Distances of the fibres from the source, mm.
+
+        Examples
+        --------
+        >>> radii = load_rig("probe").probe.radius_mm
+        >>> len(radii), radii[0], radii[-1]
+        (28, 0.3, 7.05)
+        """
+        return tuple(fibre.radius_mm for fibre in self.fibres)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class View:
     """One camera of the rig: pinhole, sensor and analyser, all nominal."""
 
@@ -368,6 +470,8 @@ class Rig:
     """Limits of the rig's LEDs; None: it has none."""
     caliper: Caliper | None = None
     """What stretches the skin; None: nothing does."""
+    probe: Probe | None = None
+    """What touches the skin with fibres; None: nothing does."""
 
     def __post_init__(self) -> None:
         checks = Checks(f"Rig {self.name!r}", RigError)

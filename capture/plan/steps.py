@@ -18,6 +18,7 @@ Kind = Literal[
     "dark", "flat", "chart", "malus", "subject",
     "olat", "tracking", "charuco", "mirror", "white",
     "gradient", "ball",
+    "fibres", "phantom", "mask",
 ]  # fmt: skip
 Polarizer = Literal["parallel", "crossed"]
 
@@ -40,6 +41,8 @@ _SETTINGS: Mapping[str, tuple[tuple[type, ...], Any, str]] = {
     "leds": ((str,), lambda v: all(is_id(name) for name in v.split("+")), "names joined by +"),
     "pattern": ((str,), lambda v: v in PATTERNS, f"one of {', '.join(PATTERNS)}"),
     "dwell_s": ((int, float), lambda v: 0 < v < math.inf, "seconds > 0"),
+    "suction_mbar": ((int, float), lambda v: 0 < v < math.inf, "mbar > 0"),
+    "fibre": ((int,), lambda v: v >= 0, "a fibre's number >= 0, or none for all"),
 }
 
 
@@ -58,7 +61,9 @@ class Step:
     kind : str
         Of the flash rig "flat", "chart", "malus" or "subject"; of the dome "olat" (one light at a
         time), "tracking" (several at once), "charuco", "mirror" or "white"; of the gradient sphere
-        "gradient" (skin) or "ball" (a ball of black glass); of all "dark".
+        "gradient" (skin) or "ball" (a ball of black glass); of the fibre probe "fibres" (skin),
+        "phantom" (a block of known optics) or "mask" (that, with all fibres covered but one); of
+        all "dark".
     index : mapping of str to str, int or float
         Where the step stands in its series, e.g. ``{"state": "neutral", "repeat": 0}``.
     settings : mapping of str to str, int, float or bool
@@ -66,7 +71,8 @@ class Step:
         ``exposure_s`` (s), ``iso``; ``analyser_deg`` (rotator reading, degrees; 0 is parallel, 90
         crossed) takes precedence over ``polarizer``. On the dome ``light`` (its name), or ``leds``
         (names joined by +), at ``level`` (0 to 1) for ``dwell_s``; in the gradient sphere
-        ``pattern`` instead of lights. A rig may bring further names.
+        ``pattern`` instead of lights; of the fibre probe ``suction_mbar`` and ``fibre`` (number of
+        the only fibre that is not covered). A rig may bring further names.
     cameras : tuple of str
         Views that take a frame.
 
