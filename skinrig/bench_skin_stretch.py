@@ -109,4 +109,6 @@ def _flat(skin: MicroSkin) -> MicroSkin:
         for name in ("height_um", "albedo", "alpha", "layer_um")
     }
     maps["height_um"] = np.zeros_like(maps["height_um"])
+    # a layer of uneven thickness bends when it is compressed, however flat its top is
+    maps["layer_um"] = np.full_like(maps["layer_um"], maps["layer_um"].mean())
     return replace(skin, **maps)  # type: ignore[arg-type]
