@@ -1,12 +1,14 @@
 """The demo as a newcomer runs it: rigs by name, a folder that is its own, a report at the end."""
 
 import json
+import multiprocessing
 
 import pytest
 
 from skinrig.cli import main
 from skinrig.console import Console
 from skinrig.demo import RIGS, DemoError, run_demo
+from skinrig.simulation import SimulationError
 
 
 @pytest.fixture
@@ -42,8 +44,14 @@ def test_each_rig_that_is_named_runs_and_no_other(tmp_path, monkeypatch, without
     for asked, expected in ((["dome"], ["dome"]), (["flash"], ["flash"]),
                             (["dome", "flash"], ["flash", "dome"])):  # fmt: skip
         ran.clear()
-        run_demo(tmp_path / "demo", asked, console=Console(False))
+        run_demo(tmp_path / "demo", asked, console=Console(False), jobs=1)
         assert ran == expected
+
+
+def test_an_error_in_one_of_two_rigs_side_by_side_is_that_rigs_own(tmp_path):
+    with pytest.raises(SimulationError, match="width"):
+        run_demo(tmp_path / "demo", ["flash", "dome"], console=Console(False), width_px=4, jobs=2)
+    assert not multiprocessing.active_children()
 
 
 def shown(out, capsys):

@@ -1,0 +1,237 @@
+"""What the demo does with each rig: simulate, capture, calibrate, reconstruct and measure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model import store
+from reconstruction import pipeline
+from skinrig import (
+    evaluation,
+    microrelief_evaluation,
+    reflection_evaluation,
+    surface_evaluation,
+)
+from skinrig.calibrating import calibrate
+from skinrig.simulation import Simulated, simulate_session
+
+FLASH_SUBJECTS = ("II", "IV")
+"""Skin types of the flash rig's faces: one light, one dark, so that errors by melanin show."""
+FLASH_WANT = (
+    "melanin", "hemoglobin", "shading", "residual", "diffuse", "picture", "specular_picture",
+    "tsumura_melanin", "tsumura_hemoglobin",
+)  # fmt: skip
+DOME_SUBJECT = "III"
+DOME_WANT = (
+    "half_vector_normals", "normals", "normals_refined", "r_d", "lobe_residual", "samples",
+)  # fmt: skip
+DOME_WIDTH_PX = 320
+"""Pixels across each of the dome's cameras, unless said otherwise."""
+
+GRADIENT_SITE = "forehead"
+GRADIENT_WANT = ("normals", "height", "crossed", "strain", "histograms", "kernels")
+
+
+@dataclass(slots=True)
+class Findings:
+    """What the rigs of a demo leave for its tables."""
+
+    errors: list[list[Any]] = field(default_factory=list)
+    """Subject, map, error, coverage, share masked."""
+    tables: list[dict[str, Any]] = field(default_factory=list)
+    next: str = ""
+
+
+Share = Callable[[str], AbstractContextManager[None]]
+
+
+def _flash(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
+    """Capture targets and two faces with the flash rig, down to melanin and hemoglobin."""
+    calibration = out / "calibration-flash"
+    with share("flash: capture the calibration targets"):
+        for target in ("flat", "white", "chart", "malus"):
+            simulate_session(
+                "flash", out / f"session-flash-{target}", target=target, seed=seed,
+                width_px=width_px,
+            )  # fmt: skip
+    with share("flash: calibrate"):
+        for kind, target in (
+            ("sensor", "flat"), ("white", "white"), ("color", "chart"), ("polarization", "malus"),
+        ):  # fmt: skip
+            calibrate(kind, [out / f"session-flash-{target}"], calibration)
+    captures: list[Simulated] = []
+    with share("flash: capture two faces"):
+        for subject in FLASH_SUBJECTS:
+            captures.append(
+                simulate_session(
+                    "flash",
+                    out / f"session-flash-{subject}",
+                    subject=subject,
+                    seed=seed,
+                    width_px=width_px,
+                )
+            )
+    with share("flash: reconstruct melanin and hemoglobin"):
+        for capture in captures:
+            name = capture.session.name.removeprefix("session-")
+            truth = capture.truth
+            pipeline.reconstruct(
+                capture.session, want=FLASH_WANT, out=out / f"appearance-{name}",
+                calibration=calibration, truth=truth.name if truth else "",
+            )  # fmt: skip
+            found.errors += _chromophore_rows(out / f"appearance-{name}", truth)
+    found.tables.append(
+        {
+            "title": "Resolution lost as light spreads in the skin, 10 to 90 % of an edge, mm",
+            "head": ["subject", "red", "green", "blue"],
+            "rows": [[c.session.name, *(round(mm, 3) for mm in c.blur_mm)] for c in captures],
+        }
+    )
+    found.tables.append(_left_out("flash rig", captures[0]))
+    found.next = (
+        f"skinrig reconstruct {captures[0].session} --calibration {calibration} --want melanin "
+        "--out maps"
+    )
+
+
+def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
+    """Capture targets and a face with the light dome, down to normals, albedo and lobes."""
+    calibration = out / "calibration-dome"
+    width = DOME_WIDTH_PX if width_px is None else min(width_px, DOME_WIDTH_PX)
+    sessions = {name: out / f"session-dome-{name}" for name in ("charuco", "mirror", "white")}
+    with share("dome: capture the calibration targets"):
+        for target, session in sessions.items():
+            simulate_session("dome", session, target=target, seed=seed, width_px=width)
+    with share("dome: calibrate cameras and lights"):
+        calibrate("geometry", [sessions["charuco"]], calibration)
+        calibrate("lights", [sessions["mirror"], sessions["white"]], calibration)
+    with share("dome: scan and capture a face"):
+        capture = simulate_session(
+            "dome", out / f"session-dome-{DOME_SUBJECT}", subject=DOME_SUBJECT, seed=seed,
+            width_px=width,
+        )  # fmt: skip
+    with share("dome: reconstruct normals, albedo and lobes"):
+        appearance = out / f"appearance-dome-{DOME_SUBJECT}"
+        pipeline.reconstruct(
+            capture.session, want=DOME_WANT, out=appearance, calibration=calibration,
+            truth=capture.truth.name if capture.truth else "",
+        )  # fmt: skip
+        found.errors += _surface_rows(appearance, capture.truth)
+    found.tables.append(
+        {
+            "title": "Light of the dome's capture",
+            "head": ["figure", "value"],
+            "rows": [[name, value] for name, value in capture.light.items()],
+        }
+    )
+    found.tables.append(_left_out("dome", capture))
+    found.next = (
+        f"skinrig reconstruct {capture.session} --calibration {calibration} --want normals,r_d "
+        "--out maps"
+    )
+
+
+def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
+    """Capture a glass ball and stretched skin in the gradient sphere, down to kernels."""
+    calibration = out / "calibration-gradient"
+    ball = out / "session-gradient-ball"
+    with share("gradient: capture a ball of black glass"):
+        simulate_session("gradient", ball, target="ball", seed=seed)
+    with share("gradient: calibrate lights and films"):
+        for kind in ("lights", "polarization"):
+            calibrate(kind, [ball], calibration)
+    with share("gradient: stretch and capture a patch of skin"):
+        capture = simulate_session(
+            "gradient", out / f"session-gradient-{GRADIENT_SITE}", site=GRADIENT_SITE, seed=seed,
+            width_px=None if width_px is None else max(128, min(width_px, 256)),
+        )  # fmt: skip
+    with share("gradient: reconstruct normals, heights and kernels"):
+        appearance = out / f"appearance-gradient-{GRADIENT_SITE}"
+        pipeline.reconstruct(
+            capture.session, want=GRADIENT_WANT, out=appearance, calibration=calibration,
+            truth=capture.truth.name if capture.truth else "",
+        )  # fmt: skip
+        found.errors += _microrelief_rows(appearance, capture.truth)
+    found.tables.append(
+        {
+            "title": "Light of a state's scan in the gradient sphere",
+            "head": ["figure", "value"],
+            "rows": [[name, value] for name, value in capture.light.items()],
+        }
+    )
+    found.tables.append(_left_out("gradient sphere", capture))
+    found.next = (
+        f"skinrig reconstruct {capture.session} --calibration {calibration} "
+        "--want height,kernels --out maps"
+    )
+
+
+RIGS: Mapping[str, Callable[[Path, int, Share, int | None, Findings], None]] = {
+    "flash": _flash,
+    "dome": _dome,
+    "gradient": _gradient,
+}
+"""What the demo does with each rig, in this order."""
+
+
+def _left_out(rig: str, capture: Simulated) -> dict[str, Any]:
+    return {
+        "title": f"Left out by the simulator of the {rig}",
+        "head": ["what", "why"],
+        "rows": [list(item) for item in capture.left_out],
+    }
+
+
+def _chromophore_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
+    if truth is None:
+        return []
+    rows = evaluation.compare(
+        store.read(appearance), store.read(truth), rng=np.random.default_rng(0)
+    )
+    return [
+        [appearance.name.removeprefix("appearance-"), row.name, 100 * row.median_relative, "%",
+         100 * row.coverage.share, 100 * row.masked]
+        for row in rows if row.band is None and row.against == "blurred"
+    ]  # fmt: skip
+
+
+def _surface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
+    if truth is None:
+        return []
+    found, true = store.read(appearance), store.read(truth)
+    name = appearance.name.removeprefix("appearance-")
+    rows: list[list[Any]] = [
+        [name, row.name, row.judged[1], row.unit, 100 * row.coverage.share, 100 * row.masked]
+        for row in surface_evaluation.compare(found, true, rng=np.random.default_rng(0))
+    ]
+    held_out = reflection_evaluation.compare(found, true, rng=np.random.default_rng(0))
+    if held_out is not None:
+        rows.append([name, "reflection, held out", 100 * held_out.median, "%", float("nan"), 0.0])
+    return rows
+
+
+def _microrelief_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
+    if truth is None:
+        return []
+    found, true = store.read(appearance), store.read(truth)
+    name = appearance.name.removeprefix("appearance-")
+    rows: list[list[Any]] = []
+    for row in microrelief_evaluation.compare(found, true, rng=np.random.default_rng(0)):
+        if row.state.endswith("_n0"):
+            rows.append([name, "normals, neutral", row.mean_deg, "deg", 100 * row.coverage,
+                         100 * row.masked])  # fmt: skip
+            rows.append([name, "height, neutral", 100 * row.height_relative, "%",
+                         100 * row.height_coverage, 100 * row.masked])  # fmt: skip
+    strain = microrelief_evaluation.compare_stretch(found, true)
+    if strain:
+        worst = max(strain, key=lambda row: abs(row.error))
+        rows.append(
+            [name, f"stretch, {worst.state}", 100 * abs(worst.error), "%", float("nan"), 0.0]
+        )
+    return rows
