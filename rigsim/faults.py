@@ -28,6 +28,8 @@ _PROBABILITIES = (
     "brownout",
     "misfire",
     "jaw_stall",
+    "shutter_stuck",
+    "shutter_jam",
     "stale",
     "drop_frame",
     "wrong_camera",
@@ -43,6 +45,9 @@ _TIMES = (
     "stall_after",
     "stall_s",
     "interlock_after",
+    "gauge_dead_after",
+    "head_lifts_after",
+    "camera_warms_after",
 )
 
 
@@ -117,7 +122,7 @@ class Faults:
     interlock: bool = False
     """The emergency-stop line is open."""
     interlock_after: float = math.inf
-    """The emergency stop of a caliper is opened so long after power-up, s."""
+    """The emergency stop of a caliper or a probe is opened so long after power-up, s."""
     jaw_stall: float = 0.0
     """Probability that the motor of a caliper stalls in a move."""
     home_missed: bool = False
@@ -126,6 +131,21 @@ class Faults:
     """The force sensor of a caliper draws no current."""
     skin_stiff: float = 1.0
     """How many times stiffer than usual the skin between a caliper's jaws is."""
+    pump_leak: float = 0.0
+    """Leak under a probe's head relative to what its pump's regulator takes: the suction settles
+    at no more than 1 / (1 + leak) of what is asked."""
+    pump_dead: bool = False
+    """The motor of a probe's pump does not turn."""
+    gauge_dead_after: float = math.inf
+    """The pressure gauge of a probe draws no current from then on, s after power-up."""
+    head_lifts_after: float = math.inf
+    """A probe's head comes off the skin so long after its pump was first switched on, s, once."""
+    shutter_stuck: float = 0.0
+    """Probability that a probe's shutter does not open."""
+    shutter_jam: float = 0.0
+    """Probability that a probe's shutter, once open, does not close."""
+    camera_warms_after: float = math.inf
+    """The cooling of a probe's camera fails so long after power-up, s."""
     stale: float = 0.0
     """Probability that a camera hands out its previous frame first."""
     drop_frame: float = 0.0
@@ -152,6 +172,8 @@ class Faults:
             raise ValueError(f"heat: got {self.heat}, expected 0 <= heat < 1")
         if not 0.0 < self.slow_charge < math.inf:
             raise ValueError(f"slow_charge: got {self.slow_charge}, expected more than 0")
+        if not 0.0 <= self.pump_leak < math.inf:
+            raise ValueError(f"pump_leak: got {self.pump_leak}, expected 0 or more")
         if not 0.0 < self.skin_stiff < math.inf:
             raise ValueError(f"skin_stiff: got {self.skin_stiff}, expected more than 0")
         if not abs(self.drift_ppm) < 1e5:
@@ -263,7 +285,21 @@ CATALOGUE: tuple[FaultKind, ...] = (
         ("jaw_stall", "home_missed", "skin_stiff", "force_dead", "interlock_after"),
         "the move ends and says why, or is refused 106, 107 or -240; no force beyond its limit",
     ),
-    FaultKind(18, "pump leaks, shutter stuck", (), "no such box yet"),
+    FaultKind(
+        18,
+        "pump leaks or is dead, head comes off, gauge dead, shutter stuck, camera warm",
+        (
+            "pump_leak",
+            "pump_dead",
+            "head_lifts_after",
+            "gauge_dead_after",
+            "shutter_stuck",
+            "shutter_jam",
+            "camera_warms_after",
+        ),
+        "vented and shut and the event says why, or refused -240; gauge and thermometer tell the "
+        "rest",
+    ),
     FaultKind(
         19,
         "camera: stale, lost, foreign or wrongly exposed frame, clock drift",

@@ -22,7 +22,7 @@ from capture.rig import Rig, load_rig
 from .box_ends import BoxEnd, PtyEnd, TcpEnd
 from .camera_service import CameraService
 from .faults import Faults
-from .world import CaliperScene, Scene, World
+from .world import CaliperScene, ProbeScene, Scene, World
 
 __all__ = ["ServeError", "Served", "serve"]
 
@@ -44,7 +44,7 @@ def serve(
     tcp: str = "127.0.0.1:0",
     allow_remote: bool = False,
     seed: int = 0,
-    scene: Scene | CaliperScene | None = None,
+    scene: Scene | CaliperScene | ProbeScene | None = None,
     faults: Faults | None = None,
     world: World | None = None,
 ) -> Served:

@@ -29,8 +29,10 @@ from .boxes.controller import Controller, Device
 from .boxes.dome import DomeUnit, LedPulse
 from .boxes.flash import FlashPop, FlashUnit
 from .boxes.gradient_sphere import GradientSphereUnit, PatternLight
+from .boxes.probe import ProbeUnit, SourceLight
 from .faults import NO_FAULTS, Faults
 from .link import Link
+from .suction import CameraCooler, HeadState, SuckedHead
 from .taped_skin import GripState, TapedSkin
 
 if TYPE_CHECKING:
@@ -40,10 +42,13 @@ __all__ = [
     "CaliperScene",
     "FlashPop",
     "GripState",
+    "HeadState",
     "LedPulse",
     "Light",
     "PatternLight",
+    "ProbeScene",
     "Scene",
+    "SourceLight",
     "World",
     "WorldClock",
     "get",
@@ -54,18 +59,20 @@ SERIAL_NUMBERS = {
     "dome": "DM-0001",
     "gradient_sphere": "GS-0001",
     "caliper": "CA-0001",
+    "probe": "PR-0001",
 }
 RIG_OF_BOX = {
     "flash": "flash",
     "dome": "dome",
     "gradient_sphere": "gradient",
     "caliper": "gradient",
+    "probe": "probe",
 }
 """Which rig that ships has a box."""
 TRANSCRIPT_LINES = 4096
 
-Light = FlashPop | LedPulse | PatternLight
-"""Light that came out of a box: a pop of the flash, or a stretch of an LED's or a pattern's."""
+Light = FlashPop | LedPulse | PatternLight | SourceLight
+"""Light out of a box: a pop of the flash, or a stretch of an LED's, a pattern's or a fibre's."""
 
 
 class Scene(Protocol):
@@ -94,6 +101,21 @@ class CaliperScene(Protocol):
         grip: GripState,
     ) -> NDArray[np.uint16]:
         """Return the DN, shape (H, W), of one exposure, see `Scene`; of skin held by `grip`."""
+
+
+class ProbeScene(Protocol):
+    """What is in front of the fibres of a rig with a contact probe."""
+
+    def exposure(
+        self,
+        view_name: str,
+        *,
+        pops: Sequence[Any],
+        exposure_s: float,
+        seed: int,
+        head: HeadState,
+    ) -> NDArray[np.uint16]:
+        """Return the DN, shape (H, W), of one exposure, see `Scene`; `head` is of its start."""
 
 
 class WorldClock:
@@ -137,10 +159,14 @@ class World:
         All light of LEDs that has ended, in the order in which it did.
     patterns : list of PatternLight
         The same of the patterns of a gradient sphere.
+    sources : list of SourceLight
+        The same of the source fibre of a contact probe.
     grips : list of (float, GripState)
         What the caliper has held, from each world time in s on; empty where the rig has none.
     skin : TapedSkin or None
         What the caliper acts upon; None where the rig has none.
+    head : SuckedHead or None
+        The contact probe's head and what is under it; None where the rig has none.
     """
 
     def __init__(
@@ -149,7 +175,7 @@ class World:
         *,
         seed: int = 0,
         clock: Literal["virtual", "real"] = "virtual",
-        scene: Scene | CaliperScene | None = None,
+        scene: Scene | CaliperScene | ProbeScene | None = None,
         faults: Faults | None = None,
     ) -> None:
         if clock not in ("virtual", "real"):
@@ -162,12 +188,23 @@ class World:
         self.pops: list[FlashPop] = []
         self.pulses: list[LedPulse] = []
         self.patterns: list[PatternLight] = []
+        self.sources: list[SourceLight] = []
         self.grips: list[tuple[float, GripState]] = []
         self.skin: TapedSkin | None = None
         if self.rig.caliper is not None:
             stiffness = self.faults.skin_stiff
             self.skin = TapedSkin(self.rig.caliper, seed=seed, stiffness=stiffness)
             self._note_grip(0.0)
+        self.head: SuckedHead | None = None
+        if self.rig.probe is not None:
+            kept_c, fails_after_s = self.rig.probe.camera_c, self.faults.camera_warms_after
+            self.head = SuckedHead(
+                CameraCooler(kept_c, fails_after_s=fails_after_s),
+                seed=seed,
+                leak=self.faults.pump_leak,
+                pump_dead=self.faults.pump_dead,
+                lifts_after_s=self.faults.head_lifts_after,
+            )
         self.clock = WorldClock(self)
         self.transcript: deque[str] = deque(maxlen=TRANSCRIPT_LINES)
         self.lock = threading.RLock()
@@ -178,6 +215,7 @@ class World:
         self._cameras: dict[str, CameraBody] = {}
         self._dome: DomeUnit | None = None
         self._sphere: GradientSphereUnit | None = None
+        self._probe: ProbeUnit | None = None
         self._links = {name: self._make_box(name) for name in self.rig.boxes}
 
     def _make_box(self, name: str) -> Link:
@@ -186,6 +224,7 @@ class World:
             "dome": self._make_dome,
             "gradient_sphere": self._make_sphere,
             "caliper": self._make_caliper,
+            "probe": self._make_probe,
         }
         if name not in kinds:
             raise ValueError(f"boxes: got {name!r}, expected one of {', '.join(kinds)}")
@@ -260,6 +299,27 @@ class World:
             interlock_after=self.faults.interlock_after,
             rng=rng,
         )
+
+    def _make_probe(self, rng: np.random.Generator) -> Device:
+        if self.rig.probe is None or self.head is None:
+            raise ValueError(f"probe: got none in rig {self.rig.name!r}, expected its description")
+        self._probe = ProbeUnit(
+            self.rig.probe,
+            self.rig.lights[0],
+            self.rig.leds or LedLimits(),
+            self.head,
+            on_light=self.sources.append,
+            on_trigger=self._trigger,
+            shutter_stuck=self.faults.shutter_stuck,
+            shutter_jam=self.faults.shutter_jam,
+            gauge_dead_after=self.faults.gauge_dead_after,
+            interlock=self.faults.interlock,
+            interlock_after=self.faults.interlock_after,
+            dead=0 in self.faults.dead_leds,
+            weak=self.faults.weak_leds.get(0, 1.0),
+            rng=rng,
+        )
+        return self._probe
 
     def rng_for(self, *names: str) -> np.random.Generator:
         """Return a generator that depends on the world's seed and on `names` only."""
@@ -344,10 +404,12 @@ class World:
             now = self.now
             pulses = [] if self._dome is None else self._dome.light_now(now)
             patterns = [] if self._sphere is None else self._sphere.light_now(now)
+            sources = [] if self._probe is None else self._probe.light_now(now)
             return (
                 *self.pops_between(start, end),
                 *_clipped(self.pulses, pulses, start, end),
                 *_clipped(self.patterns, patterns, start, end),
+                *_clipped(self.sources, sources, start, end),
             )
 
     def pops_between(self, start: float, end: float) -> tuple[FlashPop, ...]:
@@ -368,6 +430,30 @@ class World:
                 raise ValueError(f"caliper: rig {self.rig.name!r} has none")
             first = bisect_right(self.grips, t_s, key=lambda entry: entry[0])
             return self.grips[max(first - 1, 0)][1]
+
+    def head_at(self, t_s: float) -> HeadState:
+        """Return what the contact probe's head touched at a world time, s.
+
+        Raises
+        ------
+        ValueError
+            Where the rig has no contact probe.
+        """
+        with self.lock:
+            if self.head is None:
+                raise ValueError(f"probe: rig {self.rig.name!r} has none")
+            self.head.advance(self.now)
+            return self.head.state_at(t_s)
+
+    @property
+    def heads(self) -> list[tuple[float, HeadState]]:
+        """World times, s, at which something changed under the probe's head, and its states then.
+
+        Between them the suction relaxes; `head_at` tells it for any time.
+        """
+        with self.lock:
+            times = () if self.head is None else self.head.changes_s
+            return [(t_s, self.head_at(t_s)) for t_s in times]
 
     def _note_grip(self, now: float) -> None:
         if self.skin is not None and (state := self.skin.state) != self._last_grip():
@@ -409,6 +495,12 @@ class World:
             held = cast(CaliperScene, self.scene)
             grip = self.grip_at(t_start)
             return held.exposure(view_name, pops=seen, exposure_s=exposure_s, seed=seed, grip=grip)
+        if self.rig.probe is not None:
+            touching = cast(ProbeScene, self.scene)
+            head = self.head_at(t_start)
+            return touching.exposure(
+                view_name, pops=seen, exposure_s=exposure_s, seed=seed, head=head
+            )
         scene = cast(Scene, self.scene)
         return scene.exposure(view_name, pops=seen, exposure_s=exposure_s, seed=seed)
 
@@ -446,7 +538,7 @@ def get(name: str) -> World:
     return _BENCH[name]
 
 
-_Switched = TypeVar("_Switched", bound=LedPulse | PatternLight)
+_Switched = TypeVar("_Switched", bound=LedPulse | PatternLight | SourceLight)
 
 
 def _clipped(

@@ -266,10 +266,11 @@ def _run(
     from capture.devices.flash import FlashBox
     from capture.devices.gradient_sphere import GradientSphereBox
     from capture.devices.port import Port
+    from capture.devices.probe import ProbeBox
 
     drivers: Mapping[str, type[Box]] = {
         "flash": FlashBox, "dome": DomeBox, "gradient_sphere": GradientSphereBox,
-        "caliper": CaliperBox,
+        "caliper": CaliperBox, "probe": ProbeBox,
     }  # fmt: skip
 
     def open_box(kind: str) -> Box:

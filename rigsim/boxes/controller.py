@@ -88,6 +88,8 @@ class Command:
     """Whether it makes light, and so is refused unless the box is armed."""
     bare: bool = False
     """Whether it is taken without a frame although it is no query: only what makes dark."""
+    harmless: tuple[str, ...] = ()
+    """Arguments, upper case, with which it makes dark: taken unarmed and without a frame."""
     manual: str = ""
     """What it does, in one line."""
 
@@ -284,11 +286,14 @@ class Controller:
 
     def _bare(self, line: bytes, now: float) -> bytes:
         text = line.decode("ascii", errors="replace").strip()
-        header = text.partition(" ")[0].upper()
+        header, _, arguments = text.partition(" ")
+        header = header.upper()
         command = self.commands.get(header)
         try:
-            if command is not None and not (header.endswith("?") or command.bare):
-                raise Refused(Code.UNFRAMED)
+            if command is not None:
+                dark = command.bare or arguments.upper() in command.harmless
+                if not (header.endswith("?") or dark):
+                    raise Refused(Code.UNFRAMED)
             payload = self._execute(text, now)
         except Refused as refused:
             self._remember(refused)
@@ -302,7 +307,7 @@ class Controller:
             raise Refused(Code.UNDEFINED_HEADER)
         if bool(arguments) != bool(command.arguments):
             raise Refused(Code.SYNTAX, f"expected {header.upper()} {command.arguments}".strip())
-        if command.armed and not self.armed:
+        if command.armed and not (self.armed or arguments.upper() in command.harmless):
             raise Refused(Code.WATCHDOG_TRIPPED if self.tripped else Code.NOT_ARMED)
         return command.run(arguments, now)
 

@@ -114,7 +114,7 @@ def test_a_url_with_an_unknown_world_makes_one_under_that_name():
 @pytest.mark.parametrize(
     ("url", "match"),
     [
-        ("sim://probe", "expected one of flash"), ("sim://flash?seed=-1", "seed"),
+        ("sim://toaster", "expected one of flash"), ("sim://flash?seed=-1", "seed"),
         ("sim://flash?clock=fast", "clock"), ("sim://flash?dropp=1", "did you mean drop"),
         ("sim://flash?seed=1&seed=2", "twice"), ("sim://flash?drop=2", "probability"),
         ("sim://flash?seed", "bad query"),

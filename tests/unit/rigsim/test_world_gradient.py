@@ -44,11 +44,11 @@ def port(world, box):
 
 
 def test_each_box_of_a_shipped_rig_has_its_serial_number_and_its_rig():
-    for name in ("flash", "dome", "gradient"):
+    for name in ("flash", "dome", "gradient", "probe"):
         for box in load_rig(name).boxes:
             assert RIG_OF_BOX[box] == name
             assert World(load_rig(name)).box(box).serial == SERIAL_NUMBERS[box]
-    assert len(set(SERIAL_NUMBERS.values())) == 4
+    assert len(set(SERIAL_NUMBERS.values())) == 5
 
 
 def test_patterns_are_clipped_to_the_exposure(world):

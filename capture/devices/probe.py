@@ -1,0 +1,359 @@
+"""The contact probe's box: one method a command, units in and out, no policy.
+
+A person puts the head on the skin. Light and suction need an armed box and end by themselves, at
+the latest after ``shutter_max_ms`` and ``suction_max_ms``; then the skin rests. An armed box that
+hears nothing for its lease shuts the shutter, puts the LED out, vents and disarms: renew the lease
+(`ProbeBox.listen`, or any question) while a camera looks. `ProbeBox.dark` and the closing of the
+driver do the same. Whatever vents, but `ProbeBox.vent` and the pump's own end, makes the box forget
+where the head sits: a person has to look, and `ProbeBox.place` has to say it anew.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from .box import Box, BoxStatus
+from .port import PortTimeout
+
+__all__ = ["Opening", "ProbeBox", "ProbeStatus", "SuctionReport", "SuctionState"]
+
+Shut = Literal["open", "timed", "asked", "pump", "jam", "interlock", "dark"]
+Vented = Literal["timed", "asked", "low", "lost", "high", "gauge", "interlock", "dark"]
+_SHUTS: dict[str, Shut] = {
+    "OPEN": "open",
+    "TIMED": "timed",
+    "ASKED": "asked",
+    "PUMP": "pump",
+    "JAM": "jam",
+    "INTERLOCK": "interlock",
+    "DARK": "dark",
+}
+_VENTS: dict[str, Vented] = {
+    "TIMED": "timed",
+    "ASKED": "asked",
+    "LOW": "low",
+    "LOST": "lost",
+    "HIGH": "high",
+    "GAUGE": "gauge",
+    "INTERLOCK": "interlock",
+    "DARK": "dark",
+}
+_LISTEN_S = 0.1
+"""Silence between two renewals of the lease; shorter than the shortest lease."""
+_MARGIN_S = 2.0
+"""Longer than this over its own time no movement may take."""
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """One opening of the source's shutter, on the box's clock."""
+
+    number: int
+    """Openings tried since the box was made, this one included."""
+    t_open_s: float
+    """When the blades had cleared the fibre and the camera's line was pulsed, s since power-up."""
+    ended: Shut
+    """open: not yet. timed: by its own end. asked: by `ProbeBox.close_shutter`, or the head was
+    taken off. pump: the suction failed. jam: the blades did not close, and the LED was put out.
+    interlock, dark: the box has let go of everything."""
+    t_shut_s: float
+    """When its light ended, s since power-up; inf when not yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class SuctionReport:
+    """How a time of suction ended."""
+
+    number: int
+    """Times of suction since the box was made, this one included."""
+    ended: Vented
+    """timed: by its own end. asked: by `ProbeBox.vent`. low: not reached in time, so a leak or a
+    pump that does not turn. lost: it fell at once, the head has come off. high: the regulator does
+    not hold it. gauge: the gauge is dead. interlock, dark: the box has let go of everything. Only
+    the first two keep the place of the head."""
+    suction_mbar: float
+    """Last reading of the gauge before its end, mbar."""
+    t_box_s: float
+    """When it ended, s since power-up."""
+
+
+@dataclass(frozen=True, slots=True)
+class SuctionState:
+    """What the pump does now."""
+
+    on: bool
+    """Whether it sucks."""
+    wanted_mbar: float
+    """What it was asked for, mbar; 0 when it is off."""
+    left_s: float
+    """Time to its own end, s, or of the skin's rest when it is off."""
+
+
+class ProbeStatus(BoxStatus):
+    """The bits of ``STAT?``; what is lit is the source fibre."""
+
+    __slots__ = ()
+
+    @property
+    def busy(self) -> bool:
+        """Whether the shutter is open or opens, or the cover moves."""
+        return bool(self.bits & 16)
+
+    @property
+    def sucking(self) -> bool:
+        """Whether the pump is on."""
+        return bool(self.bits & 32)
+
+    @property
+    def placed(self) -> bool:
+        """Whether a person has said where the head sits, and nothing has happened since."""
+        return bool(self.bits & 512)
+
+    @property
+    def resting(self) -> bool:
+        """Whether the skin has to rest yet."""
+        return bool(self.bits & 1024)
+
+    @property
+    def jammed(self) -> bool:
+        """Whether the shutter is stuck open."""
+        return bool(self.bits & 2048)
+
+
+class ProbeBox(Box):
+    """Driver of the contact probe's box; see `capture.devices.box.Box`.
+
+    Its limits (``limits``): ``fibres``, ``level_steps``, ``shutter_min_ms``, ``shutter_max_ms``,
+    ``shutter_lag_ms`` (command to open blades), ``cover_ms``, ``suction_min_mbar``,
+    ``suction_max_mbar``, ``suction_min_ms``, ``suction_max_ms``, ``reach_ms`` (by then the suction
+    must hold), ``rest_ms``, ``control_period_ms``, ``camera_c``, ``source_w``, ``dose_ws``.
+
+    One measurement::
+
+        operator.prompt(...)              # a person puts the head on
+        box.arm(); box.place("cheek", 0.0)
+        box.set_level(1.0); box.suck(60.0, 50.0)
+        box.listen(1.0); box.pressure_mbar()
+        camera.arm(1, Trigger.EDGE)
+        box.open_shutter(0.5); box.listen(0.5)
+        box.vent()
+    """
+
+    kind: ClassVar[str] = "probe"
+
+    def status(self) -> ProbeStatus:
+        """Return the status bits."""
+        return ProbeStatus(int(self._number("STAT?")))
+
+    # head and suction -------------------------------------------------------------------------
+
+    def place(self, site: str, angle_deg: float) -> None:
+        """Pass on where a person has put the head, and its turn about its own axis, 0 to 360.
+
+        Raises
+        ------
+        CommandRefused
+            Unless armed (-203, 108); while the pump is on or the shutter open (-213).
+        """
+        self._port.ask(f"HEAD:SITE {site},{_decimal('angle_deg', angle_deg)}")
+
+    def placement(self) -> tuple[str, float] | None:
+        """Return site and angle in degrees; None: nobody has said it since the head was let go."""
+        payload = self._port.ask("HEAD:SITE?")
+        if payload == "NONE":
+            return None
+        site, _, angle = payload.partition(",")
+        return site, self._to_number("HEAD:SITE?", angle)
+
+    def take_away(self) -> None:
+        """Pass on that the head is taken off; it is vented and its place is forgotten."""
+        self._port.ask("HEAD:FREE")
+
+    def suck(self, mbar: float, seconds: float) -> int:
+        """Switch the pump on for `seconds` from now; return the number of this time of suction.
+
+        It is accepted at once; `pressure_mbar` tells when the suction is there. A retry on the line
+        never begins it twice.
+
+        Raises
+        ------
+        CommandRefused
+            Nothing was switched on: not armed (-203), 108 after the lease ran out, the head not
+            placed or the pump on (-213), the skin rests (103), beyond the limits (-222), the gauge
+            dead (-240), the emergency stop open (107).
+        """
+        span_ms = _decimal("seconds", seconds * 1e3)
+        payload = self._port.ask(f"PUMP ON,{span_ms},{_decimal('mbar', mbar)}")
+        if not payload.isdecimal():
+            raise self._bad("PUMP ON", payload, "the number of the suction")
+        return int(payload)
+
+    def vent(self) -> None:
+        """Switch the pump off and open the vent; the head stays placed, and the skin rests."""
+        self._port.ask("PUMP VENT")
+
+    def suction(self) -> SuctionState:
+        """Return what the pump does."""
+        payload = self._port.ask("PUMP?")
+        try:
+            match payload.split(","):
+                case ["ON", mbar, left_ms]:
+                    return SuctionState(True, float(mbar), int(left_ms) / 1e3)
+                case ["REST", left_ms]:
+                    return SuctionState(False, 0.0, int(left_ms) / 1e3)
+                case ["VENT"]:
+                    return SuctionState(False, 0.0, 0.0)
+        except ValueError as exc:
+            raise self._bad("PUMP?", payload, "ON,mbar,ms or REST,ms or VENT") from exc
+        raise self._bad("PUMP?", payload, "ON,mbar,ms or REST,ms or VENT")
+
+    def last_suction(self) -> SuctionReport | None:
+        """Return how the last suction ended, None when none has since power-up."""
+        payload = self._port.ask("PUMP:LAST?")
+        if payload == "NONE":
+            return None
+        try:
+            number, ended, mbar, t_us = payload.split(",")
+            return SuctionReport(int(number), _VENTS[ended], float(mbar), int(t_us) / 1e6)
+        except (ValueError, KeyError) as exc:
+            raise self._bad("PUMP:LAST?", payload, "number,END,mbar,us") from exc
+
+    def pressure_mbar(self) -> float:
+        """Return the suction under the head, mbar below the air's pressure; has noise."""
+        return self._number("PRES?")
+
+    # light ------------------------------------------------------------------------------------
+
+    def set_level(self, level: float) -> None:
+        """Drive the LED behind the closed shutter at 0 to 1 of full; the box sets thousandths.
+
+        Raises
+        ------
+        CommandRefused
+            Not armed (-203, 108), the shutter open (-213), the LED or the shutter dead (-240), the
+            emergency stop open (107). 0 is never refused.
+        """
+        steps = int(self.limits["level_steps"])
+        if not 0.0 <= level <= 1.0:
+            raise ValueError(f"level: got {level}, expected 0 to 1")
+        self._port.ask(f"LED {round(level * steps)}")
+
+    def level(self) -> float:
+        """Return what the LED is driven at, 0 to 1 of full."""
+        return self._number("LED?") / float(self.limits["level_steps"])
+
+    def open_shutter(self, seconds: float) -> Opening:
+        """Open the shutter for `seconds`; the camera's line is pulsed when the blades are clear.
+
+        Returns when it has opened. A retry on the line never opens it twice.
+
+        Raises
+        ------
+        CommandRefused
+            Nothing opened: not armed (-203), 108 after the lease ran out, open already or the cover
+            moves (-213), beyond the limits (-222), the blades stuck or made dark meanwhile (-240),
+            the dose of light reached (104), the emergency stop open (107).
+        """
+        span_ms = _decimal("seconds", seconds * 1e3)
+        payload = self._port.ask(f"SHUT OPEN,{span_ms}")
+        try:
+            number, t_us = payload.split(",")
+            return Opening(int(number), int(t_us) / 1e6, "open", math.inf)
+        except ValueError as exc:
+            raise self._bad("SHUT OPEN", payload, "number,us") from exc
+
+    def close_shutter(self) -> None:
+        """Close the shutter before its own end; where it is stuck open, try to close it again."""
+        self._port.ask("SHUT CLOSE")
+
+    def last_opening(self) -> Opening | None:
+        """Return the last opening and how it ended, None when there was none since power-up."""
+        payload = self._port.ask("SHUT:LAST?")
+        if payload == "NONE":
+            return None
+        try:
+            number, ended, open_us, shut_us = payload.split(",")
+            shut_s = math.inf if shut_us == "-" else int(shut_us) / 1e6
+            return Opening(int(number), int(open_us) / 1e6, _SHUTS[ended], shut_s)
+        except (ValueError, KeyError) as exc:
+            raise self._bad("SHUT:LAST?", payload, "number,END,us,us") from exc
+
+    def openings(self) -> int:
+        """Return how many openings were tried since the box was made."""
+        return int(self._number("SHUT:COUN?"))
+
+    def cover(self, fibre: int | None) -> None:
+        """Cover all detection fibres but number `fibre`, from 0; None: uncover all. Wait for it.
+
+        Raises
+        ------
+        CommandRefused
+            While the shutter is open (-213), or without such a fibre (-222).
+        PortTimeout
+            When the cover does not arrive.
+        """
+        self._port.ask(f"FIB {'ALL' if fibre is None else fibre}")
+        self._wait(float(self.limits["cover_ms"]) / 1e3 + _MARGIN_S)
+
+    def uncovered(self) -> int | None:
+        """Return the number of the only fibre that is not covered; None: none is covered."""
+        payload = self._port.ask("FIB?")
+        return None if payload == "ALL" else int(self._to_number("FIB?", payload))
+
+    def dose_ws(self) -> float:
+        """Return the light that went into this subject, Ws."""
+        return self._number("DOSE?")
+
+    def new_subject(self, pseudonym: str) -> None:
+        """Begin to count the dose anew."""
+        self._port.ask(f"DOSE:NEW {pseudonym}")
+
+    # camera -----------------------------------------------------------------------------------
+
+    def camera_c(self) -> float:
+        """Return the temperature of the camera, degrees Celsius; has noise."""
+        return self._number("CAM:TEMP?")
+
+    def trigger_camera(self, token: str) -> float:
+        """Pulse the camera's line without light; return the box's time, s."""
+        text = f"CAM:TRIG {token}"
+        payload = self._port.ask(text)
+        name, _, t_us = payload.partition(",")
+        if name != token or not t_us.isdecimal():
+            raise self._bad(text, payload, "token,us")
+        return int(t_us) / 1e6
+
+    # time -------------------------------------------------------------------------------------
+
+    def listen(self, seconds: float) -> None:
+        """Let `seconds` pass while the box does what it does: the lease is renewed."""
+        left_s = seconds
+        while left_s > 0.0:
+            self._port.listen(min(left_s, _LISTEN_S))
+            self.ping()
+            left_s -= _LISTEN_S
+
+    def _wait(self, timeout_s: float) -> None:
+        waited_s = 0.0
+        while not self._flag("*OPC?"):
+            if waited_s >= timeout_s:
+                raise PortTimeout(
+                    f"{self._port.url}: the probe still moves after {timeout_s:.1f} s; check it"
+                )
+            self._port.listen(_LISTEN_S)
+            waited_s += _LISTEN_S
+
+    def _to_number(self, text: str, payload: str) -> float:
+        try:
+            return float(payload)
+        except ValueError as exc:
+            raise self._bad(text, payload, "a number") from exc
+
+
+def _decimal(field: str, value: float) -> str:
+    if not math.isfinite(value):
+        raise ValueError(f"{field}: got {value}, expected a finite number")
+    text = f"{value:.6f}".rstrip("0").rstrip(".")
+    return "0" if text in ("-0", "") else text

@@ -1,0 +1,297 @@
+"""The light of a contact probe: an LED, the shutter before its fibre, and the fibres' cover.
+
+The LED shines on the closed shutter and is steady when it opens. The blades carry a sensor: an
+opening that does not happen is known, and when blades stay open the LED is put out instead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture.devices.wire import Code
+
+from .controller import Refused
+
+__all__ = ["LEVEL_STEPS", "SHUTTER_MS", "SourceLight", "SourceShutter"]
+
+LEVEL_STEPS = 1000
+SHUTTER_MS = 1.0
+"""Shortest opening, ms, and time from the command to blades that have cleared the fibre."""
+JAM_S = 0.02
+"""Time after which blades that have not closed are known to be stuck, s."""
+COVER_S = 0.3
+"""Time in which the cover goes from any place to any other, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceLight:
+    """A stretch of light out of the probe's source fibre."""
+
+    level: float
+    """Light relative to full, 0 < level <= 1."""
+    t_on_s: float
+    """World time of its beginning, s."""
+    t_off_s: float
+    """World time of its end, s."""
+    fibre: int | None
+    """Number of the only detection fibre that is not covered, from 0; None: none is covered."""
+
+
+@dataclass(slots=True)
+class _Opening:
+    """One opening of the shutter, from the command on."""
+
+    number: int
+    clears_s: float
+    ends_s: float
+    outcome: str | Refused | None = None  # how the command is answered, once that is known
+    open: bool = False
+    jams_s: float = math.inf  # when the LED is put out because the blades do not close
+
+
+class SourceShutter:
+    """LED, shutter and cover, and what they remember.
+
+    Parameters
+    ----------
+    fibres
+        How many detection fibres there are.
+    power_w, dose_ws
+        Light out of the source at full, W, and the most of it for one subject, Ws.
+    on_light
+        Called with each stretch of light when it ends.
+    on_open
+        Called with the world time in s when the blades have cleared the fibre.
+    say
+        Called with name and payload of an event.
+    clock_us
+        Turns world time into the box's.
+    stuck, jam
+        Probability that an opening, or a closing, does not happen.
+    dead, weak
+        The LED draws no current; it gives so much of a new one's light.
+    rng
+        Decides what sticks.
+    """
+
+    def __init__(
+        self,
+        fibres: int,
+        *,
+        power_w: float,
+        dose_ws: float,
+        on_light: Callable[[SourceLight], None],
+        on_open: Callable[[float], None],
+        say: Callable[[str, str], None],
+        clock_us: Callable[[float], int],
+        stuck: float,
+        jam: float,
+        dead: bool,
+        weak: float,
+        rng: np.random.Generator,
+    ) -> None:
+        self.fibres = fibres
+        self._power_w = power_w
+        self.dose_limit_ws = dose_ws
+        self._on_light = on_light
+        self._on_open = on_open
+        self._say = say
+        self._clock_us = clock_us
+        self._stuck = stuck
+        self._jam = jam
+        self._dead = dead
+        self._weak = weak
+        self._rng = rng
+        self._opening: _Opening | None = None
+        self._light_since: float | None = None
+        self._settled_s = -math.inf
+        self.level = 0
+        self.count = 0
+        self.dose_ws = 0.0
+        self.fibre: int | None = None
+        self.jammed = False
+        self.last_report = ""
+
+    # now --------------------------------------------------------------------------------------
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the blades leave the fibre free."""
+        return self.jammed or (self._opening is not None and self._opening.open)
+
+    @property
+    def lit(self) -> bool:
+        """Whether light comes out of the source."""
+        return self._light_since is not None
+
+    def under_way(self, now: float) -> bool:
+        """Tell whether an opening is going on or the cover moves."""
+        return self._opening is not None or now < self._settled_s
+
+    def light_now(self, now: float) -> list[SourceLight]:
+        """Return the light that has not ended, as given so far."""
+        if self._light_since is None:
+            return []
+        return [self._stretch(self._light_since, max(now, self._light_since))]
+
+    def left_ms(self, now: float) -> int:
+        """Return how long the shutter will be open yet, ms."""
+        left_s = 0.0 if self._opening is None else self._opening.ends_s - now
+        return max(0, math.ceil(left_s * 1e3)) if math.isfinite(left_s) else 0
+
+    def _stretch(self, t_on_s: float, t_off_s: float) -> SourceLight:
+        return SourceLight(self.level / LEVEL_STEPS * self._weak, t_on_s, t_off_s, self.fibre)
+
+    # time -------------------------------------------------------------------------------------
+
+    def deadline(self) -> float:
+        """Return when blades or LED will next do something by themselves, in s."""
+        opening = self._opening
+        if opening is None:
+            return math.inf
+        return min(opening.ends_s, opening.jams_s) if opening.open else opening.clears_s
+
+    def advance(self, now: float) -> None:
+        """Let time pass up to `now`, at most one deadline."""
+        opening = self._opening
+        if opening is None or self.deadline() > now:
+            return
+        if not opening.open:
+            self._clear(opening, now)
+        elif opening.jams_s <= now:
+            self._give_up(opening, now)
+        else:
+            self._shut(opening, "TIMED", now)
+
+    def _clear(self, opening: _Opening, now: float) -> None:
+        if self._rng.random() < self._stuck:
+            opening.outcome = Refused(Code.HARDWARE, "the shutter did not open")
+            self._opening = None
+            return
+        opening.open = True
+        self._begin_light(now)
+        self.last_report = f"{opening.number},OPEN,{self._clock_us(now)},-"
+        opening.outcome = f"{opening.number},{self._clock_us(now)}"
+        self._on_open(now)
+
+    def _shut(self, opening: _Opening, how: str, now: float) -> None:
+        """Let the blades fall, at a moment of the box's own or the host's choice."""
+        if self._rng.random() < self._jam:
+            opening.ends_s, opening.jams_s = math.inf, now + JAM_S
+            return
+        self._end(opening, how, now)
+
+    def _give_up(self, opening: _Opening, now: float) -> None:
+        """Put the LED out: the blades do not."""
+        self._put_out(now)
+        self.jammed = True
+        self._end(opening, "JAM", now)
+
+    def _end(self, opening: _Opening, how: str, now: float) -> None:
+        self._end_light(now)
+        self._opening = None
+        opened = self.last_report.split(",")[2]
+        self.last_report = f"{opening.number},{how},{opened},{self._clock_us(now)}"
+        self._say("SHUT:END", self.last_report)
+
+    def _begin_light(self, now: float) -> None:
+        if self.level > 0:
+            self._light_since = now
+
+    def _end_light(self, now: float) -> None:
+        if self._light_since is None:
+            return
+        light = self._stretch(self._light_since, now)
+        self._light_since = None
+        self.dose_ws += self._power_w * self.level / LEVEL_STEPS * (now - light.t_on_s)
+        if light.t_off_s > light.t_on_s:
+            self._on_light(light)
+
+    def _put_out(self, now: float) -> None:
+        self._end_light(now)
+        self.level = 0
+
+    # what is asked for ------------------------------------------------------------------------
+
+    def open(self, seconds: float, now: float) -> tuple[float, Callable[[], str | Refused]]:
+        """Begin an opening; return when it is known how that went, and what tells it."""
+        if self.jammed:
+            raise Refused(Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE")
+        self.require_closed(now)
+        give_ws = self._power_w * self.level / LEVEL_STEPS * seconds
+        if self.dose_ws + give_ws > self.dose_limit_ws:
+            dose = f"{self.dose_ws + give_ws:.3f} of {self.dose_limit_ws:g} Ws"
+            raise Refused(Code.LIGHT_DOSE, dose)
+        self.count += 1
+        clears_s = now + SHUTTER_MS / 1e3
+        opening = _Opening(self.count, clears_s, clears_s + seconds)
+        self._opening = opening
+
+        def outcome() -> str | Refused:
+            return opening.outcome or Refused(Code.HARDWARE, "made dark before it opened")
+
+        return clears_s, outcome
+
+    def close(self, now: float) -> None:
+        """Let the blades fall because the host says so; try it again where they are stuck."""
+        if self.jammed:
+            self.jammed = self._rng.random() < self._jam
+            if self.jammed:
+                raise Refused(Code.HARDWARE, "the shutter is stuck open")
+        elif self._opening is not None and not self._opening.open:
+            self._opening = None
+        elif self._opening is not None and math.isinf(self._opening.jams_s):
+            self._shut(self._opening, "ASKED", now)
+
+    def go_dark(self, now: float, how: str) -> None:
+        """Put the LED out and let the blades fall, at once."""
+        self._put_out(now)
+        self.shut(now, how)
+
+    def shut(self, now: float, how: str) -> None:
+        """End an opening at once, for a reason of the box's own."""
+        opening = self._opening
+        if opening is None or not opening.open:
+            self._opening = None
+        elif self._rng.random() < self._jam or math.isfinite(opening.jams_s):
+            self._give_up(opening, now)
+        else:
+            self._end(opening, how, now)
+
+    def require_closed(self, now: float) -> None:
+        """Refuse while the shutter is open, or opens, or the cover moves."""
+        if self._opening is not None:
+            raise Refused(Code.IGNORED, "the shutter is open")
+        if now < self._settled_s:
+            raise Refused(Code.IGNORED, "the cover moves")
+
+    def set_level(self, level: int, now: float) -> None:
+        """Drive the LED behind the closed shutter, 0 to 1000 thousandths of full."""
+        if level > 0:
+            self.require_closed(now)
+            if self.jammed:
+                raise Refused(Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE")
+            if self._dead:
+                raise Refused(Code.HARDWARE, "the LED draws no current")
+            self.level = level
+        else:
+            self._put_out(now)
+
+    def cover(self, fibre: int | None, now: float) -> None:
+        """Begin to move the cover: over all detection fibres but one, or off them all."""
+        self.require_closed(now)
+        if fibre != self.fibre:
+            self.fibre = fibre
+            self._settled_s = now + COVER_S
+
+    def forget(self, *, power_up: bool, now: float) -> None:
+        """Return to the settings of power-up, dark already: no fibre covered."""
+        if power_up:
+            self.last_report = ""
+        if self.fibre is not None:
+            self.fibre = None
+            self._settled_s = now + COVER_S

@@ -1,0 +1,243 @@
+"""The suction of a contact probe as its box runs it: gauge, end time, rest, and what goes wrong.
+
+The box knows the pump's switch, its vent, and what the gauge says. It looks at the gauge once each
+control period and vents when the suction is not reached, is lost, or is more than the limit. Skin
+rests between two times of suction. Only a vent that was asked for and the pump's own end leave the
+head where it was placed: after anything else nobody knows whether it is still there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from capture.devices.wire import Code
+from capture.rig import Probe
+
+from .controller import Refused
+
+__all__ = ["CONTROL_S", "LEAST_MBAR", "REACH_S", "Gauge", "SuctionLoad", "SuctionPump"]
+
+CONTROL_S = 0.05
+"""Period in which the gauge is looked at while the pump runs, s."""
+REACH_S = 2.0
+"""Time in which `HELD_SHARE` of the suction must be there, s."""
+HELD_SHARE, LOST_SHARE = 0.7, 0.4
+"""Of what was asked: from there on it holds; below that it is lost."""
+OVER_SHARE = 1.1
+"""Of the most that may be asked: above that the regulator is broken."""
+LEAST_MBAR = 10.0
+"""Least suction that may be asked for, well above the gauge's deviation."""
+LEAST_MS = 100.0
+GAUGE_NOISE_MBAR = 0.3
+GAUGE_ZERO_MBAR = 0.7
+"""Standard deviations of one reading of the gauge, and of its zero from box to box."""
+
+
+class SuctionLoad(Protocol):
+    """What the pump acts upon."""
+
+    def place(self, site: str, angle_deg: float, now: float) -> None:
+        """Be put somewhere by a person."""
+
+    def take_away(self, now: float) -> None:
+        """Be taken off."""
+
+    def draw(self, wanted_mbar: float, now: float) -> None:
+        """Have the vent closed and the pump switched on."""
+
+    def vent(self, now: float) -> None:
+        """Have the pump switched off and the vent opened."""
+
+    def suction_mbar(self, now: float) -> float:
+        """Return the suction now, mbar."""
+
+    def camera_c(self, now: float) -> float:
+        """Return the temperature of the camera behind it, degrees Celsius."""
+
+
+class Gauge:
+    """A pressure sensor with a zero of its own, and noise.
+
+    Parameters
+    ----------
+    rng
+        Draws both.
+    dead_after_s
+        World time from which it draws no current, s.
+    """
+
+    def __init__(self, *, rng: np.random.Generator, dead_after_s: float = math.inf) -> None:
+        self._rng = rng
+        self._dead_after_s = dead_after_s
+        self._zero_mbar = float(rng.normal(0.0, GAUGE_ZERO_MBAR))
+
+    def read(self, true_mbar: float, now: float) -> float | None:
+        """Return a reading, mbar; None when it is dead."""
+        if now >= self._dead_after_s:
+            return None
+        return true_mbar + self._zero_mbar + float(self._rng.normal(0.0, GAUGE_NOISE_MBAR))
+
+
+@dataclass(slots=True)
+class _Draw:
+    """A time of suction that is under way."""
+
+    number: int
+    start_s: float
+    ends_s: float
+    wanted_mbar: float
+    ticks: int = 0
+    held: bool = False
+    mbar: float = 0.0  # last reading
+
+    @property
+    def next_s(self) -> float:
+        return min(self.start_s + (self.ticks + 1) * CONTROL_S, self.ends_s)
+
+
+class SuctionPump:
+    """Pump, vent and gauge, and where a person says that the head sits.
+
+    Parameters
+    ----------
+    probe
+        Its limits and the skin's rest.
+    load
+        The head on the skin.
+    gauge
+        Of the suction under it.
+    on_fault
+        Called with the world time in s when the suction has ended by a fault.
+    say
+        Called with name and payload of an event.
+    clock_us
+        Turns world time into the box's.
+    """
+
+    def __init__(
+        self,
+        probe: Probe,
+        load: SuctionLoad,
+        gauge: Gauge,
+        *,
+        on_fault: Callable[[float], None],
+        say: Callable[[str, str], None],
+        clock_us: Callable[[float], int],
+    ) -> None:
+        self._probe = probe
+        self._load = load
+        self._gauge = gauge
+        self._on_fault = on_fault
+        self._say = say
+        self._clock_us = clock_us
+        self._draw: _Draw | None = None
+        # a clock of its own keeps the skin's rest through a reset of the box
+        self._rested_s = -math.inf
+        self.count = 0
+        self.placement: tuple[str, float] | None = None
+        self.last_report = ""
+
+    # now --------------------------------------------------------------------------------------
+
+    @property
+    def drawing(self) -> bool:
+        """Whether the pump is on."""
+        return self._draw is not None
+
+    def rest_ms(self, now: float) -> int:
+        """Return how long the skin rests yet, ms."""
+        # a clock of microseconds cannot tell a shorter rest from none
+        rest_s = self._rested_s - now
+        return math.ceil(rest_s * 1e3) if rest_s > 1e-6 and not self.drawing else 0
+
+    def state(self, now: float) -> str:
+        """Return ``ON,mbar,ms left``, ``REST,ms left`` or ``VENT``."""
+        if self._draw is not None:
+            left_ms = math.ceil((self._draw.ends_s - now) * 1e3)
+            return f"ON,{self._draw.wanted_mbar:g},{left_ms}"
+        rest_ms = self.rest_ms(now)
+        return f"REST,{rest_ms}" if rest_ms else "VENT"
+
+    def read(self, now: float) -> float:
+        """Return what the gauge says, mbar."""
+        reading = self._gauge.read(self._load.suction_mbar(now), now)
+        if reading is None:
+            raise Refused(Code.HARDWARE, "the pressure gauge is dead")
+        return reading
+
+    # time -------------------------------------------------------------------------------------
+
+    def deadline(self) -> float:
+        """Return when the gauge will next be looked at, or the pump ends by itself, in s."""
+        return math.inf if self._draw is None else self._draw.next_s
+
+    def advance(self, now: float) -> None:
+        """Let time pass up to `now`, at most one deadline."""
+        draw = self._draw
+        if draw is None or draw.next_s > now:
+            return
+        draw.ticks += 1
+        reading = self._gauge.read(self._load.suction_mbar(now), now)
+        if reading is None:
+            self._fail(draw, "GAUGE", now)
+            return
+        draw.mbar = reading
+        draw.held = draw.held or reading >= HELD_SHARE * draw.wanted_mbar
+        if reading > OVER_SHARE * self._probe.max_suction_mbar:
+            self._fail(draw, "HIGH", now)
+        elif draw.held and reading < LOST_SHARE * draw.wanted_mbar:
+            self._fail(draw, "LOST", now)
+        elif not draw.held and now >= draw.start_s + REACH_S:
+            self._fail(draw, "LOW", now)
+        elif now >= draw.ends_s:
+            self._end(draw, "TIMED", now)
+
+    def _end(self, draw: _Draw, how: str, now: float) -> None:
+        self._draw = None
+        self._load.vent(now)
+        self._rested_s = now + self._probe.rest_s
+        self.last_report = f"{draw.number},{how},{draw.mbar:.1f},{self._clock_us(now)}"
+        self._say("PUMP:END", self.last_report)
+
+    def _fail(self, draw: _Draw, how: str, now: float) -> None:
+        self._end(draw, how, now)
+        self.take_away(now)
+        self._on_fault(now)
+
+    # what is asked for ------------------------------------------------------------------------
+
+    def place(self, site: str, angle_deg: float, now: float) -> None:
+        """Take down where a person says that the head sits now."""
+        if self._draw is not None:
+            raise Refused(Code.IGNORED, "the pump is on; PUMP VENT first")
+        self._load.place(site, angle_deg, now)
+        self.placement = (site, angle_deg)
+
+    def take_away(self, now: float) -> None:
+        """Forget where the head sits: it is taken off."""
+        self.placement = None
+        self._load.take_away(now)
+
+    def draw(self, seconds: float, mbar: float, now: float) -> str:
+        """Switch the pump on until its own end; return the number of this time of suction."""
+        if self._draw is not None:
+            raise Refused(Code.IGNORED, "the pump is on; PUMP VENT first")
+        if self.placement is None:
+            raise Refused(Code.IGNORED, "HEAD:SITE first")
+        if rest_ms := self.rest_ms(now):
+            raise Refused(Code.RECYCLE, f"skin, {rest_ms} ms")
+        self.read(now)
+        self.count += 1
+        self._draw = _Draw(self.count, now, now + seconds, mbar)
+        self._load.draw(mbar, now)
+        return str(self.count)
+
+    def vent(self, now: float, how: str) -> None:
+        """Switch the pump off and open the vent."""
+        if self._draw is not None:
+            self._end(self._draw, how, now)
