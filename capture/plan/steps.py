@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal, get_args
 from pydantic import ConfigDict
 
 from capture.documents import STRICT, Checks, Fault, InputError, near_miss, parse, read_json, shown
+from capture.plan.suction import held_s
 from capture.rig import ID_RULE, Rig, is_id
 
 Value = str | int | float | bool
@@ -207,9 +208,11 @@ class Plan:
         Per step the slowest camera's exposure and read-out, or the recycling of the flash or the
         time that the light stays on where that is longer, and the turning of the analyser where
         its state changes. Where a caliper's position changes its way, and the time in which the
-        skin creeps; not the time of the person who tapes it.
+        skin creeps; where a head is held by suction, pumping and rests. Not the time of the person
+        who tapes the caliper or places the head.
         """
         total = 0.0
+        each_s: list[float] = []
         state: object = None
         held: tuple[object, int] = (None, 0)
         for step in self.steps:
@@ -217,7 +220,8 @@ class Plan:
             power = float(step.settings.get("power", 0.0))
             pause_s = max(rig.recycle_s * power, 60.0 / rig.max_pops_per_min) if power > 0 else 0.0
             pause_s = max(pause_s, float(step.settings.get("dwell_s", 0.0)))
-            total += max(float(step.settings.get("exposure_s", 0.0)) + readout_s, pause_s)
+            each_s.append(max(float(step.settings.get("exposure_s", 0.0)) + readout_s, pause_s))
+            total += each_s[-1]
             asked = step.settings.get("analyser_deg", step.settings.get("polarizer"))
             turn_s = rig.polarizer_move_s if asked not in (state, None) else 0.0
             state = state if asked is None else asked
@@ -231,7 +235,7 @@ class Plan:
                     move_s += rig.caliper.settle_s
                 held = now
             total += max(turn_s, move_s)  # the analyser turns while the jaws move
-        return total
+        return total + (0.0 if rig.probe is None else held_s(self.steps, each_s, rig.probe))
 
     def to_json(self) -> dict[str, Any]:
         """Return the plan as JSON values."""

@@ -1,0 +1,290 @@
+"""Plans of the fibre probe: series of exposures on skin, and its calibration on a phantom.
+
+Between the nearest and the farthest fibre light falls by more than five decades, of which one
+exposure shows three: so each measurement is a series of exposures, from short to long, of one
+placement of the head. A pump holds the head on the skin for as long as skin bears it without a
+rest; what does not fit into that time follows after the rest, with the head where it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from typing import Literal, get_args
+
+from capture.plan.steps import Kind, Plan, Step, Value, require
+from capture.plan.suction import Placement, placement_of
+from capture.rig import Probe, Rig, is_id
+
+ProbeTarget = Literal["phantom", "dark"]
+
+SITES = ("forehead", "cheek", "chin")
+"""Where Weyrich et al. (2006) placed their head; "chin" is below it."""
+PHANTOM = "phantom"
+"""Site of the block of known optics."""
+BRACKETS = 23
+LONGEST_S = 30.0
+STEP_EV = 2.0 / 3.0
+"""Weyrich et al. (2006), section 8 (doi 10.1145/1141911.1141987): 23 pictures, 2/3 stop apart, in
+about 88 s. From 30 s down they take 81 s, and 0.3 s each to be read out."""
+DARK_SHARES = (0.0, 0.75, 1.0)
+"""Where in the series, from its shortest to its longest exposure, frames without light stand."""
+MASK_EVERY = 3
+"""Every third exposure of the series is planned for a covered head: two stops apart."""
+MASK_LONGEST_S = 8.0
+"""A covered head is exposed no longer: cross-talk from a fibre that is dim after this is lost in
+the noise, and does not matter."""
+
+
+def probe_plan(
+    rig: Rig,
+    *,
+    sites: Sequence[str] = SITES,
+    repeats: int = 1,
+    angles: int = 1,
+    brackets: int = BRACKETS,
+    longest_s: float = LONGEST_S,
+    step_ev: float = STEP_EV,
+    darks: int = 2,
+    level: float = 1.0,
+    iso: int = 100,
+) -> Plan:
+    """Plan measurements of skin at several sites, along one or more directions.
+
+    Parameters
+    ----------
+    rig : Rig
+        With a probe.
+    sites : sequence of str
+        Where the head is placed, in this order.
+    repeats : int
+        How often at each site and angle, >= 1; the head is placed anew each time.
+    angles : int
+        How many directions of the line of fibres about the source, >= 1: multiples of 360/angles
+        degrees. 16 are 22.5 degrees apart and go all round, as in figure 10 of Weyrich et al.
+        (2006), rather than half: tissue whose fibres lie one way looks the same from opposite
+        directions, tissue that changes from one side to the other does not, and only a full turn
+        tells the two apart.
+    brackets : int
+        Exposures of a series, >= 2; number 0 is the shortest.
+    longest_s : float
+        The last exposure, s, > 0.
+    step_ev : float
+        From one exposure to the next, stops, > 0.
+    darks : int
+        Frames without light for each of few exposure times, >= 0, before the head is placed. Few
+        times are enough: what a pixel shows in the dark is its offset and a current times the
+        exposure. The shortest gives the one, the longest the other, and one between shows where
+        this is not so.
+    level : float
+        Of the LED behind the source fibre, 0 < level <= 1.
+    iso : int
+
+    Returns
+    -------
+    Plan
+        Darks, then per site, repeat and angle the series from short to long. Ids are like
+        "forehead-r0-a000-b07".
+
+    Raises
+    ------
+    PlanError
+        For what the rig's probe may not do.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> rig = load_rig("probe")
+    >>> plan = probe_plan(rig, sites=["cheek"], darks=0)
+    >>> len(plan.steps), plan.steps[0].id, round(plan.steps[0].settings["exposure_s"], 5)
+    (23, 'cheek-r0-a000-b00', 0.00115)
+    >>> [step.id for step in probe_plan(rig, sites=["chin"], angles=16).steps][-1]
+    'chin-r0-a337.5-b22'
+    >>> frames_s = sum(step.settings["exposure_s"] + 0.3 for step in plan.steps)
+    >>> round(frames_s), round(plan.estimated_s(rig))
+    (88, 99)
+    """
+    chosen = tuple(sites)
+    for site in chosen:
+        require(is_id(site) and site != PHANTOM, "sites", site, f"a name, not {PHANTOM!r}")
+    require(len(set(chosen)) == len(chosen) > 0, "sites", chosen, "at least one, none twice")
+    require(repeats >= 1, "repeats", repeats, ">= 1")
+    require(1 <= angles <= 360, "angles", angles, "1 to 360")
+    series = _Series(
+        rig, brackets=brackets, longest_s=longest_s, step_ev=step_ev, level=level, iso=iso
+    )
+    series.darks(darks)
+    for site in chosen:
+        for repeat in range(repeats):
+            for number in range(angles):
+                series.measure("fibres", site, repeat, 360.0 * number / angles)
+    return series.plan()
+
+
+def probe_calibration_plan(
+    rig: Rig,
+    target: ProbeTarget = "phantom",
+    *,
+    repeats: int = 1,
+    brackets: int = BRACKETS,
+    longest_s: float = LONGEST_S,
+    step_ev: float = STEP_EV,
+    darks: int = 4,
+    level: float = 1.0,
+    iso: int = 100,
+) -> Plan:
+    """Plan the frames of one calibration of the fibre probe.
+
+    Parameters
+    ----------
+    rig : Rig
+        With a probe.
+    target : {"phantom", "dark"}
+        "phantom": darks; the series of exposures on a block of known optics; then per fibre some
+        exposures with all other fibres covered, `MASK_EVERY` brackets apart. Of those only two
+        that serve are taken unless all are asked for, see `capture.acquire.mask_choice`;
+        "dark": the darks only.
+    repeats : int
+        Placements on the phantom, >= 1; fibres are covered at the first.
+    brackets, longest_s, step_ev, level, iso
+        As for `probe_plan`.
+    darks : int
+        Frames without light for each of a few exposure times; >= 1 of the dark.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> plan = probe_calibration_plan(load_rig("probe"))
+    >>> [step.id for step in plan.steps if step.kind != "mask"][11:13]
+    ['dark-b22-r3', 'phantom-r0-a000-b00']
+    >>> masks = [step for step in plan.steps if step.kind == "mask"]
+    >>> len(masks), masks[0].id, masks[-1].id, masks[-1].settings["fibre"]
+    (196, 'mask-f00-b0', 'mask-f27-b6', 27)
+    """
+    targets = get_args(ProbeTarget)
+    require(target in targets, "target", target, f"one of {', '.join(targets)}")
+    require(repeats >= 1, "repeats", repeats, ">= 1")
+    require(darks >= (1 if target == "dark" else 0), "darks", darks, ">= 0, of the dark >= 1")
+    series = _Series(
+        rig, brackets=brackets, longest_s=longest_s, step_ev=step_ev, level=level, iso=iso
+    )
+    series.darks(darks)
+    if target == "phantom":
+        for repeat in range(repeats):
+            series.measure("phantom", PHANTOM, repeat, 0.0)
+            if repeat == 0:
+                series.masks()
+    return series.plan()
+
+
+def exposure_series_s(
+    brackets: int = BRACKETS, *, longest_s: float = LONGEST_S, step_ev: float = STEP_EV
+) -> tuple[float, ...]:
+    """Return the exposures of a series, s, from short to long.
+
+    Examples
+    --------
+    >>> [round(seconds, 2) for seconds in exposure_series_s(4)]
+    [7.5, 11.91, 18.9, 30.0]
+    """
+    return tuple(longest_s * 2.0 ** (-step_ev * (brackets - 1 - k)) for k in range(brackets))
+
+
+def all_series(plan: Plan) -> Iterator[tuple[Placement, tuple[Step, ...]]]:
+    """Return the series of a plan on skin or phantom in its order, each with its steps.
+
+    The steps of a series show one placement of the head; each covered fibre has a series.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> plan = probe_plan(load_rig("probe"), sites=["cheek", "chin"], brackets=3)
+    >>> [(str(placement), len(steps)) for placement, steps in all_series(plan)]
+    [('cheek at 0 degrees', 3), ('chin at 0 degrees', 3)]
+    """
+    for (placement, _), group in groupby(
+        plan.steps, key=lambda step: (placement_of(step), step.settings.get("fibre"))
+    ):
+        if placement is not None:
+            yield placement, tuple(group)
+
+
+class _Series:
+    """Steps being collected, for the one camera of a probe."""
+
+    def __init__(
+        self, rig: Rig, *, brackets: int, longest_s: float, step_ev: float, level: float, iso: int
+    ) -> None:
+        require(rig.probe is not None, "rig", rig.name, "one with a probe")
+        self._probe: Probe = rig.probe  # type: ignore[assignment]
+        self._rig = rig
+        probe = self._probe
+        require(brackets >= 2, "brackets", brackets, ">= 2")
+        require(step_ev > 0, "step_ev", step_ev, "stops > 0")
+        readout_s = max(view.readout_s for view in rig.views)
+        most_s = min(probe.max_open_s, probe.max_suction_s - probe.settle_s - readout_s)
+        require(
+            0 < longest_s <= most_s, "longest_s", longest_s,
+            f"<= {most_s:g}, which one suction of {probe.max_suction_s:g} s has room for",
+        )  # fmt: skip
+        require(0 < level <= 1, "level", level, "0 < level <= 1")
+        self._exposures_s = exposure_series_s(brackets, longest_s=longest_s, step_ev=step_ev)
+        self._level, self._iso = float(level), iso
+        self._cameras = tuple(view.name for view in rig.views)
+        self._steps: list[Step] = []
+
+    def _add(
+        self, identity: str, kind: Kind, index: dict[str, str | int | float], exposure_s: float,
+        **settings: Value,
+    ) -> None:  # fmt: skip
+        every: dict[str, Value] = {"exposure_s": exposure_s, "level": self._level, "iso": self._iso}
+        self._steps.append(Step(identity, kind, index, {**every, **settings}, self._cameras))
+
+    def darks(self, count: int) -> None:
+        require(count >= 0, "darks", count, ">= 0")
+        last = len(self._exposures_s) - 1
+        for bracket in dict.fromkeys(round(share * last) for share in DARK_SHARES):
+            for repeat in range(count):
+                self._add(
+                    f"dark-b{bracket:02d}-r{repeat}", "dark",
+                    {"bracket": bracket, "repeat": repeat}, self._exposures_s[bracket], level=0.0,
+                )  # fmt: skip
+
+    def measure(self, kind: Kind, site: str, repeat: int, angle_deg: float) -> None:
+        for bracket, exposure_s in enumerate(self._exposures_s):
+            self._add(
+                f"{site}-r{repeat}-a{_angle_text(angle_deg)}-b{bracket:02d}", kind,
+                {"site": site, "repeat": repeat, "angle": _whole(angle_deg), "bracket": bracket},
+                exposure_s, suction_mbar=self._probe.suction_mbar,
+            )  # fmt: skip
+
+    def masks(self) -> None:
+        longest_s = max(MASK_LONGEST_S, self._exposures_s[0])
+        exposures_s = [t for t in self._exposures_s if t <= longest_s][::-MASK_EVERY][::-1]
+        for fibre in range(len(self._probe.fibres)):
+            for bracket, exposure_s in enumerate(exposures_s):
+                self._add(
+                    f"mask-f{fibre:02d}-b{bracket}", "mask", {"fibre": fibre, "bracket": bracket},
+                    exposure_s, suction_mbar=self._probe.suction_mbar, fibre=fibre,
+                )  # fmt: skip
+
+    def plan(self) -> Plan:
+        require(len(self._steps) > 0, "darks", 0, "something to capture")
+        probe = self._probe
+        limits = {
+            "max_suction_mbar": probe.max_suction_mbar,
+            "max_suction_s": probe.max_suction_s,
+            "max_open_s": probe.max_open_s,
+        }
+        if self._rig.leds is not None:
+            limits["dose_ws"] = self._rig.leds.dose_ws
+        return Plan(self._rig.name, tuple(self._steps), limits)
+
+
+def _whole(angle_deg: float) -> int | float:
+    return int(angle_deg) if float(angle_deg).is_integer() else float(angle_deg)
+
+
+def _angle_text(angle_deg: float) -> str:
+    whole, tenths = divmod(round(10.0 * angle_deg), 10)
+    return f"{whole:03d}.{tenths}" if tenths else f"{whole:03d}"

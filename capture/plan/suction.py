@@ -1,0 +1,98 @@
+"""How long a head is held by suction: which steps share a placement, and where skin has a rest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from capture.rig import Probe
+
+if TYPE_CHECKING:
+    from capture.plan.steps import Step
+
+SLACK_S = 0.1
+"""What words on the wire and a camera may take beside exposure and read-out, s."""
+PUMPING_S = 2.0
+"""About how long a pump takes to reach its suction, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Where a person has put the head; another repeat is another placement."""
+
+    site: str
+    angle_deg: float
+    repeat: int
+
+    def __str__(self) -> str:
+        again = f", repeat {self.repeat}" if self.repeat else ""
+        return f"{self.site} at {self.angle_deg:g} degrees{again}"
+
+
+def placement_of(step: Step) -> Placement | None:
+    """Return where a step wants the head; None where it does not matter.
+
+    Examples
+    --------
+    >>> from capture.plan import Step
+    >>> index = {"site": "cheek", "repeat": 0, "angle": 22.5, "bracket": 3}
+    >>> str(placement_of(Step("s", "fibres", index, {}, ("cam",))))
+    'cheek at 22.5 degrees'
+    """
+    if step.kind == "mask":
+        return Placement("phantom", 0.0, 0)
+    if step.kind not in ("fibres", "phantom"):
+        return None
+    index = step.index
+    return Placement(str(index["site"]), float(index["angle"]), int(index["repeat"]))
+
+
+def room_s(probe: Probe) -> float:
+    """Return how long exposures and their read-out may take in one suction, s.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> room_s(load_rig("probe").probe)
+    57.0
+    """
+    return probe.max_suction_s - PUMPING_S - probe.settle_s
+
+
+def spans(seconds: Sequence[float], probe: Probe) -> list[range]:
+    """Return which exposures of a placement share a suction, each with its read-out, s.
+
+    Examples
+    --------
+    >>> from capture.plan.probe import exposure_series_s
+    >>> from capture.rig import load_rig
+    >>> spans([t + 0.3 for t in exposure_series_s()], load_rig("probe").probe)
+    [range(0, 21), range(21, 23)]
+    """
+    found: list[range] = []
+    first, used_s = 0, 0.0
+    for number, one_s in enumerate(seconds):
+        if number > first and used_s + one_s + SLACK_S > room_s(probe):
+            found.append(range(first, number))
+            first, used_s = number, 0.0
+        used_s += one_s + SLACK_S
+    return [*found, range(first, len(seconds))] if seconds else found
+
+
+def held_s(steps: Sequence[Step], seconds: Sequence[float], probe: Probe) -> float:
+    """Return the time that suction and rests add to a plan's steps, each of so many seconds."""
+    total, held, group = 0.0, None, list[float]()
+
+    def end_of_group() -> float:
+        count = len(spans(group, probe))
+        return count * (PUMPING_S + probe.settle_s) + max(count - 1, 0) * probe.rest_s
+
+    for step, one_s in zip(steps, seconds, strict=True):
+        place = placement_of(step) if "suction_mbar" in step.settings else None
+        if place != held:
+            total += end_of_group()
+            held, group = place, []
+        if place is not None:
+            group.append(one_s)
+    return total + end_of_group()
