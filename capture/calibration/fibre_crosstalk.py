@@ -1,0 +1,210 @@
+"""Cross-talk of fibres: what each spot reads of every other fibre's light, and stray light."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration.fibre_readings import FibreReadings
+
+__all__ = ["CrossTalk", "measure_crosstalk", "no_crosstalk"]
+
+FloatArray = NDArray[np.float64]
+
+DISTANCE_EDGES: Final = (1, 2, 3, 4, 6, 9, 14, 21)
+"""First distance, in fibres, of each group that is taken to be alike."""
+LEAST_SCATTER: Final = 0.3
+"""Of pairs as far apart about their mean, relative: a few of them may agree by chance."""
+ROUNDS: Final = 30
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CrossTalk:
+    """How light of the fibres mixes in the spots' readings: ``s = X u + o``.
+
+    Attributes
+    ----------
+    matrix, stderr : ndarray of float64, shape (F, F)
+        X: ``matrix[j, i]`` is what spot j reads of fibre i's light, over what spot i reads of it;
+        1 on the diagonal, with error 0.
+    offset, offset_stderr : ndarray of float64, shape (F, C)
+        o: stray light in each spot that is no fibre's, full scales per second.
+    measured : bool
+        False: no frames told it; the matrix is 1, and its errors are unknown.
+    """
+
+    matrix: FloatArray
+    stderr: FloatArray
+    offset: FloatArray
+    offset_stderr: FloatArray
+    measured: bool = True
+
+    def __post_init__(self) -> None:
+        count = len(np.asarray(self.matrix))
+        colors = np.shape(self.offset)[-1]
+        for name, shape in (
+            ("matrix", (count, count)), ("stderr", (count, count)),
+            ("offset", (count, colors)), ("offset_stderr", (count, colors)),
+        ):  # fmt: skip
+            _freeze(self, name, shape)
+        if not (np.diagonal(self.matrix) == 1.0).all():
+            raise ValueError("CrossTalk.matrix: got a diagonal other than 1")
+        away = np.abs(self.matrix).sum(axis=0) - 1.0
+        if count and not float(away.max()) < 0.9:
+            raise ValueError(
+                f"CrossTalk.matrix: got a column of {float(away.max()):.2f} beside the diagonal,"
+                " expected less than 0.9: the spots cannot be told apart"
+            )
+
+    def unmix(self, signal: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the light of each fibre by itself, and its variance.
+
+        Parameters
+        ----------
+        signal, variance : ndarray of float64, shape (F, C)
+            Of readings; the readings' errors are independent.
+
+        Returns
+        -------
+        light, variance : ndarray of float64, shape (F, C)
+            The variance holds the readings' errors and those of the offset, not the matrix's: see
+            `matrix_variance`.
+        """
+        back = np.linalg.inv(self.matrix)
+        light = back @ (signal - self.offset)
+        return light, back**2 @ (variance + self.offset_stderr**2)
+
+    def matrix_variance(
+        self, light: FloatArray, reference: FloatArray, ratio: FloatArray
+    ) -> FloatArray:
+        """Return the variance that the matrix's errors add to light judged by a reference.
+
+        Parameters
+        ----------
+        light : ndarray of float64, shape (F, C)
+            Of the fibres, unmixed.
+        reference : ndarray of float64, shape (F, C)
+            Light of a target unmixed by the same matrix, by which `light` is divided; its errors
+            are the same ones, so that what both have alike cancels.
+        ratio : ndarray of float64, shape (F, C)
+            ``light / reference``, or 0 where only `light` is asked for.
+
+        Returns
+        -------
+        ndarray of float64, shape (F, C)
+            In the unit of ``light`` squared.
+        """
+        # -d(u_j) = sum_i dX_ji u_i to first order, and the same of the reference times the ratio
+        moved = light[None] - ratio[:, None] * reference[None]  # (F j, F i, C)
+        return np.asarray(np.einsum("ji,jic->jc", self.stderr**2, moved**2))
+
+
+def no_crosstalk(count: int, colors: int) -> CrossTalk:
+    """Return a matrix of no cross-talk, for where none was measured."""
+    nothing = np.zeros((count, colors))
+    return CrossTalk(np.eye(count), np.zeros((count, count)), nothing, nothing, measured=False)
+
+
+def measure_crosstalk(masks: Mapping[int, FibreReadings]) -> CrossTalk:
+    """Measure cross-talk and stray light with one fibre uncovered at a time.
+
+    Parameters
+    ----------
+    masks : mapping of int to FibreReadings
+        By the number of the uncovered fibre, on one bright target with one light; not all fibres
+        need to be there.
+
+    Returns
+    -------
+    CrossTalk
+
+    Notes
+    -----
+    Spot j reads ``X_ji`` times what the uncovered fibre i gives, and stray light ``o_j`` that is
+    the same whichever fibre is uncovered. Most of the 756 pairs of 28 fibres are fainter than
+    their noise; each is drawn to the mean of the pairs as far apart, as far as their own scatter
+    (the random-effects estimate of DerSimonian and Laird 1986, doi 10.1016/0197-2456(86)90046-2)
+    tells. The three colors share one matrix.
+    """
+    first = next(iter(masks.values()))
+    count, colors = first.signal.shape
+    used = [i for i in sorted(masks) if masks[i].valid[i].any()]
+    # source: light of the uncovered fibre in its own spot; column i, color c
+    source = np.zeros((count, colors))
+    value = np.zeros((count, count, colors))  # reading of j with i uncovered
+    weight = np.zeros((count, count, colors))
+    for i in used:
+        readings = masks[i]
+        own = readings.valid[i]
+        source[i] = np.where(own, readings.signal[i], 0.0)
+        good = readings.valid & own[None]
+        value[:, i] = readings.signal
+        weight[:, i] = np.where(good, 1.0 / np.maximum(readings.variance, 1e-300), 0.0)
+    rows = np.arange(count)
+    weight[rows, rows] = 0.0
+    distance = np.abs(rows[:, None] - rows[None])
+    group = np.searchsorted(DISTANCE_EDGES, distance, side="right") - 1  # -1 on the diagonal
+    offset, offset_variance = np.zeros((count, colors)), np.zeros((count, colors))
+    matrix, variance = np.zeros((count, count)), np.zeros((count, count))
+    information = np.einsum("jic,ic->ji", weight, source**2)
+    for _ in range(ROUNDS):
+        # each pair by itself, given the stray light
+        seen = np.einsum("jic,ic->ji", weight * (value - offset[:, None]), source)
+        matrix, variance = _pooled(seen, information, group)
+        # stray light, given the pairs; what is uncertain of a pair counts as noise
+        doubt = weight / (1.0 + weight * source[None] ** 2 * variance[..., None])
+        total = doubt.sum(axis=1)
+        rest = value - matrix[..., None] * source[None]
+        known = total > 0
+        before = offset
+        offset = np.where(known, (doubt * rest).sum(axis=1) / np.where(known, total, 1.0), 0.0)
+        offset_variance = np.where(known, 1.0 / np.where(known, total, 1.0), 0.0)
+        if (np.abs(offset - before) <= 1e-3 * np.sqrt(offset_variance)).all():
+            break
+    np.fill_diagonal(matrix, 1.0)
+    np.fill_diagonal(variance, 0.0)
+    return CrossTalk(matrix, np.sqrt(variance), offset, np.sqrt(offset_variance))
+
+
+def _pooled(
+    seen: FloatArray, information: FloatArray, group: NDArray[np.intp]
+) -> tuple[FloatArray, FloatArray]:
+    """Return each pair drawn to its group's mean, and its variance."""
+    matrix, variance = np.zeros_like(seen), np.zeros_like(seen)
+    last = (0.0, 0.0)
+    for number in range(int(group.max(initial=-1)) + 1):
+        here = group == number
+        told = here & (information > 0)
+        if not told.any():
+            # nothing said of such a distance: no more than of the one before
+            matrix[here], variance[here] = 0.0, last[0] ** 2 + last[1]
+            continue
+        w = information[told]
+        x = seen[told] / w
+        mean = float((w * x).sum() / w.sum())
+        spread = float((w * (x - mean) ** 2).sum()) - (len(x) - 1)
+        scale = float(w.sum() - (w**2).sum() / w.sum())
+        between = max(spread / scale, (LEAST_SCATTER * mean) ** 2) if scale > 0 else mean**2
+        both = 1.0 / (1.0 / w + between)
+        mean, error = float((both * x).sum() / both.sum()), 1.0 / float(both.sum())
+        share = between * information[here] / (1.0 + between * information[here])
+        own = np.divide(seen, information, out=np.zeros_like(seen), where=information > 0)[here]
+        matrix[here] = share * own + (1.0 - share) * mean
+        variance[here] = (1.0 - share) * between + (1.0 - share) ** 2 * error
+        last = (mean, between)
+    return matrix, variance
+
+
+def _freeze(row: Any, name: str, shape: tuple[int, ...]) -> None:
+    array = np.array(getattr(row, name), np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(
+            f"{type(row).__name__}.{name}: got shape {array.shape}, expected finite numbers of"
+            f" shape {shape}"
+        )
+    array.setflags(write=False)
+    object.__setattr__(row, name, array)

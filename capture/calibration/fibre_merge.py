@@ -1,0 +1,224 @@
+"""Brackets of exposures merged to the rate of light on each pixel, the dark signal taken off."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import uniform_filter
+
+from capture.calibration.fibre_darks import CameraNoise, DarkModel
+from capture.calibration.photon_transfer import cfa_planes
+from capture.documents import Checks
+from capture.hdr import BracketError
+
+__all__ = ["MergedSeries", "color_masks", "merge_series"]
+
+FloatArray = NDArray[np.float64]
+
+SMOOTH: Final = 3
+"""Side of the square of one color's pixels that the noise of each is told from."""
+MARGIN_SIGMAS: Final = 4.0
+FORESIGHT: Final = 0.1
+"""Of full scale: a prediction worse than this does not decide whether a frame counts."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergedSeries:
+    """Light on each pixel, from all exposures of a series.
+
+    Attributes
+    ----------
+    rate : ndarray of float64, shape (H, W)
+        Full scales per second above the dark signal, raw mosaic; may be negative; 0 where not
+        valid.
+    variance : ndarray of float64, shape (H, W)
+        Of `rate`; 0 where not valid.
+    smooth : ndarray of float64, shape (H, W)
+        `rate` averaged over the nearest valid pixels of the same color.
+    valid : ndarray of bool, shape (H, W)
+        False where a pixel is hot or saturated in every frame.
+    saturated : ndarray of bool, shape (H, W)
+        In every frame; not hot.
+    exposures_s : tuple of float
+        Ascending.
+    """
+
+    rate: FloatArray
+    variance: FloatArray
+    smooth: FloatArray
+    valid: NDArray[np.bool_]
+    saturated: NDArray[np.bool_]
+    exposures_s: tuple[float, ...]
+
+
+def merge_series(
+    frames: Sequence[NDArray[np.integer]],
+    exposures_s: ArrayLike,
+    *,
+    darks: DarkModel,
+    noise: CameraNoise,
+) -> MergedSeries:
+    """Merge raw frames of one scene at several exposure times, and take off the dark signal.
+
+    Parameters
+    ----------
+    frames : sequence of N arrays of integers, shape (H, W)
+        Raw DN, nothing subtracted; the light does not change between them.
+    exposures_s : array_like, shape (N,)
+        s, > 0, any order.
+    darks : DarkModel
+        At the frames' temperature.
+    noise : CameraNoise
+
+    Returns
+    -------
+    MergedSeries
+
+    Raises
+    ------
+    BracketError, DarkError
+        Where shapes or times do not fit.
+
+    Notes
+    -----
+    As `capture.hdr.merge`, by weights ``t / variance``, but for light that is fainter than the
+    dark signal and than the noise of a pixel:
+
+    - bias and dark current are each pixel's own, and their shot noise and errors count;
+    - a weight follows from the light on the pixel's neighbors too. From the pixel's own noisy
+      value alone it would favor low readings, by a tenth of an electron each, which sums up over
+      a spot to more than the farthest fibres give;
+    - whether a frame is near saturation is told from the shorter frames, not from its own value,
+      which would leave out its high readings.
+    """
+    stack = [np.asarray(frame) for frame in frames]
+    times = np.asarray(exposures_s, np.float64)
+    _check(stack, times, darks)
+    darks.require(times)
+    order = np.argsort(times, kind="stable")
+    stack, times = [stack[k] for k in order], times[order]
+    shape = stack[0].shape
+    usable = _usable(stack, times, darks, noise)
+    hot = darks.hot
+    # first by read noise alone, then with the noise of the light that was found
+    guess, seen = _weigh(stack, times, usable, darks, noise, np.zeros(shape))[:2]
+    smooth = _smooth(guess, seen & ~hot, noise.pattern)
+    rate, seen, variance = _weigh(stack, times, usable, darks, noise, np.maximum(smooth, 0.0))
+    valid = seen & ~hot
+    rate, variance = np.where(valid, rate, 0.0), np.where(valid, variance, 0.0)
+    span = noise.span_dn
+    return MergedSeries(
+        rate / span,
+        variance / span**2,
+        _smooth(rate, valid, noise.pattern) / span,
+        valid,
+        ~seen & ~hot,
+        tuple(float(t) for t in times),
+    )
+
+
+def color_masks(shape: tuple[int, ...], pattern: str) -> list[NDArray[np.bool_]]:
+    """Return where each color's pixels lie in a raw frame, in the order R, G, B (or one, MONO).
+
+    Examples
+    --------
+    >>> [int(mask.sum()) for mask in color_masks((4, 6), "RGGB")]
+    [6, 12, 6]
+    """
+    planes = cfa_planes(pattern)
+    step = 1 if pattern == "MONO" else 2
+    masks = []
+    for color in ("R", "G", "B") if step == 2 else tuple(planes):
+        mask = np.zeros(shape, np.bool_)
+        for row, column in planes[color]:
+            mask[row::step, column::step] = True
+        masks.append(mask)
+    return masks
+
+
+def _check(stack: list[NDArray[np.integer]], times: FloatArray, darks: DarkModel) -> None:
+    checks = Checks("Series of a probe", BracketError)
+    checks.that("frames", len(stack), len(stack) > 0, "at least one frame")
+    shapes = sorted({frame.shape for frame in stack})
+    expected = darks.bias_dn.shape
+    checks.that("frames", shapes, shapes in ([], [expected]), f"the dark frames' shape {expected}")
+    whole = all(np.issubdtype(frame.dtype, np.integer) for frame in stack)
+    checks.that("frames", [str(f.dtype) for f in stack][:3], whole, "raw DN, whole numbers")
+    checks.that("exposures_s", times.shape, times.shape == (len(stack),), f"{len(stack)} times")
+    positive = bool(np.isfinite(times).all() and (times > 0).all())
+    checks.that("exposures_s", times.tolist(), positive, "finite seconds > 0")
+    checks.close()
+
+
+def _usable(
+    stack: list[NDArray[np.integer]], times: FloatArray, darks: DarkModel, noise: CameraNoise
+) -> list[NDArray[np.bool_]]:
+    """Return in which pixels each frame is not saturated, nor would be by chance."""
+    gain, floor, span = noise.gain_e_per_dn, noise.floor_dn2, noise.span_dn
+    shape = stack[0].shape
+    signal = np.zeros(shape)  # weighted DN of light so far
+    time = np.zeros(shape)  # weighted seconds so far
+    information = np.zeros(shape)  # inverse variance of the rate so far, s^2/DN^2
+    result = []
+    for frame, t in zip(stack, times, strict=True):
+        unclipped = frame < noise.white_dn
+        dark = darks.bias_dn + darks.rate_dn_per_s * t
+        rate = np.divide(signal, time, out=np.zeros(shape), where=time > 0)
+        light = np.maximum(rate, 0.0) * t
+        own = floor + light / gain
+        with np.errstate(divide="ignore"):
+            spread = np.sqrt(own + t * t / information)
+        foreseen = spread < FORESIGHT * span
+        below = dark + light + MARGIN_SIGMAS * np.where(foreseen, spread, 0.0) < span
+        use = unclipped & (below | ~foreseen)
+        result.append(use)
+        value = frame.astype(np.float64) - noise.black_dn - dark
+        weight = np.where(use, t / own, 0.0)
+        signal += weight * value
+        time += weight * t
+        information += weight * t
+    return result
+
+
+def _weigh(
+    stack: list[NDArray[np.integer]],
+    times: FloatArray,
+    usable: list[NDArray[np.bool_]],
+    darks: DarkModel,
+    noise: CameraNoise,
+    light: FloatArray,
+) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
+    """Return rate, where any frame counts, and variance, DN/s, weighed for light of some rate."""
+    shape = stack[0].shape
+    shot = (light + max(darks.mean_rate_dn_per_s, 0.0)) / noise.gain_e_per_dn
+    signal, time, weights = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    for frame, t, use in zip(stack, times, usable, strict=True):
+        weight = np.where(use, t / (noise.floor_dn2 + shot * t), 0.0)
+        signal += weight * (frame - (noise.black_dn + darks.bias_dn))
+        time += weight * t
+        weights += weight
+    seen = time > 0
+    below = np.where(seen, time, 1.0)
+    offset = weights / below  # what a bias's error becomes, 1/s
+    (bias2, both), (_, rate2) = darks.covariance
+    variance = 1.0 / below + bias2 * offset**2 + 2.0 * both * offset + rate2
+    return signal / below - darks.rate_dn_per_s, seen, variance
+
+
+def _smooth(values: FloatArray, valid: NDArray[np.bool_], pattern: str) -> FloatArray:
+    """Return the mean over the neighbors of the same place in the cell; 0 where there is none."""
+    result = np.zeros_like(values)
+    step = 1 if pattern == "MONO" else 2
+    for row in range(step):
+        for column in range(step):
+            place = (slice(row, None, step), slice(column, None, step))
+            share = uniform_filter(valid[place].astype(np.float64), SMOOTH, mode="nearest")
+            total = uniform_filter(
+                np.where(valid[place], values[place], 0.0), SMOOTH, mode="nearest"
+            )
+            result[place] = np.where(share > 1e-6, total / np.maximum(share, 1e-6), 0.0)
+    return result

@@ -1,0 +1,118 @@
+"""Spots of the fibres are found by themselves, in order, with errors that hold."""
+
+import numpy as np
+import pytest
+
+from capture.calibration.fibre_merge import merge_series
+from capture.calibration.fibre_spots import SpotError, find_fibre_spots
+
+SHORT_S = (0.01, 1.0, 30.0)
+
+
+def merged(camera, light, times=SHORT_S):
+    return merge_series(
+        camera.series(light, times), times, darks=camera.darks(), noise=camera.noise
+    )
+
+
+def find(camera, light, **about):
+    return find_fibre_spots(
+        merged(camera, light), camera.nominal, names=camera.names, pattern="RGGB", **about
+    )
+
+
+@pytest.fixture(scope="module")
+def falling():
+    return np.geomspace(1e5, 50.0, 28)[:, None] * np.array([0.6, 1.0, 0.5])
+
+
+def test_spots_off_their_places_on_a_turned_row_are_found_within_their_errors(
+    rng, fibre_camera, falling
+):
+    camera = fibre_camera(rng)
+    spots = find(camera, falling)
+    assert spots.found.all()
+    assert spots.findings == ()
+    away = (spots.center_px - camera.places) / spots.center_stderr_px
+    # 56 coordinates: five standard errors are exceeded once in 30,000 runs
+    assert np.abs(away).max() < 5
+    assert spots.center_stderr_px.max() < 0.05
+    np.testing.assert_allclose(spots.radius_px, 13.0, atol=0.05)
+    assert spots.rotation_rad == pytest.approx(0.004, abs=1e-3)
+    # an estimate that keeps to the nominal places would fail
+    assert np.abs(camera.nominal - camera.places).max() > 1
+
+
+@pytest.mark.parametrize("shift", [(5.0, 5.0), (-5.0, -5.0), (-15.0, 8.0)])
+def test_a_row_that_is_shifted_as_a_whole_is_found(rng, fibre_camera, falling, shift):
+    camera = fibre_camera(rng, shift=shift)
+    spots = find(camera, falling)
+    np.testing.assert_allclose(spots.center_px, camera.places, atol=0.1)
+    np.testing.assert_allclose(spots.shift_px, shift, atol=1.0)
+
+
+def test_a_dark_fibre_is_reported_at_the_place_where_it_must_end(rng, fibre_camera, falling):
+    light = falling.copy()
+    light[11] = 0.0
+    camera = fibre_camera(rng)
+    spots = find(camera, light)
+    assert np.flatnonzero(~spots.found).tolist() == [11]
+    assert np.linalg.norm(spots.center_px[11] - camera.places[11]) < 4
+    assert "F12" in spots.findings[0]
+    assert "dark" in spots.findings[0]
+
+
+def test_a_spot_that_is_no_fibres_is_named(rng, fibre_camera, falling):
+    camera = fibre_camera(rng)
+    camera.places[20, 1] -= 38.0
+    other = fibre_camera(np.random.default_rng(3), places=camera.places)
+    with pytest.raises(SpotError, match=r"28 spots, of which 1 .*x 8\d\d, y 2\d px"):
+        find(other, falling)
+
+
+def test_no_light_and_too_few_spots_are_told_apart(rng, fibre_camera, falling):
+    camera = fibre_camera(rng)
+    with pytest.raises(SpotError, match="found none"):
+        find(camera, np.zeros((28, 3)))
+    light = falling.copy()
+    light[9:] = 0.0
+    with pytest.raises(SpotError, match=r"found 9 .*expected 28"):
+        find(camera, light)
+
+
+def test_two_spots_that_merge_are_told_apart_by_frames_with_one_uncovered(rng, fibre_camera):
+    nominal = fibre_camera(rng, shift=(0, 0), turn_rad=0, jitter_px=0).places
+    places = nominal.copy()
+    places[8, 0] += 14.0
+    places[9, 0] -= 14.0  # 14 px apart, each of a radius of 13
+    camera = fibre_camera(rng, places=places)
+    light = np.full((28, 3), 2e3)
+    masks = {}
+    for i in (8, 9):
+        alone = np.zeros_like(light)
+        alone[i] = light[i]
+        masks[i] = merged(camera, alone, (0.1, 1.0))
+    spots = find(camera, light, masks=masks)
+    np.testing.assert_allclose(spots.center_px, places, atol=0.2)
+    assert spots.overlapping[[8, 9]].all()
+    assert any("F09 and F10: their spots overlap" in text for text in spots.findings)
+    blind = find(camera, light)
+    assert np.flatnonzero(~blind.found).tolist() == [8, 9]
+    assert any("F09 and F10 end in one spot" in text for text in blind.findings)
+
+
+def test_a_cover_over_the_wrong_fibre_is_an_error(rng, fibre_camera, falling):
+    camera = fibre_camera(rng)
+    alone = np.zeros_like(falling)
+    alone[5] = falling[5]
+    with pytest.raises(SpotError, match="only F05 uncovered the brightest spot is that of F06"):
+        find(camera, falling, masks={4: merged(camera, alone, (0.01, 0.1))})
+
+
+def test_spots_that_have_moved_since_are_followed(rng, fibre_camera, falling):
+    camera = fibre_camera(rng)
+    spots = find(camera, falling)
+    later = fibre_camera(rng, places=camera.places + np.array([1.3, -0.7]))
+    followed, shift = spots.moved(merged(later, falling), "RGGB")
+    np.testing.assert_allclose(shift, [1.3, -0.7], atol=0.03)
+    np.testing.assert_allclose(followed.center_px, later.places, atol=0.1)
