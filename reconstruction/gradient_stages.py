@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -219,26 +218,7 @@ def _strain(evidence: Evidence, rig: Rig) -> Mapping[str, Any]:
         "pixel_um": rig.pixel_um,
         "states": [each.document(rig.pixel_um) for each in found],
     }
-    return {"_strains": found, STRAIN_FILE: _json(document)}
-
-
-def _json(document: Mapping[str, Any]) -> bytes:
-    return json.dumps(plain(document), indent=1, allow_nan=False).encode("utf-8")
-
-
-def plain(value: Any) -> Any:
-    """Return a value as JSON knows it; what is not finite becomes null."""
-    if isinstance(value, Mapping):
-        return {key: plain(entry) for key, entry in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return {"_strains": found, STRAIN_FILE: stages.document_bytes(document)}
 
 
 def _crossed(rig: Rig, state: SkinState) -> Mapping[str, SkinMap]:
@@ -375,7 +355,7 @@ def _histograms(rig: Rig, made: Mapping[str, Any]) -> Mapping[str, Any]:
     strains: list[StateStrain] = made["_strains"]
     found = count_normals(strains, _heights(strains, made), pixel_um=rig.pixel_um)
     document = histogram_document(strains, found)
-    return {"_histograms": found, HISTOGRAM_FILE: _json(document)}
+    return {"_histograms": found, HISTOGRAM_FILE: stages.document_bytes(document)}
 
 
 def _kernels(evidence: Evidence, rig: Rig, made: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -384,7 +364,7 @@ def _kernels(evidence: Evidence, rig: Rig, made: Mapping[str, Any]) -> Mapping[s
         strains, _heights(strains, made), made["_histograms"], pixel_um=rig.pixel_um,
         tell=lambda share: evidence.tell("kernels", share),
     )  # fmt: skip
-    return {KERNEL_FILE: _json(document)}
+    return {KERNEL_FILE: stages.document_bytes(document)}
 
 
 def _heights(strains: list[StateStrain], made: Mapping[str, Any]) -> dict[str, SkinMap]:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
+
+import numpy as np
 
 
 class StageError(ValueError):
@@ -215,3 +218,28 @@ def run(
         left_out=tuple(left_out),
         keys=keys,
     )
+
+
+def document_bytes(document: Mapping[str, Any]) -> bytes:
+    """Return a document as JSON text, UTF-8; arrays become lists, what is not finite null.
+
+    Examples
+    --------
+    >>> document_bytes({"r_mm": np.array([1.0, np.nan])}).split()
+    [b'{', b'"r_mm":', b'[', b'1.0,', b'null', b']', b'}']
+    """
+    return json.dumps(_plain(document), indent=1, allow_nan=False).encode("utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
