@@ -20,7 +20,7 @@ _SHIFTS = tuple(np.uint64(n) for n in (11, 17, 45, 19))
 
 
 @njit(inline="always")
-def _draw(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
+def draw(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
     """Step xoshiro256+ (Blackman, Vigna 2021, doi:10.1145/3460772); uniform in (0, 1]."""
     word = s0 + s3
     t = s1 << _SHIFTS[1]
@@ -34,7 +34,7 @@ def _draw(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _fresnel(mu_i, eta_i, eta_t):  # type: ignore[no-untyped-def]
+def fresnel(mu_i, eta_i, eta_t):  # type: ignore[no-untyped-def]
     """Unpolarized reflectance and cosine of the refracted ray; (1, 0) at total reflection."""
     ratio = eta_i / eta_t
     sin2_t = ratio * ratio * (1.0 - mu_i * mu_i)
@@ -44,6 +44,46 @@ def _fresnel(mu_i, eta_i, eta_t):  # type: ignore[no-untyped-def]
     r_s = (eta_i * mu_i - eta_t * mu_t) / (eta_i * mu_i + eta_t * mu_t)
     r_p = (eta_t * mu_i - eta_i * mu_t) / (eta_t * mu_i + eta_i * mu_t)
     return 0.5 * (r_s * r_s + r_p * r_p), mu_t
+
+
+@njit(inline="always")
+def scatter(s0, s1, s2, s3, ux, uy, uz, g):  # type: ignore[no-untyped-def]
+    """Turn a direction by the Henyey-Greenstein phase function of mean cosine g."""
+    s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+    if g == 0.0:
+        cos_theta = 2.0 * u - 1.0
+    else:
+        part = (1.0 - g * g) / (1.0 - g + 2.0 * g * u)
+        cos_theta = (1.0 + g * g - part * part) / (2.0 * g)
+    # Azimuth from a point in the unit disc: cos 2a = (p^2 - q^2)/(p^2 + q^2).
+    while True:
+        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+        p = 2.0 * u - 1.0
+        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
+        q = 2.0 * u - 1.0
+        pp = p * p
+        qq = q * q
+        norm = pp + qq
+        if 0.0 < norm <= 1.0:
+            break
+    cos_phi = (pp - qq) / norm
+    sin_phi = 2.0 * p * q / norm
+    sin2_theta = max(0.0, 1.0 - cos_theta * cos_theta)
+    sin2_z = 1.0 - uz * uz
+    if sin2_z > 1e-10:
+        bend = sqrt(sin2_theta / sin2_z)
+        vx = bend * (ux * uz * cos_phi - uy * sin_phi) + ux * cos_theta
+        vy = bend * (uy * uz * cos_phi + ux * sin_phi) + uy * cos_theta
+        uz = uz * cos_theta - bend * sin2_z * cos_phi
+        ux = vx
+        uy = vy
+    else:
+        # Along the axis: any azimuth's origin will do.
+        bend = sqrt(sin2_theta)
+        ux = bend * cos_phi
+        uy = bend * sin_phi
+        uz = copysign(cos_theta, cos_theta * uz)
+    return s0, s1, s2, s3, ux, uy, uz
 
 
 @njit(
@@ -103,7 +143,7 @@ def walk(table, ring_edges2, photons, seed, tally, events):  # type: ignore[no-u
         sigma_t = table[layer, 2]
         albedo = table[layer, 3]
         g = table[layer, 4]
-        s0, s1, s2, s3, u = _draw(s0, s1, s2, s3)
+        s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
         depth_left = -log(u)  # optical depth to the next collision
 
         while True:
@@ -118,48 +158,15 @@ def walk(table, ring_edges2, photons, seed, tally, events):  # type: ignore[no-u
                 tally[TALLIES + layer - 1] += weight * (1.0 - albedo)
                 weight *= albedo
                 if weight < ROULETTE_BELOW:
-                    s0, s1, s2, s3, u = _draw(s0, s1, s2, s3)
+                    s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
                     if u > ROULETTE_SURVIVAL:
                         tally[4] += weight
                         break
                     tally[4] += weight - weight / ROULETTE_SURVIVAL
                     weight /= ROULETTE_SURVIVAL
                 scattered = True
-                s0, s1, s2, s3, u = _draw(s0, s1, s2, s3)
-                if g == 0.0:
-                    cos_theta = 2.0 * u - 1.0
-                else:
-                    part = (1.0 - g * g) / (1.0 - g + 2.0 * g * u)
-                    cos_theta = (1.0 + g * g - part * part) / (2.0 * g)
-                # Azimuth from a point in the unit disc: cos 2a = (p^2 - q^2)/(p^2 + q^2).
-                while True:
-                    s0, s1, s2, s3, u = _draw(s0, s1, s2, s3)
-                    p = 2.0 * u - 1.0
-                    s0, s1, s2, s3, u = _draw(s0, s1, s2, s3)
-                    q = 2.0 * u - 1.0
-                    pp = p * p
-                    qq = q * q
-                    norm = pp + qq
-                    if 0.0 < norm <= 1.0:
-                        break
-                cos_phi = (pp - qq) / norm
-                sin_phi = 2.0 * p * q / norm
-                sin2_theta = max(0.0, 1.0 - cos_theta * cos_theta)
-                sin2_z = 1.0 - uz * uz
-                if sin2_z > 1e-10:
-                    bend = sqrt(sin2_theta / sin2_z)
-                    vx = bend * (ux * uz * cos_phi - uy * sin_phi) + ux * cos_theta
-                    vy = bend * (uy * uz * cos_phi + ux * sin_phi) + uy * cos_theta
-                    uz = uz * cos_theta - bend * sin2_z * cos_phi
-                    ux = vx
-                    uy = vy
-                else:
-                    # Along the axis: any azimuth's origin will do.
-                    bend = sqrt(sin2_theta)
-                    ux = bend * cos_phi
-                    uy = bend * sin_phi
-                    uz = copysign(cos_theta, cos_theta * uz)
-                s0, s1, s2, s3, u = _draw(s0, s1, s2, s3)
+                s0, s1, s2, s3, ux, uy, uz = scatter(s0, s1, s2, s3, ux, uy, uz, g)
+                s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
                 depth_left = -log(u)
                 continue
 
@@ -174,8 +181,8 @@ def walk(table, ring_edges2, photons, seed, tally, events):  # type: ignore[no-u
             eta = table[layer, 5]
             eta_beyond = table[beyond, 5]
             if eta != eta_beyond:
-                reflected, mu_t = _fresnel(abs(uz), eta, eta_beyond)
-                s0, s1, s2, s3, u = _draw(s0, s1, s2, s3)
+                reflected, mu_t = fresnel(abs(uz), eta, eta_beyond)
+                s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
                 if u <= reflected:
                     uz = -uz
                     continue

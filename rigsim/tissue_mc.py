@@ -229,17 +229,17 @@ def transport(
     1.0
     """
     edges = _ring_edges(ring_edges_mm)
-    count = _photons_per_batch(photons, batches, threads)
-    table = _layer_table(stack)
+    count = photons_per_batch(photons, batches, threads)
+    table = layer_table(stack)
     n_layers = len(stack.layers)
     tallies = np.zeros((batches, TALLIES + n_layers + edges.size - 1))
     no_events = np.zeros((0, 2 + n_layers))
-    seeds = _batch_seeds(rng, batches)
+    seeds = batch_seeds(rng, batches)
 
     def run(batch: int) -> None:
         walk(table, edges * edges, count, seeds[batch], tallies[batch], no_events)
 
-    _in_threads(run, batches, threads)
+    in_threads(run, batches, threads)
     tallies /= count
     mean = tallies.mean(axis=0)
     error = tallies.std(axis=0, ddof=1) / np.sqrt(batches)
@@ -296,10 +296,10 @@ def escape_paths(
     >>> len(batches), batches[0].path_mm.shape[1]
     (20, 1)
     """
-    count = _photons_per_batch(photons, batches, threads)
-    table = _layer_table(stack)
+    count = photons_per_batch(photons, batches, threads)
+    table = layer_table(stack)
     n_layers = len(stack.layers)
-    seeds = _batch_seeds(rng, batches)
+    seeds = batch_seeds(rng, batches)
     edges2 = np.array([0.0, inf])
 
     def run(batch: int) -> EscapePaths:
@@ -308,11 +308,14 @@ def escape_paths(
         kept = events[: walk(table, edges2, count, seeds[batch], tally, events)].copy()
         return EscapePaths(kept[:, 0], np.sqrt(kept[:, 1]), kept[:, 2:], count)
 
-    return tuple(_in_threads(run, batches, threads))
+    return tuple(in_threads(run, batches, threads))
 
 
-def _layer_table(stack: LayerStack) -> FloatArray:
-    """One row a layer: top, bottom, sigma_t, albedo, g, eta; a row around for each medium."""
+def layer_table(stack: LayerStack) -> FloatArray:
+    """Return what `rigsim.photon_walk.walk` needs of the layers and the media around them.
+
+    Columns top, bottom, sigma_t, albedo, g, eta; shape (layers + 2, 6).
+    """
     depths = np.cumsum([0.0, *(layer.thickness_mm for layer in stack.layers)])
     rows = [[-inf, 0.0, 0.0, 0.0, 0.0, stack.eta_above]]
     for layer, top, bottom in zip(stack.layers, depths[:-1], depths[1:], strict=True):
@@ -323,18 +326,27 @@ def _layer_table(stack: LayerStack) -> FloatArray:
     return np.array(rows, dtype=np.float64)
 
 
-def _batch_seeds(rng: np.random.Generator, batches: int) -> NDArray[np.uint64]:
+def batch_seeds(rng: np.random.Generator, batches: int) -> NDArray[np.uint64]:
+    """Return the states from which the batches' generators start, shape (batches, 4)."""
     return rng.integers(1, 2**64, size=(batches, 4), dtype=np.uint64)
 
 
-def _in_threads(run: Callable[[int], _T], batches: int, threads: int) -> list[_T]:
+def in_threads(run: Callable[[int], _T], batches: int, threads: int) -> list[_T]:
+    """Return what `run` gives for each batch, in order; it must release the interpreter."""
     if threads == 1:
         return [run(batch) for batch in range(batches)]
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(run, range(batches)))
 
 
-def _photons_per_batch(photons: int, batches: int, threads: int) -> int:
+def photons_per_batch(photons: int, batches: int, threads: int) -> int:
+    """Check a request and return its photons in each batch, rounded up.
+
+    Raises
+    ------
+    TransportError
+        When one of the three is too small.
+    """
     _require("photons", photons, photons >= 1, ">= 1")
     _require("batches", batches, batches >= MIN_BATCHES, f">= {MIN_BATCHES}")
     _require("threads", threads, threads >= 1, ">= 1")

@@ -1,0 +1,533 @@
+"""What fibres on tissue take from a source fibre: Monte Carlo transport scored in their cones.
+
+The quantity is the reflectance in the fibre R_f in 1/mm^2: the power that a detection fibre takes,
+divided by the source's power, the area of the fibre's core and the square of its aperture. Where
+the light that leaves is Lambertian, it is the exitance per source power, averaged over the core.
+
+Three things make it cheap. Light is scored at every collision instead of where photons happen to
+leave. A plane stack is the same everywhere, so photons start at a point and are scored in rings,
+with the exact share of the pairs of points, one in each core, that lie so far apart. And photons
+are split where few arrive and merged by roulette where many do, so that every distance is visited
+alike; weights keep all of it unbiased.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, pi
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigsim import tissue_mc
+from rigsim.fibre_walk import walk_to_fibres
+from rigsim.tissue_mc import LayerStack, TransportError
+
+FloatArray = NDArray[np.float64]
+
+PATH_SCALE_MM: Final = 0.05
+"""Path length above which the nodes of a path histogram are spaced by their logarithm."""
+
+PATH_STEP: Final = 0.006
+"""Relative spacing of those nodes; a reweighted score is off by (sigma path step)^2 / 8 of it."""
+
+LONGEST_PATH_MM: Final = 20_000.0
+"""Longer paths count as this one when they are reweighted: exp(-sigma 20 m) is 0 for all tissue."""
+
+PILOT_SHARE: Final = 0.03
+"""Part of the photons that is spent to learn how many arrive where."""
+
+WINDOW_CELLS: Final = 256
+KERNEL_NODES: Final = 400
+SCORED_DEPTH: Final = 1.5
+"""Optical depth above which every collision is scored; below, fewer and fewer with more weight."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fibres:
+    """A source fibre and detection fibres that stand on the surface."""
+
+    radii_mm: tuple[float, ...]
+    """Distances of the detection fibres' axes from the source's, mm, >= 0, at least one."""
+    core_mm: float = 0.2
+    """Diameter of the detection fibres' cores, mm, > 0."""
+    source_core_mm: float = 0.2
+    """Diameter of the source fibre's core, mm, >= 0."""
+    numerical_aperture: float = 0.22
+    """Numerical aperture of the detection fibres, in (0, 1]; 1 in air takes all angles."""
+    source_numerical_aperture: float = 0.22
+    """Numerical aperture of the source fibre, in [0, 1]; 0 for parallel light."""
+
+    def __post_init__(self) -> None:
+        if not self.radii_mm:
+            raise TransportError("radii_mm: expected at least one distance, got none")
+        for radius in self.radii_mm:
+            _require("radii_mm", radius, isfinite(radius) and radius >= 0.0, "finite, >= 0")
+        _require("core_mm", self.core_mm, isfinite(self.core_mm) and self.core_mm > 0.0, "> 0")
+        core = self.source_core_mm
+        _require("source_core_mm", core, isfinite(core) and core >= 0.0, ">= 0")
+        aperture = self.numerical_aperture
+        _require("numerical_aperture", aperture, 0.0 < aperture <= 1.0, "in (0, 1]")
+        aperture = self.source_numerical_aperture
+        _require("source_numerical_aperture", aperture, 0.0 <= aperture <= 1.0, "in [0, 1]")
+
+
+@dataclass(frozen=True, slots=True)
+class SpectralStack:
+    """Layers that depend on the wavelength, and the bands in which light is measured."""
+
+    wavelength_nm: tuple[float, ...]
+    """Wavelengths, nm, at least one."""
+    stacks: tuple[LayerStack, ...]
+    """The layers at each wavelength; as many in each."""
+    band_weights: FloatArray
+    """Share of each wavelength in each band, >= 0, shape (wavelengths, bands): the light source's
+    spectrum times the band's sensitivity, each column of sum 1 for a reflectance."""
+
+    def __post_init__(self) -> None:
+        count = len(self.wavelength_nm)
+        if not count or len(self.stacks) != count:
+            raise TransportError(
+                f"stacks: expected one for each of {count} wavelengths (at least one), "
+                f"got {len(self.stacks)}"
+            )
+        if len({len(stack.layers) for stack in self.stacks}) != 1:
+            raise TransportError("stacks: expected as many layers at every wavelength")
+        weights = np.asarray(self.band_weights, np.float64)
+        if weights.ndim != 2 or len(weights) != count or not np.all(weights >= 0.0):
+            raise TransportError(
+                f"band_weights: expected numbers >= 0 of shape ({count}, bands), got shape "
+                f"{weights.shape}"
+            )
+        if not np.all(np.isfinite(weights)) or not np.all(weights.sum(axis=0) > 0.0):
+            raise TransportError("band_weights: expected finite columns that are not all zero")
+        object.__setattr__(self, "band_weights", weights)
+
+
+@dataclass(frozen=True, slots=True)
+class FibreProfile:
+    """Reflectance in the fibre by distance, with one-sigma standard errors."""
+
+    radii_mm: FloatArray
+    """Distances as asked for, mm, shape (F,)."""
+    reflectance_per_mm2: FloatArray
+    """R_f in 1/mm^2, shape (F,), or (F, bands) of a `SpectralStack`."""
+    stderr: FloatArray
+    """Standard error of `reflectance_per_mm2`, same shape. Neighbours' errors are correlated."""
+    batch_reflectance_per_mm2: FloatArray
+    """`reflectance_per_mm2` of each independent batch, shape (batches, F[, bands])."""
+    photons: int
+    """Photons traced, those of the pilot left out."""
+
+    @property
+    def batches(self) -> int:
+        """Independent batches behind the standard errors."""
+        return len(self.batch_reflectance_per_mm2)
+
+
+@dataclass(frozen=True, slots=True)
+class FibrePaths:
+    """Light in the fibres by the path that it took through one absorber.
+
+    More of the absorber weakens a path by the factor exp(-sigma path) and changes no collision, so
+    one run serves every concentration above that of the run.
+    """
+
+    radii_mm: FloatArray
+    """Distances as asked for, mm, shape (F,)."""
+    path_mm: FloatArray
+    """Nodes of the path in the counted absorber, mm, increasing from 0, shape (nodes,)."""
+    score: NDArray[np.float32]
+    """R_f in 1/mm^2 that took each path, shape (batches, F, nodes[, bands])."""
+    photons: int
+    """Photons traced."""
+
+    def profile(self, extra_per_mm: float = 0.0) -> FibreProfile:
+        """Return the profile with absorption added to that of the run.
+
+        Parameters
+        ----------
+        extra_per_mm
+            Absorption coefficient in 1/mm of the counted absorber at a share of 1, above what the
+            run had, >= 0. Noise grows with it, as fewer and fewer paths matter.
+
+        Returns
+        -------
+        FibreProfile
+
+        Raises
+        ------
+        TransportError
+            When `extra_per_mm` is negative or not finite.
+        """
+        fine = isfinite(extra_per_mm) and extra_per_mm >= 0.0
+        _require("extra_per_mm", extra_per_mm, fine, "a finite number >= 0")
+        survival = np.exp(-extra_per_mm * self.path_mm)
+        each = np.einsum("bfn...,n->bf...", self.score, survival, dtype=np.float64)
+        return _summary(self.radii_mm, each, self.photons)
+
+
+def fibre_profile(
+    stack: LayerStack | SpectralStack,
+    *,
+    radii_mm: ArrayLike,
+    photons: int,
+    rng: np.random.Generator,
+    core_mm: float = 0.2,
+    source_core_mm: float = 0.2,
+    numerical_aperture: float = 0.22,
+    source_numerical_aperture: float = 0.22,
+    batches: int = tissue_mc.MIN_BATCHES,
+    threads: int = 1,
+) -> FibreProfile:
+    """Trace light from a source fibre to detection fibres on the same surface.
+
+    Parameters
+    ----------
+    stack
+        Layers and the media around them, at one wavelength or at several in bands. The source
+        shines uniformly over its core and over the projected solid angle of its cone.
+    radii_mm
+        Distances of the detection fibres from the source, mm, >= 0, shape (F,).
+    photons
+        Photons to trace, rounded up to a multiple of `batches` (times wavelengths).
+    rng
+        Source of the batches' seeds; a fresh generator of equal seed repeats the result exactly.
+    core_mm, source_core_mm
+        Diameters of the cores, mm.
+    numerical_aperture, source_numerical_aperture
+        Apertures of the fibres, n sin(half angle).
+    batches
+        Independent batches, at least 20.
+    threads
+        Threads to use; the result does not depend on it.
+
+    Returns
+    -------
+    FibreProfile
+        R_f with standard errors. Light that left the source and was never scattered, only
+        reflected by inner interfaces, is included; what the surface itself mirrors is not.
+
+    Raises
+    ------
+    TransportError
+        When the request makes no sense; the message names the field.
+
+    Examples
+    --------
+    >>> from rigsim.tissue_mc import Layer
+    >>> red = LayerStack((Layer(inf, 0.04, 7.5, 0.8, 1.4),))
+    >>> near_and_far = fibre_profile(
+    ...     red, radii_mm=(0.3, 3.3), photons=4000, rng=np.random.default_rng(0)
+    ... )
+    >>> bool(near_and_far.reflectance_per_mm2[0] > 10.0 * near_and_far.reflectance_per_mm2[1])
+    True
+    """
+    fibres = Fibres(
+        tuple(np.atleast_1d(np.asarray(radii_mm, np.float64)).tolist()),
+        core_mm, source_core_mm, numerical_aperture, source_numerical_aperture,
+    )  # fmt: skip
+    each, traced = _trace(stack, fibres, photons, rng, batches, threads, None)
+    return _summary(np.array(fibres.radii_mm), each, traced)
+
+
+def fibre_paths(
+    stack: LayerStack | SpectralStack,
+    fibres: Fibres,
+    *,
+    photons: int,
+    rng: np.random.Generator,
+    absorber: ArrayLike | None = None,
+    batches: int = tissue_mc.MIN_BATCHES,
+    threads: int = 1,
+) -> FibrePaths:
+    """Trace light as `fibre_profile` does and keep its paths through one absorber.
+
+    Parameters
+    ----------
+    stack, photons, rng, batches, threads
+        As in `fibre_profile`. Take the smallest absorption of interest.
+    fibres
+        The fibres.
+    absorber
+        Share of the counted absorber in each layer, >= 0 and somewhere > 0, shape (layers,) or
+        (wavelengths, layers): 1 everywhere (the default) for absorption that is added to all
+        layers, or blood's fraction times its absorption for a change of blood.
+
+    Returns
+    -------
+    FibrePaths
+
+    Raises
+    ------
+    TransportError
+        When the request makes no sense; the message names the field.
+
+    Examples
+    --------
+    >>> from rigsim.tissue_mc import Layer
+    >>> clear = LayerStack((Layer(inf, 0.01, 7.5, 0.8, 1.4),))
+    >>> paths = fibre_paths(
+    ...     clear, Fibres((0.3, 3.3)), photons=4000, rng=np.random.default_rng(0)
+    ... )
+    >>> light, dark = paths.profile(0.0), paths.profile(0.24)
+    >>> bool((light.reflectance_per_mm2 > dark.reflectance_per_mm2).all())
+    True
+    """
+    spectral = _spectral(stack)
+    shape = (len(spectral.stacks), len(spectral.stacks[0].layers))
+    shares = np.ones(shape) if absorber is None else np.asarray(absorber, np.float64)
+    if shares.ndim not in (1, 2) or not np.all(np.isfinite(shares)) or not np.all(shares >= 0.0):
+        raise TransportError(f"absorber: expected finite numbers >= 0 for {shape[1]} layers")
+    try:
+        shares = np.broadcast_to(shares, shape)
+    except ValueError as error:
+        raise TransportError(
+            f"absorber: expected shape {shape[1:]} or {shape}, got {shares.shape}"
+        ) from error
+    if not shares.max() > 0.0:
+        raise TransportError("absorber: expected a share > 0 in some layer, got none")
+    each, traced = _trace(stack, fibres, photons, rng, batches, threads, shares / shares.max())
+    nodes = PATH_SCALE_MM * np.expm1(PATH_STEP * np.arange(_path_nodes())) / shares.max()
+    return FibrePaths(np.array(fibres.radii_mm), nodes, each.astype(np.float32), traced)
+
+
+def _path_nodes() -> int:
+    return int(np.ceil(np.log1p(LONGEST_PATH_MM / PATH_SCALE_MM) / PATH_STEP)) + 1
+
+
+def _spectral(stack: LayerStack | SpectralStack) -> SpectralStack:
+    if isinstance(stack, SpectralStack):
+        return stack
+    return SpectralStack((0.0,), (stack,), np.ones((1, 1)))
+
+
+def _summary(radii_mm: FloatArray, each: FloatArray, photons: int) -> FibreProfile:
+    error = each.std(axis=0, ddof=1) / np.sqrt(len(each))
+    return FibreProfile(radii_mm, each.mean(axis=0), error, each, photons)
+
+
+def _trace(
+    stack: LayerStack | SpectralStack,
+    fibres: Fibres,
+    photons: int,
+    rng: np.random.Generator,
+    batches: int,
+    threads: int,
+    absorber: FloatArray | None,
+) -> tuple[FloatArray, int]:
+    """Return scores by batch, shape (batches, F[, nodes][, bands]), and the photons traced."""
+    spectral = _spectral(stack)
+    tissue_mc.photons_per_batch(photons, batches, threads)
+    order = np.argsort(fibres.radii_mm, kind="stable")
+    kernels, starts, counts = _kernels(fibres, order)
+    shares = spectral.band_weights.max(axis=1)
+    shares = shares / shares.sum()
+    nodes = (_path_nodes(),) if absorber is not None else ()
+    bands = spectral.band_weights.shape[1:]
+    total = np.zeros((batches, len(order), *nodes, *bands))
+    traced = 0
+    for index, layers in enumerate(spectral.stacks):
+        seeds = tissue_mc.batch_seeds(rng, batches + 2)
+        if not shares[index] > 0.0:
+            continue
+        count = -(-round(photons * float(shares[index])) // batches) or 1
+        traced += count * batches
+        plan = _Plan(layers, fibres, kernels, starts, counts, absorber, index)
+        window = plan.flat_window()
+        pilot = max(200, round(PILOT_SHARE * count * batches / 2))
+        for seed in seeds[batches:]:
+            window = plan.learned(window, pilot, seed)
+
+        def run(batch: int, plan: _Plan = plan, window: FloatArray = window,
+                count: int = count, seeds: NDArray[np.uint64] = seeds) -> FloatArray:  # fmt: skip
+            return plan.run(window, count, seeds[batch])[0]
+
+        for batch, score in enumerate(tissue_mc.in_threads(run, batches, threads)):
+            for band in range(bands[0]):
+                weight = spectral.band_weights[index, band]
+                total[batch, ..., band] += weight / count * score
+    back = np.empty_like(total)
+    back[:, order] = total
+    return (back if isinstance(stack, SpectralStack) else back[..., 0]), traced
+
+
+class _Plan:
+    """What the walk needs of one stack and its fibres."""
+
+    def __init__(
+        self,
+        stack: LayerStack,
+        fibres: Fibres,
+        kernels: FloatArray,
+        starts: NDArray[np.int64],
+        counts: NDArray[np.int64],
+        absorber: FloatArray | None,
+        index: int,
+    ) -> None:
+        self.fibres = fibres
+        self.kernels, self.starts, self.counts = kernels, starts, counts
+        table = tissue_mc.layer_table(stack)
+        depth = np.zeros(len(table))
+        share = np.zeros(len(table))
+        with np.errstate(invalid="ignore"):
+            thickness = table[1:-1, 1] - table[1:-1, 0]
+            optical = np.where(table[1:-1, 2] > 0.0, thickness * table[1:-1, 2], 0.0)
+        depth[2:] = np.cumsum(optical)
+        if absorber is not None:
+            share[1:-1] = absorber[index]
+        self.table = np.column_stack([table, depth, share])
+        self.counts_paths = absorber is not None
+        farthest = max(fibres.radii_mm) + 0.5 * (fibres.core_mm + fibres.source_core_mm)
+        self.reach_mm = 3.0 * max(farthest, 1.0)
+        self.farthest_mm = max(farthest, 1.0)
+        self.chances, self.chances_per_mm = _chances(self.table)
+
+    def flat_window(self) -> FloatArray:
+        """Return weights of 1 up to the farthest fibre, and more beyond."""
+        s = (np.arange(WINDOW_CELLS + 1) + 0.5) * self.reach_mm / WINDOW_CELLS
+        return np.asarray(np.maximum(1.0, (s / self.farthest_mm) ** 3))
+
+    def learned(self, window: FloatArray, photons: int, seed: NDArray[np.uint64]) -> FloatArray:
+        """Return weights at which every distance is visited alike, learned from some photons."""
+        visited = self.run(window, photons, seed)[1]
+        return _window_from(visited, window, self.reach_mm, self.farthest_mm)
+
+    def run(
+        self, window: FloatArray, photons: int, seed: NDArray[np.uint64]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the sums of the fibres' scores and of the weights that visited each distance."""
+        fibres = len(self.kernels)
+        tally = np.zeros(fibres)
+        histogram = np.zeros((fibres, _path_nodes()) if self.counts_paths else (0, 0))
+        visited = np.zeros(len(window))
+        walk_to_fibres(
+            self.table, self.fibres.source_numerical_aperture, self.fibres.numerical_aperture,
+            self.kernels, self.starts, self.counts, window, self.chances,
+            WINDOW_CELLS / self.reach_mm, self.chances_per_mm, PATH_STEP, PATH_SCALE_MM,
+            photons, seed.copy(), tally, histogram, visited,
+        )  # fmt: skip
+        return (histogram if self.counts_paths else tally), visited
+
+
+def _window_from(
+    visited: FloatArray, used: FloatArray, reach_mm: float, farthest_mm: float
+) -> FloatArray:
+    """Return target weights in proportion to how much weight passes each distance."""
+    s = (np.arange(len(visited)) + 0.5) * reach_mm / WINDOW_CELLS
+    width = 8
+    kernel = np.ones(2 * width + 1)
+    smooth = np.convolve(visited[:-1], kernel, "same") / np.convolve(
+        np.ones(len(visited) - 1), kernel, "same"
+    )
+    tracks = np.convolve(visited[:-1] / used[:-1], kernel, "same")
+    enough = tracks > 50.0
+    reached = int(np.argmin(enough)) if not enough.all() else len(enough)
+    window = np.ones(len(visited))
+    if reached >= 2:
+        peak = int(np.argmax(smooth[:reached]))
+        window[:reached] = np.minimum(smooth[:reached] / smooth[peak], 1.0)
+        window[:peak] = 1.0
+        # Where too few came to tell: as the last that could be told.
+        window[reached:] = window[reached - 1]
+    edge = int(np.searchsorted(s, farthest_mm))
+    # Beyond the fibres light comes back the less the farther it is.
+    window[edge:] = window[edge] * (s[edge:] / s[edge]) ** 3
+    return window
+
+
+def _chances(table: FloatArray) -> tuple[FloatArray, float]:
+    """Return the probability to score a collision by its depth, and the levels per mm."""
+    depths, optical = [0.0], [0.0]
+    for row in table[1:-1]:
+        if row[2] > 0.0:
+            limit = (SCORED_DEPTH + 40.0 - row[6]) / row[2]
+            if limit <= 0.0:
+                break
+            depths.append(min(row[1], row[0] + limit))
+            optical.append(row[6] + row[2] * (depths[-1] - row[0]))
+        elif row[1] < inf:
+            depths.append(row[1])
+            optical.append(row[6])
+    levels = 4096
+    per_mm = levels / depths[-1] if depths[-1] > 0.0 else 1.0
+    at = np.interp(np.arange(levels) / per_mm, depths, optical)
+    return np.exp(np.minimum(SCORED_DEPTH - at, 0.0)), per_mm
+
+
+def _kernels(
+    fibres: Fibres, order: Sequence[int] | NDArray[np.intp]
+) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+    """Return the densities with which fibres take light by its distance from the entry."""
+    detector, source = 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
+    both = detector + source
+    radii = np.array(fibres.radii_mm)[order]
+    farthest = radii[-1] + both
+    bins_per_mm = 2000.0 / farthest
+    rows = np.zeros((len(radii), 3 + KERNEL_NODES + 1))
+    for row, radius in zip(rows, radii, strict=True):
+        low = max(0.0, radius - both)
+        rho = np.linspace(low, radius + both, KERNEL_NODES)
+        row[:3] = low, (KERNEL_NODES - 1) / (rho[-1] - rho[0]), bins_per_mm
+        density = _ring_share(rho, radius, detector, source)
+        # The walk interpolates: what the interpolant holds in total must be 1.
+        a, b = rho[:-1], rho[1:]
+        da, db = density[:-1], density[1:]
+        held = 2.0 * pi * np.sum((b - a) / 6.0 * (da * (2.0 * a + b) + db * (a + 2.0 * b)))
+        row[3:-1] = density / held
+    edges = np.arange(2001) / bins_per_mm
+    starts = np.searchsorted(radii + both, edges[:-1], side="right")
+    stops = np.searchsorted(radii - both, edges[1:], side="left")
+    return rows, starts.astype(np.int64), np.maximum(stops - starts, 0).astype(np.int64)
+
+
+def _ring_share(
+    rho_mm: FloatArray, radius_mm: float, detector_mm: float, source_mm: float
+) -> FloatArray:
+    """Return the mean over directions of the density of (point in one core - point in the other).
+
+    That density, in 1/mm^2, is the overlap of the two discs at that displacement over the product
+    of their areas; for a point source it is 1 / area within the detector's disc.
+    """
+    if source_mm == 0.0:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cosine = (rho_mm**2 + radius_mm**2 - detector_mm**2) / (2.0 * rho_mm * radius_mm)
+        inside = rho_mm + radius_mm <= detector_mm
+        cosine = np.where(inside, -1.0, np.nan_to_num(np.clip(cosine, -1.0, 1.0), nan=1.0))
+        return np.asarray(np.arccos(cosine) / pi / (pi * detector_mm**2))
+    # Directions that reach the overlap, densely: the integrand is continuous and zero at its ends.
+    both = detector_mm + source_mm
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = (rho_mm**2 + radius_mm**2 - both**2) / (2.0 * rho_mm * radius_mm)
+    half = np.arccos(np.clip(np.nan_to_num(cosine, nan=-1.0, neginf=-1.0, posinf=1.0), -1.0, 1.0))
+    half = np.where(rho_mm + radius_mm <= both, pi, half)
+    nodes, weights = np.polynomial.legendre.leggauss(96)
+    angle = 0.5 * half[:, None] * (nodes + 1.0)
+    apart = np.sqrt(
+        np.maximum(
+            rho_mm[:, None] ** 2 + radius_mm**2 - 2.0 * rho_mm[:, None] * radius_mm * np.cos(angle),
+            0.0,
+        )
+    )
+    area = _overlap(apart, detector_mm, source_mm)
+    mean = (area * weights).sum(axis=1) * 0.5 * half / pi
+    return np.asarray(mean / (pi * detector_mm**2 * pi * source_mm**2))
+
+
+def _overlap(apart: FloatArray, a: float, b: float) -> FloatArray:
+    """Return the area that two discs of radii a and b share at a distance of their centres."""
+    small = min(a, b)
+    d = np.clip(apart, abs(a - b) + 1e-12, a + b)
+    first = np.arccos(np.clip((d * d + a * a - b * b) / (2.0 * d * a), -1.0, 1.0))
+    second = np.arccos(np.clip((d * d + b * b - a * a) / (2.0 * d * b), -1.0, 1.0))
+    product = (a + b - d) * (d + a - b) * (d - a + b) * (d + a + b)
+    kite = 0.5 * np.sqrt(np.maximum(product, 0.0))
+    lens = a * a * first + b * b * second - kite
+    return np.where(apart <= abs(a - b), pi * small * small, lens)
+
+
+def _require(name: str, value: float, holds: bool, expected: str) -> None:
+    if not holds:
+        raise TransportError(f"{name}: expected {expected}, got {value}")

@@ -1,0 +1,167 @@
+"""Profiles seen by fibres against the all-angle walk, each other, closed forms and energy."""
+
+from math import inf
+
+import numpy as np
+import pytest
+
+from rigsim import fibre_profile as profiles
+from rigsim.fibre_profile import Fibres, SpectralStack, fibre_paths, fibre_profile
+from rigsim.tissue_mc import Layer, LayerStack, TransportError, transport
+
+RED = LayerStack((Layer(inf, 0.1, 7.5, 0.8, 1.4),))
+LAYERED = LayerStack(
+    (
+        Layer(0.10, 0.5, 12.0, 0.80, 1.50),
+        Layer(0.05, 0.2, 0.0, 0.00, 1.33),
+        Layer(0.60, 1.0, 6.0, -0.30, 1.40),
+    ),
+    eta_below=1.45,
+)
+RADII_MM = (0.0, 0.1, 0.3, 0.8, 1.3, 2.0)
+
+
+def exit_profile(stack, radii_mm, *, core_mm, source_core_mm, photons, seed):
+    """Exitance averaged over pairs of points in two discs, from rings of the all-angle walk.
+
+    The weights of the rings come from random points in the discs: no code is shared.
+    """
+    edges = np.linspace(0.0, 4.0, 401)
+    run = transport(
+        stack, photons=photons, rng=np.random.default_rng(seed), ring_edges_mm=edges, threads=2
+    )
+    rng = np.random.default_rng(seed + 1)
+
+    def disc(diameter):
+        radius = 0.5 * diameter * np.sqrt(rng.random(200_000))
+        angle = rng.uniform(0.0, 2.0 * np.pi, radius.size)
+        return radius * np.cos(angle), radius * np.sin(angle)
+
+    mean, error = [], []
+    for radius in radii_mm:
+        (x, y), (x_s, y_s) = disc(core_mm), disc(source_core_mm)
+        apart = np.hypot(radius + x - x_s, y - y_s)
+        share = np.histogram(apart, edges)[0] / apart.size
+        density = run.reflectance_per_mm2
+        mean.append(share @ density)
+        error.append(
+            np.hypot(
+                np.linalg.norm(share * run.reflectance_per_mm2_stderr),
+                np.sqrt((share @ density**2 - (share @ density) ** 2) / apart.size),
+            )
+        )
+    return np.array(mean), np.array(error)
+
+
+FORWARD = LayerStack((Layer(inf, 0.1, 7.5, 0.85, 1.4),))
+
+
+@pytest.mark.parametrize(
+    ("stack", "twin", "agree"), [(RED, RED, True), (LAYERED, LAYERED, True), (RED, FORWARD, False)]
+)
+def test_fibres_that_take_all_angles_see_the_exitance_over_their_cores(stack, twin, agree):
+    # Independent runs; |z| < 4.5 for each of six radii: false alarms below 2e-3 (t, 19 dof).
+    seen = fibre_profile(
+        stack, radii_mm=RADII_MM, photons=60_000, rng=np.random.default_rng(1),
+        numerical_aperture=1.0, source_numerical_aperture=0.0, threads=2,
+    )  # fmt: skip
+    mean, error = exit_profile(
+        twin, RADII_MM, core_mm=0.2, source_core_mm=0.2, photons=200_000, seed=3
+    )
+    z = (seen.reflectance_per_mm2 - mean) / np.hypot(seen.stderr, error)
+    assert (np.abs(z).max() < 4.5) == agree
+
+
+def test_paths_reweighted_to_more_absorption_agree_with_a_run_there():
+    kept = fibre_paths(
+        RED, Fibres(RADII_MM), photons=40_000, rng=np.random.default_rng(2), threads=2
+    ).profile(0.4)
+    darker = LayerStack((Layer(inf, 0.5, 7.5, 0.8, 1.4),))
+    run = fibre_profile(
+        darker, radii_mm=RADII_MM, photons=40_000, rng=np.random.default_rng(3), threads=2
+    )
+    z = (kept.reflectance_per_mm2 - run.reflectance_per_mm2) / np.hypot(kept.stderr, run.stderr)
+    assert np.abs(z).max() < 4.5
+
+
+def test_paths_not_reweighted_are_the_profile_itself():
+    rng = np.random.default_rng
+    kept = fibre_paths(RED, Fibres(RADII_MM), photons=2000, rng=rng(4)).profile()
+    run = fibre_profile(RED, radii_mm=RADII_MM, photons=2000, rng=rng(4))
+    np.testing.assert_allclose(kept.reflectance_per_mm2, run.reflectance_per_mm2, rtol=1e-5)
+
+
+def test_band_is_the_weighted_mean_of_its_wavelengths():
+    stacks = tuple(LayerStack((Layer(inf, a, 7.5, 0.8, 1.4),)) for a in (0.05, 0.5))
+    weights = np.array([[1.0, 0.25], [0.0, 0.75]])
+    both = fibre_profile(
+        SpectralStack((650.0, 550.0), stacks, weights), radii_mm=RADII_MM, photons=60_000,
+        rng=np.random.default_rng(5), threads=2,
+    )  # fmt: skip
+    apart = [
+        fibre_profile(
+            stack, radii_mm=RADII_MM, photons=30_000, rng=np.random.default_rng(6), threads=2
+        )
+        for stack in stacks
+    ]
+    for band in (0, 1):
+        mean = sum(
+            w * run.reflectance_per_mm2 for w, run in zip(weights[:, band], apart, strict=True)
+        )
+        error = np.sqrt(
+            sum((w * run.stderr) ** 2 for w, run in zip(weights[:, band], apart, strict=True))
+            + both.stderr[:, band] ** 2
+        )
+        assert np.abs((both.reflectance_per_mm2[:, band] - mean) / error).max() < 4.5
+
+
+def test_order_of_fibres_and_number_of_threads_change_nothing():
+    rng = np.random.default_rng
+    run = fibre_profile(RED, radii_mm=RADII_MM, photons=2000, rng=rng(7))
+    other = fibre_profile(RED, radii_mm=RADII_MM[::-1], photons=2000, rng=rng(7), threads=3)
+    np.testing.assert_array_equal(run.reflectance_per_mm2, other.reflectance_per_mm2[::-1])
+
+
+@pytest.mark.parametrize(
+    ("request_", "field"),
+    [
+        ({"radii_mm": ()}, "radii_mm"),
+        ({"radii_mm": (-0.1,)}, "radii_mm"),
+        ({"core_mm": 0.0}, "core_mm"),
+        ({"source_core_mm": -0.1}, "source_core_mm"),
+        ({"numerical_aperture": 0.0}, "numerical_aperture"),
+        ({"source_numerical_aperture": 1.1}, "source_numerical_aperture"),
+        ({"photons": 0}, "photons"),
+        ({"batches": 19}, "batches"),
+    ],
+)
+def test_impossible_requests_are_refused_by_name(request_, field):
+    arguments = {
+        "radii_mm": (0.3,), "photons": 100, "rng": np.random.default_rng(0), **request_
+    }  # fmt: skip
+    with pytest.raises(TransportError, match=field):
+        fibre_profile(RED, **arguments)
+
+
+@pytest.mark.parametrize(("detector_mm", "source_mm"), [(0.2, 0.2), (0.4, 0.1), (0.2, 0.0)])
+def test_shares_of_rings_are_those_of_random_points_in_the_cores(detector_mm, source_mm):
+    rng = np.random.default_rng(8)
+    fibres = Fibres((0.25,), core_mm=detector_mm, source_core_mm=source_mm)
+    rows, _, _ = profiles._kernels(fibres, np.array([0]))
+    nodes = rows[0, 0] + np.arange(profiles.KERNEL_NODES) / rows[0, 1]
+    count = 400_000
+    points = []
+    for diameter in (detector_mm, source_mm):
+        r, a = 0.5 * diameter * np.sqrt(rng.random(count)), rng.uniform(0.0, 2 * np.pi, count)
+        points.append((r * np.cos(a), r * np.sin(a)))
+    apart = np.hypot(0.25 + points[0][0] - points[1][0], points[0][1] - points[1][1])
+    edges = np.linspace(nodes[0], nodes[-1], 21)
+    fine = np.linspace(nodes[0], nodes[-1], 20 * 500 + 1)
+    density = 2.0 * np.pi * fine * np.interp(fine, nodes, rows[0, 3:-1])
+    cumulative = np.concatenate(
+        [[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))]
+    )
+    expected = np.diff(cumulative[::500]) * count
+    found = np.histogram(apart, edges)[0]
+    # Poisson counts in 20 rings: |z| < 4.5 alarms falsely with a chance below 2e-4.
+    assert np.abs((found - expected) / np.sqrt(np.maximum(expected, 1.0))).max() < 4.5
