@@ -1,0 +1,212 @@
+"""A fibre probe as it was built: gains, spots before the camera, cross-talk and stray light."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erfc
+
+from capture.rig import Rig, View
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+
+SPOT_RADIUS_PX: Final = 12.0
+"""Nominal radius of a fibre's end in the camera's image."""
+
+UNEVENNESS: Final = 0.05
+"""Standard deviation of the tilt and of the curvature of the light over a fibre's end, relative:
+its modes are not filled alike."""
+
+
+class BuildError(ValueError):
+    """A probe is described wrongly."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeTolerances:
+    """What a workshop leaves; 0 builds to the drawing. This project's choices."""
+
+    gain: float = 0.05
+    """Relative standard deviation of the fibres' transmissions; none is off by more than twice."""
+    place_px: float = 0.6
+    """Standard deviation of a spot's place, pixels, per axis."""
+    shift_px: float = 1.0
+    """Standard deviation of the row's common shift, pixels, per axis."""
+    turn_deg: float = 0.2
+    """Standard deviation of the row's turn about the image's middle, degrees."""
+    radius: float = 0.02
+    """Relative standard deviation of the spots' radii."""
+    crosstalk: float = 1e-3
+    """Median share of a fibre's light that leaks into each neighbour; a tenth into the next."""
+    edge_px: float = 1.2
+    """Softness of the spots' edges, the lens's included, pixels, > 0."""
+    wings: float = 5e-3
+    """Share of the light that the lens puts into its wide wings."""
+    veil: float = 3e-5
+    """Share of all light in the image that a spot's area gets as a veil."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not (0.0 <= value < math.inf and (value > 0.0 or field.name != "edge_px")):
+                raise BuildError(f"{field.name}: got {value}, expected a finite number >= 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProbeBuild:
+    """The truth about the fibres, in the order of the rig."""
+
+    spot_px: FloatArray
+    """Middles of the spots, pixels, x right and y down from the first pixel's middle, (F, 2)."""
+    radius_px: FloatArray
+    """Radii of the spots at half height, pixels, > 0, shape (F,)."""
+    gain: FloatArray
+    """Transmission relative to the drawing's, > 0, shape (F,)."""
+    crosstalk: FloatArray
+    """Share of fibre j's light that comes out of fibre i, shape (F, F) at [i, j]; columns sum
+    to 1."""
+    unevenness: FloatArray
+    """Light over a spot: 1 + a u + b v + c (2 (u^2 + v^2) - 1) of u, v in radii, shape (F, 3)."""
+    edge_px: float
+    """Standard deviation of the edges' blur, pixels, > 0."""
+    wings: float
+    """Share of the light in the lens's wings, which fall with the distance cubed, 0 to 1."""
+    veil: float
+    """Share of all light that a nominal spot's area gets anywhere, 0 to 0.01."""
+    cover_leak: float = 1e-5
+    """What a covered fibre still passes, 0 to 1."""
+    ripple: float = 1e-3
+    """Relative standard deviation of the source's energy from opening to opening, 0 to 0.1."""
+
+    def __post_init__(self) -> None:
+        count = len(self.spot_px)
+        for name, shape in (
+            ("spot_px", (count, 2)),
+            ("radius_px", (count,)),
+            ("gain", (count,)),
+            ("crosstalk", (count, count)),
+            ("unevenness", (count, 3)),
+        ):
+            value = getattr(self, name)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise BuildError(f"{name}: got shape {value.shape}, expected finite {shape}")
+        for name in ("radius_px", "gain"):
+            least = float(getattr(self, name).min(initial=math.inf))
+            if not least > 0.0:
+                raise BuildError(f"{name}: got {least}, expected > 0")
+        if not (self.crosstalk >= 0.0).all() or not np.allclose(self.crosstalk.sum(axis=0), 1.0):
+            raise BuildError("crosstalk: expected shares >= 0 that sum to 1 in each column")
+        for name, most in (("wings", 1.0), ("veil", 0.01), ("cover_leak", 1.0), ("ripple", 0.1)):
+            value = getattr(self, name)
+            if not 0.0 <= value <= most:
+                raise BuildError(f"{name}: got {value}, expected 0 to {most}")
+        if not 0.0 < self.edge_px < math.inf:
+            raise BuildError(f"edge_px: got {self.edge_px}, expected > 0")
+
+
+def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = None) -> ProbeBuild:
+    """Draw a probe as built.
+
+    Parameters
+    ----------
+    rig
+        The drawing; it must have a probe and one view.
+    seed
+        Seed of what the workshop left; 0 or more.
+    tolerances
+        How far off; None takes the usual ones.
+
+    Returns
+    -------
+    ProbeBuild
+
+    Raises
+    ------
+    BuildError
+        The rig has no probe.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> built = build_probe(load_rig("probe"), seed=1)
+    >>> built.gain.shape, bool(abs(built.gain - 1.0).max() <= 0.1)
+    ((28,), True)
+    """
+    if rig.probe is None or len(rig.views) != 1:
+        raise BuildError(f"rig {rig.name!r}: expected a contact probe and one view")
+    size = ProbeTolerances() if tolerances is None else tolerances
+    view, fibres = rig.views[0], rig.probe.fibres
+    count = len(fibres)
+    rng = np.random.default_rng([seed, 0x70726F62])
+    turn = math.radians(size.turn_deg) * float(rng.standard_normal())
+    middle = 0.5 * np.array([view.width_px - 1.0, view.height_px - 1.0])
+    place = np.array([fibre.spot_px for fibre in fibres]) - middle
+    c, s = math.cos(turn), math.sin(turn)
+    place = place @ np.array([[c, s], [-s, c]]) + middle
+    place += size.shift_px * _bounded(rng, (1, 2)) + size.place_px * _bounded(rng, (count, 2))
+    gain = 1.0 + size.gain * _bounded(rng, (count,))
+    radius = SPOT_RADIUS_PX * (1.0 + size.radius * _bounded(rng, (count,)))
+    uneven = UNEVENNESS * _bounded(rng, (count, 3)) if size.radius > 0.0 else np.zeros((count, 3))
+    return ProbeBuild(
+        place, radius, gain, _leaks(count, size.crosstalk, rng), uneven,
+        size.edge_px, size.wings, size.veil,
+    )  # fmt: skip
+
+
+def unit_images(build: ProbeBuild, view: View) -> Float32Array:
+    """Return the image of each fibre's light, wings and veil included.
+
+    All images have one flux, to what the wings throw beside the sensor: that of an even spot of
+    nominal radius that is 1 high in its middle, pi (radius^2 + edge^2).
+
+    Parameters
+    ----------
+    build
+        The probe.
+    view
+        The camera.
+
+    Returns
+    -------
+    ndarray of float32
+        Shape (F, H, W), >= 0, for light that comes out of one fibre each.
+    """
+    y = np.arange(view.height_px, dtype=np.float64)[:, None]
+    x = np.arange(view.width_px, dtype=np.float64)[None, :]
+    out = np.empty((len(build.spot_px), view.height_px, view.width_px), np.float32)
+    nominal = math.pi * (SPOT_RADIUS_PX**2 + build.edge_px**2)
+    for image, place, radius, uneven in zip(
+        out, build.spot_px, build.radius_px, build.unevenness, strict=True
+    ):
+        u, v = (x - place[0]) / radius, (y - place[1]) / radius
+        square = u * u + v * v
+        away = radius * np.sqrt(square)
+        disc = 0.5 * erfc((away - radius) / (math.sqrt(2.0) * build.edge_px))
+        inside = np.minimum(square, 1.5)
+        light = 1.0 + uneven[0] * u + uneven[1] * v + uneven[2] * (2.0 * inside - 1.0)
+        disc *= np.where(disc > 1e-12, np.maximum(light, 0.0), 0.0)
+        disc *= nominal / disc.sum()
+        wing = (away * away + radius * radius) ** -1.5
+        wing *= nominal * radius / (2.0 * math.pi)
+        image[:] = (1.0 - build.wings) * disc + build.wings * wing + build.veil
+    return out
+
+
+def _bounded(rng: np.random.Generator, shape: tuple[int, ...]) -> FloatArray:
+    """Return standard normal numbers of at most 2; a workshop throws the others away."""
+    return np.asarray(np.clip(rng.standard_normal(shape), -2.0, 2.0))
+
+
+def _leaks(count: int, neighbour: float, rng: np.random.Generator) -> FloatArray:
+    out = np.zeros((count, count))
+    for step, share in ((1, neighbour), (2, 0.1 * neighbour)):
+        for i in range(count - step):
+            leak = share * math.exp(0.3 * float(_bounded(rng, ())))
+            out[i, i + step] = out[i + step, i] = leak
+    return np.asarray(out + np.diag(1.0 - out.sum(axis=0)))

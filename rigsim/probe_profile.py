@@ -1,0 +1,160 @@
+"""What the probe's fibres take from a tissue, by Monte Carlo, kept for a whole series."""
+
+from __future__ import annotations
+
+import dataclasses
+import zlib
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Fibre, Probe, Rig
+from model import spectra
+from rigsim.fibre_profile import FibrePaths, Fibres, SpectralStack, fibre_paths, fibre_profile
+from rigsim.probe_tissue import ProbedTissue, TissueError, TissueOptics
+
+FloatArray = NDArray[np.float64]
+
+KEPT: Final = 64
+"""Profiles and runs of photons that are kept."""
+
+SUCTION_STEP_MBAR: Final = 0.1
+"""Suctions nearer than half of it share a profile: the blood differs by less than a 1000th."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Profile:
+    """Reflectance in the fibres in the camera's bands."""
+
+    reflectance_per_mm2: FloatArray
+    """R_f in 1/mm^2, shape (F, 3), >= 0."""
+    stderr: FloatArray
+    """Standard error of the Monte Carlo, same shape."""
+
+
+class Profiles:
+    """Profiles of one tissue under one probe.
+
+    Parameters
+    ----------
+    rig
+        The drawing; it must have a probe, one view and one light.
+    tissue
+        What the probe sits on.
+    photons
+        Photons for one site and angle.
+    seed
+        Of the photons; a profile depends on it and on the tissue alone, not on what was asked
+        before.
+    threads
+        Threads of the photons; the result does not depend on it.
+    """
+
+    def __init__(
+        self, rig: Rig, tissue: ProbedTissue, *, photons: int, seed: int, threads: int = 2
+    ) -> None:
+        if rig.probe is None or len(rig.views) != 1 or len(rig.lights) != 1:
+            raise TissueError(f"rig {rig.name!r}: expected a contact probe, one view and one light")
+        self.rig, self.tissue = rig, tissue
+        self.photons, self.seed, self.threads = photons, seed, threads
+        self.probe: Probe = rig.probe
+        self._runs: OrderedDict[tuple[object, ...], FibrePaths | Profile] = OrderedDict()
+        self._profiles: OrderedDict[tuple[object, ...], Profile] = OrderedDict()
+
+    def profile(self, site: str, angle_deg: float = 0.0, suction_mbar: float = 0.0) -> Profile:
+        """Return what the fibres take at a site.
+
+        Parameters
+        ----------
+        site
+            Name of the site.
+        angle_deg
+            Turn of the head about its axis, degrees.
+        suction_mbar
+            Suction under the head, mbar.
+
+        Returns
+        -------
+        Profile
+            The same for equal arguments and seeds.
+
+        Raises
+        ------
+        TissueError
+            The tissue has no such site.
+        """
+        suction = SUCTION_STEP_MBAR * round(suction_mbar / SUCTION_STEP_MBAR)
+        key = (site, angle_deg, suction)
+        if key not in self._profiles:
+            while len(self._profiles) >= KEPT:
+                self._profiles.popitem(last=False)
+            self._profiles[key] = self._made(self.tissue.optics(site, angle_deg, suction))
+        self._profiles.move_to_end(key)
+        return self._profiles[key]
+
+    def _made(self, optics: TissueOptics) -> Profile:
+        run = self._run(optics)
+        if isinstance(run, Profile):
+            return run
+        made = run.profile(optics.amount)
+        return Profile(made.reflectance_per_mm2, made.stderr)
+
+    def _run(self, optics: TissueOptics) -> FibrePaths | Profile:
+        key = (optics.wavelength_nm, optics.stacks)
+        if key not in self._runs:
+            while len(self._runs) >= KEPT:
+                self._runs.popitem(last=False)
+            self._runs[key] = self._traced(optics)
+        self._runs.move_to_end(key)
+        return self._runs[key]
+
+    def _traced(self, optics: TissueOptics) -> FibrePaths | Profile:
+        words = repr((optics.wavelength_nm, optics.stacks)).encode()
+        rng = np.random.default_rng([self.seed, zlib.crc32(words)])
+        stack = optics.stacks[0] if not optics.wavelength_nm else self.spectral(optics)
+        kind = fibres_of(self.probe)
+        if optics.absorber is not None:
+            return fibre_paths(
+                stack, kind, photons=self.photons, rng=rng, absorber=optics.absorber,
+                threads=self.threads,
+            )  # fmt: skip
+        if not any(layer.sigma_s_per_mm for one in optics.stacks for layer in one.layers):
+            nothing = np.zeros((len(self.probe.fibres), 3))
+            return Profile(nothing, nothing)
+        made = fibre_profile(
+            stack, photons=self.photons, rng=rng, threads=self.threads, **dataclasses.asdict(kind)
+        )
+        value, error = made.reflectance_per_mm2, made.stderr
+        if value.ndim == 1:
+            value, error = (np.repeat(a[:, None], 3, axis=1) for a in (value, error))
+        return Profile(value, error)
+
+    def spectral(self, optics: TissueOptics) -> SpectralStack:
+        """Return the stacks with the camera's bands under the probe's light."""
+        weights = spectra.band_weights(
+            self.rig.views[0].spectral_sensitivity,
+            self.rig.lights[0].illuminant,
+            optics.wavelength_nm,
+        )
+        return SpectralStack(optics.wavelength_nm, optics.stacks, weights)
+
+
+def fibres_of(probe: Probe) -> Fibres:
+    """Return the probe's fibres as the walk of photons wants them.
+
+    Raises
+    ------
+    TissueError
+        The detection fibres are not all alike.
+    """
+    first: Fibre = probe.fibres[0]
+    for fibre in probe.fibres:
+        if (fibre.core_mm, fibre.numerical_aperture) != (first.core_mm, first.numerical_aperture):
+            raise TissueError(f"fibre {fibre.name!r}: expected all detection fibres alike")
+    return Fibres(
+        probe.radius_mm, first.core_mm, probe.source_core_mm, first.numerical_aperture,
+        probe.source_numerical_aperture,
+    )  # fmt: skip

@@ -1,0 +1,85 @@
+"""What estimators of the fibre probe should find: profiles, optics, and the probe as built."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from model.skin import SkinAppearance
+from rigsim.probe_tissue import HomogeneousTissue
+
+if TYPE_CHECKING:
+    from rigsim.scenes.probe import ProbeScene
+
+
+@dataclass(frozen=True, slots=True)
+class Probing:
+    """One placement of the head on the skin, during one series of exposures."""
+
+    site: str
+    """Name of the site."""
+    repeat: int
+    """Number of the placement there, from 0."""
+    angle_deg: float
+    """Turn of the head about its own axis, degrees."""
+    suction_mbar: float
+    """Mean suction while it was lit, mbar below the air's pressure, >= 0."""
+
+
+def appearance(scene: ProbeScene, probings: Sequence[Probing]) -> SkinAppearance:
+    """Return the truth of some placements of the head.
+
+    Parameters
+    ----------
+    scene
+        What the head was on.
+    probings
+        The placements.
+
+    Returns
+    -------
+    SkinAppearance
+        No maps. ``parameters``: ``profiles``, one for each placement with ``site``, ``repeat``,
+        ``angle_deg``, ``suction_mbar``, ``radius_mm``, ``reflectance_per_mm2`` and ``stderr``
+        (fibres x 3, of the Monte Carlo), ``sigma_a_per_mm``, ``sigma_s_prime_per_mm``,
+        ``sigma_tr_per_mm`` (3 each) and ``kind``; ``spots_px``, ``gain``, ``crosstalk`` of the
+        probe as built.
+    """
+    profiles = [_profile(scene, probing) for probing in probings]
+    build = scene.build
+    parameters: dict[str, object] = {
+        "profiles": profiles,
+        "spots_px": build.spot_px.tolist(),
+        "gain": build.gain.tolist(),
+        "crosstalk": build.crosstalk.tolist(),
+    }
+    return SkinAppearance(
+        {}, "simulated", parameters=parameters, left_out=tuple(scene.left_out), seed=scene.seed
+    )
+
+
+def _profile(scene: ProbeScene, probing: Probing) -> dict[str, object]:
+    made = scene.profiles.profile(probing.site, probing.angle_deg, probing.suction_mbar)
+    tissue = scene.tissue
+    out: dict[str, object] = {
+        "site": probing.site,
+        "repeat": probing.repeat,
+        "angle_deg": probing.angle_deg,
+        "suction_mbar": probing.suction_mbar,
+        "radius_mm": list(scene.profiles.probe.radius_mm),
+        "reflectance_per_mm2": made.reflectance_per_mm2.tolist(),
+        "stderr": made.stderr.tolist(),
+        "kind": tissue.kind,
+    }
+    if not isinstance(tissue, HomogeneousTissue) or tissue.wavelength_nm:
+        raise NotImplementedError("the best homogeneous medium")
+    sigma_a = float(np.squeeze(tissue.sigma_a_per_mm))
+    scattering = float(np.squeeze(tissue.sigma_s_prime_per_mm))
+    out["sigma_a_per_mm"] = [sigma_a] * 3
+    out["sigma_s_prime_per_mm"] = [scattering] * 3
+    out["sigma_tr_per_mm"] = [math.sqrt(3.0 * sigma_a * (sigma_a + scattering))] * 3
+    return out

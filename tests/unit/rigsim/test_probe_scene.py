@@ -1,0 +1,222 @@
+"""From light in the fibres to raw frames of the fibre probe, against closed forms."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from capture.rig import load_rig
+from model import spectra
+from rigsim.boxes.probe import SourceLight
+from rigsim.probe_build import (
+    SPOT_RADIUS_PX,
+    BuildError,
+    ProbeTolerances,
+    build_probe,
+    unit_images,
+)
+from rigsim.probe_tissue import HomogeneousTissue
+from rigsim.scenes.probe import DARK_E_PER_S, METER_RATE_PER_S, ProbeScene, SceneError
+from rigsim.suction import HeadState
+
+RIG = load_rig("probe")
+VIEW = RIG.views[0]
+AIR = HeadState("", 0.0, False, 0.0, 5.0)
+CHEEK = HeadState("cheek", 0.0, True, 60.0, 5.0)
+NOMINAL = ProbeTolerances(gain=0.0, place_px=0.0, shift_px=0.0, turn_deg=0.0, radius=0.0,
+                          crosstalk=0.0, wings=0.0, veil=0.0)  # fmt: skip
+AREA_PX = math.pi * (SPOT_RADIUS_PX**2 + ProbeTolerances().edge_px ** 2)
+FALSE_ALARM = 4.0  # standard deviations: 6e-5 of normal values lie beyond
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return ProbeScene(RIG, HomogeneousTissue(0.04, 1.5), build=build_probe(RIG, seed=3), photons=1)
+
+
+@pytest.fixture(scope="module")
+def noiseless(scene):
+    quiet = dataclasses.replace(
+        scene.sensor(), prnu=0.0, dsnu_e=0.0, vignetting=0.0, dark_e_per_s=0.0, read_noise_e=0.0
+    )
+    build = dataclasses.replace(scene.build, ripple=0.0)
+    return ProbeScene(RIG, scene.tissue, build=build, sensor=quiet, photons=1)
+
+
+def lit(exposure_s, *, level=1.0, fibre=None):
+    return [SourceLight(level, 0.0, exposure_s, fibre)]
+
+
+def test_light_of_two_per_mm2_fills_eight_tenths_of_the_middle_in_the_shortest_exposure():
+    build = build_probe(RIG, seed=0, tolerances=NOMINAL)
+    scene = ProbeScene(RIG, HomogeneousTissue(0.04, 1.5), build=build, photons=1)
+    light = scene.image(scene.through_fibres(np.full((28, 3), 2.0))) * 30.0 * 2.0 ** (-22 * 2 / 3)
+    middle = light[64, 33]
+    assert middle.max() == pytest.approx(0.8, rel=1e-4)
+    white = spectra.camera_white(VIEW.spectral_sensitivity, RIG.lights[0].illuminant)
+    np.testing.assert_allclose(middle / middle.max(), white, rtol=1e-5)
+
+
+def test_a_spots_flux_is_its_area_wherever_it_stands():
+    ideal = dataclasses.replace(build_probe(RIG, seed=3), wings=0.0, veil=0.0)
+    flux = unit_images(ideal, VIEW).sum(axis=(1, 2), dtype=np.float64)
+    np.testing.assert_allclose(flux, AREA_PX, rtol=1e-5)
+
+
+def test_wings_and_veil_add_what_they_say():
+    build = dataclasses.replace(build_probe(RIG, seed=3), wings=0.0, veil=5e-5)
+    image = unit_images(build, VIEW)[4]
+    assert image[0, 1000] == np.float32(5e-5)
+    winged = dataclasses.replace(build, wings=0.01, veil=0.0)
+    # the sensor holds all of the disc and the part of the wings that a wide strip catches
+    flux = unit_images(winged, VIEW)[14].sum(dtype=np.float64) / AREA_PX
+    assert 0.997 < flux < 1.0
+    place = build.spot_px[14].round().astype(int)
+    near, far = unit_images(winged, VIEW)[14][place[1], place[0] + np.array([150, 300])]
+    assert near / far == pytest.approx(8.0, rel=0.05)
+
+
+def test_spots_stand_where_they_were_built_off_the_drawing(scene):
+    images = unit_images(dataclasses.replace(scene.build, wings=0.0, veil=0.0,
+                                             unevenness=np.zeros((28, 3))), VIEW)  # fmt: skip
+    y, x = np.mgrid[: VIEW.height_px, : VIEW.width_px]
+    flux = images.sum(axis=(1, 2))
+    found = np.stack([(images * x).sum(axis=(1, 2)), (images * y).sum(axis=(1, 2))], axis=1)
+    np.testing.assert_allclose(found / flux[:, None], scene.build.spot_px, atol=0.01)
+    nominal = np.array([fibre.spot_px for fibre in RIG.probe.fibres])
+    off = np.linalg.norm(scene.build.spot_px - nominal, axis=1)
+    assert 0.5 < off.mean() < 6.0
+
+
+def test_a_frame_is_linear_in_light_up_to_rounding(noiseless):
+    head = CHEEK
+    light = noiseless.fibre_light(head)
+    one, both = noiseless.image(light), noiseless.image(light + 2.0 * light[::-1])
+    np.testing.assert_allclose(both, one + 2.0 * noiseless.image(light[::-1]), rtol=2e-4, atol=1e-9)
+    half = [*lit(1.0, level=0.5), SourceLight(0.5, 1.0, 2.0, None)]
+    rng_free = [noiseless.image(noiseless.fibre_light(head) * e) for e in (1.0, 0.5)]
+    np.testing.assert_allclose(rng_free[0], 2.0 * rng_free[1], rtol=1e-6)
+    frames = [
+        noiseless.exposure("cam", pops=pops, exposure_s=2.0, seed=s, head=head)
+        for pops, s in ((lit(1.0), 1), (half, 2))
+    ]
+    sums = [(frame.astype(float) - VIEW.black_level).sum() for frame in frames]
+    noise = math.sqrt(2.0 * max(sums) / VIEW.gain_e_per_dn)
+    assert abs(sums[0] - sums[1]) < FALSE_ALARM * noise
+
+
+def test_reflectance_reaches_the_pixels_in_the_channels_ratio(noiseless):
+    """The sum over a spot's pixels of each color is R_f times gain, white and unit image."""
+    exposure_s = 0.008
+    frame = noiseless.exposure("cam", pops=lit(exposure_s), exposure_s=exposure_s, seed=5,
+                               head=CHEEK)  # fmt: skip
+    reflectance = noiseless.profile(CHEEK).reflectance_per_mm2
+    taken = noiseless.build.crosstalk @ (noiseless.build.gain[:, None] * reflectance)
+    light = METER_RATE_PER_S * exposure_s * taken * noiseless.white
+    images = unit_images(noiseless.build, VIEW)
+    x, y = noiseless.build.spot_px[2].round().astype(int)
+    box = np.s_[y - 16 : y + 16, x - 16 : x + 16]
+    full = VIEW.white_level - VIEW.black_level
+    assert frame[box].max() < VIEW.white_level
+    for channel, cells in enumerate(([(0, 0)], [(0, 1), (1, 0)], [(1, 1)])):
+        mask = np.zeros(frame.shape, bool)
+        for row, column in cells:
+            mask[row::2, column::2] = True
+        mask = mask[box]
+        expected = full * np.einsum("f,fyx->yx", light[:, channel], images[:, *box])[mask].sum()
+        got = (frame[box].astype(float) - VIEW.black_level)[mask].sum()
+        rounding = mask.sum() / 12.0
+        sigma = math.sqrt(expected / VIEW.gain_e_per_dn + rounding)
+        assert abs(got - expected) < FALSE_ALARM * sigma
+
+
+def test_noise_is_that_of_electrons(scene):
+    """Differences of equal frames, without the source's ripple, which is common to all pixels."""
+    steady = ProbeScene(RIG, scene.tissue, photons=1,
+                        build=dataclasses.replace(scene.build, ripple=0.0))  # fmt: skip
+    first, second = (
+        steady.exposure("cam", pops=lit(1.0), exposure_s=1.0, seed=s, head=CHEEK).astype(float)
+        for s in (1, 2)
+    )
+    mean = 0.5 * (first + second) - VIEW.black_level
+    inside = (mean > 100.0) & (mean < 3500.0)
+    gain = VIEW.gain_e_per_dn
+    expected = mean[inside] / gain + VIEW.read_noise_e**2 / gain**2 + 1.0 / 12.0
+    ratio = 0.5 * (first - second)[inside] ** 2 / expected
+    assert inside.sum() > 1000
+    assert abs(ratio.mean() - 1.0) < FALSE_ALARM * math.sqrt(2.0 / inside.sum())
+
+
+def test_dark_current_doubles_every_six_and_a_half_kelvin(scene):
+    sensors = [scene.sensor(camera_c=c) for c in (5.0, 11.5, 18.0)]
+    assert [s.dark_e_per_s / DARK_E_PER_S for s in sensors] == pytest.approx([1.0, 2.0, 4.0])
+    cold, warm = (
+        np.median(
+            scene.exposure("cam", pops=[], exposure_s=30.0, seed=1,
+                           head=dataclasses.replace(CHEEK, camera_c=c)).astype(float), axis=None
+        )
+        for c in (5.0, 31.0)
+    )  # fmt: skip
+    assert warm - cold == pytest.approx(DARK_E_PER_S * 30.0 * 15.0 / VIEW.gain_e_per_dn, rel=0.04)
+
+
+def test_some_pixels_are_hot_at_the_same_places(scene):
+    frames = [
+        scene.exposure("cam", pops=[], exposure_s=30.0, seed=s, head=CHEEK).astype(float)
+        for s in (1, 2)
+    ]
+    hot = [frame > np.median(frame) + 15.0 for frame in frames]
+    assert 30 < hot[0].sum() < 400
+    assert (hot[0] & hot[1]).sum() > 0.9 * hot[0].sum()
+
+
+def test_covered_fibres_pass_a_hundred_thousandth(scene):
+    uncovered, masked = scene.fibre_light(CHEEK), scene.fibre_light(CHEEK, fibre=0)
+    share = masked[:, 1] / uncovered[:, 1]
+    assert share[0] == pytest.approx(1.0, rel=2e-3)
+    leak = scene.build.crosstalk[1, 0] * scene.build.gain[0]
+    reflectance = scene.profile(CHEEK).reflectance_per_mm2[:, 1]
+    assert masked[1, 1] / (METER_RATE_PER_S * scene.white[1]) == pytest.approx(
+        leak * reflectance[0] + 1e-5 * scene.build.gain[1] * reflectance[1], rel=1e-3
+    )
+
+
+def test_a_head_in_the_air_sees_the_room_and_not_the_source(scene):
+    lights = [scene.exposure("cam", pops=pops, exposure_s=1.0, seed=1, head=AIR).astype(float)
+              for pops in (lit(1.0), [])]  # fmt: skip
+    assert (lights[0] == lights[1]).mean() > 0.2
+    x, y = scene.build.spot_px[27].round().astype(int)
+    middle = lights[1][y - 4 : y + 4, x - 4 : x + 4].mean() - VIEW.black_level
+    assert middle > 50.0
+    closed = scene.exposure("cam", pops=[], exposure_s=1.0, seed=1, head=CHEEK).astype(float)
+    assert abs(closed[y - 4 : y + 4, x - 4 : x + 4].mean() - VIEW.black_level) < 5.0
+
+
+def test_equal_seeds_give_equal_frames_whatever_came_before(scene):
+    other = ProbeScene(RIG, scene.tissue, build=scene.build, photons=1)
+    scene.exposure("cam", pops=lit(0.1), exposure_s=0.1, seed=9,
+                   head=dataclasses.replace(CHEEK, site="chin"))  # fmt: skip
+    frames = [s.exposure("cam", pops=lit(0.1), exposure_s=0.1, seed=4, head=CHEEK)
+              for s in (scene, other)]  # fmt: skip
+    np.testing.assert_array_equal(*frames)
+    again = scene.exposure("cam", pops=lit(0.1), exposure_s=0.1, seed=5, head=CHEEK)
+    assert (frames[0] != again).any()
+
+
+def test_what_makes_no_sense_is_refused(scene):
+    with pytest.raises(SceneError, match="view"):
+        scene.exposure("left", pops=[], exposure_s=1.0, seed=0, head=CHEEK)
+    with pytest.raises(SceneError, match="level"):
+        scene.exposure("cam", pops=lit(1.0, level=1.5), exposure_s=1.0, seed=0, head=CHEEK)
+    with pytest.raises(SceneError, match="end after its beginning"):
+        scene.exposure("cam", pops=[SourceLight(1.0, 1.0, 0.5, None)], exposure_s=1.0, seed=0,
+                       head=CHEEK)  # fmt: skip
+    with pytest.raises(SceneError, match="fibre: got 28"):
+        scene.exposure("cam", pops=lit(1.0, fibre=28), exposure_s=1.0, seed=0, head=CHEEK)
+    with pytest.raises(SceneError, match="contact probe"):
+        ProbeScene(load_rig("dome"), scene.tissue)
+    with pytest.raises(BuildError, match="gain"):
+        dataclasses.replace(scene.build, gain=np.zeros(28))
