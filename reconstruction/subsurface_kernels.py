@@ -1,0 +1,419 @@
+"""Levenberg and Marquardt's fit of radial profiles, a thread for a share of the profiles.
+
+Parameters of a profile are log sigma_a, log sigma_s', log of a common factor, and the asymmetry g;
+the last two are held by Gaussian priors, or fixed. Models are the dipole and Kienle and Patterson's
+diffusion, which differ in constants only, and a table of log reflectance per fibre.
+
+The parallel kernel is called from one thread. Sums may be taken in any order within a profile, but
+a profile's result does not depend on the others nor on the number of threads.
+
+References
+----------
+Marquardt 1963, doi:10.1137/0111030. Jensen et al. 2001, doi:10.1145/383259.383319.
+Kienle and Patterson 1997, doi:10.1364/JOSAA.14.000246.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+PARAMETERS = 4
+TABLE = 1
+"""The model is a table; anything else is a closed form."""
+MOST_STEP = 1.5
+"""Largest change of a logarithm in one step."""
+_FAST = {"contract", "reassoc", "nsz"}
+_LOWEST = 1e-290
+_FOUR_PI = 4.0 * math.pi
+
+
+@njit(inline="always")
+def _decay(x):  # type: ignore[no-untyped-def]
+    """Return exp(-x) for x >= 0 within 2e-13 up to x = 100: (exp(-x/1024))^1024, no table."""
+    t = -min(x, 660.0) * (1.0 / 1024.0)
+    p = 1.0 + t * (1.0 / 9.0)
+    p = 1.0 + t * 0.125 * p
+    p = 1.0 + t * (1.0 / 7.0) * p
+    p = 1.0 + t * (1.0 / 6.0) * p
+    p = 1.0 + t * 0.2 * p
+    p = 1.0 + t * 0.25 * p
+    p = 1.0 + t * (1.0 / 3.0) * p
+    p = 1.0 + t * 0.5 * p
+    p = 1.0 + t * p
+    for _ in range(10):
+        p = p * p
+    return p
+
+
+@njit(fastmath=_FAST, error_model="numpy")
+def _closed(theta, radius, constants, m, jac):  # type: ignore[no-untyped-def]
+    """Fill reflectance and its derivatives by log sigma_a and log sigma_s'.
+
+    With P = exp(-kd)/d and T = -dP/dz of the source at depth z and its image,
+    R = albedo^n (3 t c_phi (P - P') + c_j (T + T')) / (4 pi); constants = b, c_phi, c_j, n.
+    """
+    a, s = math.exp(theta[0]), math.exp(theta[1])
+    t = a + s
+    k = math.sqrt(3.0 * a * t)
+    stretch, c_phi, c_j, power = constants[0], constants[1], constants[2], constants[3]
+    z0 = 1.0 / t
+    z1 = stretch / t
+    factor = math.exp(theta[2]) / _FOUR_PI * (s / t) ** power
+    k_a, k_s = k * (a + t) / (2.0 * t), k * s / (2.0 * t)
+    t_a, t_s = a / t, s / t  # of log t
+    lean = power * a / t  # of log albedo: by log s, minus that by log a
+    phi = 3.0 * t * c_phi
+    for f in range(radius.size):
+        r2 = radius[f] * radius[f]
+        i0 = 1.0 / math.sqrt(r2 + z0 * z0)
+        i1 = 1.0 / math.sqrt(r2 + z1 * z1)
+        d0, d1 = (r2 + z0 * z0) * i0, (r2 + z1 * z1) * i1
+        e0, e1 = _decay(k * d0), _decay(k * d1)
+        u0, u1 = 1.0 + k * d0, 1.0 + k * d1
+        q0, q1 = e0 * i0 * i0 * i0, e1 * i1 * i1 * i1
+        T0, T1 = z0 * u0 * q0, z1 * u1 * q1
+        P = e0 * i0 - e1 * i1
+        value = phi * P + c_j * (T0 + T1)
+        by_k = -phi * (e0 - e1) - c_j * k * (z0 * e0 * i0 + z1 * e1 * i1)
+        # by log z, equal for both depths
+        by_z = -phi * (z0 * T0 - z1 * T1) + c_j * (
+            z0 * q0 * (u0 - z0 * z0 * (k * k + 3.0 * u0 * i0 * i0))
+            + z1 * q1 * (u1 - z1 * z1 * (k * k + 3.0 * u1 * i1 * i1))
+        )
+        by_t = phi * P - by_z
+        m[f] = factor * value
+        jac[0, f] = factor * (by_k * k_a + by_t * t_a - lean * value)
+        jac[1, f] = factor * (by_k * k_s + by_t * t_s + lean * value)
+
+
+@njit(inline="always")
+def _cubic(x, count, w, d):  # type: ignore[no-untyped-def]
+    """Fill Lagrange's weights on four of `count` nodes 0, 1, ... around x; their derivatives."""
+    i = min(max(math.floor(x) - 1, 0), count - 4)
+    u = x - i
+    w[0] = -(u - 1.0) * (u - 2.0) * (u - 3.0) / 6.0
+    w[1] = u * (u - 2.0) * (u - 3.0) / 2.0
+    w[2] = -u * (u - 1.0) * (u - 3.0) / 2.0
+    w[3] = u * (u - 1.0) * (u - 2.0) / 6.0
+    d[0] = -(3.0 * u * u - 12.0 * u + 11.0) / 6.0
+    d[1] = (3.0 * u * u - 10.0 * u + 6.0) / 2.0
+    d[2] = -(3.0 * u * u - 8.0 * u + 3.0) / 2.0
+    d[3] = (3.0 * u * u - 6.0 * u + 2.0) / 6.0
+    return i
+
+
+@njit(fastmath=_FAST, error_model="numpy")
+def _tabled(theta, axes, grid, w, m, jac):  # type: ignore[no-untyped-def]
+    """Fill reflectance and derivatives by all parameters from logs (sigma_s', root, g, fibre).
+
+    The second axis is log(1 + 10 sqrt(sigma_a/sigma_s')); axes = first node and spacing of each.
+    """
+    n_s, n_u, n_g, fibres = grid.shape
+    root = 10.0 * math.exp(0.5 * (theta[0] - theta[1]))
+    slope = 0.5 * root / (1.0 + root) / axes[1, 1]
+    x = (theta[1] - axes[0, 0]) / axes[0, 1]
+    y = (math.log1p(root) - axes[1, 0]) / axes[1, 1]
+    i = _cubic(x, n_s, w[0], w[1])
+    j = _cubic(y, n_u, w[2], w[3])
+    h = 0
+    if n_g > 1:
+        h = _cubic((theta[3] - axes[2, 0]) / axes[2, 1], n_g, w[4], w[5])
+    else:
+        w[4, :] = 0.0
+        w[5, :] = 0.0
+        w[4, 0] = 1.0
+    m[:] = 0.0
+    jac[:] = 0.0
+    depth = min(4, n_g)
+    for p in range(4):
+        for q in range(4):
+            both = w[0, p] * w[2, q]
+            by_s, by_u = w[1, p] * w[2, q], w[0, p] * w[3, q]
+            for o in range(depth):
+                row = grid[i + p, j + q, h + o]
+                v, g_s, g_u, g_g = both * w[4, o], by_s * w[4, o], by_u * w[4, o], both * w[5, o]
+                for f in range(fibres):
+                    m[f] += v * row[f]
+                    jac[0, f] += g_u * row[f]
+                    jac[1, f] += g_s * row[f]
+                    jac[3, f] += g_g * row[f]
+    for f in range(fibres):
+        value = math.exp(max(m[f] + theta[2], -660.0))
+        by_a = jac[0, f] * slope
+        m[f] = value
+        jac[0, f] = value * by_a
+        jac[1, f] = value * (jac[1, f] / axes[0, 1] - by_a)
+        jac[3, f] = value * jac[3, f] / axes[2, 1]
+
+
+@njit(error_model="numpy")
+def _solve(h, g, chosen, count, damping, low, x):  # type: ignore[no-untyped-def]
+    """Solve (h + damping diag h) x = g for the chosen parameters by Cholesky; False: singular."""
+    for r in range(count):
+        i = chosen[r]
+        for c in range(r + 1):
+            j = chosen[c]
+            total = h[i, j]
+            if r == c:
+                total *= 1.0 + damping
+            for e in range(c):
+                total -= low[r, e] * low[c, e]
+            if r == c:
+                if not total > 1e-13 * h[i, i]:
+                    return False
+                low[r, r] = math.sqrt(total)
+            else:
+                low[r, c] = total / low[c, c]
+    for r in range(count):
+        total = g[chosen[r]]
+        for e in range(r):
+            total -= low[r, e] * x[chosen[e]]
+        x[chosen[r]] = total / low[r, r]
+    for r in range(count - 1, -1, -1):
+        total = x[chosen[r]]
+        for e in range(r + 1, count):
+            total -= low[e, r] * x[chosen[e]]
+        x[chosen[r]] = total / low[r, r]
+    return True
+
+
+@njit(fastmath=_FAST, error_model="numpy")
+def _misfit(y, m, weight, logarithmic):  # type: ignore[no-untyped-def]
+    total = 0.0
+    if logarithmic:
+        for f in range(y.size):
+            d = y[f] - math.log(max(m[f], _LOWEST))
+            total += weight[f] * d * d
+    else:
+        for f in range(y.size):
+            d = y[f] - m[f]
+            total += weight[f] * d * d
+    return total
+
+
+@njit(fastmath=_FAST, error_model="numpy")
+def _normal(y, m, jac, weight, logarithmic, active, count, h, g):  # type: ignore[no-untyped-def]
+    """Fill J'WJ and J'W residual of the active parameters; scales `jac` to logs where wanted."""
+    if logarithmic:
+        for r in range(count):
+            row = jac[active[r]]
+            for f in range(y.size):
+                row[f] /= max(m[f], _LOWEST)
+    for r in range(count):
+        i = active[r]
+        for c in range(r + 1):
+            j = active[c]
+            total = 0.0
+            for f in range(y.size):
+                total += weight[f] * jac[i, f] * jac[j, f]
+            h[i, j] = total
+            h[j, i] = total
+        total = 0.0
+        if logarithmic:
+            for f in range(y.size):
+                total += weight[f] * jac[i, f] * (y[f] - math.log(max(m[f], _LOWEST)))
+        else:
+            for f in range(y.size):
+                total += weight[f] * jac[i, f] * (y[f] - m[f])
+        g[i] = total
+
+
+@njit(error_model="numpy")
+def _evaluate(kind, theta, radius, constants, axes, grid, w, m, jac):  # type: ignore[no-untyped-def]
+    if kind == TABLE:
+        _tabled(theta, axes, grid, w, m, jac)
+    else:
+        _closed(theta, radius, constants, m, jac)
+    jac[2, :] = m
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def fit(
+    kind: Any,
+    radius: Any,
+    constants: Any,
+    axes: Any,
+    grid: Any,
+    y: Any,
+    variance: Any,
+    model_error: Any,
+    logarithmic: Any,
+    prior: Any,
+    bounds: Any,
+    theta: Any,
+    rounds: Any,
+    most: Any,
+    parts: Any,
+    covariance: Any,
+    chi2: Any,
+    predicted: Any,
+    total: Any,
+    steps: Any,
+) -> None:
+    """Fit every profile, from `theta` on.
+
+    Parameters
+    ----------
+    kind : int
+        TABLE or a closed form.
+    radius : (F,)
+        mm.
+    constants : (4,)
+        Of the closed form.
+    axes : (3, 2); grid : (S, U, G, F)
+        Of the table.
+    y : (N, F)
+        Reflectance, or its logarithm where `logarithmic`.
+    variance : (N, F)
+        Of `y`; infinite where a fibre is left out.
+    model_error : (2,)
+        Relative: everywhere, and at the source, falling by exp(-r (sigma_a + sigma_s')).
+    logarithmic : bool
+        Compare logarithms; then the model's error is not added.
+    prior : (4, 2)
+        Mean and standard deviation; 0: fixed; infinite: free.
+    bounds : (4, 2)
+        Least and greatest value of each parameter.
+    theta : (N, 4)
+        Start; becomes the result.
+    rounds, most, parts : int
+        Times the model's error is taken anew, steps of a round at most, shares of the profiles.
+    covariance : (N, 4, 4), chi2 : (N,), predicted, total : (N, F), steps : (N,)
+        Results: covariance of theta (infinite where singular); chi2 with the priors' part; the
+        profile; its variance with the model's error; evaluations, negative: not converged.
+    """
+    profiles, fibres = y.shape
+    for part in prange(parts):
+        m, trial_m = np.empty(fibres), np.empty(fibres)
+        jac, trial_jac = np.empty((4, fibres)), np.empty((4, fibres))
+        weight, w = np.zeros(fibres), np.zeros((6, 4))
+        h, g, low = np.zeros((4, 4)), np.zeros(4), np.zeros((4, 4))
+        x, trial, unit = np.zeros(4), np.zeros(4), np.zeros(4)
+        active, chosen = np.zeros(4, np.int64), np.zeros(4, np.int64)
+        count = 0
+        for p in range(4):
+            if prior[p, 1] > 0.0:
+                active[count] = p
+                count += 1
+        for n in range(part * profiles // parts, (part + 1) * profiles // parts):
+            now = theta[n]
+            _evaluate(kind, now, radius, constants, axes, grid, w, m, jac)
+            done = 1
+            settled = False
+            best = 0.0
+            for _round in range(rounds):
+                extinction = math.exp(now[0]) + math.exp(now[1])
+                for f in range(fibres):
+                    v = variance[n, f]
+                    if not logarithmic and v < np.inf:
+                        e = model_error[0] ** 2
+                        if model_error[1] > 0.0:
+                            e += (model_error[1] * _decay(radius[f] * extinction)) ** 2
+                        v += e * m[f] * m[f]
+                    total[n, f] = v
+                    weight[f] = 1.0 / v
+                first = True
+                settled = False
+                damping = 1e-3
+                best = _misfit(y[n], m, weight, logarithmic)
+                for r in range(count):
+                    p = active[r]
+                    best += ((now[p] - prior[p, 0]) / prior[p, 1]) ** 2
+                fresh = True
+                for _ in range(most):
+                    if fresh:
+                        _normal(y[n], m, jac, weight, logarithmic, active, count, h, g)
+                        free = 0
+                        for r in range(count):
+                            p = active[r]
+                            h[p, p] += 1.0 / prior[p, 1] ** 2
+                            g[p] -= (now[p] - prior[p, 0]) / prior[p, 1] ** 2
+                            if not (
+                                (now[p] <= bounds[p, 0] and g[p] < 0.0)
+                                or (now[p] >= bounds[p, 1] and g[p] > 0.0)
+                                or h[p, p] <= 0.0
+                            ):
+                                chosen[free] = p
+                                free += 1
+                        fresh = False
+                    if free == 0:
+                        settled = True
+                        break
+                    x[:] = 0.0
+                    if not _solve(h, g, chosen, free, damping, low, x):
+                        damping = max(damping * 10.0, 1e-12)
+                        if damping > 1e10:
+                            break
+                        continue
+                    longest = 0.0
+                    for p in range(4):
+                        longest = max(longest, abs(x[p]))
+                    shrink = min(1.0, MOST_STEP / max(longest, 1e-300))
+                    longest = 0.0
+                    for p in range(4):
+                        to = now[p] + shrink * x[p]
+                        if x[p] == 0.0:
+                            to = now[p]
+                        trial[p] = min(max(to, bounds[p, 0]), bounds[p, 1])
+                        longest = max(longest, abs(trial[p] - now[p]))
+                    if longest < 1e-9:
+                        settled = True
+                        break
+                    _evaluate(kind, trial, radius, constants, axes, grid, w, trial_m, trial_jac)
+                    done += 1
+                    there = _misfit(y[n], trial_m, weight, logarithmic)
+                    for r in range(count):
+                        p = active[r]
+                        there += ((trial[p] - prior[p, 0]) / prior[p, 1]) ** 2
+                    if there <= best:
+                        gain = best - there
+                        best = there
+                        now[:] = trial
+                        m, trial_m = trial_m, m
+                        jac, trial_jac = trial_jac, jac
+                        fresh = True
+                        first = first and longest < 1e-7
+                        damping = max(damping * 0.1, 1e-9)
+                        if longest < 1e-6 or gain <= 1e-13 * best:
+                            settled = True
+                            break
+                    else:
+                        if there - best <= 1e-11 * best and longest < 1e-4:
+                            settled = True  # rounding is all that is left
+                            break
+                        damping *= 10.0
+                        if damping > 1e10:
+                            settled = longest < 1e-6
+                            break
+                if logarithmic or first:
+                    break
+            steps[n] = done if settled else -done
+            chi2[n] = best
+            predicted[n] = m
+            if fresh:
+                _normal(y[n], m, jac, weight, logarithmic, active, count, h, g)
+                for r in range(count):
+                    h[active[r], active[r]] += 1.0 / prior[active[r], 1] ** 2
+            covariance[n] = 0.0
+            for r in range(count):
+                unit[:] = 0.0
+                unit[active[r]] = 1.0
+                x[:] = 0.0
+                if _solve(h, unit, active, count, 0.0, low, x):
+                    covariance[n, active[r]] = x
+                else:
+                    covariance[n, active[r], :] = np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def evaluate(
+    kind: Any, theta: Any, radius: Any, constants: Any, axes: Any, grid: Any, out: Any, slopes: Any
+) -> None:
+    """Fill profiles (N, F) of parameters (N, 4) and their derivatives (N, 4, F)."""
+    w = np.zeros((6, 4))
+    for n in range(theta.shape[0]):
+        _evaluate(kind, theta[n], radius, constants, axes, grid, w, out[n], slopes[n])

@@ -1,0 +1,201 @@
+"""Models of a radial profile as the fit's kernels take them, and where the fits begin.
+
+"photon_table" is `model.photon_table`, laid out for the fibres at hand as logarithms on a grid;
+"diffusion" is Kienle and Patterson's, "dipole" Jensen's, both as closed forms. Neither of the two
+knows of a fibre's cone or core: R(r) of all directions at the fibre's middle stands for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import fresnel, photon_table
+from reconstruction import subsurface_kernels as kernels
+
+Floats = NDArray[np.float64]
+Method = Literal["photon_table", "diffusion", "dipole"]
+METHODS: tuple[Method, ...] = ("photon_table", "diffusion", "dipole")
+Collection = Literal["all", "fibre"]
+
+SIGMA_A_LIMITS = (1e-6, 100.0)
+SIGMA_S_LIMITS = (1e-3, 1e3)
+SCALE_LIMITS = (1e-3, 1e3)
+"""Of the closed forms, 1/mm and 1: beyond them nothing that a probe reads changes any more."""
+TABLE_SIGMA_S = (0.05, 50.0)
+"""Of the table, 1/mm."""
+TABLE_ERROR = np.array([0.005, 0.0])
+"""Relative: the table's own noise."""
+START_SIGMA_TR = np.geomspace(0.01, 15.0, 40)
+START_SIGMA_S = np.geomspace(0.06, 50.0, 12)
+"""The pairs that each profile is compared with to find its start, 1/mm."""
+STRATA = 3
+"""Parts of `START_SIGMA_S` that a bad fit begins in again."""
+LEAST_LOG = -100.0
+"""Logarithms of reflectance below this are as good as none, for starts."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileModel:
+    """One forward model at fixed radii.
+
+    Attributes
+    ----------
+    radius_mm : ndarray, shape (F,)
+    kind : int
+        As `subsurface_kernels.fit` takes it.
+    constants, axes, grid : ndarray
+        Likewise.
+    bounds : ndarray, shape (4, 2)
+        Of log sigma_a, log sigma_s', log of the common factor, g.
+    error : ndarray, shape (2,)
+        Relative model error: everywhere, and more at the source.
+    most_ratio : float
+        Greatest sigma_a/sigma_s' that the model is good for.
+    """
+
+    radius_mm: Floats
+    kind: int
+    constants: Floats
+    axes: Floats
+    grid: Floats
+    bounds: Floats
+    error: Floats
+    most_ratio: float
+
+    def profiles(self, theta: Floats) -> tuple[Floats, Floats]:
+        """Return profiles (N, F), 1/mm^2, of parameters (N, 4), and derivatives (N, 4, F)."""
+        out = np.empty((theta.shape[0], self.radius_mm.size))
+        slopes = np.zeros((theta.shape[0], kernels.PARAMETERS, self.radius_mm.size))
+        kernels.evaluate(
+            self.kind, np.ascontiguousarray(theta), self.radius_mm, self.constants, self.axes,
+            self.grid, out, slopes,
+        )  # fmt: skip
+        return out, slopes
+
+    def holds(self, theta: Floats) -> NDArray[np.bool_]:
+        """Return where the model is good for parameters (N, 4)."""
+        return np.asarray(theta[:, 0] - theta[:, 1] <= np.log(self.most_ratio))
+
+    def starts(
+        self, log_reflectance: Floats, weight: Floats, g: float, stratum: int | None = None
+    ) -> Floats:
+        """Return for each profile the pair whose logarithms are nearest, (N, 4).
+
+        Parameters
+        ----------
+        log_reflectance, weight : ndarray, shape (N, F)
+            Weight 0 where a logarithm means nothing.
+        g : float
+            Asymmetry to begin with.
+        stratum : int, optional
+            Part of `START_SIGMA_S`; all by default.
+        """
+        each = START_SIGMA_S if stratum is None else np.split(START_SIGMA_S, STRATA)[stratum]
+        k, s = np.meshgrid(START_SIGMA_TR, each, indexing="ij")
+        a = 0.5 * (np.sqrt(s**2 + 4.0 / 3.0 * k**2) - s)
+        theta = np.zeros((a.size, kernels.PARAMETERS))
+        theta[:, 0], theta[:, 1], theta[:, 3] = np.log(a).ravel(), np.log(s).ravel(), g
+        inside = np.all((theta >= self.bounds[:, 0]) & (theta <= self.bounds[:, 1]), axis=1)
+        inside &= theta[:, 0] - theta[:, 1] <= np.log(self.most_ratio) + 0.5
+        theta = theta[inside] if inside.any() else theta[:1]
+        curves = np.log(np.maximum(self.profiles(theta)[0], np.exp(LEAST_LOG)))
+        score = (weight * log_reflectance) @ (-2.0 * curves.T)
+        score += weight @ (curves**2).T
+        return np.asarray(theta[np.argmin(score, axis=1)])
+
+
+def profile_model(
+    method: Method,
+    radius_mm: Floats,
+    *,
+    eta: float,
+    collection: Collection,
+    core_mm: float,
+    source_core_mm: float,
+    g: float,
+    g_error: float,
+) -> ProfileModel:
+    """Return a method's model at some radii.
+
+    Parameters
+    ----------
+    method : {"photon_table", "diffusion", "dipole"}
+    radius_mm : ndarray, shape (F,)
+    eta : float
+        Refractive index of the medium over that outside, at least 1.
+    collection, core_mm, source_core_mm
+        As of `model.photon_table.reflectance`; closed forms do without.
+    g, g_error : float
+        The asymmetry's prior; closed forms do without.
+    """
+    if method == "photon_table":
+        return _tabled(radius_mm.tobytes(), eta, collection, core_mm, source_core_mm, g, g_error)
+    nothing = np.ones((3, 2))
+    bounds = np.log(np.array([SIGMA_A_LIMITS, SIGMA_S_LIMITS, SCALE_LIMITS, (1.0, 1.0)]))
+    bounds[3] = 0.0, 1.0
+    constants, error, most = _CLOSED[method](eta)
+    return ProfileModel(
+        radius_mm, 0, constants, nothing, np.zeros((1, 1, 1, 1)), bounds, error, most
+    )
+
+
+@lru_cache(maxsize=16)
+def _tabled(
+    radius: bytes,
+    eta: float,
+    collection: Collection,
+    core_mm: float,
+    source_core_mm: float,
+    g: float,
+    g_error: float,
+) -> ProfileModel:
+    """Lay the photon table out as logarithms over (sigma_s', root, g) for each fibre."""
+    radius_mm = np.frombuffer(radius, np.float64)
+    held = photon_table.asymmetries()
+    low, high = max(g - 3.0 * g_error, held[0]), min(g + 3.0 * g_error, held[-1])
+    count = 4 if high - low > 1e-6 else 1
+    asymmetries = np.linspace(low, high, count)
+    steps = np.array([0.1, 0.075, (high - low) / 3.0 if count > 1 else 1.0])
+    logs = np.arange(np.log(TABLE_SIGMA_S[0]), np.log(TABLE_SIGMA_S[1]) + steps[0], steps[0])
+    most = np.log1p(10.0 * np.sqrt(photon_table.MAX_ABSORPTION_RATIO))
+    roots = np.arange(0.0, most + steps[1], steps[1])
+    s = np.exp(logs)[:, None]
+    a = s * (0.1 * np.expm1(roots)) ** 2
+    grid = np.empty((*a.shape, count, radius_mm.size))
+    for n, each in enumerate(asymmetries):
+        profile = photon_table.reflectance(
+            radius_mm, a[..., None], s[..., None], eta=eta, g=float(each), collection=collection,
+            core_mm=core_mm, source_core_mm=source_core_mm,
+        )  # fmt: skip
+        grid[:, :, n] = np.log(np.maximum(profile, 1e-290))
+    bounds = np.log(np.array([SIGMA_A_LIMITS, TABLE_SIGMA_S, SCALE_LIMITS, (1.0, 1.0)]))
+    bounds[3] = low, high
+    axes = np.stack([np.array([logs[0], roots[0], low]), steps], axis=1)
+    return ProfileModel(
+        radius_mm, kernels.TABLE, np.zeros(4), axes, grid, bounds, TABLE_ERROR,
+        photon_table.MAX_ABSORPTION_RATIO,
+    )  # fmt: skip
+
+
+def _dipole(eta: float) -> tuple[Floats, Floats, float]:
+    """Return constants of Jensen's dipole; its error, equal for all fibres."""
+    stretch = 1.0 + 4.0 / 3.0 * fresnel.boundary_factor(eta)
+    return np.array([stretch, 0.0, 1.0, 1.0]), np.array([0.1, 0.0]), 1.0
+
+
+def _diffusion(eta: float) -> tuple[Floats, Floats, float]:
+    """Return constants of Kienle and Patterson's diffusion; its error grows at the source."""
+    outgoing = fresnel.diffuse_internal(eta), fresnel.diffuse_internal_flux_moment(eta)
+    # Haskell et al. 1994, doi:10.1364/JOSAA.11.002727
+    effective = sum(outgoing) / (2.0 - outgoing[0] + outgoing[1])
+    stretch = 1.0 + 4.0 / 3.0 * (1.0 + effective) / (1.0 - effective)
+    c_phi, c_j = 0.25 * (1.0 - outgoing[0]), 0.5 * (1.0 - outgoing[1])
+    return np.array([stretch, c_phi, c_j, 1.0]), np.array([0.05, 0.6]), 1.0
+
+
+_CLOSED = {"dipole": _dipole, "diffusion": _diffusion}
