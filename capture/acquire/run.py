@@ -11,13 +11,14 @@ from capture.acquire.dome import run_dome
 from capture.acquire.flash import run_flash
 from capture.acquire.gradient import run_gradient
 from capture.acquire.outcome import Acquired, AcquisitionError, Operator
+from capture.acquire.probe import run_probe
 from capture.devices.camera import Camera, check_serials
 from capture.devices.dome import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session
 
-KINDS = ("gradient_sphere", "dome", "flash")
+KINDS = ("gradient_sphere", "dome", "probe", "flash")
 """Boxes by which a rig is known."""
 
 
@@ -35,6 +36,7 @@ def run_plan(
     run_id: str = "",
     eyes: Eyes = "open",
     force_limit_n: float | None = None,
+    all_brackets: bool = False,
 ) -> Acquired:
     """Capture what the session still lacks of a plan.
 
@@ -45,17 +47,18 @@ def run_plan(
     rig
         The rig that the plan is for.
     boxes, cameras
-        Open drivers by name: the box of the rig ("flash", "dome" or "gradient_sphere", and
-        "caliper" where skin is stretched), and a camera for each view.
+        Open drivers by name: the box of the rig ("flash", "dome", "probe" or "gradient_sphere",
+        and "caliper" where skin is stretched), and a camera for each view.
     session
         Open for writing.
     progress
         Called with one line a step, or a second of a sequence.
     prompt
         Called before the first step that needs it with the state ("smile"), with the place of the
-        target on the dome ("pose 3"), or with how skin is to be taped ("tape the skin at 45
-        degrees"); returns when the subject or the target is ready. Called too with what to press
-        when only a hand can release a camera.
+        target on the dome ("pose 3"), with how skin is to be taped ("tape the skin at 45
+        degrees"), or with where the probe goes ("place the head on the cheek at 0 degrees");
+        returns when the subject or the target is ready. Called too with what to press when only a
+        hand can release a camera.
     interrupted
         Asked before each step, or each sequence; True stops in good order.
     clock
@@ -69,6 +72,8 @@ def run_plan(
     force_limit_n
         Greatest force of the caliper on the skin, N; there is no default, and nothing moves
         without.
+    all_brackets
+        Whether the probe takes all exposures of a series, also those that can show no more.
 
     Returns
     -------
@@ -106,6 +111,11 @@ def run_plan(
         return run_dome(
             plan, rig, box=box, cameras=cameras, session=session, operator=operator, eyes=eyes
         )
+    if kind == "probe":
+        return run_probe(
+            plan, rig, box=box, cameras=cameras, session=session, operator=operator,
+            all_brackets=all_brackets,
+        )  # fmt: skip
     return run_flash(plan, rig, box=box, cameras=cameras, session=session, operator=operator)
 
 

@@ -1,0 +1,309 @@
+"""Series of exposures of one placement of the probe's head: held, watched, ended when it is enough.
+
+All frames of a series are of one placement; they are committed when the last is there. When the
+head is lost in between, it is placed anew and the series begins again. Exposures run from short to
+long, and those that can show no more are left out, with the reason. No short one ever is: whether
+one saturates nowhere is known only when it is there, and it costs a read-out.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from capture import raw
+from capture.acquire.fibre_signal import LEVEL, FibreSignal, said_of
+from capture.acquire.frames import encode
+from capture.acquire.mask_choice import serving
+from capture.acquire.outcome import (
+    MAX_ATTEMPTS,
+    Operator,
+    attempts_so_far,
+    given_up,
+    steps_to_do,
+)
+from capture.acquire.probe_head import Head, HeadLost, NotHeld, ProbeDriver
+from capture.acquire.source_exposure import Exposed, expose, expose_dark
+from capture.devices.camera import Camera, CameraError, Frame, FrameRefused, FrameTimeout
+from capture.plan import Step, Value
+from capture.plan.probe import all_series
+from capture.plan.suction import Placement
+from capture.rig import Probe, Rig
+from capture.session import Session
+
+log = logging.getLogger(__name__)
+
+
+class BracketSeries:
+    """The series of one run.
+
+    Parameters
+    ----------
+    rig, box, cameras, session, operator
+        As of the run.
+    all_brackets
+        Whether exposures are taken that can show no more.
+
+    Attributes
+    ----------
+    steps, frames, stale, retakes : int
+        What was done so far, see `capture.acquire.outcome.Acquired`.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        box: ProbeDriver,
+        cameras: Mapping[str, Camera],
+        session: Session,
+        operator: Operator,
+        *,
+        all_brackets: bool,
+    ) -> None:
+        self._rig = rig
+        self._probe: Probe = rig.probe  # type: ignore[assignment]
+        self._box = box
+        self._cameras = cameras
+        self._session = session
+        self._operator = operator
+        self._all_brackets = all_brackets
+        self._attempts = attempts_so_far(session)
+        self._head = Head(self._probe, box, operator, placements=_placements_so_far(session))
+        self._tokens = 0
+        self.steps = self.frames = self.stale = self.retakes = 0
+
+    # darks ------------------------------------------------------------------------------------
+
+    def darks(self) -> None:
+        """Take the frames without light that are missing; the box is not armed for them."""
+        missing = [step for step in steps_to_do(self._session) if step.kind == "dark"]
+        if missing:
+            self._box.cover(None)
+        for number, step in enumerate(missing, start=1):
+            self._operator.stop_if_asked()
+            seconds = float(step.settings["exposure_s"])
+            self._operator.progress(f"dark {number}/{len(missing)} {step.id} {seconds:.3g} s")
+            self._commit(self._dark(step), {})
+
+    def _dark(self, step: Step) -> tuple[Exposed, dict[str, Value], int]:
+        why = ""
+        for attempt in range(1, MAX_ATTEMPTS + 1):
+            before_c = self._head.temperature_c()
+            self._tokens += 1
+            token = f"{self._operator.run_id}.{self._tokens}"
+            try:
+                exposed = expose_dark(step, self._rig, self._box, self._cameras, token=token)
+            except (FrameRefused, FrameTimeout) as error:
+                why = self._not_taken(step, attempt, error)
+                continue
+            self.stale += exposed.stale
+            after_c = self._head.temperature_c()
+            return exposed, {"light": "none", "camera_c": 0.5 * (before_c + after_c)}, attempt
+        raise given_up(f"step {step.id}", why, self._session)
+
+    # series -----------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Take the series that are missing, in the plan's order, with the head placed as needed."""
+        for placement, steps in all_series(self._session.plan):
+            if steps[0].kind == "mask" and not self._all_brackets:
+                self._choose_masks()
+            if self._is_missing(steps):
+                self._series(placement, steps)
+
+    def _is_missing(self, steps: Sequence[Step]) -> bool:
+        """Tell whether a series lacks frames, or has some of several placements."""
+        left_out = self._session.left_out()
+        ids = {step.id for step in steps if step.id not in left_out}
+        found = [record for record in self._session.frames() if record.step_id in ids]
+        placements = {record.actual.get("placement") for record in found}
+        return bool(ids) and ({record.step_id for record in found} != ids or len(placements) != 1)
+
+    def _series(self, placement: Placement, steps: Sequence[Step]) -> None:
+        left_out = self._session.left_out()
+        wanted = [step for step in steps if step.id not in left_out]
+        for attempt in range(1, MAX_ATTEMPTS + 1):
+            try:
+                taken, reason = self._once(placement, wanted)
+            except HeadLost as lost:
+                log.warning("%s, placement %d: %s", placement, attempt, lost)
+                why = str(lost)
+                self._head.lost(why)
+                self.retakes += 1
+                continue
+            for one in taken:
+                self._commit(one, {"placement": self._head.placements})
+            self._leave_out(wanted[len(taken) :], reason)
+            return
+        raise self._head.refusal(placement, why, captured=bool(self._session.frames()))
+
+    def _once(
+        self, placement: Placement, wanted: Sequence[Step]
+    ) -> tuple[list[tuple[Exposed, dict[str, Value], int]], str]:
+        """Take a series of one placement; return it, and why the rest of it is not needed."""
+        signal = FibreSignal(self._probe, self._rig.view(wanted[0].cameras[0]))
+        taken: list[tuple[Exposed, dict[str, Value], int]] = []
+        self._head.at(placement)
+        fibre = wanted[0].settings.get("fibre")
+        self._box.cover(None if fibre is None else int(fibre))
+        for number, step in enumerate(wanted):
+            self._operator.stop_if_asked()
+            taken.append(self._exposure(placement, step))
+            exposed, actual, _ = taken[-1]
+            self._operator.progress(
+                f"{placement}: {number + 1}/{len(wanted)} {step.id} "
+                f"{float(step.settings['exposure_s']):.3g} s, "
+                f"{float(actual['suction_mbar']):.1f} mbar"
+            )
+            left = wanted[number + 1 :]
+            if fibre is not None or self._all_brackets or not left:
+                continue
+            first = exposed.frames[step.cameras[0]]
+            signal.look(_pixels(first, step), float(step.settings["exposure_s"]))
+            if reason := self._enough(placement, signal, step, left):
+                return taken, reason
+        return taken, ""
+
+    def _exposure(self, placement: Placement, step: Step) -> tuple[Exposed, dict[str, Value], int]:
+        """Take one exposure with the head held before and after, or take it again."""
+        why = ""
+        needs_s = float(step.settings["exposure_s"])
+        needs_s += max(self._rig.view(name).readout_s for name in step.cameras)
+        level = float(step.settings["level"])
+        held = True
+        for attempt in range(1, MAX_ATTEMPTS + 1):
+            try:
+                self._head.hold(level, needs_s)
+                before_mbar, before_c = self._head.readings()
+                exposed = expose(step, self._rig, self._box, self._cameras)
+                after_mbar, after_c = self._head.readings()
+            except NotHeld as error:
+                why, held = str(error), False
+                self._drop_frames(step)
+                log.warning("step %s, attempt %d: %s", step.id, attempt, error)
+                self.retakes += 1
+                continue
+            except HeadLost:
+                self._drop_frames(step)
+                raise
+            except (FrameRefused, FrameTimeout) as error:
+                why, held = self._not_taken(step, attempt, error), True
+                continue
+            self.stale += exposed.stale
+            actual: dict[str, Value] = {
+                "light": "source", "level": level, "open_s": exposed.open_s,
+                "suction_mbar": 0.5 * (before_mbar + after_mbar),
+                "suction_before_mbar": before_mbar, "suction_after_mbar": after_mbar,
+                "camera_c": 0.5 * (before_c + after_c),
+            }  # fmt: skip
+            if "fibre" in step.settings:
+                actual["fibre"] = step.settings["fibre"]
+            return exposed, actual, attempt
+        if held:
+            raise given_up(f"step {step.id}", why, self._session)
+        raise self._head.refusal(placement, why, captured=bool(self._session.frames()))
+
+    def _not_taken(self, step: Step, attempt: int, error: CameraError) -> str:
+        log.warning("step %s, attempt %d: %s", step.id, attempt, error)
+        self.retakes += 1
+        self._drop_frames(step)
+        return str(error)
+
+    def _drop_frames(self, step: Step) -> None:
+        for name in step.cameras:
+            self._cameras[name].abort()
+
+    # what is not needed -----------------------------------------------------------------------
+
+    def _enough(
+        self, placement: Placement, signal: FibreSignal, step: Step, left: Sequence[Step]
+    ) -> str:
+        """Return why the exposures that are left can show no more; empty where they can."""
+        verdict = signal.verdict([float(one.settings["exposure_s"]) for one in left])
+        if not verdict.enough:
+            return ""
+        first, last = (int(left[k].index["bracket"]) for k in (0, -1))
+        span = f"bracket {first}" if first == last else f"brackets {first}-{last}"
+        count = len(self._probe.fibres)
+        most = f"{100 * LEVEL:g} % of full scale"
+        at_s = float(step.settings["exposure_s"])
+        what = f"all {count} fibres" + (" that can be measured" if verdict.hopeless else "")
+        reason = f"{placement}: {span} left out: {what} above {most} at {at_s:.2g} s"
+        if verdict.hopeless:
+            reason += f"; {said_of(verdict.hopeless, self._probe)} would stay in the noise"
+        if verdict.saturated:
+            reason += f"; {said_of(verdict.saturated, self._probe)} saturated in every exposure"
+        return reason
+
+    def _choose_masks(self) -> None:
+        """Leave out those exposures of covered heads that do not serve, once."""
+        session = self._session
+        masks = [step for step in session.plan.steps if step.kind == "mask"]
+        done = {record.step_id for record in session.frames("mask")}
+        left_out = session.left_out()
+        phantom = session.frames("phantom", repeat=0)
+        if not phantom or done or any(step.id in left_out for step in masks):
+            return
+        signal = FibreSignal(self._probe, self._rig.view(masks[0].cameras[0]))
+        for record in phantom:
+            if record.camera == masks[0].cameras[0]:
+                image = np.asarray(session.read(record).cfa)
+                signal.look(image, float(record.settings["exposure_s"]))
+        kept = serving(masks, signal.rate_per_s)
+        rest = [step for step in masks if step.id not in kept]
+        self._leave_out(
+            rest,
+            f"{len(rest)} of {len(masks)} exposures of the covered head left out: per fibre one "
+            "that shows it unsaturated serves, and one that shows light astray from it",
+        )
+
+    def _leave_out(self, steps: Sequence[Step], reason: str) -> None:
+        if not steps:
+            return
+        self._operator.progress(reason)
+        log.info(reason)
+        self._session.leave_out(
+            [step.id for step in steps], reason=reason, t_host_s=self._operator.clock()
+        )
+
+    # commit -----------------------------------------------------------------------------------
+
+    def _commit(
+        self, one: tuple[Exposed, dict[str, Value], int], more: Mapping[str, Value]
+    ) -> None:
+        exposed, actual, tries = one
+        step = exposed.step
+        for name, frame in exposed.frames.items():
+            view, camera = self._rig.view(name), self._cameras[name]
+            light: dict[str, str | float] = {
+                "light": str(actual["light"]), "level": float(step.settings["level"]),
+            }  # fmt: skip
+            attempt = self._attempts.get((step.id, name), 0) + 1
+            self._session.commit(
+                step.id, name, encode(frame, view, camera, step, self._session, light),
+                settings=dict(step.settings),
+                actual={
+                    "exposure_s": frame.exposure.exposure_s, "iso": frame.exposure.iso,
+                    "serial": frame.serial, "tries": tries, **actual, **more,
+                },
+                t_box_s=exposed.t_box_s,
+                t_host_s=self._operator.clock(),
+                attempt=attempt,
+            )  # fmt: skip
+            self._attempts[step.id, name] = attempt
+            self.frames += 1
+        self.steps += 1
+
+
+def _pixels(frame: Frame, step: Step) -> np.ndarray:
+    """Return the sensor values of a frame, also of one that is a maker's raw file."""
+    if isinstance(frame.image, bytes):
+        return np.asarray(raw.decode(memoryview(frame.image), where=f"step {step.id}").cfa)
+    return frame.image
+
+
+def _placements_so_far(session: Session) -> int:
+    """Return how often the head was placed in earlier runs, as far as anything came of it."""
+    return max((int(r.actual.get("placement", 0)) for r in session.frames()), default=0)

@@ -1,0 +1,192 @@
+"""What a series of exposures has shown of the fibres so far, and whether longer ones can tell more.
+
+This looks at a frame as it comes, at the nominal places of the spots, and only decides when to
+stop; the measurement itself is made later, of the raw frames, by a calibration that knows where the
+spots are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import Probe, View
+
+LEVEL = 0.5
+"""Share of full scale that a spot has to reach, unsaturated: at two thirds of a stop the next
+exposure would reach 0.8 and saturate after that."""
+LEAST_SNR = 100.0
+"""Signal to noise that all unsaturated exposures of a spot together have to reach: a per cent."""
+FAINTEST_SNR = 3.0
+"""What would stay below this even with all exposures that are left cannot be measured."""
+BRIGHTEST_PX = 8
+"""The eighth brightest pixel of a color counts as a spot's peak: fewer may be hot."""
+SPOT_SHARE = 0.4
+"""Half the side of the square in which a spot is sought, of the distance between spots."""
+AROUND_SHARE = 0.55
+"""Farther than this from every spot, of that distance, is what no fibre lights."""
+_COLORS = {"R": 0, "G": 1, "B": 2}
+COLOR_NAMES = ("red", "green", "blue")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether a series may end."""
+
+    enough: bool
+    """Whether every fibre has been measured that can be, in every color."""
+    hopeless: tuple[tuple[int, int], ...]
+    """Fibre and color of what no exposure of the series shows."""
+    saturated: tuple[tuple[int, int], ...]
+    """The same of what saturates in every one."""
+
+
+class FibreSignal:
+    """Light of each fibre in each color, exposure by exposure of one series.
+
+    Parameters
+    ----------
+    probe : Probe
+        For the nominal spots.
+    view : View
+        The camera; its levels and its noise.
+
+    Attributes
+    ----------
+    level : ndarray of float64, shape (F, C)
+        Greatest peak above black of an unsaturated exposure so far, of full scale.
+    rate_per_s : ndarray of float64, shape (F, C)
+        That peak per second, of full scale; 0 where there is none.
+    """
+
+    def __init__(self, probe: Probe, view: View) -> None:
+        self._view = view
+        spots = np.array([fibre.spot_px for fibre in probe.fibres])
+        gaps = np.linalg.norm(spots[:, None] - spots[None, :], axis=-1)
+        gaps[np.diag_indices(len(spots))] = math.inf
+        pitch_px = float(gaps.min()) if len(spots) > 1 else float(view.height_px) / 2.0
+        self._colors = _color_of(view)
+        count = 1 if view.cfa == "MONO" else 3
+        self._windows = [
+            [_in_color(self._colors, _window(view, spot, SPOT_SHARE * pitch_px), c)
+             for c in range(count)]
+            for spot in spots
+        ]  # fmt: skip
+        lit = np.zeros((view.height_px, view.width_px), bool)
+        for spot in spots:
+            lit[_window(view, spot, AROUND_SHARE * pitch_px)] = True
+        self._around = [np.flatnonzero(~lit & (self._colors == c)) for c in range(count)]
+        shape = (len(spots), count)
+        self.level = np.zeros(shape)
+        self.rate_per_s = np.zeros(shape)
+        self._sum = np.zeros(shape)
+        self._variance = np.zeros(shape)
+        self._seconds = np.zeros(shape)
+        self._always_saturated = np.ones(shape, bool)
+        self._looked = 0
+
+    def look(self, image: NDArray[np.uint16], exposure_s: float) -> None:
+        """Take an exposure into account: sensor values, shape (H, W), and its time, s."""
+        view = self._view
+        pixels = np.asarray(image).ravel()
+        full = float(view.white_level - view.black_level)
+        noise_dn2 = (view.read_noise_e / view.gain_e_per_dn) ** 2 + 1.0 / 12.0
+        self._looked += 1
+        for color, around in enumerate(self._around):
+            zero = float(np.median(pixels[around])) if len(around) else float(view.black_level)
+            for fibre, windows in enumerate(self._windows):
+                values = pixels[windows[color]]
+                rank = max(len(values) - BRIGHTEST_PX, 0)
+                peak = float(np.partition(values, rank)[rank])
+                if peak >= view.white_level:
+                    continue
+                self._always_saturated[fibre, color] = False
+                signal = float(values.sum(dtype=np.float64)) - zero * len(values)
+                dn2 = noise_dn2 * len(values) + max(signal, 0.0) / view.gain_e_per_dn
+                dn2 += max(zero - view.black_level, 0.0) * len(values) / view.gain_e_per_dn
+                self._sum[fibre, color] += signal
+                self._variance[fibre, color] += dn2
+                self._seconds[fibre, color] += exposure_s
+                level = (peak - zero) / full
+                if level > self.level[fibre, color]:
+                    self.level[fibre, color] = level
+                    self.rate_per_s[fibre, color] = level / exposure_s
+
+    @property
+    def signal_to_noise(self) -> NDArray[np.float64]:
+        """Signal to noise of all unsaturated exposures of each fibre and color, shape (F, C)."""
+        return self._sum / np.sqrt(np.maximum(self._variance, 1e-12))
+
+    def verdict(self, left_s: Sequence[float]) -> Verdict:
+        """Tell whether the exposures that are left, s, can show more.
+
+        Notes
+        -----
+        The light of a fibre that has not been seen is taken as bright as three standard errors
+        above its estimate; only what even that would leave in the noise is given up.
+        """
+        snr = self.signal_to_noise
+        measured = (self.level >= LEVEL) & (snr >= LEAST_SNR)
+        saturated = self._always_saturated & (self._looked > 0)
+        seconds = np.maximum(self._seconds, 1e-12)
+        error = np.sqrt(self._variance)
+        rate = np.maximum((self._sum + FAINTEST_SNR * error) / seconds, 0.0)
+        more_s = float(sum(left_s))
+        signal = np.maximum(self._sum, 0.0) + rate * more_s
+        per_frame = self._variance / max(self._looked, 1)
+        noise = self._variance + per_frame * len(left_s) + rate * more_s / self._view.gain_e_per_dn
+        hopeless = ~measured & ~saturated & (signal < FAINTEST_SNR * np.sqrt(noise))
+        return Verdict(
+            bool((measured | hopeless | saturated).all()), _pairs(hopeless), _pairs(saturated)
+        )
+
+
+def said_of(pairs: Sequence[tuple[int, int]], probe: Probe) -> str:
+    """Return fibres and colors as words.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> said_of([(26, 2), (27, 2)], load_rig("probe").probe)
+    'blue of F27, F28'
+    """
+    parts = []
+    for color, name in enumerate(COLOR_NAMES):
+        fibres = [probe.fibres[fibre].name for fibre, of in pairs if of == color]
+        if fibres:
+            span = f"{fibres[0]} to {fibres[-1]}" if len(fibres) > 3 else ", ".join(fibres)
+            parts.append(f"{name} of {span}")
+    return "; ".join(parts)
+
+
+def _color_of(view: View) -> NDArray[np.int8]:
+    """Return the color of each pixel, 0 to 2 for R, G, B; all 0 for MONO; shape (H, W)."""
+    colors = np.zeros((view.height_px, view.width_px), np.int8)
+    if view.cfa != "MONO":
+        for place, letter in enumerate(view.cfa):
+            colors[place // 2 :: 2, place % 2 :: 2] = _COLORS[letter]
+    return colors
+
+
+def _window(view: View, spot: NDArray[np.float64], half_px: float) -> tuple[slice, slice]:
+    x, y = float(spot[0]), float(spot[1])
+    rows = slice(max(math.ceil(y - half_px), 0), max(math.floor(y + half_px) + 1, 0))
+    columns = slice(max(math.ceil(x - half_px), 0), max(math.floor(x + half_px) + 1, 0))
+    return rows, columns
+
+
+def _in_color(
+    colors: NDArray[np.int8], window: tuple[slice, slice], color: int
+) -> NDArray[np.intp]:
+    """Return the flat indices of a window's pixels of one color."""
+    inside = np.zeros(colors.shape, bool)
+    inside[window] = colors[window] == color
+    return np.flatnonzero(inside)
+
+
+def _pairs(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
+    return tuple((int(fibre), int(color)) for fibre, color in np.argwhere(mask))
