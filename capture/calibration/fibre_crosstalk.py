@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.calibration.fibre_readings import FibreReadings
+from capture.calibration.record import CalibrationError
 
-__all__ = ["CrossTalk", "measure_crosstalk", "no_crosstalk"]
+__all__ = ["CrossTalk", "CrossTalkError", "measure_crosstalk", "no_crosstalk"]
 
 FloatArray = NDArray[np.float64]
 
@@ -20,6 +21,10 @@ DISTANCE_EDGES: Final = (1, 2, 3, 4, 6, 9, 14, 21)
 LEAST_SCATTER: Final = 0.3
 """Of pairs as far apart about their mean, relative: a few of them may agree by chance."""
 ROUNDS: Final = 30
+
+
+class CrossTalkError(CalibrationError):
+    """Spots whose light cannot be told apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,9 +60,9 @@ class CrossTalk:
             raise ValueError("CrossTalk.matrix: got a diagonal other than 1")
         away = np.abs(self.matrix).sum(axis=0) - 1.0
         if count and not float(away.max()) < 0.9:
-            raise ValueError(
-                f"CrossTalk.matrix: got a column of {float(away.max()):.2f} beside the diagonal,"
-                " expected less than 0.9: the spots cannot be told apart"
+            raise CrossTalkError(
+                f"cross-talk: got {float(away.max()):.2f} of a fibre's light in the others' spots,"
+                " expected less than 0.9: they cannot be told apart; check focus and cover"
             )
 
     def unmix(self, signal: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -139,9 +144,9 @@ def measure_crosstalk(masks: Mapping[int, FibreReadings]) -> CrossTalk:
     weight = np.zeros((count, count, colors))
     for i in used:
         readings = masks[i]
-        own = readings.valid[i]
-        source[i] = np.where(own, readings.signal[i], 0.0)
-        good = readings.valid & own[None]
+        # a fibre that gives no light tells of stray light only
+        source[i] = np.where(readings.detected[i], readings.signal[i], 0.0)
+        good = readings.valid & readings.valid[i]
         value[:, i] = readings.signal
         weight[:, i] = np.where(good, 1.0 / np.maximum(readings.variance, 1e-300), 0.0)
     rows = np.arange(count)

@@ -61,7 +61,7 @@ class PhantomCertificate:
     ...     sigma_s_prime_per_mm=(1.8, 1.2),
     ...     uncertainty=CertificateUncertainty(sigma_a=0.03, sigma_s_prime=0.02))
     >>> paper.at([550.0])[1].round(3).tolist()
-    [1.456]
+    [1.429]
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT

@@ -1,0 +1,271 @@
+"""Gains, cross-talk and stray light from a phantom turn readings into reflectance."""
+
+import json
+from datetime import date
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from capture.calibration import store
+from capture.calibration.fibre import FibreCalibration, FibreError, calibrate_fibres
+from capture.calibration.fibre_crosstalk import measure_crosstalk
+from capture.calibration.fibre_readings import FibreReadings
+from capture.calibration.fibre_spots import FibreSpots
+from capture.calibration.phantom import (
+    CertificateError,
+    ExpectedReflectance,
+    read_certificate,
+)
+from capture.calibration.record import CalibrationMismatch
+from capture.rig import load_rig
+
+FALSE_ALARM = 1e-5
+RIG = load_rig("probe")
+RADIUS = np.array(RIG.probe.radius_mm)
+NAMES = tuple(fibre.name for fibre in RIG.probe.fibres)
+DISTANCE = np.abs(np.subtract.outer(np.arange(28), np.arange(28)))
+PER_S = 3000.0  # signal of 1/mm^2
+
+
+def profile(sigma_tr):
+    return 0.03 * np.exp(-np.asarray(sigma_tr) * RADIUS[:, None]) / RADIUS[:, None] ** 2
+
+
+PHANTOM = profile([0.5, 0.7, 0.9])
+SKIN = profile([0.9, 1.3, 1.6])
+
+
+def spots(found=None):
+    place = np.array([fibre.spot_px for fibre in RIG.probe.fibres])
+    row = np.full(28, 13.0)
+    found = np.ones(28, bool) if found is None else found
+    return FibreSpots(NAMES, place, np.full((28, 2), 0.02), row, 0.01 * row, 0.1 * row, found, 17.0)
+
+
+def mixing(rng, neighbor=1e-3, far=2e-5):
+    matrix = far * np.exp(-DISTANCE / 6) * rng.lognormal(0, 0.3, (28, 28))
+    matrix[DISTANCE == 1] = neighbor * rng.lognormal(0, 0.3, (DISTANCE == 1).sum())
+    np.fill_diagonal(matrix, 1.0)
+    return matrix
+
+
+class Probe:
+    """Readings drawn from a mixing matrix, gains, stray light, and noise."""
+
+    def __init__(self, rng, *, matrix=None, stray=2e-5, floor=1e-6, dead=()):
+        self.rng, self.floor = rng, floor
+        self.matrix = mixing(rng) if matrix is None else matrix
+        self.gain = PER_S * rng.normal(1, 0.05, (28, 1)) * np.array([0.6, 1.0, 0.5])
+        self.gain[list(dead)] = 0.0
+        self.stray = stray * rng.uniform(0.5, 1.5, (28, 3))
+
+    def read(self, reflectance, *, only=None, level=1.0, saturated=()):
+        light = self.gain * reflectance
+        if only is not None:
+            light = np.where(np.arange(28)[:, None] == only, light, 0.0)
+        mean = level * (self.matrix @ light + self.stray)
+        variance = self.floor**2 + 1e-6 * mean * self.floor + (5e-4 * mean) ** 2
+        signal = mean + np.sqrt(variance) * self.rng.normal(size=mean.shape)
+        full = np.zeros((28, 3), bool)
+        full[list(saturated)] = True
+        return FibreReadings(
+            NAMES, np.where(full, 0, signal), np.where(full, 0, variance), ~full, full,
+            np.zeros((28, 3)), (1.0,),
+        )  # fmt: skip
+
+    def masks(self, **about):
+        return {i: self.read(PHANTOM, only=i, **about) for i in range(28)}
+
+    def calibrate(self, *, expected=None, level=1.0, masks=None, **about):
+        expected = expected or ExpectedReflectance(PHANTOM, np.zeros((28, 3)))
+        return calibrate_fibres(
+            self.read(PHANTOM, level=level, **about), self.masks() if masks is None else masks,
+            spots=spots(), radius_mm=RADIUS, expected=expected, level=level,
+        )  # fmt: skip
+
+
+def away(found, truth):
+    good = found.valid
+    return ((found.reflectance_per_mm2 - truth) / np.where(good, found.stderr, 1.0))[good]
+
+
+def test_reflectance_comes_back_within_its_errors():
+    sigmas, blind = [], []
+    for seed in range(12):
+        probe = Probe(np.random.default_rng(seed))
+        result = probe.calibrate().reflectance(probe.read(SKIN))
+        sigmas.append(away(result, SKIN))
+        nothing = probe.calibrate(masks={}).reflectance(probe.read(SKIN))
+        blind.append(np.abs(away(nothing, SKIN)).max())
+    sigmas = np.concatenate(sigmas)
+    # the fibres of a run share errors of cross-talk, so of 28 x 3 some count as one
+    assert 0.75 < np.sqrt((sigmas**2).mean()) < 1.25
+    assert np.quantile(np.abs(sigmas), 0.999) < 5
+    # without the frames of covered fibres the far ones are off by many standard errors
+    assert min(blind) > 10
+
+
+def test_pairs_of_fibres_are_measured_within_their_errors(rng):
+    probe = Probe(rng)
+    found = measure_crosstalk(probe.masks())
+    first = DISTANCE == 1
+    sigmas = ((found.matrix - probe.matrix) / np.where(first, found.stderr, 1))[first]
+    assert np.sqrt((sigmas**2).mean()) < 1.6
+    bright = np.arange(28) < 14
+    assert (found.stderr[first & bright] < 0.05 * found.matrix[first & bright]).all()
+    # of what is below the noise of each pair the mean of all as far apart is known
+    far = DISTANCE >= 6
+    assert found.matrix[far].mean() == pytest.approx(probe.matrix[far].mean(), rel=0.2)
+
+
+def test_stray_light_is_told_from_cross_talk(rng):
+    probe = Probe(rng, stray=5e-5)
+    found = measure_crosstalk(probe.masks())
+    sigmas = (found.offset - probe.stray) / found.offset_stderr
+    low, high = chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], sigmas.size)
+    assert 0.5 * low < float((sigmas**2).sum()) < 1.5 * high
+    assert (found.offset_stderr < 0.2 * 5e-5).all()
+
+
+def test_a_weaker_source_gives_the_same_reflectance(rng):
+    probe = Probe(rng)
+    calibration = probe.calibrate(level=0.5, masks=probe.masks(level=0.5))
+    result = calibration.reflectance(probe.read(SKIN, level=0.25), level=0.25)
+    near = slice(0, 6)
+    np.testing.assert_allclose(result.reflectance_per_mm2[near], SKIN[near], rtol=0.01)
+    wrong = calibration.reflectance(probe.read(SKIN, level=0.25))
+    assert (wrong.reflectance_per_mm2[near] < 0.3 * SKIN[near]).all()
+
+
+def test_a_dead_fibre_is_reported_and_leaves_the_others_alone(rng):
+    probe = Probe(rng, dead=[7])
+    calibration = probe.calibrate()
+    assert np.flatnonzero(calibration.dead).tolist() == [7]
+    result = calibration.reflectance(probe.read(SKIN))
+    assert not result.valid[7].any()
+    assert result.valid[:7].all()
+    assert "dead" in result.reasons["F08"]
+    np.testing.assert_allclose(result.reflectance_per_mm2[[6, 8]], SKIN[[6, 8]], rtol=0.02)
+
+
+def test_a_saturated_fibre_is_flagged_and_its_leak_bounded(rng):
+    probe = Probe(rng)
+    calibration = probe.calibrate()
+    result = calibration.reflectance(probe.read(SKIN, saturated=[0, 1]))
+    assert not result.valid[:2].any()
+    assert result.valid[2:10].all()
+    assert "saturated" in result.reasons["F01"]
+    assert (result.reflectance_per_mm2[:2] == 0).all()
+    sigmas = ((result.reflectance_per_mm2 - SKIN) / np.where(result.valid, result.stderr, 1))[2:6]
+    assert np.abs(sigmas).max() < 5
+
+
+def test_a_series_that_is_saturated_everywhere_gives_nothing_and_says_so(rng):
+    probe = Probe(rng)
+    result = probe.calibrate().reflectance(probe.read(SKIN, saturated=range(28)))
+    assert not result.valid.any()
+    assert set(result.reasons) == set(NAMES)
+
+
+def test_no_signal_in_far_fibres_keeps_its_sign_and_its_error(rng):
+    probe = Probe(rng)
+    calibration = probe.calibrate()
+    dark = np.where(RADIUS[:, None] < 3, SKIN, 0.0)
+    far = RADIUS >= 3
+    result = calibration.reflectance(probe.read(dark))
+    seen = result.valid & far[:, None]
+    assert seen.sum() > 30
+    assert (result.reflectance_per_mm2[seen] < 0).any()
+    assert np.abs(away(result, dark)).max() < 6
+
+
+def test_what_the_certificate_leaves_open_moves_all_fibres_together(rng):
+    probe = Probe(rng)
+    scale = np.full((1, 28, 3), 0.03)
+    expected = ExpectedReflectance(1.03 * PHANTOM, 0.002 * PHANTOM, scale)
+    result = probe.calibrate(expected=expected).reflectance(probe.read(SKIN))
+    near = slice(0, 8)
+    ratio = result.reflectance_per_mm2[near] / SKIN[near]
+    np.testing.assert_allclose(ratio, 1.03, rtol=0.01)
+    own = np.sqrt(result.variance[near]) / SKIN[near]
+    assert (own < 0.01).all()  # the fibres agree with each other
+    np.testing.assert_allclose((result.stderr / SKIN)[near], 0.03, rtol=0.1)
+    covariance = result.covariance
+    assert covariance.shape == (3, 28, 28)
+    correlation = covariance[1, 0, 3] / np.sqrt(covariance[1, 0, 0] * covariance[1, 3, 3])
+    assert correlation > 0.95
+    np.testing.assert_allclose(
+        np.diagonal(covariance, axis1=1, axis2=2).T, result.stderr**2, rtol=1e-12
+    )
+
+
+def test_readings_of_no_light_cannot_calibrate(rng):
+    probe = Probe(rng, dead=range(28), stray=0.0)
+    with pytest.raises(FibreError, match="no fibre gives light"):
+        probe.calibrate()
+
+
+def test_readings_of_another_probe_are_refused(rng):
+    probe = Probe(rng)
+    calibration = probe.calibrate()
+    readings = probe.read(SKIN)
+    other = FibreReadings(
+        tuple(reversed(NAMES)), readings.signal, readings.variance, readings.valid,
+        readings.saturated, readings.around, (1.0,),
+    )  # fmt: skip
+    with pytest.raises(FibreError, match="expected those of the calibration"):
+        calibration.reflectance(other)
+    with pytest.raises(FibreError, match="level: got 0"):
+        calibration.reflectance(readings, level=0.0)
+
+
+def test_a_calibration_survives_its_file(rng, tmp_path):
+    probe = Probe(rng, dead=[20])
+    expected = ExpectedReflectance(PHANTOM, 0.01 * PHANTOM, np.full((2, 28, 3), 0.02))
+    made = probe.calibrate(expected=expected)
+    record = made.to_calibration(
+        serial="SP-0001", rig="probe", source="simulated", created=date(2026, 11, 21)
+    )
+    store.save(record, tmp_path)
+    back = FibreCalibration.load(tmp_path, RIG, on=date(2026, 11, 22))
+    readings = probe.read(SKIN)
+    one, two = made.reflectance(readings), back.reflectance(readings)
+    for name in ("reflectance_per_mm2", "variance", "common_per_mm2", "valid"):
+        np.testing.assert_allclose(getattr(one, name), getattr(two, name), rtol=1e-12)
+    assert back.names == made.names
+    with pytest.raises(CalibrationMismatch, match="expected 'fibre' of 'flash'"):
+        FibreCalibration.from_calibration(record, load_rig("flash"), "SP-0001")
+
+
+CERTIFICATE = {
+    "schema": "skinrig.phantom/1",
+    "eta": 1.4,
+    "g": 0.7,
+    "wavelength_nm": [400.0, 500.0, 700.0],
+    "sigma_a_per_mm": [0.02, 0.015, 0.01],
+    "sigma_s_prime_per_mm": [2.0, 1.6, 1.1],
+    "uncertainty": {"sigma_a": 0.03, "sigma_s_prime": 0.02},
+}
+
+
+def test_a_certificate_is_read_and_its_faults_are_listed(tmp_path):
+    path = tmp_path / "phantom.json"
+    path.write_text(json.dumps(CERTIFICATE))
+    certificate = read_certificate(path)
+    sigma_a, sigma_s = certificate.at([400.0, 700.0])
+    np.testing.assert_allclose(sigma_a, [0.02, 0.01])
+    np.testing.assert_allclose(sigma_s, [2.0, 1.1])
+    with pytest.raises(CertificateError, match="380"):
+        certificate.at([380.0])
+    path.write_text(json.dumps({**CERTIFICATE, "sigma_a_per_mm": [0.02, -0.01], "colour": 1}))
+    with pytest.raises(CertificateError, match="colour"):
+        read_certificate(path)
+    path.write_text(json.dumps({**CERTIFICATE, "sigma_a_per_mm": [0.02, -0.01]}))
+    with pytest.raises(CertificateError, match=r"3 numbers[\s\S]*numbers > 0, in 1/mm"):
+        read_certificate(path)
+    path.write_text(json.dumps({**CERTIFICATE, "schema": "skinrig.phantom/9"}))
+    with pytest.raises(CertificateError, match="schema"):
+        read_certificate(path)
+    with pytest.raises(CertificateError, match="cannot be read"):
+        read_certificate(tmp_path / "none.json")
