@@ -36,10 +36,15 @@ PATH_STEP: Final = 0.006
 LONGEST_PATH_MM: Final = 20_000.0
 """Longer paths count as this one when they are reweighted: exp(-sigma 20 m) is 0 for all tissue."""
 
-PILOT_SHARE: Final = 0.03
-"""Part of the photons that is spent to learn how many arrive where."""
+PILOT_SHARE: Final = 0.01
+"""Photons that each of `PILOTS` runs spends to learn how many arrive where, of those traced."""
+
+PILOTS: Final = 3
+"""Each pilot sees farther than the one before it."""
 
 WINDOW_CELLS: Final = 256
+SMOOTHED_CELLS: Final = 8  # to each side
+ENOUGH_TRACKS: Final = 50.0
 KERNEL_NODES: Final = 400
 SCORED_DEPTH: Final = 1.5
 """Optical depth above which every collision is scored; below, fewer and fewer with more weight."""
@@ -330,14 +335,14 @@ def _trace(
     total = np.zeros((batches, len(order), *nodes, *bands))
     traced = 0
     for index, layers in enumerate(spectral.stacks):
-        seeds = tissue_mc.batch_seeds(rng, batches + 2)
+        seeds = tissue_mc.batch_seeds(rng, batches + PILOTS)
         if not shares[index] > 0.0:
             continue
         count = -(-round(photons * float(shares[index])) // batches) or 1
         traced += count * batches
         plan = _Plan(layers, fibres, kernels, starts, counts, absorber, index)
         window = plan.flat_window()
-        pilot = max(200, round(PILOT_SHARE * count * batches / 2))
+        pilot = max(200, round(PILOT_SHARE * count * batches))
         for seed in seeds[batches:]:
             window = plan.learned(window, pilot, seed)
 
@@ -384,6 +389,7 @@ class _Plan:
         self.reach_mm = 3.0 * max(farthest, 1.0)
         self.farthest_mm = max(farthest, 1.0)
         self.chances, self.chances_per_mm = _chances(self.table)
+        self.deeper_per_mm = 1.0 / _transport_depth_mm(self.table)
 
     def flat_window(self) -> FloatArray:
         """Return weights of 1 up to the farthest fibre, and more beyond."""
@@ -406,7 +412,7 @@ class _Plan:
         walk_to_fibres(
             self.table, self.fibres.source_numerical_aperture, self.fibres.numerical_aperture,
             self.kernels, self.starts, self.counts, window, self.chances,
-            WINDOW_CELLS / self.reach_mm, self.chances_per_mm, PATH_STEP, PATH_SCALE_MM,
+            WINDOW_CELLS / self.reach_mm, self.deeper_per_mm, self.chances_per_mm, PATH_STEP, PATH_SCALE_MM,
             photons, seed.copy(), tally, histogram, visited,
         )  # fmt: skip
         return (histogram if self.counts_paths else tally), visited
@@ -417,25 +423,38 @@ def _window_from(
 ) -> FloatArray:
     """Return target weights in proportion to how much weight passes each distance."""
     s = (np.arange(len(visited)) + 0.5) * reach_mm / WINDOW_CELLS
-    width = 8
-    kernel = np.ones(2 * width + 1)
-    smooth = np.convolve(visited[:-1], kernel, "same") / np.convolve(
-        np.ones(len(visited) - 1), kernel, "same"
-    )
+    kernel = np.ones(2 * SMOOTHED_CELLS + 1)
+    around = np.convolve(np.ones(len(visited) - 1), kernel, "same")
+    smooth = np.convolve(visited[:-1], kernel, "same") / around
     tracks = np.convolve(visited[:-1] / used[:-1], kernel, "same")
-    enough = tracks > 50.0
-    reached = int(np.argmin(enough)) if not enough.all() else len(enough)
+    edge = min(int(np.searchsorted(s, farthest_mm)), WINDOW_CELLS - 1)
+    enough = tracks[: edge + 1] > ENOUGH_TRACKS
+    reached = len(enough) if enough.all() else int(np.argmin(enough))
     window = np.ones(len(visited))
     if reached >= 2:
         peak = int(np.argmax(smooth[:reached]))
-        window[:reached] = np.minimum(smooth[:reached] / smooth[peak], 1.0)
-        window[:peak] = 1.0
-        # Where too few came to tell: as the last that could be told.
-        window[reached:] = window[reached - 1]
-    edge = int(np.searchsorted(s, farthest_mm))
+        window[peak:reached] = smooth[peak:reached] / smooth[peak]
+        # Where too few came to tell: on as it fell before.
+        before = max(peak, reached - 2 * len(kernel))
+        if reached <= edge and before < reached - 1:
+            fall = np.log(window[reached - 1] / window[before]) / (reached - 1 - before)
+            further = np.arange(1, edge + 2 - reached)
+            window[reached : edge + 1] = window[reached - 1] * np.exp(min(fall, 0.0) * further)
     # Beyond the fibres light comes back the less the farther it is.
     window[edge:] = window[edge] * (s[edge:] / s[edge]) ** 3
     return window
+
+
+def _transport_depth_mm(table: FloatArray) -> float:
+    """Return the depth to which light goes before it has turned or been absorbed once."""
+    left = 1.0
+    for top, bottom, sigma_t, albedo, g in table[1:-1, :5]:
+        turned = sigma_t * (1.0 - albedo * g)
+        if turned * (bottom - top) >= left:
+            return float(top + left / turned)
+        left -= turned * (bottom - top) if turned > 0.0 else 0.0
+    bottom = float(table[-1, 0])
+    return bottom if bottom < inf else 1.0
 
 
 def _chances(table: FloatArray) -> tuple[FloatArray, float]:

@@ -21,6 +21,7 @@ the top below the surface, share of the counted absorber."""
 
 STACK_DEPTH = 512  # copies of photons that wait; when full, photons are not split further
 MOST_COPIES = 16  # of one photon at one collision
+DEEPEST = 30.0  # most that the depth raises the weight at which photons are kept
 _STATE = 9  # x, y, z, ux, uy, uz, weight, path, layer
 
 
@@ -54,7 +55,7 @@ def _on_fibres(rho, value, path, kernels, starts, counts, log_step, path_scale, 
 
 @njit(
     "void(float64[:,::1], float64, float64, float64[:,::1], int64[::1], int64[::1], float64[::1],"
-    " float64[::1], float64, float64, float64, float64, int64, uint64[::1], float64[::1],"
+    " float64[::1], float64, float64, float64, float64, float64, int64, uint64[::1], float64[::1],"
     " float64[:,::1], float64[::1])",
     cache=True,
     nogil=True,
@@ -62,7 +63,7 @@ def _on_fibres(rho, value, path, kernels, starts, counts, log_step, path_scale, 
 )
 def walk_to_fibres(  # type: ignore[no-untyped-def]
     table, source_sine, fibre_sine, kernels, starts, counts, window, chances, per_mm,
-    chances_per_mm, log_step, path_scale, photons, seed, tally, histogram, visited,
+    deeper_per_mm, chances_per_mm, log_step, path_scale, photons, seed, tally, histogram, visited,
 ):  # fmt: skip
     """Trace photons from a point source in a cone and score what fibres take.
 
@@ -87,6 +88,8 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
         float64, shape (levels,).
     per_mm, chances_per_mm
         Cells of `window` and of `chances` per mm.
+    deeper_per_mm
+        Growth of the kept weight per mm of depth, in units of that at the surface.
     log_step, path_scale
         Nodes of `histogram` lie at ``path_scale * (exp(log_step * k) - 1)`` mm.
     photons
@@ -100,7 +103,7 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
         The same by the path in the counted absorber, each score shared by the two nodes around it
         so that its mean path is kept. float64, shape (F, nodes) or (0, 0), added to.
     visited
-        Weight of collisions by distance from the entry, float64, shape (cells,), added to.
+        Weight of scored collisions by distance from the entry, float64, shape (cells,), added to.
     """
     s0, s1, s2, s3 = seed[0], seed[1], seed[2], seed[3]
     last = table.shape[0] - 1
@@ -145,10 +148,10 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                     weight *= table[layer, 3]
                     r2 = x * x + y * y
                     cell = min(int(sqrt(r2 + z * z) * per_mm), cells)
-                    visited[cell] += weight
 
                     level = int(z * chances_per_mm)
                     chance = chances[level] if level < levels else 0.0
+                    visited[cell] += weight * chance
                     if chance > 0.0:
                         s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
                         if u <= chance:
@@ -193,7 +196,7 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                                 starts, counts, log_step, path_scale, tally, histogram,
                             )  # fmt: skip
 
-                    target = window[cell]
+                    target = window[cell] * min(1.0 + z * deeper_per_mm, DEEPEST)
                     if weight < 0.5 * target:
                         s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
                         if u * target > weight:
