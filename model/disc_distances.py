@@ -1,0 +1,115 @@
+"""How far apart two points of two round fibre ends are: averages over finite cores.
+
+A detector's reading is the reflectance profile averaged over all pairs of a point of the source's
+core and one of the detector's. The average over four coordinates needs only the distribution of
+the distance; a few Gauss nodes of that distribution give it for a whole family of profiles.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+_NEAR, _FAR = 3.0, 10.0  # centre distances over the sum of core radii at which fewer nodes do
+_NODES = (8, 5, 3)  # relative error below 1e-5 for the profiles of tissue: see the tests
+_RINGS, _ANGLES = 48, 96
+
+
+@lru_cache(maxsize=4096)
+def distance_rule(
+    radius_mm: float, core_mm: float, source_core_mm: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return distances and weights that average a radial profile over two cores.
+
+    Parameters
+    ----------
+    radius_mm
+        Distance of the cores' centres in mm, >= 0.
+    core_mm, source_core_mm
+        Diameters of the two cores in mm, >= 0; 0 is a point.
+
+    Returns
+    -------
+    distances_mm, weights : ndarray
+        At most 8 nodes in mm and their weights, which add up to 1. Exact for polynomials of the
+        distance over the distance, so that profiles like 1/r near 0 are averaged well.
+
+    Examples
+    --------
+    >>> distance, weight = distance_rule(0.3, 0.2, 0.2)
+    >>> round(float(weight @ distance**2), 6)  # r^2 + (a^2 + b^2)/2
+    0.1
+    >>> distance_rule(1.0, 0.0, 0.0)
+    (array([1.]), array([1.]))
+    """
+    for name, value in (
+        ("radius_mm", radius_mm),
+        ("core_mm", core_mm),
+        ("source_core_mm", source_core_mm),
+    ):
+        if not 0.0 <= value < np.inf:
+            raise ValueError(f"{name}: got {value}, expected a finite length of at least 0")
+    a, b = 0.5 * core_mm, 0.5 * source_core_mm
+    reach = a + b
+    if reach == 0.0:
+        return np.array([radius_mm]), np.array([1.0])
+    count = _NODES[int(radius_mm > _NEAR * reach) + int(radius_mm > _FAR * reach)]
+    offset, offset_weight = _offsets(a, b)
+    angle = np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES
+    across = radius_mm + offset[:, None] * np.cos(angle)
+    distance = np.hypot(across, offset[:, None] * np.sin(angle)).ravel()
+    weight = np.repeat(offset_weight / _ANGLES, _ANGLES)
+    node, node_weight = _gauss(distance, weight / distance, count)
+    return node, node_weight * node
+
+
+def _offsets(a: float, b: float) -> tuple[FloatArray, FloatArray]:
+    """Return the distribution of the length of the difference of points in concentric discs."""
+    small, large = min(a, b), max(a, b)
+    node, weight = np.polynomial.legendre.leggauss(_RINGS)
+    node, weight = 0.5 * (node + 1.0), 0.5 * weight
+    if small == 0.0:
+        s = large * node
+        return s, 2.0 * s / large * weight
+    inner, outer = large - small, large + small
+    # The lens that two discs share ends in roots at both ends of (inner, outer): s by a cosine.
+    bend = 0.5 * (1.0 - np.cos(np.pi * node))
+    s = np.concatenate([inner * node, inner + (outer - inner) * bend])
+    ds = np.concatenate(
+        [inner * weight, (outer - inner) * 0.5 * np.pi * np.sin(np.pi * node) * weight]
+    )
+    density = 2.0 * np.pi * s * _shared_area(s, small, large) / (np.pi * small * large) ** 2
+    keep = ds > 0.0
+    return s[keep], (density * ds)[keep]
+
+
+def _shared_area(s: FloatArray, small: float, large: float) -> FloatArray:
+    """Return the area that two discs share whose centres are `s` apart."""
+    s_safe = np.maximum(s, 1e-300)
+    first = np.clip((s**2 + small**2 - large**2) / (2.0 * s_safe * small), -1.0, 1.0)
+    second = np.clip((s**2 + large**2 - small**2) / (2.0 * s_safe * large), -1.0, 1.0)
+    square = (small + large - s) * (s + small - large) * (s - small + large) * (s + small + large)
+    return np.asarray(
+        small**2 * np.arccos(first)
+        + large**2 * np.arccos(second)
+        - 0.5 * np.sqrt(np.maximum(square, 0.0))
+    )
+
+
+def _gauss(x: FloatArray, weight: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the Gauss rule of a discrete measure by Stieltjes' recurrence (Golub, Welsch)."""
+    total = weight.sum()
+    diagonal, off = np.empty(count), np.empty(count)
+    before, p = np.zeros_like(x), np.full_like(x, 1.0 / np.sqrt(total))
+    for k in range(count):
+        diagonal[k] = weight @ (x * p * p)
+        q = (x - diagonal[k]) * p - (off[k - 1] * before if k else 0.0)
+        off[k] = np.sqrt(weight @ (q * q))
+        before, p = p, q / off[k]
+    matrix = np.diag(diagonal) + np.diag(off[:-1], 1) + np.diag(off[:-1], -1)
+    node, vector = np.linalg.eigh(matrix)
+    return node, total * vector[0] ** 2

@@ -1,0 +1,443 @@
+"""Reflectance around a beam by transport: a white Monte Carlo table of semi-infinite media.
+
+Diffusion fails within a few transport lengths of the source and under strong absorption; this
+table does not. With lengths in units of 1/sigma_s' the profile depends on sigma_a/sigma_s', the
+asymmetry g of the Henyey-Greenstein phase function and the index of refraction only::
+
+    R(r) = sigma_s'^2 Rhat(r sigma_s', sigma_a/sigma_s'; eta, g)
+
+Stored is ln of Rhat over (1 + kappa d)/d^3 exp(-kappa d) with d^2 = (r sigma_s')^2 + 1 and the
+exact asymptotic decay kappa, as a bicubic spline over ln(r sigma_s') and
+ln(1 + 10 sqrt(sigma_a/sigma_s')): smooth, positive, with exact slopes for least squares, and right
+far away. tools/make_photon_table.py makes model/data/photon_table.npz and says how.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RectBivariateSpline
+from scipy.linalg import eigh_tridiagonal
+
+from model import photon_kernels as kernels
+from model.disc_distances import distance_rule
+
+FloatArray = NDArray[np.float64]
+Collection = Literal["all", "fibre"]
+
+NUMERICAL_APERTURE = 0.22
+"""Of the source and of the detectors in the collection "fibre", in air."""
+MAX_ABSORPTION_RATIO = 10.0
+"""Largest sigma_a/sigma_s' in the domain."""
+MIN_REDUCED_RADIUS, MAX_REDUCED_RADIUS = 0.02, 50.0
+"""Range of r sigma_s' in the domain."""
+MAX_RELATIVE_ERROR = 0.03
+"""Standard error of the table itself, relative, up to which a point is in the domain."""
+
+_MOMENTS = 600  # Legendre orders for kappa: exact to rounding up to g = 0.95 and beyond
+
+
+class TableDomainError(ValueError):
+    """A medium or a collection that the table does not hold."""
+
+
+class Slopes(NamedTuple):
+    """Reflectance and its derivatives, broadcast alike."""
+
+    reflectance_per_mm2: FloatArray
+    """R, 1/mm^2."""
+    by_sigma_a: FloatArray
+    """dR/d sigma_a, 1/mm."""
+    by_sigma_s_prime: FloatArray
+    """dR/d sigma_s', 1/mm."""
+
+
+@dataclass(frozen=True, slots=True)
+class Medium:
+    """One (eta, g, collection) of the table, ready for `model.photon_kernels.evaluate`."""
+
+    coefficients: FloatArray
+    """B-spline coefficients of ln of the reduced reflectance, shape (radii, roots)."""
+    decay: FloatArray
+    """B-spline coefficients of kappa/sqrt(sigma_a/sigma_s'), shape (roots,)."""
+    log_error: FloatArray
+    """ln of the relative standard error at every other knot, shape (radii/2, roots/2)."""
+
+
+def reflectance(
+    radius_mm: ArrayLike,
+    sigma_a_per_mm: ArrayLike,
+    sigma_s_prime_per_mm: ArrayLike,
+    *,
+    eta: float = 1.4,
+    g: float = 0.8,
+    collection: Collection = "all",
+    core_mm: float = 0.0,
+    source_core_mm: float = 0.0,
+) -> FloatArray:
+    """Return the reflectance per area at a distance from the source.
+
+    Parameters
+    ----------
+    radius_mm
+        Distance from the beam, or between the centres of the fibres, mm, at least 0; more than 0
+        when both cores are points. Broadcast with the coefficients; fastest with the radii on the
+        last axis and coefficients of length 1 there.
+    sigma_a_per_mm, sigma_s_prime_per_mm
+        Absorption and reduced scattering, 1/mm, at least 0.
+    eta
+        Refractive index of the medium over that of its surroundings, 1 to 1.6.
+    g
+        Mean cosine of the Henyey-Greenstein phase function, see `asymmetries`.
+    collection
+        "all": a pencil beam at right angles and the light that leaves at any angle, 1/mm^2.
+        "fibre": source and detector of numerical aperture 0.22, the source's cone evenly filled;
+        power within the detector's cone over incident power, area and NA^2, which is the same
+        quantity where the light leaves like from a Lambertian surface.
+    core_mm, source_core_mm
+        Diameters of the detector's and the source's core, over which the profile is averaged.
+
+    Returns
+    -------
+    ndarray
+        R in 1/mm^2; 0 where there is no scattering. Outside `domain` it is an extrapolation.
+
+    Raises
+    ------
+    TableDomainError
+        For an eta, g or collection that the table does not hold.
+    ValueError
+        For negative or non-finite arguments, or a radius of 0 between points (R is infinite there).
+
+    Examples
+    --------
+    >>> radius = np.array([0.3, 1.0, 3.0])
+    >>> reflectance(radius, 0.05, 1.5, collection="fibre", core_mm=0.2, source_core_mm=0.2).shape
+    (3,)
+    """
+    return derivatives(
+        radius_mm,
+        sigma_a_per_mm,
+        sigma_s_prime_per_mm,
+        eta=eta,
+        g=g,
+        collection=collection,
+        core_mm=core_mm,
+        source_core_mm=source_core_mm,
+    ).reflectance_per_mm2
+
+
+def derivatives(
+    radius_mm: ArrayLike,
+    sigma_a_per_mm: ArrayLike,
+    sigma_s_prime_per_mm: ArrayLike,
+    *,
+    eta: float = 1.4,
+    g: float = 0.8,
+    collection: Collection = "all",
+    core_mm: float = 0.0,
+    source_core_mm: float = 0.0,
+) -> Slopes:
+    """Return the reflectance and its derivatives by both coefficients.
+
+    Parameters and errors as :func:`reflectance`. The derivatives are those of the spline itself;
+    without scattering both are 0.
+
+    Examples
+    --------
+    >>> slopes = derivatives(2.0, [0.0, 0.01], 1.0)
+    >>> bool(np.all(slopes.by_sigma_a < 0.0))
+    True
+    """
+    medium = prepare(eta, g, collection)
+    radius = _not_negative("radius_mm", radius_mm)
+    sigma_a = _not_negative("sigma_a_per_mm", sigma_a_per_mm)
+    sigma_s = _not_negative("sigma_s_prime_per_mm", sigma_s_prime_per_mm)
+    shape = np.broadcast_shapes(radius.shape, sigma_a.shape, sigma_s.shape)
+    columns = shape[-1] if shape else 1
+    one_radius_list = radius.ndim <= 1 or all(n == 1 for n in radius.shape[:-1])
+    by_rows = one_radius_list and all(x.ndim == 0 or x.shape[-1] == 1 for x in (sigma_a, sigma_s))
+    if by_rows:
+        leading = shape[:-1]
+        unique, index = np.unique(radius, return_inverse=True)
+        group = np.broadcast_to(index.reshape(1, -1), (1, columns))
+        sigma_a, sigma_s = (
+            np.broadcast_to(x if x.ndim == 0 else x[..., 0], leading).ravel()
+            for x in (sigma_a, sigma_s)
+        )
+    else:
+        radius, sigma_a, sigma_s = (np.broadcast_to(x, shape) for x in (radius, sigma_a, sigma_s))
+        unique, index = np.unique(radius, return_inverse=True)
+        group = index.reshape(-1, 1)
+        sigma_a, sigma_s = sigma_a.ravel(), sigma_s.ravel()
+    starts, log_distance, weight = _distances(unique, core_mm, source_core_mm)
+    scatters = sigma_s > 0.0
+    out = np.empty((3, sigma_a.size, group.shape[1]))
+    kernels.evaluate(
+        np.ascontiguousarray(sigma_a),
+        np.where(scatters, sigma_s, 1.0),
+        medium.coefficients,
+        medium.decay,
+        np.ascontiguousarray(group, dtype=np.int64),
+        starts,
+        log_distance,
+        weight,
+        out[0],
+        out[1],
+        out[2],
+    )
+    out[:, ~scatters] = 0.0
+    return Slopes(*(part.reshape(shape) for part in out))
+
+
+def by_asymmetry(
+    radius_mm: ArrayLike,
+    sigma_a_per_mm: ArrayLike,
+    sigma_s_prime_per_mm: ArrayLike,
+    *,
+    eta: float = 1.4,
+    g: float = 0.8,
+    collection: Collection = "all",
+    core_mm: float = 0.0,
+    source_core_mm: float = 0.0,
+    step: float = 0.05,
+) -> FloatArray:
+    """Return dR/dg, 1/mm^2, at constant sigma_s': a difference over 2 `step` (one-sided at ends).
+
+    Other parameters and errors as :func:`reflectance`.
+
+    Examples
+    --------
+    >>> slope = by_asymmetry([0.5, 20.0], 0.0, 1.0)
+    >>> bool(abs(slope[1]) < 0.1 * abs(slope[0]))
+    True
+    """
+    held = asymmetries()
+    low, high = max(g - step, held[0]), min(g + step, held[-1])
+    first, second = (
+        reflectance(
+            radius_mm,
+            sigma_a_per_mm,
+            sigma_s_prime_per_mm,
+            eta=eta,
+            g=value,
+            collection=collection,
+            core_mm=core_mm,
+            source_core_mm=source_core_mm,
+        )
+        for value in (low, high)
+    )
+    return np.asarray((second - first) / (high - low))
+
+
+def relative_error(
+    radius_mm: ArrayLike,
+    sigma_a_per_mm: ArrayLike,
+    sigma_s_prime_per_mm: ArrayLike,
+    *,
+    eta: float = 1.4,
+    g: float = 0.8,
+    collection: Collection = "all",
+) -> FloatArray:
+    """Return the standard error of the table itself over its value, broadcast.
+
+    From the scatter of independent batches of photons; infinite outside the table and where no
+    photons came. The errors of neighbouring radii and absorptions are correlated.
+
+    Examples
+    --------
+    >>> bool(relative_error(2.0, 0.05, 1.0) < 0.01)
+    True
+    """
+    medium = prepare(eta, g, collection)
+    radius, sigma_a, sigma_s = np.broadcast_arrays(
+        _not_negative("radius_mm", radius_mm),
+        _not_negative("sigma_a_per_mm", sigma_a_per_mm),
+        _not_negative("sigma_s_prime_per_mm", sigma_s_prime_per_mm),
+    )
+    scatters = (sigma_s > 0.0) & (radius > 0.0)
+    s = np.where(scatters, sigma_s, 1.0)
+    rho = np.where(scatters, radius * s, 1.0)
+    u = np.sqrt(sigma_a / s)
+    x = (np.log(rho) - kernels.RADIUS_START) / (2.0 * kernels.RADIUS_STEP)
+    y = np.log1p(u / kernels.ROOT_SCALE) / (2.0 * kernels.ROOT_STEP)
+    rows, columns = medium.log_error.shape
+    held = scatters & (x >= 0.0) & (x <= rows - 1) & (y <= columns - 1)
+    spline = RectBivariateSpline(np.arange(rows), np.arange(columns), medium.log_error, kx=1, ky=1)
+    value = np.exp(spline.ev(np.where(held, x, 0.0), np.where(held, y, 0.0)))
+    return np.asarray(np.where(held & (value < 0.5), value, np.inf))
+
+
+def domain(
+    radius_mm: ArrayLike,
+    sigma_a_per_mm: ArrayLike,
+    sigma_s_prime_per_mm: ArrayLike,
+    *,
+    eta: float = 1.4,
+    g: float = 0.8,
+    collection: Collection = "all",
+) -> NDArray[np.bool_]:
+    """Return where the table holds: r sigma_s', sigma_a/sigma_s' in range and its error <= 3 %.
+
+    Examples
+    --------
+    >>> domain([0.001, 2.0, 2.0, 200.0], [0.1, 0.1, 20.0, 0.1], 1.0).tolist()
+    [False, True, False, False]
+    """
+    radius, sigma_a, sigma_s = (
+        np.asarray(x, dtype=np.float64) for x in (radius_mm, sigma_a_per_mm, sigma_s_prime_per_mm)
+    )
+    error = relative_error(radius, sigma_a, sigma_s, eta=eta, g=g, collection=collection)
+    rho = radius * sigma_s
+    return np.asarray(
+        (error <= MAX_RELATIVE_ERROR)
+        & (sigma_a <= MAX_ABSORPTION_RATIO * sigma_s)
+        & (rho >= MIN_REDUCED_RADIUS)
+        & (rho <= MAX_REDUCED_RADIUS)
+    )
+
+
+def asymmetries() -> tuple[float, ...]:
+    """Return the values of g that the table holds, increasing; others between are interpolated.
+
+    Examples
+    --------
+    >>> 0.8 in asymmetries()
+    True
+    """
+    return tuple(float(x) for x in _stored()["g"])
+
+
+@lru_cache(maxsize=64)
+def prepare(eta: float, g: float, collection: Collection) -> Medium:
+    """Return one medium of the table, interpolated over eta and g.
+
+    Raises
+    ------
+    TableDomainError
+        For an eta, g or collection that the table does not hold.
+    """
+    stored = _stored()
+    if collection not in ("all", "fibre"):
+        raise TableDomainError(f'collection: got {collection!r}, expected "all" or "fibre"')
+    weight_g = _lagrange("g", stored["g"], float(g))
+    weight_eta = _lagrange("eta", stored["eta"], float(eta))
+    which = ("all", "fibre").index(collection)
+    weight = weight_g[:, None] * weight_eta
+    coefficients = np.einsum(
+        "ge,gexy->xy", weight, stored["coefficients"][:, which].astype(np.float64)
+    )
+    error = np.exp(stored["log_error"][:, which].astype(np.float64))
+    log_error = 0.5 * np.log(np.einsum("ge,gexy->xy", weight**2, error**2))
+    medium = Medium(np.ascontiguousarray(coefficients), decay_coefficients(float(g)), log_error)
+    for array in (medium.coefficients, medium.decay, medium.log_error):
+        array.flags.writeable = False
+    return medium
+
+
+def decay_coefficients(g: float) -> FloatArray:
+    """Return the B-spline coefficients of kappa/sqrt(sigma_a/sigma_s'), shape (ROOT_COUNT,)."""
+    root = kernels.ROOT_SCALE * np.expm1(kernels.ROOT_STEP * np.arange(kernels.ROOT_COUNT - 2))
+    ratio = np.array([np.sqrt(3.0), *(asymptotic_decay(u * u, g) / u for u in root[1:])])
+    return np.linalg.solve(root_spline_matrix(), np.append(ratio, (0.0, 0.0)))
+
+
+def asymptotic_decay(absorption_ratio: float, g: float) -> float:
+    """Return kappa/sigma_s' of the light far from any source, for sigma_a/sigma_s' > 0.
+
+    The largest eigenvalue 1/kappa of the equations of the Legendre moments of the radiance; it
+    tends to the diffusion's sqrt(3 sigma_a (sigma_a + sigma_s')) for weak absorption.
+
+    References
+    ----------
+    Case and Zweifel 1967, Linear Transport Theory, chapter 8.
+
+    Examples
+    --------
+    >>> round(float(asymptotic_decay(1e-6, 0.8) / np.sqrt(3e-6)), 5)
+    1.0
+    >>> k = asymptotic_decay(1.0, 0.0)  # isotropic: (c/2 k) ln((1 + k)/(1 - k)) = 1, c = 1/2
+    >>> round(float(0.25 / (k / 2) * np.log((1 + k / 2) / (1 - k / 2))), 9)
+    1.0
+    """
+    order = np.arange(_MOMENTS)
+    removed = absorption_ratio + (1.0 - g**order) / (1.0 - g)
+    ell = order[1:]
+    off = ell / np.sqrt((2.0 * ell - 1.0) * (2.0 * ell + 1.0) * removed[:-1] * removed[1:])
+    largest = eigh_tridiagonal(
+        np.zeros(_MOMENTS),
+        off,
+        eigvals_only=True,
+        select="i",
+        select_range=(_MOMENTS - 1, _MOMENTS - 1),
+    )
+    return float(1.0 / largest[0])
+
+
+def root_spline_matrix() -> FloatArray:
+    """Return what makes B-spline coefficients over the roots from values at the knots and two 0s.
+
+    The last two rows: no slope at sigma_a = 0 (reflectance is even in the root up to its cube),
+    and one cubic over the last two intervals.
+    """
+    count = kernels.ROOT_COUNT
+    matrix = np.zeros((count, count))
+    for k in range(count - 2):
+        matrix[k, k : k + 3] = (1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0)
+    matrix[-2, :3] = (-0.5, 0.0, 0.5)
+    matrix[-1, -5:] = (1.0, -4.0, 6.0, -4.0, 1.0)
+    return matrix
+
+
+@lru_cache(maxsize=1)
+def _stored() -> dict[str, NDArray[np.generic]]:
+    with (files("model") / "data" / "photon_table.npz").open("rb") as stream:
+        with np.load(stream, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+
+
+def _lagrange(name: str, nodes: NDArray[np.generic], value: float) -> FloatArray:
+    """Return the weights of the (up to) four nearest nodes for cubic interpolation."""
+    x = nodes.astype(np.float64)
+    if not x[0] - 1e-9 <= value <= x[-1] + 1e-9:
+        raise TableDomainError(
+            f"{name}: got {value}, expected {x[0]:g} to {x[-1]:g}, which the photon table holds"
+        )
+    weight = np.zeros(x.size)
+    count = min(4, x.size)
+    first = min(max(int(np.searchsorted(x, value)) - count // 2, 0), x.size - count)
+    for k in range(first, first + count):
+        others = np.delete(x[first : first + count], k - first)
+        weight[k] = np.prod((value - others) / (x[k] - others))
+    return weight
+
+
+def _distances(
+    radii: FloatArray, core_mm: float, source_core_mm: float
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    """Return starts, logarithms of distances and weights of the averages over the cores."""
+    if core_mm == 0.0 and source_core_mm == 0.0:
+        if np.any(radii == 0.0):
+            raise ValueError("radius_mm: got 0 between points, where R is infinite; expected > 0")
+        return np.arange(radii.size + 1), np.log(radii), np.ones(radii.size)
+    rules = [distance_rule(float(r), core_mm, source_core_mm) for r in radii]
+    starts = np.cumsum([0, *(node.size for node, _ in rules)])
+    if not rules:
+        return starts.astype(np.int64), np.empty(0), np.empty(0)
+    return (
+        starts.astype(np.int64),
+        np.log(np.concatenate([node for node, _ in rules])),
+        np.concatenate([weight for _, weight in rules]),
+    )
+
+
+def _not_negative(name: str, value: ArrayLike) -> FloatArray:
+    array = np.asarray(value, dtype=np.float64)
+    if not np.all((array >= 0.0) & (array < np.inf)):
+        raise ValueError(f"{name}: got negative or non-finite values, expected at least 0")
+    return array

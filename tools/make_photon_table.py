@@ -1,0 +1,493 @@
+"""Make model/data/photon_table.npz: reflectance around a beam on semi-infinite turbid media.
+
+Run from the repository root, ``python tools/make_photon_table.py WORK`` with a folder for
+intermediate results; each asymmetry g and collection is one checkpoint there, and the table is made
+of those that exist. See `main` for options.
+
+White Monte Carlo with sigma_s' = 1 and no absorption: photons are histogrammed over the radius and
+the length of their path, and absorption is put in afterwards. What makes few photons enough:
+
+- One walk serves all indices of refraction. It is driven by the largest, which reflects most;
+  beside the photon go its relative weights for the others, multiplied by the ratio of the Fresnel
+  reflectances at every hit of the surface.
+- Photons that are far out for the length of their path are split and those near the middle of the
+  cloud, and long ones, are thinned, after the diffusion's exp(-3 r^2/(4 L)) to the power 0.6. So
+  large radii and strong absorption get as many photons as weak absorption gets.
+- At the surface the expected transmitted part is scored, not a random choice.
+- "fibre": each shallow collision scores what it sends directly into the fibre's cone (next-event
+  estimation), in one direction drawn inside the cone.
+- Paths longer than 3000 transport lengths are continued by the diffusion's L^(-5/2) law, whose
+  constant is taken from the last factor of two of the histogram.
+
+The sampler (the generator sfc64, the walk, the scoring) is written for this table alone; the
+simulated rigs have another one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from itertools import product
+from math import cos, exp, log, pi, sin, sqrt
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+from scipy.interpolate import BSpline
+
+from model import photon_kernels as kernels
+from model import photon_table
+
+ETAS = np.array([1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6])
+NUMERICAL_APERTURE = 0.22
+LOG_RADIUS_START, LOG_RADIUS_STEP, RADIUS_BINS = log(0.005), 0.1, 94  # 0.005 to 60
+LOG_PATH_START, LOG_PATH_STEP, PATH_BINS = log(0.005), 0.04, 333  # 0.005 to 3050
+PATH_END = 3000.0
+LATE_BIN = 316  # paths of 1541 and longer tell the constant of the law that continues them
+COLLECTIONS = ("all", "fibre")
+# Photons a batch: about equal times but for g = 0 and 0.5, which need fewer.
+PHOTONS = {0.8: 250_000, 0.9: 125_000, 0.95: 50_000, 0.7: 125_000, 0.5: 80_000, 0.0: 80_000}
+BATCHES = 32
+ROOT_ABSORPTIONS = 0.1 * np.expm1(np.linspace(0.0, log(41.0), 25))  # 0 to 4: sigma_a <= 16
+SPLIT_POWER, SPLIT_LIMIT = 0.6, 15.0
+NARROW = 1.0 / 1.4**2  # the part of the sine squared that the cone of eta = 1.4 fills
+NARROW_SHARE = 0.75  # directions drawn in the cone of eta = 1.4, the others in that of eta = 1
+STACK = 4096
+RELIABLE = 0.15  # relative error of a ring up to which it is used
+FOLDS = 8  # of the jackknife
+MODEL_ERROR = 5e-4  # of the splines themselves, relative
+_UNIT = 2.0**-53
+_ELEVEN, _24, _3, _40, _ONE = (np.uint64(n) for n in (11, 24, 3, 40, 1))
+
+
+@njit(inline="always")
+def _draw(state):
+    """Step sfc64 (C. Doty-Humphrey, PractRand); uniform in (0, 1]."""
+    word = state[0] + state[1] + state[3]
+    state[3] += _ONE
+    state[0] = state[1] ^ (state[1] >> _ELEVEN)
+    state[1] = state[2] + (state[2] << _3)
+    state[2] = ((state[2] << _24) | (state[2] >> _40)) + word
+    return (np.float64(word >> _ELEVEN) + 1.0) * _UNIT
+
+
+@njit(inline="always")
+def _reflected(mu, eta):
+    """Fresnel reflectance from inside at the cosine mu."""
+    sin2 = eta * eta * (1.0 - mu * mu)
+    if eta == 1.0:
+        return 0.0
+    if sin2 >= 1.0:
+        return 1.0
+    out = sqrt(1.0 - sin2)
+    a = (eta * mu - out) / (eta * mu + out)
+    b = (mu - eta * out) / (mu + eta * out)
+    return 0.5 * (a * a + b * b)
+
+
+@njit(inline="always")
+def _cone_sine2(state, aperture2):
+    """Draw a squared sine inside the cone of eta = 1; also its density over the uniform one."""
+    if _draw(state) <= NARROW_SHARE:
+        s = NARROW * aperture2 * _draw(state)
+    else:
+        s = aperture2 * _draw(state)
+    density = 1.0 - NARROW_SHARE
+    if s <= NARROW * aperture2:
+        density += NARROW_SHARE / NARROW
+    return s, density
+
+
+@njit(inline="always")
+def _score(hist, e, radius2, path, weight):
+    i = int((0.5 * log(radius2 + 1e-300) - LOG_RADIUS_START) / LOG_RADIUS_STEP + 1.0)
+    j = int((log(path) - LOG_PATH_START) / LOG_PATH_STEP)
+    if i < 1 or i > RADIUS_BINS or j < 0 or j >= PATH_BINS:
+        return
+    hist[e, i - 1, j, 0] += weight
+    hist[e, i - 1, j, 1] += weight * path
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def walk(photons, seed, g, fibre, etas, hist):
+    """Trace photons into `hist`, (etas, radii, paths, 2): weights and weights times path."""
+    state = np.empty(4, np.uint64)
+    for k in range(3):
+        state[k] = seed[k]
+    state[3] = _ONE
+    for _ in range(16):
+        _draw(state)
+    n_eta = etas.size
+    top = n_eta - 1
+    sigma = 1.0 / (1.0 - g)
+    aperture2 = NUMERICAL_APERTURE**2
+    stack = np.empty((STACK, 9 + n_eta))
+    v = np.empty(n_eta)
+    collisions = 0
+    for _photon in range(photons):
+        x = y = z = path = 0.0
+        ux = uy = 0.0
+        uz = 1.0
+        weight = 1.0
+        for e in range(n_eta):
+            v[e] = 1.0 - _reflected(1.0, etas[e])
+        if fibre:
+            s2, density = _cone_sine2(state, aperture2)
+            uz = sqrt(1.0 - s2)
+            ux = sqrt(s2)
+            for e in range(n_eta):
+                inside = s2 * etas[e] ** 2 <= aperture2
+                v[e] = etas[e] ** 2 / density * (1.0 - _reflected(uz, etas[e])) if inside else 0.0
+        check = 0.25
+        depth = 0
+        alive = True
+        while True:
+            if not alive:
+                if depth == 0:
+                    break
+                depth -= 1
+                x, y, z = stack[depth, 0], stack[depth, 1], stack[depth, 2]
+                ux, uy, uz = stack[depth, 3], stack[depth, 4], stack[depth, 5]
+                path, weight, check = stack[depth, 6], stack[depth, 7], stack[depth, 8]
+                for e in range(n_eta):
+                    v[e] = stack[depth, 9 + e]
+                alive = True
+            step = -log(_draw(state)) / sigma
+            if z + uz * step < 0.0:  # up to the surface
+                step = -z / uz
+                x += ux * step
+                y += uy * step
+                z = 0.0
+                path += step
+                mu = -uz
+                uz = mu
+                reflected_top = _reflected(mu, etas[top])
+                radius2 = x * x + y * y
+                for e in range(n_eta):
+                    if v[e] > 0.0:
+                        reflected = _reflected(mu, etas[e])
+                        if reflected < 1.0 and not fibre:
+                            _score(hist, e, radius2, path, weight * v[e] * (1.0 - reflected))
+                        v[e] *= reflected / reflected_top
+                if _draw(state) > reflected_top:
+                    alive = False
+                continue
+            x += ux * step
+            y += uy * step
+            z += uz * step
+            path += step
+            if path > PATH_END:
+                alive = False
+                continue
+            collisions += 1
+            if fibre and z * sigma < 14.0:
+                s2, density = _cone_sine2(state, aperture2)
+                mu = sqrt(1.0 - s2)
+                tau = z * sigma / mu
+                kept = exp(-tau)
+                if tau > 3.0:
+                    kept = 0.049787068367863944 if _draw(state) <= kept * exp(3.0) else 0.0
+                if kept > 0.0:
+                    sine = sqrt(s2)
+                    phi = 2.0 * pi * _draw(state)
+                    dx, dy = sine * cos(phi), sine * sin(phi)
+                    c = ux * dx + uy * dy - uz * mu
+                    h = 1.0 + g * g - 2.0 * g * c
+                    phase = (1.0 - g * g) / (4.0 * pi * h * sqrt(h))
+                    part = weight * kept * phase * pi / (mu * density)
+                    px, py = x + dx * z / mu, y + dy * z / mu
+                    radius2 = px * px + py * py
+                    for e in range(n_eta):
+                        if v[e] > 0.0 and s2 * etas[e] ** 2 <= aperture2:
+                            through = 1.0 - _reflected(mu, etas[e])
+                            _score(hist, e, radius2, path + z / mu, part * v[e] * through)
+            # scatter
+            if g == 0.0:
+                c = 2.0 * _draw(state) - 1.0
+            else:
+                q = (1.0 - g * g) / (1.0 + g - 2.0 * g * _draw(state))
+                c = (1.0 + g * g - q * q) / (2.0 * g)
+                c = min(1.0, max(-1.0, c))
+            a, b, h = 1.0, 1.0, 2.0
+            while h > 1.0:  # von Neumann's azimuth: the doubled angle of a point in a disc
+                a, b = 2.0 * _draw(state) - 1.0, 2.0 * _draw(state) - 1.0
+                h = a * a + b * b
+            sine = sqrt(1.0 - c * c) / h
+            a, b = sine * (a * a - b * b), 2.0 * sine * a * b
+            # frame about u by Duff et al. 2017 (JCGT 6:1)
+            sign = 1.0 if uz >= 0.0 else -1.0
+            m = -1.0 / (sign + uz)
+            n = ux * uy * m
+            tx, ty, tz = 1.0 + sign * ux * ux * m, sign * n, -sign * ux
+            bx, by, bz = n, sign + uy * uy * m, -uy
+            nx = a * tx + b * bx + c * ux
+            ny = a * ty + b * by + c * uy
+            nz = a * tz + b * bz + c * uz
+            norm = 1.5 - 0.5 * (nx * nx + ny * ny + nz * nz)
+            ux, uy, uz = nx * norm, ny * norm, nz * norm
+            if path >= check:
+                check = path + max(0.25, 0.05 * path)
+                distance = 0.75 * (x * x + y * y) / path
+                wanted = exp(-SPLIT_POWER * min(distance, SPLIT_LIMIT)) * sqrt(
+                    max(1.0, 0.25 * path)
+                )
+                ratio = weight / wanted
+                if ratio > 2.0 or ratio < 0.5:
+                    ratio = min(ratio, 8.0)
+                    copies = int(ratio + _draw(state) - 1e-16)
+                    weight /= ratio
+                    if copies == 0:
+                        alive = False
+                    for _ in range(min(copies - 1, STACK - depth)):
+                        stack[depth, 0], stack[depth, 1], stack[depth, 2] = x, y, z
+                        stack[depth, 3], stack[depth, 4], stack[depth, 5] = ux, uy, uz
+                        stack[depth, 6], stack[depth, 7], stack[depth, 8] = path, weight, check
+                        for e in range(n_eta):
+                            stack[depth, 9 + e] = v[e]
+                        depth += 1
+    return collisions
+
+
+def radius_edges():
+    return np.exp(LOG_RADIUS_START + LOG_RADIUS_STEP * np.arange(RADIUS_BINS + 1))
+
+
+def absorb(hist, absorptions):
+    """Reweight one batch's histogram to absorptions: (etas, radii, absorptions)."""
+    weight, moment = hist[..., 0], hist[..., 1]
+    low = np.exp(LOG_PATH_START + LOG_PATH_STEP * np.arange(PATH_BINS))
+    spread2 = (low * np.expm1(LOG_PATH_STEP)) ** 2 / 12.0
+    path = np.where(weight > 0.0, moment / np.where(weight > 0.0, weight, 1.0), low)
+    out = np.empty((*weight.shape[:2], absorptions.size))
+    for k, a in enumerate(absorptions):
+        out[..., k] = np.sum(weight * np.exp(-a * path) * (1.0 + 0.5 * a * a * spread2), axis=2)
+    return out
+
+
+def simulate(folder, g, collection, photons, batches):
+    """Trace what is missing of `batches` batches of `photons`, keeping each in `folder`."""
+    name = folder / f"g{g:g}-{collection}-{photons}.npz"
+    rings, late = [], []
+    seconds = 0.0
+    if name.exists():
+        with np.load(name) as stored:
+            rings, late = list(stored["rings"]), list(stored["late"])
+            seconds = float(stored["seconds"])
+    for batch in range(len(rings), batches):
+        entropy = (19, round(100 * g), COLLECTIONS.index(collection), batch)
+        seed = np.random.SeedSequence(entropy).generate_state(3, np.uint64)
+        hist = np.zeros((ETAS.size, RADIUS_BINS, PATH_BINS, 2))
+        start = time.process_time()
+        walk(photons, seed, g, collection == "fibre", ETAS, hist)
+        seconds += time.process_time() - start
+        rings.append(absorb(hist, ROOT_ABSORPTIONS**2) / photons)
+        late.append(hist[:, :, LATE_BIN:, 0].sum(axis=(1, 2)) / photons)
+        part = name.with_suffix(".part.npz")
+        np.savez(part, rings=rings, late=late, seconds=seconds)
+        part.replace(name)
+    print(f"{name.name}: {len(rings)} x {photons} photons, {seconds:.0f} s", flush=True)
+
+
+def continued(stored, batches):
+    """Return mean and standard error of R on (etas, rings, absorptions) over some batches.
+
+    The L^(-5/2) law of paths beyond PATH_END is in the mean; its constant is that of all batches.
+    """
+    edges = radius_edges()
+    area = pi * np.diff(edges**2)
+    centre2 = 0.5 * (edges[1:] ** 2 + edges[:-1] ** 2)
+    start = exp(LOG_PATH_START + LOG_PATH_STEP * LATE_BIN)
+    node, weight = np.polynomial.legendre.leggauss(64)
+    node, weight = 0.5 * (node + 1.0), 0.5 * weight
+    path = start + (PATH_END - start) * node
+    inside = path**-1.5 * 4.0 / 3.0 * pi * -np.expm1(-0.75 * edges[-1] ** 2 / path)
+    law = stored["late"].mean(axis=0) / ((PATH_END - start) * weight @ inside)
+    root = node / sqrt(PATH_END)  # L = root^-2, L^-5/2 dL = 2 root^2 droot
+    shape = np.exp(
+        -0.75 * centre2[:, None, None] * root**2 - ROOT_ABSORPTIONS[:, None] ** 2 / root**2
+    )
+    late = shape @ (2.0 * root**2 * weight / sqrt(PATH_END))
+    rings = stored["rings"][batches] / area[:, None]
+    mean = rings.mean(axis=0) + law[:, None, None] * late
+    error = rings.std(axis=0, ddof=1) / sqrt(len(rings))
+    return mean, error
+
+
+def basis(x):
+    """Return the B-splines over ln(r) at x, shape (..., RADIUS_COUNT)."""
+    p = (np.asarray(x) - kernels.RADIUS_START) / kernels.RADIUS_STEP
+    knots = np.arange(-3, kernels.RADIUS_COUNT + 1)
+    return BSpline.design_matrix(p.ravel(), knots.astype(float), 3, extrapolate=True).toarray()
+
+
+def reference(x, kappa):
+    """Return ln of the diffusion's law that the table is relative to."""
+    d = np.sqrt(np.exp(2.0 * x) + 1.0)
+    return np.log1p(kappa * d) - 3.0 * np.log(d) - kappa * d
+
+
+def reliable(error):
+    """Return a smoothed copy of the rings' relative errors, and which rings are to be used."""
+    smooth = error.copy()
+    for shift in (1, 2):
+        smooth[shift:-shift] = np.exp(
+            (
+                np.log(smooth[: -2 * shift])
+                + np.log(smooth[shift:-shift])
+                + np.log(smooth[2 * shift :])
+            )
+            / 3.0
+        )
+    return smooth, (smooth < RELIABLE) & (error < 2.0 * RELIABLE)
+
+
+def fit(mean, error, kappa, roughness):
+    """Fit one profile: spline coefficients of ln(R/reference), and the rings used.
+
+    Differences of the slope between knots are taken as drawn from N(0, roughness); beyond six
+    transport lengths those of the value from N(0, 0.04), which continues the profile by the
+    diffusion's law where photons end.
+    """
+    edges = LOG_RADIUS_START + LOG_RADIUS_STEP * np.arange(RADIUS_BINS + 1)
+    centre = 0.5 * (edges[1:] + edges[:-1])
+    node, weight = np.polynomial.legendre.leggauss(4)
+    inner = centre[:, None] + 0.5 * LOG_RADIUS_STEP * node
+    ring_weight = weight * np.exp(2.0 * (inner - centre[:, None]))
+    ring_weight /= ring_weight.sum(axis=1, keepdims=True)
+    safe = np.maximum(mean, 1e-300)
+    relative, used = reliable(np.where(error > 0.0, np.maximum(error / safe, 1e-4), 10.0))
+    bend = np.diff(np.eye(kernels.RADIUS_COUNT), 2, axis=0) / roughness
+    knots = kernels.RADIUS_START + kernels.RADIUS_STEP * np.arange(kernels.RADIUS_COUNT - 1)
+    far = np.diff(np.eye(kernels.RADIUS_COUNT), axis=0)[knots > log(6.0)] / 0.04
+    penalty = bend.T @ bend + far.T @ far
+    design, inner_design = basis(centre), basis(inner).reshape(*inner.shape, -1)
+    correction = np.zeros(centre.size)  # ln of a ring's mean over the value at its centre
+    log_reference = reference(centre, kappa)
+    for _ in range(3):
+        target = np.log(safe) - log_reference - correction
+        weighted = (design / relative[:, None] ** 2)[used]
+        coefficients = np.linalg.solve(
+            weighted.T @ design[used] + penalty, weighted.T @ target[used]
+        )
+        shape = reference(inner, kappa) - log_reference[:, None]
+        shape += inner_design @ coefficients - (design @ coefficients)[:, None]
+        correction = np.log(np.sum(ring_weight * np.exp(shape), axis=1))
+    return coefficients, used
+
+
+def profiles(stored, batches, kappas, roughness):
+    """Fit all profiles of some batches: coefficients (etas, radii, roots), and rings used."""
+    mean, error = continued(stored, batches)
+    out = np.empty((ETAS.size, kernels.RADIUS_COUNT, ROOT_ABSORPTIONS.size))
+    used = np.empty(mean.shape, bool)
+    for e, k in np.ndindex(ETAS.size, ROOT_ABSORPTIONS.size):
+        out[e, :, k], used[e, :, k] = fit(mean[e, :, k], error[e, :, k], kappas[k], roughness)
+    return out, used
+
+
+def choose_roughness(stored, kappas):
+    """Return the roughness whose fits to one half of the batches predict the other half best."""
+    count = len(stored["rings"])
+    halves = np.arange(0, count, 2), np.arange(1, count, 2)
+    centre = LOG_RADIUS_START + LOG_RADIUS_STEP * (np.arange(RADIUS_BINS) + 0.5)
+    best = (np.inf, 0.0)
+    for roughness in (0.01, 0.02, 0.03, 0.05, 0.1, 0.2):
+        loss = 0.0
+        for first, second in (halves, halves[::-1]):
+            mean, error = continued(stored, second)
+            fitted, used = profiles(stored, first, kappas, roughness)
+            for e, k in product((0, 4), range(0, ROOT_ABSORPTIONS.size, 3)):
+                # the ring means of smooth profiles and their values at the centre differ alike
+                other, used_too = fit(mean[e, :, k], error[e, :, k], kappas[k], 1.0)
+                both = used[e, :, k] & used_too
+                relative = (error / np.maximum(mean, 1e-300))[e, both, k]
+                gap = (basis(centre) @ (fitted[e, :, k] - other))[both]
+                loss += np.sum((gap / np.maximum(relative, 1e-4)) ** 2)
+        print(f"  roughness {roughness}: {loss:.0f}", flush=True)
+        best = min(best, (loss, roughness))
+    return best[1]
+
+
+def tabulate(stored, g):
+    """Return spline coefficients (etas, radii, roots) and ln of errors on every other knot."""
+    kappas = np.array(
+        [0.0, *(photon_table.asymptotic_decay(u * u, g) for u in ROOT_ABSORPTIONS[1:])]
+    )
+    roughness = choose_roughness(stored, kappas)
+    everything = np.arange(len(stored["rings"]))
+    values, used = profiles(stored, everything, kappas, roughness)
+    knots = kernels.RADIUS_START + kernels.RADIUS_STEP * np.arange(0, kernels.RADIUS_COUNT - 2, 2)
+    at = basis(knots)
+    left_out = np.stack(
+        [
+            np.einsum(
+                "pr,erk->epk",
+                at,
+                profiles(stored, np.delete(everything, np.s_[fold::FOLDS]), kappas, roughness)[0],
+            )
+            for fold in range(FOLDS)
+        ]
+    )
+    variance = (FOLDS - 1) ** 2 / FOLDS * left_out.var(axis=0, ddof=1) + MODEL_ERROR**2
+    centre = LOG_RADIUS_START + LOG_RADIUS_STEP * (np.arange(RADIUS_BINS) + 0.5)
+    for e, k in np.ndindex(ETAS.size, ROOT_ABSORPTIONS.size):
+        held = centre[used[e, :, k]]
+        beyond = knots > held.max() + 0.5 * kernels.RADIUS_STEP if held.size else knots > -99.0
+        variance[e, beyond, k] = 1.0
+    full = np.zeros((ETAS.size, kernels.RADIUS_COUNT, kernels.ROOT_COUNT))
+    full[:, :, : ROOT_ABSORPTIONS.size] = values
+    coefficients = np.linalg.solve(
+        photon_table.root_spline_matrix(),
+        np.swapaxes(full, 1, 2).reshape(ETAS.size, -1, kernels.RADIUS_COUNT),
+    )
+    return np.swapaxes(coefficients, 1, 2), 0.5 * np.log(variance[:, :, ::2])
+
+
+def make_table(folder):
+    """Write model/data/photon_table.npz of the asymmetries whose collections are both there."""
+    held, coefficients, errors = [], [], []
+    for g in sorted(PHOTONS):
+        names = [folder / f"g{g:g}-{collection}-{PHOTONS[g]}.npz" for collection in COLLECTIONS]
+        if not all(name.exists() for name in names):
+            continue
+        pair = []
+        for name in names:
+            with np.load(name) as arrays:
+                stored = {key: arrays[key] for key in ("rings", "late")}
+            print(f"{name.name}: {len(stored['rings'])} batches", flush=True)
+            pair.append(tabulate(stored, g))
+        held.append(g)
+        coefficients.append([value for value, _ in pair])
+        errors.append([error for _, error in pair])
+    target = Path("model/data/photon_table.npz")
+    np.savez_compressed(
+        target,
+        g=np.array(held),
+        eta=ETAS,
+        coefficients=np.array(coefficients, np.float32),
+        log_error=np.array(errors, np.float16),
+    )
+    print(f"{target}: {target.stat().st_size / 1e3:.0f} kB")
+
+
+def main():
+    """Trace photons and make the table of all there are.
+
+    ``--trace-only`` leaves the table alone, ``--table-only`` traces nothing.
+    """
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--trace-only", action="store_true")
+    parser.add_argument("--table-only", action="store_true")
+    arguments = parser.parse_args()
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    if not arguments.table_only:
+        for g, photons in PHOTONS.items():
+            for collection in reversed(COLLECTIONS):
+                simulate(arguments.work, g, collection, photons, BATCHES)
+    if not arguments.trace_only:
+        make_table(arguments.work)
+
+
+if __name__ == "__main__":
+    main()
