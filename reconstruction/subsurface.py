@@ -47,7 +47,6 @@ from model.fresnel import ETA_SKIN
 from reconstruction import subsurface_kernels as kernels
 from reconstruction.subsurface_models import (
     METHODS,
-    STRATA,
     Collection,
     Method,
     ProfileModel,
@@ -85,6 +84,8 @@ SHARE = 0.6827
 """Of the interval."""
 START_ERROR = 0.1
 """Relative error added for the comparison with starts."""
+RISE = 50.0
+"""A second valley of the misfit is tried when it begins no higher above the deepest."""
 BATCH = 8192
 """Profiles fitted at a time, for the size of temporaries."""
 
@@ -418,13 +419,11 @@ class _Work:
             weight = np.zeros(y.shape)
             np.divide(1.0, variance / safe**2 + START_ERROR**2, out=weight, where=seen)
         g = float(self.prior[3, 0])
-        self._run(model, chosen, y, variance, model.starts(logs, weight, g))
-        for stratum in range(STRATA):
-            bad = np.flatnonzero(self._misfits(chosen))
-            if bad.size == 0:
-                break
-            theta = model.starts(logs[bad], weight[bad], g, stratum)
-            self._run(model, chosen[bad], y[bad], variance[bad], theta, better=True)
+        best, second, rise = model.starts(logs, weight, g)
+        self._run(model, chosen, y, variance, best)
+        doubt = np.flatnonzero(np.isfinite(rise) & ((rise < RISE) | self._misfits(chosen)))
+        if doubt.size:
+            self._run(model, chosen[doubt], y[doubt], variance[doubt], second[doubt], better=True)
         for _ in range(2 if self.logarithmic else 0):
             off = np.where(seen, y - np.log(np.maximum(self.predicted[chosen], 1e-290)), 0.0)
             variance = _local_variance(model.radius_mm, off, seen)

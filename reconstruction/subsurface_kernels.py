@@ -410,6 +410,50 @@ def fit(
 
 
 @njit(cache=True, error_model="numpy")
+def valleys(score: Any, valley: Any, place: Any, depth: Any) -> None:
+    """Find the deepest two valleys of a misfit along its first axis.
+
+    Parameters
+    ----------
+    score : (N, S, K) float32
+        Infinite where there is no model.
+    valley : (2, N) int64
+        Index on the first axis, the deepest valley first.
+    place, depth : (2, N) float64
+        Index on the second axis of the least misfit there, and that misfit, from the parabola
+        through three nodes; an infinite depth where there is no second valley.
+    """
+    profiles, n_s, n_k = score.shape
+    at, low = np.empty(n_s), np.empty(n_s + 2)
+    for n in range(profiles):
+        low[:] = np.inf
+        for i in range(n_s):
+            row = score[n, i]
+            k = 0
+            for j in range(1, n_k):
+                if row[j] < row[k]:
+                    k = j
+            at[i], low[i + 1] = k, row[k]
+            if 0 < k < n_k - 1 and row[k - 1] < np.inf and row[k + 1] < np.inf:
+                lean = float(row[k + 1]) - row[k - 1]
+                bend = float(row[k + 1]) + row[k - 1] - 2.0 * row[k]
+                if bend > 0.0:
+                    at[i] -= 0.5 * lean / bend
+                    low[i + 1] -= 0.125 * lean * lean / bend
+        for v in range(2):
+            valley[v, n], place[v, n], depth[v, n] = 0, 0.0, np.inf
+        for i in range(n_s):
+            here = low[i + 1]
+            if here < np.inf and here <= low[i] and here <= low[i + 2]:
+                v = 0 if here < depth[0, n] else 1
+                if v == 0:
+                    valley[1, n], place[1, n], depth[1, n] = valley[0, n], place[0, n], depth[0, n]
+                elif here >= depth[1, n]:
+                    continue
+                valley[v, n], place[v, n], depth[v, n] = i, at[i], here
+
+
+@njit(cache=True, error_model="numpy")
 def evaluate(
     kind: Any, theta: Any, radius: Any, constants: Any, axes: Any, grid: Any, out: Any, slopes: Any
 ) -> None:

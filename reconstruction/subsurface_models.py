@@ -31,10 +31,8 @@ TABLE_SIGMA_S = (0.05, 50.0)
 TABLE_ERROR = np.array([0.005, 0.0])
 """Relative: the table's own noise."""
 START_SIGMA_TR = np.geomspace(0.01, 15.0, 40)
-START_SIGMA_S = np.geomspace(0.06, 50.0, 12)
-"""The pairs that each profile is compared with to find its start, 1/mm."""
-STRATA = 3
-"""Parts of `START_SIGMA_S` that a bad fit begins in again."""
+START_SIGMA_S = np.geomspace(0.06, 50.0, 16)
+"""The pairs that each profile is compared with to find its starts, 1/mm."""
 LEAST_LOG = -100.0
 """Logarithms of reflectance below this are as good as none, for starts."""
 
@@ -82,9 +80,12 @@ class ProfileModel:
         return np.asarray(theta[:, 0] - theta[:, 1] <= np.log(self.most_ratio))
 
     def starts(
-        self, log_reflectance: Floats, weight: Floats, g: float, stratum: int | None = None
-    ) -> Floats:
-        """Return for each profile the pair whose logarithms are nearest, (N, 4).
+        self, log_reflectance: Floats, weight: Floats, g: float
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return where fits begin: the valleys of the misfit of logarithms along sigma_s'.
+
+        For each sigma_s' of a grid the best sigma_tr is found, between its grid's nodes by the
+        parabola through three of them.
 
         Parameters
         ----------
@@ -92,21 +93,49 @@ class ProfileModel:
             Weight 0 where a logarithm means nothing.
         g : float
             Asymmetry to begin with.
-        stratum : int, optional
-            Part of `START_SIGMA_S`; all by default.
+
+        Returns
+        -------
+        best, second : ndarray, shape (N, 4)
+            Parameters in the deepest valley and in the next.
+        rise : ndarray, shape (N,)
+            How much worse the second is, as sum of weighted squares; infinite without a second.
         """
-        each = START_SIGMA_S if stratum is None else np.split(START_SIGMA_S, STRATA)[stratum]
-        k, s = np.meshgrid(START_SIGMA_TR, each, indexing="ij")
-        a = 0.5 * (np.sqrt(s**2 + 4.0 / 3.0 * k**2) - s)
-        theta = np.zeros((a.size, kernels.PARAMETERS))
-        theta[:, 0], theta[:, 1], theta[:, 3] = np.log(a).ravel(), np.log(s).ravel(), g
-        inside = np.all((theta >= self.bounds[:, 0]) & (theta <= self.bounds[:, 1]), axis=1)
-        inside &= theta[:, 0] - theta[:, 1] <= np.log(self.most_ratio) + 0.5
-        theta = theta[inside] if inside.any() else theta[:1]
-        curves = np.log(np.maximum(self.profiles(theta)[0], np.exp(LEAST_LOG)))
-        score = (weight * log_reflectance) @ (-2.0 * curves.T)
-        score += weight @ (curves**2).T
-        return np.asarray(theta[np.argmin(score, axis=1)])
+        log_k, log_s = np.log(START_SIGMA_TR), np.log(START_SIGMA_S)
+        theta = np.zeros((log_s.size, log_k.size, kernels.PARAMETERS))
+        theta[..., 0] = _log_absorption(log_k, log_s[:, None])
+        theta[..., 1], theta[..., 3] = log_s[:, None], g
+        outside = (theta[..., 0] - theta[..., 1] > np.log(self.most_ratio) + 0.5) | np.any(
+            (theta < self.bounds[:, 0]) | (theta > self.bounds[:, 1]), axis=2
+        )
+        profiles = self.profiles(theta.reshape(-1, kernels.PARAMETERS))[0]
+        curves = np.log(np.maximum(profiles, np.exp(LEAST_LOG)))
+        middle = np.median(curves, axis=0)  # single precision has digits enough for the rest
+        curves = (curves - middle).astype(np.float32)
+        weights = weight.astype(np.float32)
+        score = (weights * (log_reflectance - middle).astype(np.float32)) @ (-2.0 * curves.T)
+        score += weights @ (curves**2).T
+        score = score.reshape(-1, log_s.size, log_k.size)
+        score[:, outside] = np.inf
+        place, depth = np.empty((2, 2, len(score)))
+        valley = np.empty((2, len(score)), np.int64)
+        kernels.valleys(score, valley, place, depth)
+        ends = []
+        for which, at in zip(valley, place, strict=True):
+            start = np.zeros((which.size, kernels.PARAMETERS))
+            refined = log_k[0] + at * (log_k[1] - log_k[0])
+            start[:, 0] = _log_absorption(refined, log_s[which])
+            start[:, 1], start[:, 3] = log_s[which], g
+            ends.append(np.clip(start, self.bounds[:, 0], self.bounds[:, 1]))
+        rise = np.full(depth.shape[1], np.inf)
+        np.subtract(depth[1], depth[0], out=rise, where=np.isfinite(depth[1]))
+        return ends[0], ends[1], rise
+
+
+def _log_absorption(log_sigma_tr: Floats, log_sigma_s: Floats) -> Floats:
+    """Return log sigma_a of sigma_tr and sigma_s', without cancellation."""
+    x = 2.0 / 3.0 * np.exp(2.0 * (log_sigma_tr - log_sigma_s))
+    return np.asarray(log_sigma_s + np.log(x) - np.log1p(np.sqrt(1.0 + 2.0 * x)))
 
 
 def profile_model(
