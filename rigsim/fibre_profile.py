@@ -412,8 +412,8 @@ class _Plan:
         walk_to_fibres(
             self.table, self.fibres.source_numerical_aperture, self.fibres.numerical_aperture,
             self.kernels, self.starts, self.counts, window, self.chances,
-            WINDOW_CELLS / self.reach_mm, self.deeper_per_mm, self.chances_per_mm, PATH_STEP, PATH_SCALE_MM,
-            photons, seed.copy(), tally, histogram, visited,
+            WINDOW_CELLS / self.reach_mm, self.deeper_per_mm, self.chances_per_mm,
+            PATH_STEP, PATH_SCALE_MM, photons, seed.copy(), tally, histogram, visited,
         )  # fmt: skip
         return (histogram if self.counts_paths else tally), visited
 
