@@ -61,6 +61,7 @@ def merge_series(
     *,
     darks: DarkModel,
     noise: CameraNoise,
+    light_s: ArrayLike | None = None,
 ) -> MergedSeries:
     """Merge raw frames of one scene at several exposure times, and take off the dark signal.
 
@@ -73,6 +74,8 @@ def merge_series(
     darks : DarkModel
         At the frames' temperature.
     noise : CameraNoise
+    light_s : array_like, shape (N,), optional
+        How long the light lasted in each frame, s, > 0; None: as long as the exposure.
 
     Returns
     -------
@@ -98,16 +101,22 @@ def merge_series(
     stack = [np.asarray(frame) for frame in frames]
     times = np.asarray(exposures_s, np.float64)
     _check(stack, times, darks)
+    lit = times if light_s is None else np.asarray(light_s, np.float64)
+    _check(stack, lit, darks, "light_s")
     darks.require(times)
     order = np.argsort(times, kind="stable")
-    stack, times = [stack[k] for k in order], times[order]
+    stack, times, lit = [stack[k] for k in order], times[order], lit[order]
+    # what each frame shows without light is the same in all that follows
+    base = [noise.black_dn + darks.bias_dn + darks.rate_dn_per_s * t for t in times]
     shape = stack[0].shape
-    usable = _usable(stack, times, darks, noise)
+    usable = _usable(stack, lit, base, noise)
     hot = darks.hot
     # first by read noise alone, then with the noise of the light that was found
-    guess, seen = _weigh(stack, times, usable, darks, noise, np.zeros(shape))[:2]
+    guess, seen = _weigh(stack, times, lit, base, usable, darks, noise, np.zeros(shape))[:2]
     smooth = _smooth(guess, seen & ~hot, noise.pattern)
-    rate, seen, variance = _weigh(stack, times, usable, darks, noise, np.maximum(smooth, 0.0))
+    rate, seen, variance = _weigh(
+        stack, times, lit, base, usable, darks, noise, np.maximum(smooth, 0.0)
+    )
     valid = seen & ~hot
     rate, variance = np.where(valid, rate, 0.0), np.where(valid, variance, 0.0)
     span = noise.span_dn
@@ -140,7 +149,12 @@ def color_masks(shape: tuple[int, ...], pattern: str) -> list[NDArray[np.bool_]]
     return masks
 
 
-def _check(stack: list[NDArray[np.integer]], times: FloatArray, darks: DarkModel) -> None:
+def _check(
+    stack: list[NDArray[np.integer]],
+    times: FloatArray,
+    darks: DarkModel,
+    name: str = "exposures_s",
+) -> None:
     checks = Checks("Series of a probe", BracketError)
     checks.that("frames", len(stack), len(stack) > 0, "at least one frame")
     shapes = sorted({frame.shape for frame in stack})
@@ -148,14 +162,17 @@ def _check(stack: list[NDArray[np.integer]], times: FloatArray, darks: DarkModel
     checks.that("frames", shapes, shapes in ([], [expected]), f"the dark frames' shape {expected}")
     whole = all(np.issubdtype(frame.dtype, np.integer) for frame in stack)
     checks.that("frames", [str(f.dtype) for f in stack][:3], whole, "raw DN, whole numbers")
-    checks.that("exposures_s", times.shape, times.shape == (len(stack),), f"{len(stack)} times")
+    checks.that(name, times.shape, times.shape == (len(stack),), f"{len(stack)} times")
     positive = bool(np.isfinite(times).all() and (times > 0).all())
-    checks.that("exposures_s", times.tolist(), positive, "finite seconds > 0")
+    checks.that(name, times.tolist(), positive, "finite seconds > 0")
     checks.close()
 
 
 def _usable(
-    stack: list[NDArray[np.integer]], times: FloatArray, darks: DarkModel, noise: CameraNoise
+    stack: list[NDArray[np.integer]],
+    times: FloatArray,
+    base: list[FloatArray],
+    noise: CameraNoise,
 ) -> list[NDArray[np.bool_]]:
     """Return in which pixels each frame is not saturated, nor would be by chance."""
     gain, floor, span = noise.gain_e_per_dn, noise.floor_dn2, noise.span_dn
@@ -164,19 +181,18 @@ def _usable(
     time = np.zeros(shape)  # weighted seconds so far
     information = np.zeros(shape)  # inverse variance of the rate so far, s^2/DN^2
     result = []
-    for frame, t in zip(stack, times, strict=True):
+    for frame, t, dark in zip(stack, times, base, strict=True):
         unclipped = frame < noise.white_dn
-        dark = darks.bias_dn + darks.rate_dn_per_s * t
         rate = np.divide(signal, time, out=np.zeros(shape), where=time > 0)
         light = np.maximum(rate, 0.0) * t
         own = floor + light / gain
         with np.errstate(divide="ignore"):
             spread = np.sqrt(own + t * t / information)
         foreseen = spread < FORESIGHT * span
-        below = dark + light + MARGIN_SIGMAS * np.where(foreseen, spread, 0.0) < span
+        below = dark + light + MARGIN_SIGMAS * np.where(foreseen, spread, 0.0) < noise.white_dn
         use = unclipped & (below | ~foreseen)
         result.append(use)
-        value = frame.astype(np.float64) - noise.black_dn - dark
+        value = frame - dark
         weight = np.where(use, t / own, 0.0)
         signal += weight * value
         time += weight * t
@@ -187,26 +203,32 @@ def _usable(
 def _weigh(
     stack: list[NDArray[np.integer]],
     times: FloatArray,
+    lit: FloatArray,
+    base: list[FloatArray],
     usable: list[NDArray[np.bool_]],
     darks: DarkModel,
     noise: CameraNoise,
     light: FloatArray,
 ) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
     """Return rate, where any frame counts, and variance, DN/s, weighed for light of some rate."""
-    shape = stack[0].shape
-    shot = (light + max(darks.mean_rate_dn_per_s, 0.0)) / noise.gain_e_per_dn
-    signal, time, weights = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    for frame, t, use in zip(stack, times, usable, strict=True):
-        weight = np.where(use, t / (noise.floor_dn2 + shot * t), 0.0)
-        signal += weight * (frame - (noise.black_dn + darks.bias_dn))
-        time += weight * t
+    shape, gain = stack[0].shape, noise.gain_e_per_dn
+    current = max(darks.mean_rate_dn_per_s, 0.0) / gain
+    shot = light / gain
+    signal, time = np.zeros(shape), np.zeros(shape)
+    weights, dark_time = np.zeros(shape), np.zeros(shape)
+    for frame, t, t_light, dark, use in zip(stack, times, lit, base, usable, strict=True):
+        weight = np.where(use, t_light / (noise.floor_dn2 + current * t + shot * t_light), 0.0)
+        signal += weight * (frame - dark)
+        time += weight * t_light
         weights += weight
+        dark_time += weight * t
     seen = time > 0
     below = np.where(seen, time, 1.0)
-    offset = weights / below  # what a bias's error becomes, 1/s
+    # what errors of a pixel's bias and dark current become
+    by_bias, by_rate = weights / below, dark_time / below
     (bias2, both), (_, rate2) = darks.covariance
-    variance = 1.0 / below + bias2 * offset**2 + 2.0 * both * offset + rate2
-    return signal / below - darks.rate_dn_per_s, seen, variance
+    variance = 1.0 / below + bias2 * by_bias**2 + 2.0 * both * by_bias * by_rate
+    return signal / below, seen, variance + rate2 * by_rate**2
 
 
 def _smooth(values: FloatArray, valid: NDArray[np.bool_], pattern: str) -> FloatArray:

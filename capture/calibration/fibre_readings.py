@@ -100,6 +100,7 @@ def read_fibres(
     darks: DarkModel,
     noise: CameraNoise,
     temperature_c: float | None = None,
+    light_s: ArrayLike | None = None,
 ) -> FibreReadings:
     """Read the fibres from a series of exposures.
 
@@ -116,6 +117,8 @@ def read_fibres(
     noise : CameraNoise
     temperature_c : float, optional
         Of the camera during the series; the dark current is carried over to it.
+    light_s : array_like, shape (N,), optional
+        How long the light lasted in each frame, s, > 0; None: as long as the exposure.
 
     Returns
     -------
@@ -126,7 +129,9 @@ def read_fibres(
     BracketError, DarkError
         Where shapes, times or temperatures do not fit.
     """
-    merged = merge_series(frames, exposures_s, darks=darks.at(temperature_c), noise=noise)
+    merged = merge_series(
+        frames, exposures_s, darks=darks.at(temperature_c), noise=noise, light_s=light_s
+    )
     return sum_spots(merged, spots, noise=noise)
 
 

@@ -229,3 +229,20 @@ def test_sums_scale_with_the_aperture_not_with_the_light_around(fibre_camera):
         assert_consistent((readings.signal - camera.own_light(light, spots)) / readings.stderr)
         expected = 1e-4 * 28 * 100 / (camera.noise.gain_e_per_dn * camera.noise.span_dn)
         assert np.median(readings.around) == pytest.approx(expected, rel=0.05)
+
+
+def test_light_of_other_lengths_than_the_exposures_gives_the_same_rates(fibre_camera, rng):
+    camera = fibre_camera(rng)
+    light = np.full((28, 3), 100.0)
+    darks = camera.darks()
+    exposures = np.array([1.0, 5.0, 20.0])
+    lit = exposures * [0.98, 1.01, 1.005]
+    rate = camera.rate(light)
+    frames = [camera.expose(rate * on / t, t) for t, on in zip(exposures, lit, strict=True)]
+    truth = camera.own_light(light, spots_of(camera))
+    told = read(camera, frames, exposures, darks, light_s=lit)
+    assert_consistent((told.signal - truth) / told.stderr)
+    untold = read(camera, frames, exposures, darks)
+    assert np.abs((untold.signal - truth) / untold.stderr).mean() > 2
+    with pytest.raises(BracketError, match="light_s"):
+        read(camera, frames, exposures, darks, light_s=[1.0, 5.0, 0.0])
