@@ -41,6 +41,8 @@ class Evidence:
         PLY of the face in mm that takes the place of the session's own; None: the session's.
     basis
         Folder of MERL tables to fit surface lobes with; None: the generated dielectrics.
+    landmarks
+        Table of places on the face's texture; None: those that are known.
     hashes
         SHA-256 of everything that was read, by what it is.
     noted
@@ -55,6 +57,7 @@ class Evidence:
     on_date: date
     scan: bytes | None = None
     basis: Path | None = None
+    landmarks: Path | None = None
     assumed: list[str] = field(default_factory=list)
     hashes: dict[str, str] = field(default_factory=dict)
     noted: dict[str, Any] = field(default_factory=dict)
@@ -77,6 +80,7 @@ class Evidence:
         on_date: date | None,
         scan: str | Path | None = None,
         basis: str | Path | None = None,
+        landmarks: str | Path | None = None,
     ) -> Evidence:
         """Begin with what the session itself says that it assumed.
 
@@ -96,6 +100,9 @@ class Evidence:
         tables = None if basis is None else Path(basis)
         if tables is not None:
             hashes["basis"] = _digest_of(tables)
+        places = None if landmarks is None else Path(landmarks)
+        if places is not None:
+            hashes["landmarks"] = hashlib.sha256(places.read_bytes()).hexdigest()
         return Evidence(
             session=session,
             calibration=None if calibration is None else Path(calibration),
@@ -104,6 +111,7 @@ class Evidence:
             assumed=[str(text) for text in session.manifest.extra.get("assumed", [])],
             scan=mesh,
             basis=tables,
+            landmarks=places,
             hashes=hashes,
         )
 

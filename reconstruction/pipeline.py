@@ -12,7 +12,14 @@ from typing import Any
 from capture.session import Session
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from reconstruction import dome_stages, flash_stages, gradient_stages, stack_stages, stages
+from reconstruction import (
+    dome_stages,
+    flash_stages,
+    gradient_stages,
+    probe_stages,
+    stack_stages,
+    stages,
+)
 from reconstruction.evidence import Evidence, EvidenceError
 
 
@@ -44,6 +51,9 @@ RECIPES: Mapping[str, Recipe] = {
         gradient_stages.graph,
         gradient_stages.FILES,
         products=gradient_stages.products,
+    ),
+    "fibres": Recipe(
+        probe_stages.MAPS, probe_stages.graph, probe_stages.FILES, products=probe_stages.products
     ),
 }
 """By the kind of step that shows the subject."""
@@ -81,6 +91,7 @@ def reconstruct(
     on_date: date | None = None,
     scan: str | Path | None = None,
     basis: str | Path | None = None,
+    landmarks: str | Path | None = None,
     truth: str = "",
     progress: Callable[[str], None] | None = None,
 ) -> stages.Outcome:
@@ -106,6 +117,9 @@ def reconstruct(
     basis
         Folder of MERL ``.binary`` tables that surface lobes are fitted with, instead of the
         generated dielectrics.
+    landmarks
+        Table "name,x,y" of places on a probe's translucency map, pixels from its top left; None:
+        forehead, cheek and chin of the simulated heads' texture.
     truth
         Name of the TRUTH/ folder beside ``out``, for the report.
     progress
@@ -131,8 +145,9 @@ def reconstruct(
     if unknown:
         raise EvidenceError(f"want: got {unknown[0]!r}, expected names out of {known}")
     evidence = Evidence.of(
-        opened, calibration, state=state, on_date=on_date, scan=scan, basis=basis
-    )
+        opened, calibration, state=state, on_date=on_date, scan=scan, basis=basis,
+        landmarks=landmarks,
+    )  # fmt: skip
     evidence.progress = progress
     graph = recipe.graph(evidence)
     kept_names = recipe.expand(opened, (*recipe.maps, *recipe.files))

@@ -420,6 +420,10 @@ def reconstruct(
     basis: Annotated[
         Path | None, typer.Option(help="Folder of MERL tables to fit a dome's lobes with.")
     ] = None,
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(help="Table name,x,y of a probe's sites in pixels of its 256 x 256 map."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Make maps of a session; computes only what is wanted and not there yet.
@@ -433,8 +437,8 @@ def reconstruct(
     truth = truth_beside(session)
     done = pipeline.reconstruct(
         session, want=[w.strip() for w in want.split(",") if w.strip()], out=out,
-        calibration=calibration, state=state, scan=scan, basis=basis, progress=console.progress,
-        truth=truth.name if truth else "",
+        calibration=calibration, state=state, scan=scan, basis=basis, landmarks=landmarks,
+        progress=console.progress, truth=truth.name if truth else "",
     )  # fmt: skip
     for text in done.assumed:
         console.say(f"assumed: {text}")

@@ -141,21 +141,31 @@ class Curve:
     """Whether they are joined."""
 
 
-def curves(title: str, x_name: str, y_name: str, series: Sequence[Curve]) -> str:
-    """Draw series over a common axis, with bars of one standard error; NaN leaves a gap."""
+def curves(
+    title: str, x_name: str, y_name: str, series: Sequence[Curve], *, log_y: bool = False
+) -> str:
+    """Draw series over a common axis, with bars of one standard error; NaN leaves a gap.
+
+    On a logarithmic axis what is not above zero leaves a gap too.
+    """
     figure, axes = _figure(5.2, 3.4)
     for number, curve in enumerate(series):
         color = _COLORS[number % len(_COLORS)]
         style = ("o" if curve.marks else "") + ("-" if curve.line else "")
         x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
+        if log_y:
+            y = np.where(y > 0.0, y, np.nan)
         if curve.stderr is None:
             axes.plot(x, y, style or "o", color=color, ms=4, lw=1.2, label=curve.name)
             continue
         bars = np.where(np.isfinite(curve.stderr), np.asarray(curve.stderr, float), 0.0)
+        down = np.fmin(bars, 0.999 * y) if log_y else bars  # a log axis has no room for zero
         axes.errorbar(
-            x, y, yerr=bars, fmt=style or "o", color=color, ms=4, lw=1.2, elinewidth=1,
-            label=curve.name,
+            x, y, yerr=np.stack([down, bars]), fmt=style or "o", color=color, ms=4, lw=1.2,
+            elinewidth=1, label=curve.name,
         )  # fmt: skip
+    if log_y:
+        axes.set_yscale("log")
     axes.set_xlabel(x_name)
     axes.set_ylabel(y_name)
     axes.set_title(title, fontsize=10)

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.flash_stages import NOISE_STDERR
-from skinrig import evaluation, figures, microrelief_section, page, surface_section
+from skinrig import (
+    evaluation,
+    figures,
+    microrelief_section,
+    page,
+    subsurface_section,
+    surface_section,
+)
 
 
 class ReportError(ValueError):
@@ -141,6 +148,8 @@ def _appearance_section(
         body += surface_section.section(name, appearance, truth, checks)
     elif microrelief:
         body += microrelief_section.section(name, appearance, truth, checks)
+    elif subsurface_section.is_probe(appearance):
+        body += subsurface_section.section(name, appearance, truth, checks)
     for key, skin_map in sorted(appearance.maps.items()):
         if skin_map.values.ndim != 2 or key.startswith("_") or on_mesh or microrelief:
             continue

@@ -1,0 +1,190 @@
+"""Radial profiles and sigma_tr of a fibre probe against their truths."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.skin import SkinAppearance
+from reconstruction.probe_stages import CHANNELS, METHODS, PROFILE_FILE, SUBSURFACE_FILE
+
+MEDIAN_LIMIT, WORST_LIMIT = 0.03, 0.08
+"""Relative error of sigma_tr on homogeneous media, median and worst."""
+RECOMMENDED = METHODS[0]
+SIGNAL_TO_NOISE = 10.0
+"""A fibre's reading tells something of the profile from here on."""
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileError:
+    """How one measured profile compares with the true one.
+
+    Attributes
+    ----------
+    name, channel
+        Of the measurement.
+    median, worst
+        Relative error over the fibres whose signal is ten times its standard error.
+    fibres
+        How many those are.
+    coverage
+        Share of them within one standard error, the truth's own statistical error included.
+    """
+
+    name: str
+    channel: str
+    median: float
+    worst: float
+    fibres: int
+    coverage: float
+
+
+@dataclass(frozen=True, slots=True)
+class FitError:
+    """How one fitted sigma_tr compares with the truth."""
+
+    name: str
+    channel: str
+    method: str
+    kind: str
+    """Of the tissue: "homogeneous", "layered" or "anisotropic"."""
+    truth: float
+    """1/mm; of layers that of the homogeneous medium whose profile fits best."""
+    found: float
+    stderr: float
+    interval: tuple[float, float]
+    """68 % interval, 1/mm."""
+    valid: bool
+
+    @property
+    def relative(self) -> float:
+        """Found less true, over the true."""
+        return (self.found - self.truth) / self.truth
+
+    @property
+    def covered(self) -> bool:
+        """Whether the truth lies in the 68 % interval."""
+        return self.interval[0] <= self.truth <= self.interval[1]
+
+
+def document_of(appearance: SkinAppearance, name: str) -> Mapping[str, Any] | None:
+    """Return one of the JSON files of an appearance, or None."""
+    blob = appearance.files.get(name)
+    return None if blob is None else json.loads(blob)
+
+
+def true_profiles(truth: SkinAppearance | None) -> Mapping[str, Mapping[str, Any]]:
+    """Return the true profiles by the name of the measurement."""
+    known = None if truth is None else truth.parameters.get("profiles")
+    if not isinstance(known, list):
+        return {}
+    return {name_of(entry): entry for entry in known}
+
+
+def name_of(entry: Mapping[str, Any]) -> str:
+    """Return the name of a measurement from its site, repeat and angle.
+
+    Examples
+    --------
+    >>> name_of({"site": "cheek", "repeat": 1, "angle_deg": 22.5})
+    'cheek_r1_a022.5'
+    """
+    return f"{entry['site']}_r{int(entry['repeat'])}_a{float(entry['angle_deg']):05.1f}"
+
+
+def compare_profiles(appearance: SkinAppearance, truth: SkinAppearance) -> list[ProfileError]:
+    """Compare the profiles of every measurement and channel with the true ones."""
+    measured, known = document_of(appearance, PROFILE_FILE), true_profiles(truth)
+    rows: list[ProfileError] = []
+    for entry in [] if measured is None else measured["measurements"]:
+        true = known.get(name_of(entry))
+        if true is None:
+            continue
+        for number, channel in enumerate(CHANNELS):
+            one = entry["channels"][channel]
+            found, stderr = numbers(one["reflectance_per_mm2"]), numbers(one["stderr"])
+            real = np.asarray(true["reflectance_per_mm2"], float)[:, number]
+            noise = np.asarray(true["stderr"], float)[:, number]
+            good = np.asarray(one["valid"], bool) & (found > SIGNAL_TO_NOISE * stderr)
+            if not good.any():
+                continue
+            error = np.abs(found / real - 1.0)[good]
+            inside = np.abs(found - real) <= np.hypot(stderr, noise)
+            rows.append(
+                ProfileError(
+                    name_of(entry), channel, float(np.median(error)), float(error.max()),
+                    int(good.sum()), float(inside[good].mean()),
+                )
+            )  # fmt: skip
+    return rows
+
+
+def compare_fits(appearance: SkinAppearance, truth: SkinAppearance) -> list[FitError]:
+    """Compare every fitted sigma_tr with the true one."""
+    fitted, known = document_of(appearance, SUBSURFACE_FILE), true_profiles(truth)
+    rows: list[FitError] = []
+    for entry in [] if fitted is None else fitted["measurements"]:
+        true = known.get(name_of(entry))
+        if true is None:
+            continue
+        for fit in entry["fits"]:
+            sigma_tr = float(true["sigma_tr_per_mm"][CHANNELS.index(fit["channel"])])
+            low, high = numbers(fit["interval_per_mm"]).tolist()
+            rows.append(
+                FitError(
+                    name_of(entry), fit["channel"], fit["method"], str(true["kind"]), sigma_tr,
+                    number(fit["sigma_tr_per_mm"]), number(fit["sigma_tr_stderr"]), (low, high),
+                    bool(fit["valid"]),
+                )
+            )  # fmt: skip
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class MethodError:
+    """Errors of one method over many fits."""
+
+    method: str
+    fits: int
+    median: float
+    """Median of the relative error's size."""
+    worst: float
+    bias: float
+    """Mean relative error."""
+    coverage: float
+    """Share of truths within the 68 % interval."""
+
+
+def by_method(rows: Sequence[FitError]) -> list[MethodError]:
+    """Return the errors of each method over its valid fits."""
+    found = []
+    for method in METHODS:
+        chosen = [row for row in rows if row.method == method and row.valid]
+        if not chosen:
+            continue
+        error = np.array([row.relative for row in chosen])
+        found.append(
+            MethodError(
+                method, len(chosen), float(np.median(np.abs(error))), float(np.abs(error).max()),
+                float(error.mean()), float(np.mean([row.covered for row in chosen])),
+            )
+        )  # fmt: skip
+    return found
+
+
+def number(value: object) -> float:
+    """Return a number of a document; null becomes NaN."""
+    return math.nan if value is None else float(str(value))
+
+
+def numbers(values: Sequence[object]) -> FloatArray:
+    """Return numbers of a document, float64; null becomes NaN."""
+    return np.array([number(value) for value in values], np.float64)
