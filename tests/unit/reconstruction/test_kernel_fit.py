@@ -117,6 +117,7 @@ def test_the_hierarchical_search_finds_what_the_exhaustive_one_does(rng):
 
 
 @pytest.mark.long
+@pytest.mark.timeout(600)
 def test_twenty_random_cases_of_the_full_grid_agree_with_the_exhaustive_search():
     rng = np.random.default_rng(7)
     for _ in range(20):
