@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,7 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.linalg import eigh_tridiagonal
 
 from model import photon_kernels as kernels
+from model.diffusion import Slopes
 from model.disc_distances import distance_rule
 
 FloatArray = NDArray[np.float64]
@@ -44,17 +45,6 @@ _MOMENTS = 600  # Legendre orders for kappa: exact to rounding up to g = 0.95 an
 
 class TableDomainError(ValueError):
     """A medium or a collection that the table does not hold."""
-
-
-class Slopes(NamedTuple):
-    """Reflectance and its derivatives, broadcast alike."""
-
-    reflectance_per_mm2: FloatArray
-    """R, 1/mm^2."""
-    by_sigma_a: FloatArray
-    """dR/d sigma_a, 1/mm."""
-    by_sigma_s_prime: FloatArray
-    """dR/d sigma_s', 1/mm."""
 
 
 @dataclass(frozen=True, slots=True)
