@@ -249,6 +249,7 @@ class FibreCalibration:
             "row_shift_px": Quantity(np.array(spots.shift_px)),
             "row_rotation_rad": _one(spots.rotation_rad),
             "crosstalk_measured": _one(float(mixed.measured)),
+            "cover_leak": _one(mixed.cover_leak, mixed.cover_leak_stderr),
         }
         notes = {
             "unit": "gain: full scales per second, summed over a spot, for a reflectance in the"
@@ -297,7 +298,7 @@ class FibreCalibration:
         def camera(name: str) -> FloatArray:
             return calibration.quantity(serial, name).value
 
-        shift = camera("row_shift_px")
+        shift, leak = camera("row_shift_px"), calibration.quantity(serial, "cover_leak")
         return cls(
             FibreSpots(
                 names, value("spot_px"), stderr("spot_px"), value("spot_radius_px"),
@@ -309,7 +310,8 @@ class FibreCalibration:
             value("gain_common").transpose(1, 0, 2), value("phantom_light"),
             CrossTalk(
                 value("crosstalk"), stderr("crosstalk"), value("stray"), stderr("stray"),
-                bool(camera("crosstalk_measured")),
+                bool(camera("crosstalk_measured")), float(leak.value),
+                0.0 if leak.stderr is None else float(leak.stderr),
             ),
             value("valid") > 0, value("dead") > 0,
         )  # fmt: skip
@@ -387,7 +389,7 @@ def calibrate_fibres(
         )
     if not 0 < level <= 1:
         raise FibreError(f"level: got {level}, expected 0 < level <= 1")
-    mixed = measure_crosstalk(masks) if masks else no_crosstalk(count, colors)
+    mixed = measure_crosstalk(masks, phantom) if masks else no_crosstalk(count, colors)
     signal, variance, told = _guessed(phantom)
     light, spread = mixed.unmix(signal, variance)
     doubt = mixed.matrix_variance(light, light, np.zeros_like(light))
@@ -409,7 +411,7 @@ def calibrate_fibres(
     )
     mixed = CrossTalk(
         mixed.matrix, mixed.stderr, mixed.offset / level, mixed.offset_stderr / level,
-        mixed.measured,
+        mixed.measured, mixed.cover_leak, mixed.cover_leak_stderr,
     )  # fmt: skip
     return FibreCalibration(
         spots,

@@ -20,6 +20,8 @@ DISTANCE_EDGES: Final = (1, 2, 3, 4, 6, 9, 14, 21)
 """First distance, in fibres, of each group that is taken to be alike."""
 LEAST_SCATTER: Final = 0.3
 """Of pairs as far apart about their mean, relative: a few of them may agree by chance."""
+UNEVEN_COVER: Final = 0.3
+"""By how much covers may differ in what they let through, relative."""
 ROUNDS: Final = 30
 
 
@@ -40,6 +42,8 @@ class CrossTalk:
         o: stray light in each spot that is no fibre's, full scales per second.
     measured : bool
         False: no frames told it; the matrix is 1, and its errors are unknown.
+    cover_leak, cover_leak_stderr : float
+        What a covered fibre still let through when this was measured, of its own light.
     """
 
     matrix: FloatArray
@@ -47,6 +51,8 @@ class CrossTalk:
     offset: FloatArray
     offset_stderr: FloatArray
     measured: bool = True
+    cover_leak: float = 0.0
+    cover_leak_stderr: float = 0.0
 
     def __post_init__(self) -> None:
         count = len(np.asarray(self.matrix))
@@ -114,7 +120,7 @@ def no_crosstalk(count: int, colors: int) -> CrossTalk:
     return CrossTalk(np.eye(count), np.zeros((count, count)), nothing, nothing, measured=False)
 
 
-def measure_crosstalk(masks: Mapping[int, FibreReadings]) -> CrossTalk:
+def measure_crosstalk(masks: Mapping[int, FibreReadings], phantom: FibreReadings) -> CrossTalk:
     """Measure cross-talk and stray light with one fibre uncovered at a time.
 
     Parameters
@@ -122,6 +128,8 @@ def measure_crosstalk(masks: Mapping[int, FibreReadings]) -> CrossTalk:
     masks : mapping of int to FibreReadings
         By the number of the uncovered fibre, on one bright target with one light; not all fibres
         need to be there.
+    phantom : FibreReadings
+        The same with no fibre covered: tells what leaks through the covers from stray light.
 
     Returns
     -------
@@ -129,11 +137,13 @@ def measure_crosstalk(masks: Mapping[int, FibreReadings]) -> CrossTalk:
 
     Notes
     -----
-    Spot j reads ``X_ji`` times what the uncovered fibre i gives, and stray light ``o_j`` that is
-    the same whichever fibre is uncovered. Most of the 756 pairs of 28 fibres are fainter than
-    their noise; each is drawn to the mean of the pairs as far apart, as far as their own scatter
-    (the random-effects estimate of DerSimonian and Laird 1986, doi 10.1016/0197-2456(86)90046-2)
-    tells. The three colors share one matrix.
+    Spot j reads ``X_ji`` times what the uncovered fibre i gives, and light that is the same
+    whichever fibre is uncovered: stray light ``o_j``, and what leaks through the fibre's own cover,
+    a share of its light that all covers have in common but for 30 %.
+
+    Most of the 756 pairs of 28 fibres are fainter than their noise; each is drawn to the mean of
+    the pairs as far apart, as far as their own scatter (the random-effects estimate of DerSimonian
+    and Laird 1986, doi 10.1016/0197-2456(86)90046-2) tells. The three colors share one matrix.
     """
     first = next(iter(masks.values()))
     count, colors = first.signal.shape
@@ -172,7 +182,50 @@ def measure_crosstalk(masks: Mapping[int, FibreReadings]) -> CrossTalk:
             break
     np.fill_diagonal(matrix, 1.0)
     np.fill_diagonal(variance, 0.0)
-    return CrossTalk(matrix, np.sqrt(variance), offset, np.sqrt(offset_variance))
+    leak, leak_stderr, offset, offset_variance = _stray(offset, offset_variance, phantom)
+    return CrossTalk(
+        matrix, np.sqrt(variance), offset, np.sqrt(offset_variance), True, leak, leak_stderr
+    )
+
+
+def _stray(
+    steady: FloatArray, variance: FloatArray, phantom: FibreReadings
+) -> tuple[float, float, FloatArray, FloatArray]:
+    """Part light that is the same in all masks into a cover's leak and stray light.
+
+    Returns the leak, its standard error, and stray light with its variance, shape (F, C), drawn to
+    the mean of each color's spots.
+    """
+    count, colors = steady.shape
+    good = phantom.valid & (variance > 0)
+    source = np.where(good, np.maximum(phantom.signal, 0.0), 0.0)
+    leak, leak_variance = 0.0, 0.0
+    level = np.zeros(colors)
+    for _ in range(ROUNDS):
+        # one leak and a stray light in each color; covers differ, so bright fibres do not rule
+        spread = np.where(good, variance + (UNEVEN_COVER * leak * source) ** 2, np.inf)
+        design = np.zeros((count, colors, 1 + colors))
+        design[..., 0] = source
+        design[:, np.arange(colors), 1 + np.arange(colors)] = 1.0
+        weighed = design / spread[..., None]
+        normal = np.einsum("fcp,fcq->pq", weighed, design)
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        inverse = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+        found = inverse @ np.einsum("fcp,fc->p", weighed, np.where(good, steady, 0.0))
+        before = leak
+        leak, leak_variance = max(float(found[0]), 0.0), float(inverse[0, 0])
+        level = found[1:]
+        if abs(leak - before) <= 1e-3 * leak:
+            break
+    rest = steady - leak * source
+    doubt = variance + source**2 * (leak_variance + (UNEVEN_COVER * leak) ** 2)
+    stray, stray_variance = np.tile(level, (count, 1)), np.zeros((count, colors))
+    for c in range(colors):
+        if good[:, c].any():
+            stray[:, c], stray_variance[:, c] = shrunk(
+                rest[:, c], np.where(good[:, c], 1.0 / np.maximum(doubt[:, c], 1e-300), 0.0), 0.0
+            )
+    return leak, float(np.sqrt(leak_variance)), stray, stray_variance
 
 
 def _pooled(
@@ -180,28 +233,53 @@ def _pooled(
 ) -> tuple[FloatArray, FloatArray]:
     """Return each pair drawn to its group's mean, and its variance."""
     matrix, variance = np.zeros_like(seen), np.zeros_like(seen)
-    last = (0.0, 0.0)
+    own = np.divide(seen, information, out=np.zeros_like(seen), where=information > 0)
+    last = 0.0
     for number in range(int(group.max(initial=-1)) + 1):
         here = group == number
-        told = here & (information > 0)
-        if not told.any():
-            # nothing said of such a distance: no more than of the one before
-            matrix[here], variance[here] = 0.0, last[0] ** 2 + last[1]
-            continue
-        w = information[told]
-        x = seen[told] / w
-        mean = float((w * x).sum() / w.sum())
-        spread = float((w * (x - mean) ** 2).sum()) - (len(x) - 1)
-        scale = float(w.sum() - (w**2).sum() / w.sum())
-        between = max(spread / scale, (LEAST_SCATTER * mean) ** 2) if scale > 0 else mean**2
-        both = 1.0 / (1.0 / w + between)
-        mean, error = float((both * x).sum() / both.sum()), 1.0 / float(both.sum())
-        share = between * information[here] / (1.0 + between * information[here])
-        own = np.divide(seen, information, out=np.zeros_like(seen), where=information > 0)[here]
-        matrix[here] = share * own + (1.0 - share) * mean
-        variance[here] = (1.0 - share) * between + (1.0 - share) ** 2 * error
-        last = (mean, between)
+        if (information[here] > 0).any():
+            matrix[here], variance[here] = shrunk(own[here], information[here], LEAST_SCATTER)
+            last = float(np.median(np.abs(matrix[here])))
+        else:
+            # nothing is told of such a distance: no more than of the one before
+            variance[here] = last**2
     return matrix, variance
+
+
+def shrunk(
+    value: FloatArray, information: FloatArray, least_scatter: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return values drawn to their mean as far as their own scatter tells, and variances.
+
+    Parameters
+    ----------
+    value : ndarray of float64, shape (n,)
+    information : ndarray of float64, shape (n,)
+        Inverse variances; 0 where nothing was measured, 1 or more of them above 0.
+    least_scatter : float
+        Standard deviation of the true values over their mean, at least: a few may agree by chance.
+
+    Examples
+    --------
+    >>> value, variance = shrunk(np.array([1.0, 3.0, 9.0]), np.array([1e4, 1e4, 0.0]), 0.0)
+    >>> value.round(2).tolist()
+    [1.0, 3.0, 2.0]
+    """
+    told = information > 0
+    w, x = information[told], value[told]
+    mean = float((w * x).sum() / w.sum())
+    spread = float((w * (x - mean) ** 2).sum()) - (len(x) - 1)
+    scale = float(w.sum() - (w**2).sum() / w.sum())
+    between = max(spread / scale, 0.0) if scale > 0 else mean**2
+    between = max(between, (least_scatter * mean) ** 2)
+    both = 1.0 / (1.0 / w + between)
+    mean, error = float((both * x).sum() / both.sum()), 1.0 / float(both.sum())
+    share = between * information / (1.0 + between * information)
+    known = np.where(told, value, mean)
+    return (
+        share * known + (1.0 - share) * mean,
+        (1.0 - share) * between + (1.0 - share) ** 2 * error,
+    )
 
 
 def _freeze(row: Any, name: str, shape: tuple[int, ...]) -> None:

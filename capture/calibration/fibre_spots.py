@@ -31,6 +31,8 @@ SHIFT_PITCH: Final = 0.5
 """Beyond half a distance between neighbors nobody can tell whose a spot is."""
 STRUCTURE: Final = 0.03
 """How far pixels of a spot scatter about a smooth disc, relative."""
+UNEVEN: Final = 0.1
+"""Slopes and bend of the light over a spot, relative, as large as they may well be."""
 LEAST_SHARE: Final = 0.5
 """Of the fibres must show, or the image is not one of this probe."""
 EDGES: Final = 2.5
@@ -182,8 +184,8 @@ def find_fibre_spots(
             f"fibre spots: found none in the image, expected {count} in a row {pitch:.0f} px apart;"
             " check that the light was on, the head on the phantom, and the exposures"
         )
-    typical = float(np.median([fit[0][2] for fit in fits]))
-    whole = [fit for fit in fits if 0.5 * typical < fit[0][2] < 2.5 * typical]
+    typical = float(np.median([fit[2] for fit in fits]))
+    whole = [fit for fit in fits if 0.5 * typical < fit[2] < 2.5 * typical]
     places = np.array([fit[0][:2] for fit in whole])
     spot, model = _assign(places, nominal, pitch)
     between = _between(places, spot, model, pitch)
@@ -212,8 +214,9 @@ def find_fibre_spots(
     return _table(best, model, nominal, names, findings)
 
 
-_Fit = tuple[FloatArray, FloatArray]
-"""x, y, radius, edge in pixels, and their standard errors."""
+_Fit = tuple[FloatArray, FloatArray, float]
+"""x, y, radius, edge in pixels, their standard errors, and the radius of a disc as large as what is
+brighter than half."""
 
 
 def _consult_masks(
@@ -227,12 +230,12 @@ def _consult_masks(
 ) -> None:
     """Measure in their own frames the fibres that touch or are missing, and check the order."""
     known = np.array([model[i] if fit is None else fit[0][:2] for i, fit in enumerate(best)])
-    size = float(np.median([fit[0][2] for fit in best if fit is not None]))
+    size = float(np.median([fit[2] for fit in best if fit is not None]))
     apart = np.linalg.norm(known[:, None] - known[None], axis=-1)
     np.fill_diagonal(apart, np.inf)
     for i, series in sorted(masks.items()):
-        doubtful = best[i] is None or apart[i].min() < 2.2 * size
-        doubtful = doubtful or not 0.7 < best[i][0][2] / size < 1.4  # type: ignore[index]
+        fit = best[i]
+        doubtful = fit is None or apart[i].min() < 2.2 * size or not 0.8 < fit[2] / size < 1.25
         image = _gray(series, pattern)
         alone = _candidates(image, pitch)
         if len(alone) == 0:
@@ -385,35 +388,47 @@ def _fit(
     sigma = np.maximum(sigma, 1e-9)
     data = data / scale
 
-    def split(p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the disc, and amplitudes and floors of the colors that fit it best."""
-        d = np.hypot(px - p[0], py - p[1])
-        disc = 0.5 * erfc((d - p[2]) / (np.sqrt(2.0) * p[3]))
-        amplitude, floor = np.zeros(len(colors)), np.zeros(len(colors))
-        for c in range(len(colors)):
-            at = color == c
-            w, f, v = sigma[at] ** -2, disc[at], data[at]
-            mean_f, mean_v = (w @ f) / w.sum(), (w @ v) / w.sum()
-            square = float(w @ (f - mean_f) ** 2)
-            amplitude[c] = float(w @ ((f - mean_f) * (v - mean_v))) / max(square, 1e-30)
-            floor[c] = mean_v - amplitude[c] * mean_f
-        return disc, amplitude, floor
+    parts = [np.flatnonzero(color == c) for c in range(len(colors))]
+    # slopes and bend of a color may be as large as UNEVEN of its level, with a normal prior
+    stiff = [np.array([0.0, 1.0, 1.0, 1.0, 0.0]) / (UNEVEN * max(v / scale, 1e-3)) for v in levels]
+
+    def split(p: FloatArray) -> tuple[list[FloatArray], list[FloatArray], FloatArray]:
+        """Return residuals of each color's best linear model, and their amplitudes.
+
+        A fibre's modes are not filled alike: light over the disc has slopes and a bend.
+        """
+        u, v = (px - p[0]) / p[2], (py - p[1]) / p[2]
+        d = np.hypot(u, v)
+        disc = 0.5 * erfc((d - 1.0) * (p[2] / (np.sqrt(2.0) * p[3])))
+        bend = np.minimum(d, 1.2) ** 2 - 0.5
+        design = np.stack([disc, disc * u, disc * v, disc * bend, np.ones_like(disc)])
+        residuals, priors = [], []
+        amplitude = np.zeros(len(parts))
+        for c, at in enumerate(parts):
+            rows = design[:, at] / sigma[at]
+            value = data[at] / sigma[at]
+            normal = rows @ rows.T + np.diag(stiff[c] ** 2)
+            found = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(5), rows @ value)
+            residuals.append(value - found @ rows)
+            priors.append((stiff[c] * found)[1:4])
+            amplitude[c] = found[0]
+        return residuals, priors, amplitude
 
     def misfit(p: FloatArray) -> FloatArray:
-        disc, amplitude, floor = split(p)
-        return np.asarray((data - amplitude[color] * disc - floor[color]) / sigma)
+        residuals, priors, _ = split(p)
+        return np.concatenate([*residuals, *priors])
 
-    begin = np.array([place[0], place[1], start_radius, max(0.1 * start_radius, 0.7)])
+    begin = np.array([*place, start_radius, max(0.1 * start_radius, 0.7)])
     low = np.array([place[0] - 0.5 * pitch, place[1] - 0.5 * pitch, 1.0, 0.2])
     high = np.array([place[0] + 0.5 * pitch, place[1] + 0.5 * pitch, 0.7 * pitch, 0.3 * pitch])
     begin = np.clip(begin, low + 1e-6, high - 1e-6)
     done = least_squares(misfit, begin, bounds=(low, high), x_scale=[1, 1, 1, 0.5], max_nfev=30)
-    _, amplitude, _ = split(done.x)
-    at_bound = bool(((done.x <= low + 1e-3) | (done.x >= high - 1e-3))[:3].any())
+    amplitude = split(done.x)[2]
+    at_bound = bool(((done.x <= low + 1e-3) | (done.x >= high - 1e-3))[:2].any())
     if at_bound or amplitude.max() <= 0:
         return None
     normal = done.jac.T @ done.jac
-    chi2 = 2.0 * done.cost / max(len(data) - 4 - 2 * len(colors), 1)
+    chi2 = 2.0 * done.cost / max(len(data) - 4 - 5 * len(colors), 1)
     try:
         covariance = np.linalg.inv(normal) * max(chi2, 1.0)
     except np.linalg.LinAlgError:
@@ -421,7 +436,7 @@ def _fit(
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if not np.isfinite(error).all() or error[0] > 0.1 * pitch or error[1] > 0.1 * pitch:
         return None
-    return done.x, error
+    return done.x, error, start_radius
 
 
 def _distinct(fits: list[_Fit], apart: float) -> list[_Fit]:

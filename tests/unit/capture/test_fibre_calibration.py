@@ -53,8 +53,8 @@ def mixing(rng, neighbor=1e-3, far=2e-5):
 class Probe:
     """Readings drawn from a mixing matrix, gains, stray light, and noise."""
 
-    def __init__(self, rng, *, matrix=None, stray=2e-5, floor=1e-6, dead=()):
-        self.rng, self.floor = rng, floor
+    def __init__(self, rng, *, matrix=None, stray=2e-5, floor=1e-6, dead=(), leak=0.0):
+        self.rng, self.floor, self.leak = rng, floor, leak
         self.matrix = mixing(rng) if matrix is None else matrix
         self.gain = PER_S * rng.normal(1, 0.05, (28, 1)) * np.array([0.6, 1.0, 0.5])
         self.gain[list(dead)] = 0.0
@@ -63,7 +63,7 @@ class Probe:
     def read(self, reflectance, *, only=None, level=1.0, saturated=()):
         light = self.gain * reflectance
         if only is not None:
-            light = np.where(np.arange(28)[:, None] == only, light, 0.0)
+            light = np.where(np.arange(28)[:, None] == only, light, self.leak * light)
         mean = level * (self.matrix @ light + self.stray)
         variance = self.floor**2 + 1e-6 * mean * self.floor + (5e-4 * mean) ** 2
         signal = mean + np.sqrt(variance) * self.rng.normal(size=mean.shape)
@@ -108,7 +108,7 @@ def test_reflectance_comes_back_within_its_errors():
 
 def test_pairs_of_fibres_are_measured_within_their_errors(rng):
     probe = Probe(rng)
-    found = measure_crosstalk(probe.masks())
+    found = measure_crosstalk(probe.masks(), probe.read(PHANTOM))
     first = DISTANCE == 1
     sigmas = ((found.matrix - probe.matrix) / np.where(first, found.stderr, 1))[first]
     assert np.sqrt((sigmas**2).mean()) < 1.6
@@ -121,11 +121,21 @@ def test_pairs_of_fibres_are_measured_within_their_errors(rng):
 
 def test_stray_light_is_told_from_cross_talk(rng):
     probe = Probe(rng, stray=5e-5)
-    found = measure_crosstalk(probe.masks())
+    found = measure_crosstalk(probe.masks(), probe.read(PHANTOM))
     sigmas = (found.offset - probe.stray) / found.offset_stderr
     low, high = chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], sigmas.size)
     assert 0.5 * low < float((sigmas**2).sum()) < 1.5 * high
     assert (found.offset_stderr < 0.2 * 5e-5).all()
+
+
+def test_what_leaks_through_covers_is_no_stray_light(rng):
+    probe = Probe(rng, stray=0.0, leak=1e-5)
+    found = measure_crosstalk(probe.masks(), probe.read(PHANTOM))
+    assert found.cover_leak == pytest.approx(1e-5, abs=5 * found.cover_leak_stderr)
+    assert found.cover_leak_stderr < 0.2e-5
+    assert np.abs(found.offset / found.offset_stderr).max() < 5
+    # taken for stray light it would be worth many standard errors in the far fibres of skin
+    assert (found.offset_stderr < 1e-6).any(axis=0).all()
 
 
 def test_a_weaker_source_gives_the_same_reflectance(rng):
