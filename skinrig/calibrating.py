@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 
 from capture import raw
 from capture.calibration import chart, color, colorimetry, polarization, sensor, store, white
+from capture.calibration.phantom import read_certificate
 from capture.calibration.photon_transfer import FlatPair
 from capture.session import FrameRecord, Session
-from skinrig import calibrating_dome, calibrating_gradient
+from skinrig import calibrating_dome, calibrating_gradient, calibrating_probe
 
-KINDS = ("sensor", "color", "polarization", "white", *calibrating_dome.KINDS)
+KINDS = (
+    "sensor", "color", "polarization", "white", *calibrating_dome.KINDS, calibrating_probe.KIND
+)  # fmt: skip
 
 
 class CalibratingError(ValueError):
@@ -44,6 +47,7 @@ def calibrate(
     *,
     created: date | None = None,
     targets: calibrating_dome.DomeTargets | None = None,
+    phantom: str | Path | None = None,
 ) -> Outcome:
     """Make one kind of calibration from target sessions and save it.
 
@@ -60,6 +64,9 @@ def calibrate(
         Date of the calibration; None: that of the latest session.
     targets
         What stood in the dome.
+    phantom
+        Certificate of the block that a probe's "fibre" was measured on; None: of a simulated
+        session the simulated block's.
 
     Raises
     ------
@@ -73,7 +80,11 @@ def calibrate(
         raise CalibratingError("sessions: got none, expected at least one folder")
     made_on = created or max(s.manifest.created_at.date() for s in opened)
     findings: tuple[str, ...] = ()
-    if calibrating_gradient.of_a_gradient_sphere(opened):
+    if kind == calibrating_probe.KIND:
+        paper = None if phantom is None else read_certificate(phantom)
+        done = calibrating_probe.calibrate_probe(opened, out, made_on, certificate=paper)
+        calibration, summary, findings = done.calibration, done.summary, done.findings
+    elif calibrating_gradient.of_a_gradient_sphere(opened):
         found = calibrating_gradient.calibrate_gradient(kind, opened, out, made_on)
         calibration, summary, findings = found.calibration, found.summary, found.findings
     elif kind in calibrating_dome.KINDS:

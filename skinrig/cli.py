@@ -244,7 +244,7 @@ def calibrate(
         str,
         typer.Argument(
             help="Of the flash rig sensor, color, polarization, white; of the dome geometry, "
-            "lights; of the gradient sphere sensor, lights, polarization."
+            "lights; of the gradient sphere sensor, lights, polarization; of the probe fibre."
         ),
     ],
     sessions: Annotated[list[Path], typer.Argument(help="Sessions of the target.")],
@@ -255,6 +255,9 @@ def calibrate(
     sphere_mm: Annotated[
         float, typer.Option(help="Radius of the mirror sphere of lights, mm.")
     ] = 50.0,
+    phantom: Annotated[
+        Path | None, typer.Option(help="Certificate (JSON) of the block fibre was measured on.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Make a calibration from sessions of a target and say how it drifted.
@@ -265,7 +268,7 @@ def calibrate(
     from skinrig.calibrating_dome import dome_targets
 
     console = Console(json)
-    done = make(kind, sessions, out, targets=dome_targets(square_mm, sphere_mm))
+    done = make(kind, sessions, out, targets=dome_targets(square_mm, sphere_mm), phantom=phantom)
     console.rows(("quantity", "value"), done.summary)
     for text in done.findings:
         console.say(f"found: {text}")

@@ -1,0 +1,415 @@
+"""A session of a fibre probe on a phantom to its calibration: spots, gains, cross-talk."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration import sensor, store
+from capture.calibration.fibre import FibreCalibration, calibrate_fibres
+from capture.calibration.fibre_darks import CameraNoise, DarkModel, measure_darks
+from capture.calibration.fibre_merge import MergedSeries, merge_series
+from capture.calibration.fibre_readings import FibreReadings, sum_spots
+from capture.calibration.fibre_spots import find_fibre_spots
+from capture.calibration.phantom import (
+    CertificateError,
+    ExpectedReflectance,
+    PhantomCertificate,
+    read_certificate,
+)
+from capture.rig import Probe, Rig
+from capture.session import FrameRecord, Session
+from model import photon_table, spectra
+
+KIND: Final = "fibre"
+WORN_GAIN: Final = 0.5
+"""Of the usual gain: a fibre below it is told of."""
+
+
+class ProbeCalibratingError(ValueError):
+    """Sessions that do not hold what a calibration of the probe needs."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeCalibration:
+    """A calibration of a probe and what to say of it."""
+
+    calibration: store.Calibration
+    fibres: FibreCalibration
+    summary: tuple[tuple[str, str], ...]
+    findings: tuple[str, ...]
+    """What is wrong with the probe: dead fibres, spots that overlap."""
+
+
+def calibrate_probe(
+    sessions: Sequence[Session],
+    folder: str | Path,
+    created: date,
+    *,
+    certificate: PhantomCertificate | None = None,
+) -> ProbeCalibration:
+    """Make the calibration "fibre" of a probe from a session of target "phantom".
+
+    Parameters
+    ----------
+    sessions
+        One, with frames of the kinds dark and phantom, and better also mask.
+    folder
+        The CALIBRATION/ folder: gain and read noise are its sensor's, where it holds one.
+    created
+        Date of the calibration.
+    certificate
+        Of the phantom; None: for simulated sessions that of the simulated phantom.
+
+    Raises
+    ------
+    ProbeCalibratingError
+        When the frames that are needed are missing, or the phantom is not known.
+    CalibrationError
+        When the frames do not tell what is wanted.
+    """
+    if len(sessions) != 1:
+        raise ProbeCalibratingError(
+            f"sessions: got {len(sessions)}, expected one; between two the light may have changed,"
+            " so calibrate from each alone"
+        )
+    session = sessions[0]
+    rig = session.rig
+    if rig.probe is None:
+        raise ProbeCalibratingError(
+            f"kind 'fibre': got a session of rig {rig.name!r}, expected one with a fibre probe"
+        )
+    paper = certificate or _packaged_certificate(session)
+    noise, notes = _noise(Path(folder), session, created)
+    series = _Series(session, noise)
+    phantoms = series.phantoms()
+    level = series.level()
+    masks = series.masks()
+    nominal = np.array([fibre.spot_px for fibre in rig.probe.fibres])
+    names = [fibre.name for fibre in rig.probe.fibres]
+    spots = find_fibre_spots(phantoms[0], nominal, names=names, pattern=noise.pattern, masks=masks)
+    readings = _mean([sum_spots(merged, spots, noise=noise) for merged in phantoms])
+    fibres = calibrate_fibres(
+        readings,
+        {fibre: sum_spots(merged, spots, noise=noise) for fibre, merged in masks.items()},
+        spots=spots,
+        radius_mm=rig.probe.radius_mm,
+        expected=expected_reflectance(paper, rig),
+        level=level,
+    )
+    if not masks:
+        notes = (
+            *notes,
+            "the session holds no frames with covered fibres: cross-talk and stray light are taken"
+            " to be none, and the far fibres' errors do not know of it",
+        )
+    findings = (*spots.findings, *notes, *_worn(fibres))
+    made = fibres.to_calibration(
+        serial=rig.views[0].serial,
+        rig=rig.name,
+        source=session.source,
+        created=created,
+        notes={
+            **{f"finding {k}": text for k, text in enumerate(findings)},
+            "phantom": paper.name or "not named",
+            "noise": noise.origin,
+        },
+        inputs={session.id: session.content_hash},
+    )
+    return ProbeCalibration(made, fibres, _summary(fibres, series, paper), findings)
+
+
+def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedReflectance:
+    """Return what the fibres of a perfect probe take from a phantom, averaged over the bands.
+
+    Parameters
+    ----------
+    certificate
+        Of the phantom.
+    rig
+        With a probe, a light of known illuminant and a camera of known sensitivity.
+
+    Returns
+    -------
+    ExpectedReflectance
+        Two common causes: the certificate's absorption and its scattering.
+
+    Raises
+    ------
+    CertificateError
+        Where the photon table does not hold the phantom.
+
+    Examples
+    --------
+    >>> from capture.calibration.phantom import CertificateUncertainty
+    >>> from capture.rig import load_rig
+    >>> paper = PhantomCertificate(
+    ...     eta=1.4, g=0.8, wavelength_nm=(550.0,), sigma_a_per_mm=(0.01,),
+    ...     sigma_s_prime_per_mm=(1.2,),
+    ...     uncertainty=CertificateUncertainty(sigma_a=0.02, sigma_s_prime=0.02))
+    >>> expected = expected_reflectance(paper, load_rig("probe"))
+    >>> expected.per_mm2.shape, expected.common.shape
+    ((28, 3), (2, 28, 3))
+    """
+    probe = _probe(rig)
+    light, camera = rig.lights[0].illuminant, rig.views[0].spectral_sensitivity
+    # a certificate of one wavelength calls the phantom gray: any wavelength stands for all
+    gray = len(certificate.wavelength_nm) == 1
+    wavelength = np.array([550.0]) if gray else np.asarray(spectra.WAVELENGTH_NM, np.float64)
+    weights = (
+        np.ones((1, 3)) if gray else spectra.band_weights(camera, light, wavelength_nm=wavelength)
+    )
+    sigma_a, sigma_s = certificate.at(wavelength)
+    radius = np.array(probe.radius_mm)
+    how: dict[str, Any] = {"eta": certificate.eta, "g": certificate.g, "collection": "fibre"}
+    try:
+        held = photon_table.domain(radius, sigma_a[:, None], sigma_s[:, None], **how)
+        slopes = photon_table.derivatives(
+            radius, sigma_a[:, None], sigma_s[:, None], core_mm=probe.fibres[0].core_mm,
+            source_core_mm=probe.source_core_mm, **how,
+        )  # fmt: skip
+        own = photon_table.relative_error(radius, sigma_a[:, None], sigma_s[:, None], **how)
+    except photon_table.TableDomainError as exc:
+        raise CertificateError(f"phantom: {exc}") from exc
+    if not held[:, :3].any():
+        raise CertificateError(
+            "phantom: the photon table does not hold its coefficients"
+            f" (sigma_a {sigma_a.min():g} to {sigma_a.max():g}, sigma_s'"
+            f" {sigma_s.min():g} to {sigma_s.max():g} per mm); use one like skin"
+        )
+
+    def band(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(values.T @ weights)
+
+    value = slopes.reflectance_per_mm2
+    mean = band(value)
+    # the table's errors at neighboring wavelengths are the same ones: they do not average out
+    stderr = band(value * np.where(np.isfinite(own), np.minimum(own, 1.0), 1.0))
+    unsure = certificate.uncertainty
+    common = np.stack(
+        [
+            band(slopes.by_sigma_a * sigma_a[:, None]) * unsure.sigma_a / mean,
+            band(slopes.by_sigma_s_prime * sigma_s[:, None]) * unsure.sigma_s_prime / mean,
+        ]
+    )
+    return ExpectedReflectance(mean, stderr, common)
+
+
+def packaged_certificate() -> PhantomCertificate:
+    """Return the certificate of the simulated phantom."""
+    return read_certificate(Path(str(files("rigsim"))) / "data" / "phantom.json")
+
+
+class _Series:
+    """The series of exposures in a session of a phantom."""
+
+    def __init__(self, session: Session, noise: CameraNoise) -> None:
+        self._session, self._noise = session, noise
+        darks = session.frames("dark")
+        if not darks:
+            raise ProbeCalibratingError(
+                f"session {session.id}: holds no frames of kind 'dark', so the camera's dark signal"
+                " is not known; capture the phantom with darks"
+            )
+        self.darks: DarkModel = measure_darks(
+            [session.read(record).cfa for record in darks],
+            [_exposure_s(record) for record in darks],
+            noise=noise,
+            temperature_c=_temperature(darks),
+        )
+        self._phantom = session.frames("phantom")
+        if not self._phantom:
+            raise ProbeCalibratingError(
+                f"session {session.id}: holds no frames of kind 'phantom'; capture that target"
+                " (`skinrig simulate probe --target phantom`, or `skinrig capture probe --target"
+                " phantom`)"
+            )
+
+    def level(self) -> float:
+        """Return the source's level, the same in all frames."""
+        frames = [*self._phantom, *self._session.frames("mask")]
+        levels = {float(record.settings.get("level", 1.0)) for record in frames}
+        if len(levels) != 1:
+            raise ProbeCalibratingError(
+                f"session {self._session.id}: got levels {sorted(levels)} of the source, expected"
+                " one"
+            )
+        return levels.pop()
+
+    def phantoms(self) -> list[MergedSeries]:
+        """Return the series with all fibres uncovered, one for each placement."""
+        return [merged for _, merged in sorted(self._merged(self._phantom, "repeat").items())]
+
+    def masks(self) -> dict[int, MergedSeries]:
+        """Return the series with one fibre uncovered, by its number."""
+        return self._merged(self._session.frames("mask"), "fibre")
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Frames of dark, phantom and mask."""
+        session = self._session
+        dark, phantom, mask = (len(session.frames(kind)) for kind in ("dark", "phantom", "mask"))
+        return dark, phantom, mask
+
+    def _merged(self, records: Sequence[FrameRecord], key: str) -> dict[int, MergedSeries]:
+        groups: dict[int, list[FrameRecord]] = defaultdict(list)
+        for record in records:
+            groups[int(record.index.get(key, 0))].append(record)
+        return {
+            number: merge_series(
+                [self._session.read(record).cfa for record in group],
+                [_exposure_s(record) for record in group],
+                darks=self.darks.at(_temperature(group)),
+                noise=self._noise,
+                light_s=[_light_s(record) for record in group],
+            )
+            for number, group in groups.items()
+        }
+
+
+def _exposure_s(record: FrameRecord) -> float:
+    return float(record.actual.get("exposure_s", record.settings["exposure_s"]))
+
+
+def _light_s(record: FrameRecord) -> float:
+    return float(record.actual.get("open_s", _exposure_s(record)))
+
+
+def _temperature(records: Sequence[FrameRecord]) -> float | None:
+    told = [float(record.actual["camera_c"]) for record in records if "camera_c" in record.actual]
+    return float(np.mean(told)) if told else None
+
+
+def _noise(folder: Path, session: Session, created: date) -> tuple[CameraNoise, tuple[str, ...]]:
+    view = session.rig.views[0]
+    try:
+        found = store.load(folder, "sensor")
+        store.require(
+            found, rig=session.rig.name, serials=[view.serial], on_date=created, kind="sensor"
+        )
+    except store.CalibrationMissing:
+        return CameraNoise.of_view(view), (
+            "the folder holds no sensor calibration: gain and read noise are the camera's nominal"
+            " ones",
+        )
+    known = sensor.SensorCalibration.from_calibration(found, view.serial)
+    return CameraNoise.of_sensor(known), ()
+
+
+def _packaged_certificate(session: Session) -> PhantomCertificate:
+    if session.source != "simulated":
+        raise ProbeCalibratingError(
+            "phantom: its optics are not known; give the certificate of the block that was measured"
+            " as --phantom FILE.json (schema skinrig.phantom/1, see docs/probe-calibration.md)"
+        )
+    return packaged_certificate()
+
+
+def _mean(readings: Sequence[FibreReadings]) -> FibreReadings:
+    """Return the mean over placements, with their scatter where it is more than the noise."""
+    if len(readings) == 1:
+        return readings[0]
+    valid = np.logical_and.reduce([r.valid for r in readings])
+    signal = np.where(valid, np.mean([r.signal for r in readings], axis=0), 0.0)
+    count = len(readings)
+    noise = np.mean([r.variance for r in readings], axis=0) / count
+    scatter = np.var([r.signal for r in readings], axis=0, ddof=1) / count
+    return FibreReadings(
+        readings[0].names,
+        signal,
+        np.where(valid, np.maximum(noise, scatter), 0.0),
+        valid,
+        np.logical_or.reduce([r.saturated for r in readings]),
+        np.asarray(np.mean([r.around for r in readings], axis=0)),
+        readings[0].exposures_s,
+        readings[0].noise_origin,
+    )
+
+
+def _probe(rig: Rig) -> Probe:
+    if rig.probe is None:
+        raise ProbeCalibratingError(f"rig {rig.name!r}: has no probe")
+    return rig.probe
+
+
+def _worn(fibres: FibreCalibration) -> tuple[str, ...]:
+    usual = np.array(
+        [
+            np.median(g[v]) if v.any() else 1.0
+            for g, v in zip(fibres.gain.T, fibres.valid.T, strict=True)
+        ]
+    )
+    found = []
+    for i, name in enumerate(fibres.names):
+        if fibres.dead[i]:
+            found.append(f"{name} is dead: it gives no light")
+        elif fibres.valid[i].any():
+            share = float(np.median((fibres.gain[i] / usual)[fibres.valid[i]]))
+            if share < WORN_GAIN:
+                found.append(f"{name} passes {100 * share:.0f} % of what the others do: clean it")
+        elif fibres.spots.found[i]:
+            found.append(f"{name}: too little light from the phantom to calibrate it")
+    return tuple(found)
+
+
+def _summary(
+    fibres: FibreCalibration, series: _Series, paper: PhantomCertificate
+) -> tuple[tuple[str, str], ...]:
+    spots, mixed = fibres.spots, fibres.crosstalk
+    count = len(fibres.names)
+    rows = [
+        ("spots found", f"{int(spots.found.sum())} of {count}, {spots.shift_px[0]:+.2f},"
+         f" {spots.shift_px[1]:+.2f} px off their places, row turned"
+         f" {np.degrees(spots.rotation_rad):+.2f} degrees"),
+        ("standard error of a place", f"worst {spots.center_stderr_px[spots.found].max():.3f} px"),
+        ("radius of spots, of apertures", f"{spots.radius_px[spots.found].mean():.2f},"
+         f" {spots.aperture_px:.2f} px"),
+    ]  # fmt: skip
+    for c, color in enumerate(("red", "green", "blue")[: fibres.gain.shape[1]]):
+        good = fibres.valid[:, c]
+        if not good.any():
+            rows.append((f"gain {color}", "no fibre calibrated"))
+            continue
+        gain, error = (
+            fibres.gain[good, c],
+            (fibres.gain_stderr / np.maximum(fibres.gain, 1e-300))[good, c],
+        )
+        shape = np.hypot.reduce(np.abs(fibres.common[:, good, c]), axis=0).max(initial=0.0)
+        worst = int(np.flatnonzero(good)[np.argmax(error)])
+        rows.append(
+            (f"gain {color}", f"{gain.min() / np.median(gain):.2f} to"
+             f" {gain.max() / np.median(gain):.2f} of the usual, {int(good.sum())} fibres; standard"
+             f" error median {100 * np.median(error):.2f} %, worst {100 * error.max():.2f} %"
+             f" ({fibres.names[worst]}); in common up to {100 * shape:.1f} %")
+        )  # fmt: skip
+    if mixed.measured:
+        first, second = (np.diagonal(mixed.matrix, k) for k in (1, 2))
+        error = np.diagonal(mixed.stderr, 1)
+        rows.append(
+            ("cross-talk", f"neighbors {np.median(first):.2e} ({first.min():.1e} to"
+             f" {first.max():.1e}, standard error {np.median(error):.0e}), next"
+             f" {np.median(second):.1e}")
+        )  # fmt: skip
+        strays = np.abs(mixed.offset).max()
+        rows.append(("stray light", f"at most {strays:.1e} ± {mixed.offset_stderr.max():.0e} full"
+                     " scales per second"))  # fmt: skip
+        rows.append(("covers let through", f"{mixed.cover_leak:.1e} ±"
+                     f" {mixed.cover_leak_stderr:.0e}"))  # fmt: skip
+    darks, phantom, mask = series.counts
+    rows += [
+        ("dark current", f"{series.darks.mean_rate_dn_per_s:.3g} ±"
+         f" {series.darks.mean_rate_stderr:.1g} DN/s, {int(series.darks.hot.sum())} hot pixels"),
+        ("dead fibres", ", ".join(np.array(fibres.names)[fibres.dead]) or "none"),
+        ("frames", f"{darks} dark, {phantom} phantom, {mask} mask"),
+        ("phantom", f"{paper.name or 'not named'}: uncertain by {100 * paper.uncertainty.sigma_a:g}"
+         f" % of sigma_a, {100 * paper.uncertainty.sigma_s_prime:g} % of sigma_s'"),
+    ]  # fmt: skip
+    return tuple(rows)
