@@ -20,6 +20,7 @@ from capture.plan.gradient import (
     gradient_plan,
     state_of,
 )
+from capture.plan.probe import SITES, ProbeTarget, probe_calibration_plan, probe_plan
 from capture.rig import Rig, load_rig
 from capture.session import Session, Subject
 from skinrig.addresses import addresses, patiently, require_addresses
@@ -66,6 +67,17 @@ def numbers_of(text: str | None, option: str) -> tuple[float, ...] | None:
         raise UsageError(f"{option}: got {text!r}, expected numbers joined by commas") from exc
 
 
+def names_of(text: str | None) -> tuple[str, ...] | None:
+    """Return names joined by commas; None for None.
+
+    Examples
+    --------
+    >>> names_of("cheek, chin")
+    ('cheek', 'chin')
+    """
+    return None if text is None else tuple(part.strip() for part in text.split(","))
+
+
 def range_of(text: str | None, option: str) -> tuple[int, int] | None:
     """Return the first and last number of ``FIRST..LAST``; None for None.
 
@@ -96,6 +108,8 @@ def choose_plan(
     *,
     angles: Sequence[float] | None = None,
     steps: tuple[int, int] | None = None,
+    sites: Sequence[str] | None = None,
+    repeats: int = 1,
 ) -> Plan:
     """Return the plan in ``file``, or the rig's own for a target, or for a subject.
 
@@ -107,23 +121,35 @@ def choose_plan(
     target
         What stands in the rig; None: a subject.
     angles, steps
-        Of a caliper; None: all.
+        Of a caliper; None: all. Of a probe one number, of directions.
+    sites, repeats
+        Of a probe.
 
     Raises
     ------
     CaptureError
         For an unknown target.
     UsageError
-        For angles or steps where there is no caliper, or that a plan in a file has already.
+        For what the rig does not know, or that a plan in a file has already.
     """
-    if (angles or steps) and (rig.caliper is None or file is not None or target is not None):
-        raise UsageError("--angles, --steps: are for the gradient rig's own plan of skin")
+    own = file is None and target is None
+    if (angles or steps) and not (own and (rig.caliper or (rig.probe and not steps))):
+        raise UsageError(
+            "--angles, --steps: are for the gradient rig's own plan of skin, --angles for the "
+            "probe's, too"
+        )
+    if sites and not (own and rig.probe):
+        raise UsageError("--sites: is for the probe's own plan of skin")
+    if repeats != 1 and (file is not None or rig.probe is None):
+        raise UsageError("--repeats: is for the probe's own plans")
     if file is not None:
         return Plan.from_json(file.read_text(encoding="utf-8"), where=str(file))
     if "gradient_sphere" in rig.boxes:
         return _gradient_plan(rig, target, angles, steps)
     if "dome" in rig.boxes:
         return _dome_plan(rig, target)
+    if rig.probe is not None:
+        return _probe_plan(rig, target, sites, repeats, angles)
     if target is None:
         return flash_plan(rig)
     if target == "white":
@@ -155,6 +181,44 @@ def _gradient_plan(
         expected = ", ".join(get_args(GradientTarget))
         raise CaptureError(f"target: got {target!r}, expected one of {expected}")
     return gradient_calibration_plan(rig, cast(GradientTarget, target))
+
+
+def _probe_plan(
+    rig: Rig,
+    target: str | None,
+    sites: Sequence[str] | None,
+    repeats: int,
+    angles: Sequence[float] | None,
+) -> Plan:
+    if target is None:
+        return probe_plan(rig, sites=sites or SITES, repeats=repeats, angles=directions_of(angles))
+    if target not in get_args(ProbeTarget):
+        expected = ", ".join(get_args(ProbeTarget))
+        raise CaptureError(f"target: got {target!r}, expected one of {expected}")
+    return probe_calibration_plan(rig, cast(ProbeTarget, target), repeats=repeats)
+
+
+def directions_of(angles: Sequence[float] | None) -> int:
+    """Return how many directions of the probe's head ``--angles N`` asks for; 1 for None.
+
+    Raises
+    ------
+    UsageError
+        For anything but one whole number.
+
+    Examples
+    --------
+    >>> directions_of((16.0,)), directions_of(None)
+    (16, 1)
+    """
+    if angles is None:
+        return 1
+    if len(angles) != 1 or not float(angles[0]).is_integer():
+        text = ",".join(f"{angle:g}" for angle in angles)
+        raise UsageError(
+            f"--angles: got {text!r}, expected how many directions of the probe's head, such as 16"
+        )
+    return int(angles[0])
 
 
 def needed_boxes(rig: Rig, plan: Plan) -> tuple[str, ...]:
@@ -196,6 +260,9 @@ def capture_session(
     force_limit_n: float | None = None,
     angles: Sequence[float] | None = None,
     steps: tuple[int, int] | None = None,
+    sites: Sequence[str] | None = None,
+    repeats: int = 1,
+    all_brackets: bool = False,
 ) -> Mapping[str, Any]:
     """Capture into ``out`` and return the command's document.
 
@@ -210,7 +277,9 @@ def capture_session(
     """
     box_urls, camera_urls = addresses(ports, "--port"), addresses(cameras, "--camera")
     rig = load_rig(rig_name)
-    chosen = choose_plan(rig, plan, target, angles=angles, steps=steps)
+    chosen = choose_plan(
+        rig, plan, target, angles=angles, steps=steps, sites=sites, repeats=repeats
+    )
     seconds = chosen.estimated_s(rig)
     needed = needed_boxes(rig, chosen)
     if not dry_run:
@@ -242,8 +311,9 @@ def capture_session(
         }  # fmt: skip
     box_urls = {name: box_urls[name] for name in needed}
     return _run(
-        rig, chosen, out, box_urls, camera_urls, subject, resume, console, eyes, force_limit_n
-    )
+        rig, chosen, out, box_urls, camera_urls, subject, resume, console, eyes, force_limit_n,
+        all_brackets,
+    )  # fmt: skip
 
 
 def _run(
@@ -257,6 +327,7 @@ def _run(
     console: Console,
     eyes: Eyes,
     force_limit_n: float | None,
+    all_brackets: bool,
 ) -> Mapping[str, Any]:
     from capture.acquire import run_plan
     from capture.devices.box import Box
@@ -309,6 +380,7 @@ def _run(
                 plan, rig, boxes=boxes, cameras=opened, session=session,
                 progress=console.progress, prompt=partial(ask, console.progress),
                 interrupted=stopped, eyes=eyes, force_limit_n=force_limit_n,
+                all_brackets=all_brackets,
             )  # fmt: skip
         session.close()
         left_out = dict(session.left_out())
@@ -327,7 +399,7 @@ def _run(
 
 def ask(progress: Callable[[str], None], what: str) -> None:
     """Say what the operator has to make ready, and wait for Enter where there is a keyboard."""
-    what = what if what.startswith(("step ", "tape ")) else f"make ready: {what}"
+    what = what if what.startswith(("step ", "tape ", "place ")) else f"make ready: {what}"
     if sys.stdin is None or not sys.stdin.isatty():
         progress(what)
         return

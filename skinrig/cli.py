@@ -31,8 +31,22 @@ Site = Annotated[
     str | None,
     typer.Option(help="Where the gradient rig's skin is from: forehead (default), cheek or chin."),
 ]
+Sites = Annotated[
+    str | None,
+    typer.Option(help="Where the probe is placed, joined by commas: forehead,cheek,chin."),
+]
+Repeats = Annotated[
+    int, typer.Option(help="Placements of the probe a site and angle; pairs a state of the flash.")
+]
+AllBrackets = Annotated[
+    bool, typer.Option("--all-brackets", help="The probe's exposures that can show no more, too.")
+]
 Angles = Annotated[
-    str | None, typer.Option(help="Angles of the caliper, degrees, joined by commas: 0,90.")
+    str | None,
+    typer.Option(
+        help="Angles of the caliper, degrees, joined by commas: 0,90; of the probe how many "
+        "directions of its head: 16."
+    ),
 ]
 Steps = Annotated[str | None, typer.Option(help="First and last position of the caliper: -2..3.")]
 Consent = Annotated[
@@ -88,7 +102,7 @@ def demo(
 
 @app.command()
 def simulate(
-    rig: Annotated[str, typer.Argument(help="Name of a rig: flash, dome or gradient.")],
+    rig: Annotated[str, typer.Argument(help="Name of a rig: flash, dome, gradient or probe.")],
     out: Out,
     size: Annotated[str, typer.Option(help="Of the pictures: small or full.")] = "small",
     width: Annotated[
@@ -102,17 +116,26 @@ def simulate(
     ] = None,
     move: Annotated[bool, typer.Option("--move", help="The face in the dome moves.")] = False,
     seed: Seed = 0,
-    subject: Annotated[str, typer.Option(help="Preset, I to VI, palest or darkest.")] = "III",
+    subject: Annotated[
+        str,
+        typer.Option(
+            help="Preset, I to VI, palest or darkest; of the probe also "
+            "homogeneous:SIGMA_A,SIGMA_S_PRIME in 1/mm."
+        ),
+    ] = "III",
     mesh: Annotated[Path | None, typer.Option(help="Face mesh, .npz or .obj.")] = None,
     target: Annotated[
         str | None,
         typer.Option(
             help="A target instead of a face: white, dark; of the flash rig chart, flat, malus; "
-            "of the dome charuco, mirror; of the gradient rig ball, flat."
+            "of the dome charuco, mirror; of the gradient rig ball, flat; of the probe phantom."
         ),
     ] = None,
     site: Site = None,
+    sites: Sites = None,
+    repeats: Repeats = 1,
     angles: Angles = None,
+    all_brackets: AllBrackets = False,
     steps: Steps = None,
     state: Annotated[
         list[str] | None,
@@ -127,17 +150,18 @@ def simulate(
 
     Example: skinrig simulate flash --out session-flash --subject IV
     """
-    from skinrig.acquisition import numbers_of, range_of
+    from skinrig.acquisition import names_of, numbers_of, range_of
     from skinrig.consent import subject_of
-    from skinrig.simulation import USES, simulate_session
+    from skinrig.simulation import USES, pseudonym, simulate_session
 
     console = Console(json)
     done = simulate_session(
         rig, out, size=size, width_px=width, seed=seed, subject=subject, mesh=mesh, target=target,
         states=tuple(state or ("neutral",)), resume=resume, lights=lights, views=views, move=move,
         site=site, angles=numbers_of(angles, "--angles"), steps=range_of(steps, "--steps"),
+        sites=names_of(sites), repeats=repeats, all_brackets=all_brackets,
         progress=console.progress,
-        person=subject_of(f"simulated-{subject}-{seed}", consent or USES, consent_expires),
+        person=subject_of(pseudonym(subject, seed), consent or USES, consent_expires),
     )  # fmt: skip
     console.say(
         f"{done.session}: {done.frames} frames" + (f", truth in {done.truth}" if done.truth else "")
@@ -153,7 +177,12 @@ def _next_step(rig: str, session: Path, target: str | None) -> str:
         kinds = {"charuco": "geometry", "mirror": "lights", "white": "lights"}
     if rig == "gradient":
         kinds = {"ball": "lights", "flat": "sensor", "dark": "sensor"}
+    if rig == "probe":
+        kinds = {"phantom": "fibre"}
     if target is None:
+        if rig == "probe":
+            want = "sigma_tr --calibration calibration"
+            return f"skinrig reconstruct {session} --want {want} --out appearance"
         if rig == "gradient":
             want = "normals,height,histograms,kernels --calibration calibration"
             return f"skinrig reconstruct {session} --want {want} --out appearance"
@@ -189,7 +218,10 @@ def capture(
         float | None,
         typer.Option(help="Greatest force of the caliper on this skin, newton; no default."),
     ] = None,
+    sites: Sites = None,
+    repeats: Repeats = 1,
     angles: Angles = None,
+    all_brackets: AllBrackets = False,
     steps: Steps = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
     json: Json = False,
@@ -199,7 +231,7 @@ def capture(
     Example: skinrig capture flash --port flash=/dev/ttyUSB0 --camera cam=hotfolder:incoming
     --out session
     """
-    from skinrig.acquisition import capture_session, eyes_of, numbers_of, range_of
+    from skinrig.acquisition import capture_session, eyes_of, names_of, numbers_of, range_of
     from skinrig.consent import subject_of
 
     console = Console(json)
@@ -208,7 +240,8 @@ def capture(
         subject=subject_of(subject, consent, consent_expires), dry_run=dry_run,
         plan_out=plan_out, resume=resume, console=console, eyes=eyes_of(eyes),
         force_limit_n=force_limit, angles=numbers_of(angles, "--angles"),
-        steps=range_of(steps, "--steps"),
+        steps=range_of(steps, "--steps"), sites=names_of(sites), repeats=repeats,
+        all_brackets=all_brackets,
     )  # fmt: skip
     console.document("skinrig.capture/1", done)
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from capture.plan import Plan
 from capture.plan.dose import dose_report
+from capture.plan.fibre_light import SKIN_APERTURE_MM, fibre_light
 from capture.plan.flicker import flicker_report
 from capture.plan.gradient import scan_duty, states
 from capture.rig import LedLimits, Rig
@@ -15,7 +16,8 @@ def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
     """Return flicker and dose of a plan as JSON values, units in the names.
 
     Of patterns on skin also the light of a state, and the most mean level of an LED; open eyes are
-    refused whatever the figures say, because the patch may lie beside an eye.
+    refused whatever the figures say, because the patch may lie beside an eye. Of the fibre probe,
+    whose light stays under its head, the dose, and how long an eye could bear the bare fibre.
 
     Examples
     --------
@@ -25,6 +27,16 @@ def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
     >>> figures["flashes_per_s"], figures["open_eyes"]
     (1.0, 'allowed')
     """
+    if rig.probe is not None:
+        light = fibre_light(plan, rig)
+        return {
+            "led": light.led,
+            "led_ws": light.led_ws,
+            "limit_ws": light.limit_ws,
+            "placement_ws": light.placement_ws,
+            "skin_w_m2": light.skin_w_m2,
+            "stare_s": light.stare_s,
+        }
     flicker, dose = flicker_report(plan, rig), dose_report(plan, rig)
     limits = rig.leds or LedLimits()
     skin: dict[str, float | str] = {}
@@ -57,6 +69,14 @@ def light_lines(plan: Plan, rig: Rig) -> list[str]:
     """
     limits = rig.leds or LedLimits()
     figures = light_figures(plan, rig)
+    if rig.probe is not None:
+        return [
+            f"light into the skin: at most {1e3 * float(figures['placement_ws']):.3g} mWs at one "
+            f"placement, {float(figures['led_ws']):.3g} Ws in all, {limits.dose_ws:g} Ws allowed; "
+            f"{float(figures['skin_w_m2']):.0f} W/m2 over {SKIN_APERTURE_MM:g} mm",
+            f"the fibre is not to be looked into: an eye would be at its blue-light limit after "
+            f"{float(figures['stare_s']):.1f} s; the shutter opens only while the head is held on",
+        ]
     verdict = "may be open" if figures["open_eyes"] == "allowed" else "must be closed or shielded"
     more = []
     if "state_s" in figures:

@@ -34,7 +34,10 @@ def simulate_dome(order: Order) -> Simulated:
     targets = get_args(DomeTarget)
     if order.target is not None and order.target not in targets:
         raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
-    order.refuse("dome", states=("neutral",), repeats=1, site=None, angles=None, steps=None)
+    order.refuse(
+        "dome", states=("neutral",), repeats=1, site=None, angles=None, steps=None, sites=None,
+        all_brackets=False,
+    )  # fmt: skip
     rig = small_dome(
         load_rig("dome"),
         lights=order.lights or LIGHTS[order.size],

@@ -24,7 +24,10 @@ def simulate_flash(order: Order) -> Simulated:
     target, states, seed = order.target, order.states, order.seed
     if target is not None and target not in TARGETS:
         raise SimulationError(f"target: got {target!r}, expected one of {', '.join(TARGETS)}")
-    order.refuse("flash", lights=None, views=None, move=False, site=None, angles=None, steps=None)
+    order.refuse(
+        "flash", lights=None, views=None, move=False, site=None, angles=None, steps=None,
+        sites=None, all_brackets=False,
+    )  # fmt: skip
     if target is None:
         from rigsim.perfusion import STATES
 

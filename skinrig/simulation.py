@@ -16,13 +16,15 @@ from capture.devices.dome import DomeBox, Eyes
 from capture.devices.flash import FlashBox
 from capture.devices.gradient_sphere import GradientSphereBox
 from capture.devices.port import Port
+from capture.devices.probe import ProbeBox
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject
 
-RIGS = ("flash", "dome", "gradient")
+RIGS = ("flash", "dome", "gradient", "probe")
 BOXES: Mapping[str, type[Box]] = {
     "flash": FlashBox, "dome": DomeBox, "gradient_sphere": GradientSphereBox, "caliper": CaliperBox,
+    "probe": ProbeBox,
 }  # fmt: skip
 """Driver of each kind of box."""
 SIZES = ("small", "full")
@@ -63,6 +65,18 @@ class Simulated:
         }
 
 
+def pseudonym(subject: str, seed: int) -> str:
+    """Return the pseudonym of a simulated subject.
+
+    Examples
+    --------
+    >>> pseudonym("III", 0), pseudonym("homogeneous:0.04,1.5", 2)
+    ('simulated-III-0', 'simulated-homogeneous-0.04-1.5-2')
+    """
+    name = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "-" for c in subject)
+    return f"simulated-{name}-{seed}"
+
+
 def truth_folder(session: Path) -> Path:
     """Return the folder beside a session that holds its truth.
 
@@ -96,6 +110,8 @@ class Order:
     site: str | None
     angles: tuple[float, ...] | None
     steps: tuple[int, int] | None
+    sites: tuple[str, ...] | None
+    all_brackets: bool
     created: datetime | None
     person: Subject | None
     progress: Callable[[str], None] | None
@@ -134,6 +150,8 @@ def simulate_session(
     site: str | None = None,
     angles: Sequence[float] | None = None,
     steps: tuple[int, int] | None = None,
+    sites: Sequence[str] | None = None,
+    all_brackets: bool = False,
     created: datetime | None = None,
     person: Subject | None = None,
     progress: Callable[[str], None] | None = None,
@@ -150,21 +168,22 @@ def simulate_session(
         "small" or "full": of the flash rig 768 pixels across or the camera's own 3024; of the dome
         6 cameras, 200 pixels across, and 48 lights, or all that it has; of the gradient sphere the
         middle 256 pixels and one angle of the caliper, or all 2048, which the ball always takes,
-        and all angles.
+        and all angles; of the probe only how many photons its truth is made of.
     seed
         Of the subject, the sensor and the boxes.
     subject
-        Preset of the face, by skin type.
+        Preset of the face, by skin type; of the probe also
+        "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm.
     mesh
         A face mesh to wear the skin instead of the procedural head.
     target
         Something else instead of a face: of the flash rig "white", "chart", "flat", "dark" or
         "malus"; of the dome "charuco", "mirror", "white" or "dark"; of the gradient sphere "ball",
-        "flat" or "dark".
+        "flat" or "dark"; of the probe "phantom" or "dark".
     states
         Expressions and physiological states, captured one after the other by the flash rig.
     repeats
-        Image pairs a state of the flash rig.
+        Image pairs a state of the flash rig, or placements of the probe a site and angle.
     resume
         Go on with a session that was interrupted; what is on disk is kept.
     width_px
@@ -176,9 +195,14 @@ def simulate_session(
     site
         Where the skin in the gradient sphere is from: "forehead" (the default), "cheek", "chin".
     angles
-        Angles of the caliper, degrees; None: as ``size`` says.
+        Angles of the caliper, degrees; None: as ``size`` says. Of the probe one number: how many
+        directions of its head; None: 1.
     steps
         Its first and last position; None: all. Where the skin ends is found out.
+    sites
+        Where the probe is placed; None: forehead, cheek and chin.
+    all_brackets
+        Whether the probe takes exposures that can show no more.
     created
         Date of the session; None: now.
     person
@@ -197,7 +221,8 @@ def simulate_session(
         out=Path(out), size=size, seed=seed, subject=subject, mesh=mesh, target=target,
         states=tuple(states), repeats=repeats, resume=resume, width_px=width_px, lights=lights,
         views=views, move=move, site=site, angles=None if angles is None else tuple(angles),
-        steps=steps, created=created, person=person, progress=progress,
+        steps=steps, sites=None if sites is None else tuple(sites), all_brackets=all_brackets,
+        created=created, person=person, progress=progress,
     )  # fmt: skip
     if rig_name == "dome":
         from skinrig.simulating_dome import simulate_dome
@@ -207,6 +232,10 @@ def simulate_session(
         from skinrig.simulating_gradient import simulate_gradient
 
         return simulate_gradient(order)
+    if rig_name == "probe":
+        from skinrig.simulating_probe import simulate_probe
+
+        return simulate_probe(order)
     from skinrig.simulating_flash import simulate_flash
 
     return simulate_flash(order)
@@ -233,7 +262,7 @@ def open_session(order: Order, plan: Plan, rig: Rig, asked: Mapping[str, Any]) -
             **{name: f"rigsim {name} box" for name in rig.boxes},
             **{view.name: view.serial for view in rig.views},
         },
-        subject=order.person or Subject(f"simulated-{order.subject}-{order.seed}", USES),
+        subject=order.person or Subject(pseudonym(order.subject, order.seed), USES),
         source="simulated",
         seed=order.seed,
         extra={"simulation": dict(asked)},
@@ -252,6 +281,7 @@ def drive(
     eyes: Eyes = "open",
     force_limit_n: float | None = None,
     run_id: str = "",
+    all_brackets: bool = False,
 ) -> float:
     """Run a session's plan through the drivers, on a world registered under its id, and close it.
 
@@ -273,6 +303,8 @@ def drive(
         Of a caliper, N.
     run_id
         Begins the tokens of this run.
+    all_brackets
+        Of a probe.
 
     Returns
     -------
@@ -293,7 +325,7 @@ def drive(
         run_plan(
             session.plan, rig, boxes=boxes, cameras=cameras, session=session,
             progress=progress, prompt=lambda text: prompt(world, text), eyes=eyes,
-            force_limit_n=force_limit_n, run_id=run_id,
+            force_limit_n=force_limit_n, run_id=run_id, all_brackets=all_brackets,
         )  # fmt: skip
         session.close()
         return float(world.now)

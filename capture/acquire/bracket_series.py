@@ -194,6 +194,7 @@ class BracketSeries:
             self.stale += exposed.stale
             actual: dict[str, Value] = {
                 "light": "source", "level": level, "open_s": exposed.open_s,
+                "run": self._operator.run_id,
                 "suction_mbar": 0.5 * (before_mbar + after_mbar),
                 "suction_before_mbar": before_mbar, "suction_after_mbar": after_mbar,
                 "camera_c": 0.5 * (before_c + after_c),

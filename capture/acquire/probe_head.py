@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 LEASE_S = 5.0
 """A frame may keep the host busy for a while; after this silence the box lets go."""
 LISTEN_S = 0.1
+RENEW_S = 1.0
+"""Silence between two renewals of the lease while nothing but time is waited for."""
 REACH_MARGIN_S = 1.0
 """Beyond the box's own time for reaching a suction."""
 OFF_SHARE = 0.5
@@ -96,7 +98,7 @@ class ProbeDriver(Protocol):
     def trigger_camera(self, token: str) -> float:
         """Pulse the camera's line without light."""
 
-    def listen(self, seconds: float) -> None:
+    def listen(self, seconds: float, *, every_s: float = ...) -> None:
         """Let time pass while the lease is renewed."""
 
 

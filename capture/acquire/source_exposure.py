@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from capture.acquire.frames import configure, wanted_exposure
-from capture.acquire.probe_head import HeadLost, ProbeDriver
+from capture.acquire.probe_head import RENEW_S, HeadLost, ProbeDriver
 from capture.devices.camera import Camera, Frame, FrameRefused, Trigger, next_frame
 from capture.devices.port import CommandRefused
 from capture.devices.probe import Opening
@@ -77,14 +77,15 @@ def expose(step: Step, rig: Rig, box: ProbeDriver, cameras: Mapping[str, Camera]
             if error.code == Code.HARDWARE:
                 mend(box, step)
                 raise ShutterFault(str(error)) from error
-            if error.code in (Code.WATCHDOG_TRIPPED, Code.NOT_ARMED):
-                raise HeadLost("the box had let go of the head") from error
+            if error.code in (Code.WATCHDOG_TRIPPED, Code.NOT_ARMED, Code.IGNORED):
+                raise HeadLost("the box did not hold the head") from error
             raise
         try:
             return opening.t_open_s, _light_s(step, box, opening)
         except (ShutterFault, HeadLost):
             # the camera still exposes or reads out, and would miss the next pulse
-            box.listen(opening.t_open_s + seconds + readout_s + CLOSING_S - box.ping())
+            over_s = opening.t_open_s + seconds + readout_s + CLOSING_S
+            box.listen(over_s - box.ping(), every_s=RENEW_S)
             raise
 
     return _expose(step, rig, box, cameras, release)
@@ -93,7 +94,7 @@ def expose(step: Step, rig: Rig, box: ProbeDriver, cameras: Mapping[str, Camera]
 def _light_s(step: Step, box: ProbeDriver, opening: Opening) -> float:
     """Wait until the shutter has closed and return how long its light lasted, s."""
     seconds = float(step.settings["exposure_s"])
-    box.listen(seconds)
+    box.listen(seconds, every_s=RENEW_S)
     last = box.last_opening()
     waited_s = 0.0
     while last is not None and last.ended == "open" and waited_s < CLOSING_S:
@@ -140,7 +141,7 @@ def _expose(
     readout_s = max(rig.view(name).readout_s for name in chosen)
     # the lease is renewed up to the moment at which the frame should be there
     dark_s = 0.0 if open_s else want.exposure_s
-    box.listen(dark_s + readout_s)
+    box.listen(dark_s + readout_s, every_s=RENEW_S)
     frames: dict[str, Frame] = {}
     stale = 0
     for name, camera in chosen.items():

@@ -327,13 +327,21 @@ class ProbeBox(Box):
 
     # time -------------------------------------------------------------------------------------
 
-    def listen(self, seconds: float) -> None:
-        """Let `seconds` pass while the box does what it does: the lease is renewed."""
+    def listen(self, seconds: float, *, every_s: float = _LISTEN_S) -> None:
+        """Let `seconds` pass while the box does what it does: the lease is renewed.
+
+        Parameters
+        ----------
+        seconds
+            How long, s.
+        every_s
+            Silence between two renewals, s; shorter than the lease.
+        """
         left_s = seconds
         while left_s > 0.0:
-            self._port.listen(min(left_s, _LISTEN_S))
+            self._port.listen(min(left_s, every_s))
             self.ping()
-            left_s -= _LISTEN_S
+            left_s -= every_s
 
     def _wait(self, timeout_s: float) -> None:
         waited_s = 0.0
