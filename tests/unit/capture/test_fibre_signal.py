@@ -1,0 +1,100 @@
+"""What a series of exposures has shown so far: enough, hopeless, or to be gone on with."""
+
+import numpy as np
+import pytest
+
+from capture.acquire.fibre_signal import FibreSignal, said_of
+from capture.plan.probe import exposure_series_s
+from capture.rig import load_rig
+
+RIG = load_rig("probe")
+VIEW, PROBE = RIG.views[0], RIG.probe
+SERIES_S = exposure_series_s(8, longest_s=4.0, step_ev=1.0)
+EVERY = len(SERIES_S)
+
+
+def spots():
+    """Return the number of the fibre that lights each pixel, 28 for none, shape (H, W)."""
+    rows, columns = np.mgrid[: VIEW.height_px, : VIEW.width_px]
+    found = np.full(rows.shape, len(PROBE.fibres))
+    for number, fibre in enumerate(PROBE.fibres):
+        x, y = fibre.spot_px
+        found[np.hypot(columns - x - 1, rows - y) < 8] = number
+    return found
+
+
+SPOTS = spots()
+
+
+def frame(rates, exposure_s, rng, *, dark_e=0.0, hot=0):
+    """Return DN of spots with so many full scales per second, (28,), alike in all colors."""
+    electrons = dark_e * exposure_s + VIEW.full_well_e * exposure_s * np.append(rates, 0.0)[SPOTS]
+    electrons = rng.poisson(np.minimum(electrons, 1e6)) + rng.normal(
+        0.0, VIEW.read_noise_e, SPOTS.shape
+    )
+    image = np.clip(np.round(VIEW.black_level + electrons / VIEW.gain_e_per_dn), 0, 4095)
+    for number in range(hot):
+        image[60 + number, 35 + 42 * number] = 4095
+    return image.astype(np.uint16)
+
+
+def looked(rates, rng, count=EVERY, **more):
+    signal = FibreSignal(PROBE, VIEW)
+    for exposure_s in SERIES_S[:count]:
+        signal.look(frame(rates, exposure_s, rng, **more), exposure_s)
+    return signal
+
+
+def test_a_rate_is_that_of_the_brightest_unsaturated_exposure(rng):
+    rates = np.geomspace(10.0, 0.2, 28)
+    signal = looked(rates, rng, dark_e=50.0)
+    np.testing.assert_allclose(
+        signal.rate_per_s, np.broadcast_to(rates[:, None], (28, 3)), rtol=0.06
+    )
+    assert signal.level.max() < 1.0
+
+
+def test_a_series_goes_on_until_the_faintest_fibre_has_half_of_full_scale(rng):
+    rates = np.geomspace(10.0, 0.8, 28)
+    enough = [looked(rates, rng, count).verdict(SERIES_S[count:]).enough for count in range(1, 8)]
+    # 0.8/s comes to a half at 0.63 s: the exposure of 1 s is the sixth
+    assert enough == [False] * 5 + [True] * 2
+
+
+def test_the_noise_alone_is_never_enough_while_it_may_hide_a_signal(rng):
+    rates = np.full(28, 5.0)
+    rates[-1] = 2e-3
+    assert not looked(rates, rng, 5).verdict(SERIES_S[5:]).enough
+
+
+def test_what_all_exposures_left_would_not_show_is_given_up_and_named(rng):
+    rates = np.full(28, 5.0)
+    rates[-2:] = 0.0
+    verdict = looked(rates, rng).verdict([1e-3])
+    assert verdict.enough
+    assert set(verdict.hopeless) == {(26, c) for c in range(3)} | {(27, c) for c in range(3)}
+    assert said_of(verdict.hopeless, PROBE) == (
+        "red of F27, F28; green of F27, F28; blue of F27, F28"
+    )
+
+
+def test_a_fibre_that_saturates_in_the_shortest_exposure_is_told_apart(rng):
+    rates = np.full(28, 5.0)
+    rates[0] = 1e3
+    verdict = looked(rates, rng, 5).verdict(SERIES_S[5:])
+    assert verdict.enough
+    assert {fibre for fibre, _ in verdict.saturated} == {0}
+    assert verdict.hopeless == ()
+
+
+def test_few_hot_pixels_are_no_signal(rng):
+    clean = looked(np.full(28, 0.01), rng)
+    hot = looked(np.full(28, 0.01), rng, hot=6)
+    assert hot.level.max() == pytest.approx(clean.level.max(), rel=0.2)
+    assert not hot.verdict([1.0]).saturated
+
+
+def test_dark_current_is_no_signal(rng):
+    signal = looked(np.zeros(28), rng, dark_e=300.0)
+    assert np.abs(signal.signal_to_noise).max() < 6.0
+    assert signal.level.max() < 0.03

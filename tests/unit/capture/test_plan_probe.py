@@ -1,0 +1,182 @@
+"""Plans of the fibre probe: series, rests, darks, light."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from capture.plan import Plan, PlanError, Step
+from capture.plan.fibre_light import fibre_light
+from capture.plan.probe import (
+    MASK_LONGEST_S,
+    all_series,
+    exposure_series_s,
+    probe_calibration_plan,
+    probe_plan,
+)
+from capture.plan.suction import SLACK_S, placement_of, room_s, spans
+from capture.rig import load_rig
+
+RIG = load_rig("probe")
+PROBE = RIG.probe
+
+
+def test_a_series_is_23_exposures_two_thirds_of_a_stop_apart_in_88_seconds():
+    steps = [s for s in probe_plan(RIG, sites=["cheek"]).steps if s.kind == "fibres"]
+    seconds = np.array([step.settings["exposure_s"] for step in steps])
+    assert len(seconds) == 23
+    np.testing.assert_allclose(np.diff(np.log2(seconds)), 2.0 / 3.0, rtol=1e-12)
+    assert seconds[-1] == 30.0
+    # Weyrich et al. 2006, section 8: about 88 s
+    assert 87.0 < (seconds + RIG.views[0].readout_s).sum() < 89.0
+    assert [step.index["bracket"] for step in steps] == list(range(23))
+    assert {step.settings["suction_mbar"] for step in steps} == {PROBE.suction_mbar}
+
+
+def test_the_brackets_span_more_than_four_decades_of_exposure():
+    seconds = exposure_series_s()
+    assert seconds[-1] / seconds[0] > 10**4.4
+
+
+def test_sites_repeats_and_angles_are_series_of_their_own_placement():
+    plan = probe_plan(RIG, sites=["forehead", "chin"], repeats=2, angles=3, brackets=4)
+    places = [placement for placement, _ in all_series(plan)]
+    assert [(p.site, p.repeat, p.angle_deg) for p in places] == [
+        (site, repeat, angle)
+        for site in ("forehead", "chin")
+        for repeat in (0, 1)
+        for angle in (0.0, 120.0, 240.0)
+    ]
+    assert {len(steps) for _, steps in all_series(plan)} == {4}
+
+
+def test_sixteen_directions_go_all_round_in_equal_steps():
+    plan = probe_plan(RIG, sites=["cheek"], angles=16, brackets=2)
+    angles = [placement.angle_deg for placement, _ in all_series(plan)]
+    np.testing.assert_allclose(np.diff(angles), 22.5)
+    assert angles[0] == 0.0
+    assert angles[-1] == 337.5
+    assert len({step.id for step in plan.steps}) == len(plan.steps)
+
+
+def test_darks_come_first_at_the_shortest_the_longest_and_one_exposure_between():
+    plan = probe_plan(RIG, darks=2)
+    kinds = [step.kind for step in plan.steps]
+    count = kinds.count("dark")
+    assert kinds[:count] == ["dark"] * count
+    darks = plan.steps[:count]
+    times = {step.settings["exposure_s"] for step in darks}
+    series = exposure_series_s()
+    assert len(times) == 3
+    assert {min(times), max(times)} == {series[0], series[-1]}
+    assert times <= set(series)
+    assert {step.settings["level"] for step in darks} == {0.0}
+    assert not any("suction_mbar" in step.settings for step in darks)
+
+
+def test_no_suction_of_a_plan_is_longer_than_skin_bears_and_none_is_cut_early():
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        seconds = rng.uniform(0.3, 30.3, rng.integers(1, 40)).tolist()
+        found = spans(seconds, PROBE)
+        assert [k for span in found for k in span] == list(range(len(seconds)))
+        for span in found:
+            used_s = sum(seconds[k] + SLACK_S for k in span)
+            assert used_s <= room_s(PROBE) or len(span) == 1
+        for one, other in itertools.pairwise(found):
+            both_s = sum(seconds[k] + SLACK_S for k in one) + seconds[other[0]] + SLACK_S
+            assert both_s > room_s(PROBE)
+
+
+def test_the_estimate_counts_exposures_pumping_and_rests():
+    plan = probe_plan(RIG, sites=["cheek"], darks=0)
+    frames_s = sum(s.settings["exposure_s"] + RIG.views[0].readout_s for s in plan.steps)
+    held_s = 2 * (PROBE.settle_s + 2.0) + PROBE.rest_s
+    assert plan.estimated_s(RIG) == pytest.approx(frames_s + held_s)
+    twice = probe_plan(RIG, sites=["cheek", "chin"], darks=0)
+    assert twice.estimated_s(RIG) == pytest.approx(2 * plan.estimated_s(RIG))
+
+
+def test_other_rigs_take_the_time_that_they_took():
+    rig = dataclasses.replace(RIG, probe=None)
+    step = Step("a", "dark", {}, {"exposure_s": 1.0}, ("cam",))
+    assert Plan(rig.name, (step,)).estimated_s(rig) == pytest.approx(1.3)
+
+
+def test_a_calibration_has_the_whole_series_and_each_fibre_uncovered_alone():
+    plan = probe_calibration_plan(RIG)
+    kinds = {kind: [s for s in plan.steps if s.kind == kind] for kind in ("phantom", "mask")}
+    assert [s.settings["exposure_s"] for s in kinds["phantom"]] == list(exposure_series_s())
+    by_fibre = {}
+    for step in kinds["mask"]:
+        assert step.settings["fibre"] == step.index["fibre"]
+        by_fibre.setdefault(step.settings["fibre"], []).append(step.settings["exposure_s"])
+    assert sorted(by_fibre) == list(range(28))
+    for seconds in by_fibre.values():
+        np.testing.assert_allclose(np.diff(np.log2(seconds)), 2.0)
+        assert MASK_LONGEST_S / 4 < seconds[-1] <= MASK_LONGEST_S
+        assert set(seconds) <= set(exposure_series_s())
+    # one placement serves the series and all covers
+    assert {placement_of(s) for s in (*kinds["phantom"], *kinds["mask"])} == {
+        placement_of(kinds["phantom"][0])
+    }
+    assert {s.kind for s in probe_calibration_plan(RIG, "dark").steps} == {"dark"}
+
+
+def test_a_plan_goes_through_json_unchanged():
+    plan = probe_calibration_plan(RIG, brackets=3)
+    assert Plan.from_json(plan.to_json()) == plan
+    plan.check(RIG)
+
+
+def test_light_is_power_times_open_time_and_a_smaller_cone_is_worse_for_an_eye():
+    plan = probe_plan(RIG, sites=["cheek", "chin"], darks=3)
+    light = fibre_light(plan, RIG)
+    given_ws = 2 * sum(exposure_series_s()) * RIG.lights[0].power_w
+    assert light.led_ws == pytest.approx(given_ws)
+    assert light.placement_ws == pytest.approx(given_ws / 2)
+    narrow = dataclasses.replace(
+        RIG, probe=dataclasses.replace(PROBE, source_numerical_aperture=0.11)
+    )
+    assert fibre_light(plan, narrow).stare_s == pytest.approx(light.stare_s / 4)
+    dim = probe_plan(RIG, sites=["cheek", "chin"], darks=3, level=0.5)
+    assert fibre_light(dim, RIG).led_ws == pytest.approx(given_ws / 2)
+    assert fibre_light(dim, RIG).stare_s == pytest.approx(2 * light.stare_s)
+
+
+@pytest.mark.parametrize(
+    ("words", "match"),
+    [
+        ({"sites": []}, "at least one"),
+        ({"sites": ["cheek", "cheek"]}, "none twice"),
+        ({"sites": ["phantom"]}, "not 'phantom'"),
+        ({"sites": ["left cheek"]}, "a name"),
+        ({"repeats": 0}, "repeats: got 0"),
+        ({"angles": 0}, "angles: got 0"),
+        ({"brackets": 1}, "brackets: got 1"),
+        ({"longest_s": 31.0}, "longest_s: got 31"),
+        ({"longest_s": 0.0}, "longest_s: got 0"),
+        ({"step_ev": 0.0}, "step_ev: got 0"),
+        ({"level": 0.0}, "level: got 0"),
+        ({"darks": -1}, "darks: got -1"),
+    ],
+)
+def test_what_cannot_be_planned_is_named(words, match):
+    with pytest.raises(PlanError, match=match):
+        probe_plan(RIG, **words)
+
+
+def test_other_rigs_have_no_such_plan():
+    with pytest.raises(PlanError, match="one with a probe"):
+        probe_plan(load_rig("flash"))
+    with pytest.raises(PlanError, match="expected one of phantom, dark"):
+        probe_calibration_plan(RIG, "white")
+
+
+def test_a_pump_that_may_run_for_less_time_bounds_the_longest_exposure():
+    weak = dataclasses.replace(RIG, probe=dataclasses.replace(PROBE, max_suction_s=20.0))
+    with pytest.raises(PlanError, match="one suction of 20 s has room for"):
+        probe_plan(weak)
+    plan = probe_plan(weak, sites=["cheek"], longest_s=15.0, darks=0)
+    assert len(spans([s.settings["exposure_s"] + 0.3 for s in plan.steps], weak.probe)) > 2
