@@ -22,6 +22,11 @@ FloatArray = NDArray[np.float64]
 SMOOTH: Final = 3
 """Side of the square of one color's pixels that the noise of each is told from."""
 MARGIN_SIGMAS: Final = 4.0
+LEAST_SIGMAS: Final = 20.0
+"""Of a pixel's light over its error, to tell how bright the source was in each frame."""
+WIDEST_RIPPLE: Final = 0.1
+"""Standard deviation of the source's light from frame to frame, relative, at most."""
+RIPPLE_ROUNDS: Final = 8
 FORESIGHT: Final = 0.1
 """Of full scale: a prediction worse than this does not decide whether a frame counts."""
 
@@ -45,6 +50,9 @@ class MergedSeries:
         In every frame; not hot.
     exposures_s : tuple of float
         Ascending.
+    scale, scale_stderr : tuple of float
+        Light of each frame per second over the mean of all, from what the frames tell of each
+        other, and its standard error: a source that is not steady, a shutter that is not exact.
     """
 
     rate: FloatArray
@@ -53,6 +61,8 @@ class MergedSeries:
     valid: NDArray[np.bool_]
     saturated: NDArray[np.bool_]
     exposures_s: tuple[float, ...]
+    scale: tuple[float, ...]
+    scale_stderr: tuple[float, ...]
 
 
 def merge_series(
@@ -95,6 +105,8 @@ def merge_series(
     - a weight follows from the light on the pixel's neighbors too. From the pixel's own noisy
       value alone it would favor low readings, by a tenth of an electron each, which sums up over
       a spot to more than the farthest fibres give;
+    - frames that two exposures or more show unsaturated tell how bright the source was in each,
+      if it was not steady: see `MergedSeries.scale`;
     - whether a frame is near saturation is told from the shorter frames, not from its own value,
       which would leave out its high readings.
     """
@@ -114,9 +126,17 @@ def merge_series(
     # first by read noise alone, then with the noise of the light that was found
     guess, seen = _weigh(stack, times, lit, base, usable, darks, noise, np.zeros(shape))[:2]
     smooth = _smooth(guess, seen & ~hot, noise.pattern)
-    rate, seen, variance = _weigh(
-        stack, times, lit, base, usable, darks, noise, np.maximum(smooth, 0.0)
-    )
+    light = np.maximum(smooth, 0.0)
+    rate, seen, variance = _weigh(stack, times, lit, base, usable, darks, noise, light)
+    clear = seen & ~hot & (rate > LEAST_SIGMAS * np.sqrt(variance))
+    scale, scale_stderr = np.ones(len(times)), np.zeros(len(times))
+    if len(times) > 1 and clear.any():
+        scale, scale_stderr = _scales(
+            np.stack([(frame - dark)[clear] for frame, dark in zip(stack, base, strict=True)]),
+            np.stack([use[clear] for use in usable]),
+            times, lit, rate[clear], light[clear], darks, noise,
+        )  # fmt: skip
+        rate, seen, variance = _weigh(stack, times, lit * scale, base, usable, darks, noise, light)
     valid = seen & ~hot
     rate, variance = np.where(valid, rate, 0.0), np.where(valid, variance, 0.0)
     span = noise.span_dn
@@ -127,6 +147,8 @@ def merge_series(
         valid,
         ~seen & ~hot,
         tuple(float(t) for t in times),
+        tuple(float(f) for f in scale),
+        tuple(float(e) for e in scale_stderr),
     )
 
 
@@ -229,6 +251,43 @@ def _weigh(
     (bias2, both), (_, rate2) = darks.covariance
     variance = 1.0 / below + bias2 * by_bias**2 + 2.0 * both * by_bias * by_rate
     return signal / below, seen, variance + rate2 * by_rate**2
+
+
+def _scales(
+    value: FloatArray,
+    usable: NDArray[np.bool_],
+    times: FloatArray,
+    lit: FloatArray,
+    rate: FloatArray,
+    light: FloatArray,
+    darks: DarkModel,
+    noise: CameraNoise,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the light of each frame over the mean, and its standard error.
+
+    Least squares of ``value = rate scale time`` over pixels (K, P) whose rates are free, with a
+    normal prior of the scales about 1, as wide as they turn out to scatter.
+    """
+    variance = (
+        noise.floor_dn2
+        + (max(darks.mean_rate_dn_per_s, 0.0) * times[:, None] + light * lit[:, None])
+        / noise.gain_e_per_dn
+    )
+    expected = rate * lit[:, None]
+    information = np.where(usable, expected**2 / variance, 0.0)
+    miss = np.where(usable, value / expected - 1.0, 0.0)
+    total = information.sum(axis=0)
+    mean = (information * miss).sum(axis=0) / total
+    normal = np.diag(information.sum(axis=1)) - (information / total) @ information.T
+    right = (information * (miss - mean)).sum(axis=1)
+    prior = WIDEST_RIPPLE**2
+    away, covariance = np.zeros(len(times)), np.zeros((len(times), len(times)))
+    for _ in range(RIPPLE_ROUNDS):
+        covariance = np.linalg.inv(normal + np.eye(len(times)) / prior)
+        away = covariance @ right
+        prior = float(np.mean(away**2 + np.diag(covariance)))
+        prior = min(max(prior, 1e-12), WIDEST_RIPPLE**2)
+    return 1.0 + away, np.sqrt(np.diag(covariance))
 
 
 def _smooth(values: FloatArray, valid: NDArray[np.bool_], pattern: str) -> FloatArray:
