@@ -328,7 +328,7 @@ def invert(
             g_error=float(g_error),
         )  # fmt: skip
         if model_error is not None:
-            model = replace(model, error=np.array([float(model_error), 0.0]))
+            model = replace(model, error=np.array([float(model_error), 0.0, 0.0]))
         bounds = model.bounds
         members = np.flatnonzero(which == number)
         for begin in range(0, members.size, BATCH):

@@ -270,8 +270,9 @@ def fit(
         Reflectance, or its logarithm where `logarithmic`.
     variance : (N, F)
         Of `y`; infinite where a fibre is left out.
-    model_error : (2,)
-        Relative: everywhere, and at the source, falling by exp(-r (sigma_a + sigma_s')).
+    model_error : (3,)
+        Relative: everywhere; at the source, falling by exp(-r (sigma_a + sigma_s')); and times
+        sigma_a/sigma_s'.
     logarithmic : bool
         Compare logarithms; then the model's error is not added.
     prior : (4, 2)
@@ -305,12 +306,17 @@ def fit(
             done = 1
             settled = False
             best = 0.0
-            for _round in range(rounds):
+            changing = not logarithmic and (
+                model_error[0] > 0.0 or model_error[1] > 0.0 or model_error[2] > 0.0
+            )
+            for round_ in range(rounds):
+                close = max(1e-6, 1e-2 * 0.01**round_) if changing else 1e-6
                 extinction = math.exp(now[0]) + math.exp(now[1])
+                base = model_error[0] ** 2 + (model_error[2] * math.exp(now[0] - now[1])) ** 2
                 for f in range(fibres):
                     v = variance[n, f]
                     if not logarithmic and v < np.inf:
-                        e = model_error[0] ** 2
+                        e = base
                         if model_error[1] > 0.0:
                             e += (model_error[1] * _decay(radius[f] * extinction)) ** 2
                         v += e * m[f] * m[f]
@@ -378,7 +384,7 @@ def fit(
                         fresh = True
                         first = first and longest < 1e-7
                         damping = max(damping * 0.1, 1e-9)
-                        if longest < 1e-6 or gain <= 1e-13 * best:
+                        if longest < close or gain <= 1e-13 * best:
                             settled = True
                             break
                     else:
@@ -389,7 +395,7 @@ def fit(
                         if damping > 1e10:
                             settled = longest < 1e-6
                             break
-                if logarithmic or first:
+                if not changing or (first and close <= 1e-6):
                     break
             steps[n] = done if settled else -done
             chi2[n] = best
