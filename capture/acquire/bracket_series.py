@@ -77,10 +77,11 @@ class BracketSeries:
     # darks ------------------------------------------------------------------------------------
 
     def darks(self) -> None:
-        """Take the frames without light that are missing; the box is not armed for them."""
+        """Take the frames without light that are missing, with the head capped."""
         missing = [step for step in steps_to_do(self._session) if step.kind == "dark"]
         if missing:
             self._box.cover(None)
+            self._head.cap()
         for number, step in enumerate(missing, start=1):
             self._operator.stop_if_asked()
             seconds = float(step.settings["exposure_s"])

@@ -15,6 +15,7 @@ from capture.acquire.outcome import MAX_ATTEMPTS, AcquisitionError, Operator
 from capture.devices.port import CommandRefused
 from capture.devices.probe import Opening, ProbeStatus, SuctionReport, SuctionState
 from capture.devices.wire import Code
+from capture.plan.probe import CAP
 from capture.plan.suction import SLACK_S, Placement
 from capture.rig import Probe
 
@@ -155,6 +156,14 @@ class Head:
         self._place = place
         self.placements += 1
         log.info("placement %d: %s", self.placements, place)
+
+    def cap(self) -> None:
+        """Have a person cap the head, so that no light of the room enters the fibres."""
+        self.let_go()
+        self._operator.stop_if_asked()
+        self._operator.prompt("put the cap on the head")
+        self._box.arm()
+        self._box.place(CAP, 0.0)
 
     def let_go(self) -> None:
         """Vent, disarm and forget the placement: a person's hands are at the head now."""

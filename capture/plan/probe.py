@@ -22,6 +22,8 @@ SITES = ("forehead", "cheek", "chin")
 """Where Weyrich et al. (2006) placed their head; "chin" is below it."""
 PHANTOM = "phantom"
 """Site of the block of known optics."""
+CAP = "cap"
+"""Where the head is while frames without light are taken."""
 BRACKETS = 23
 LONGEST_S = 30.0
 STEP_EV = 2.0 / 3.0
@@ -106,7 +108,8 @@ def probe_plan(
     """
     chosen = tuple(sites)
     for site in chosen:
-        require(is_id(site) and site != PHANTOM, "sites", site, f"a name, not {PHANTOM!r}")
+        named = is_id(site) and site not in (PHANTOM, CAP)
+        require(named, "sites", site, f"a name, not {PHANTOM!r} or {CAP!r}")
     require(len(set(chosen)) == len(chosen) > 0, "sites", chosen, "at least one, none twice")
     require(repeats >= 1, "repeats", repeats, ">= 1")
     require(1 <= angles <= 360, "angles", angles, "1 to 360")

@@ -46,6 +46,9 @@ HOT_SHARE, HOT_E_PER_S = 1e-3, 10.0
 ROOM_R_F_PER_MM2: Final = 1e-3
 """What the room's light on a head in the air is worth in reflectance at full level."""
 
+CAP: Final = "cap"
+"""Site at which the head's fibres look into the dark."""
+
 VIGNETTING: Final = 0.1
 PHOTONS: Final = 200_000
 """Photons for each site and angle."""
@@ -154,7 +157,7 @@ class ProbeScene:
         SceneError
             The tissue has no such site.
         """
-        if not head.placed or not head.site:
+        if not head.placed or head.site in ("", CAP):
             return None
         try:
             return self.profiles.profile(head.site, head.angle_deg, head.suction_mbar)
@@ -255,7 +258,7 @@ class ProbeScene:
             energy = pop.level * (pop.t_off_s - pop.t_on_s)
             energy *= 1.0 + self.build.ripple * float(rng.standard_normal())
             total += max(energy, 0.0) * self.fibre_light(head, fibre=pop.fibre)
-        if not head.placed or not head.site:
+        if (not head.placed and head.site != CAP) or not head.site:
             room = np.full((len(self.build.gain), 3), ROOM_R_F_PER_MM2)
             total += exposure_s * self.through_fibres(room)
         light = self.image(total)

@@ -1,0 +1,78 @@
+"""Judge the fibre probe on homogeneous media: capture, calibrate, reconstruct, compare sigma_tr.
+
+    python tools/judge_probe.py OUT FIRST_SEED MEDIA [REPEATS]
+
+Draws media with sigma_tr from 0.3 to 3.0 per mm and sigma_s' from 0.7 to 3.0 per mm, evenly in the
+logarithm, and g from 0.7 to 0.9; simulates each as a session of REPEATS placements with all its
+noise, and prints the error of sigma_tr by the three methods with the coverage of the 68 %
+intervals. Each repeat is a placement of its own. What lies in OUT already is not made again.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from model import store
+from reconstruction import pipeline
+from skinrig import subsurface_evaluation as evaluation
+from skinrig.calibrating import calibrate
+from skinrig.simulation import simulate_session, truth_folder
+
+
+def medium(seed: int) -> tuple[float, float, float]:
+    """Return sigma_a, sigma_s' and g of the medium of a seed."""
+    rng = np.random.default_rng(seed)
+    sigma_tr = math.exp(rng.uniform(math.log(0.3), math.log(3.0)))
+    sigma_s_prime = math.exp(rng.uniform(math.log(0.7), math.log(3.0)))
+    g = rng.uniform(0.7, 0.9)
+    # sigma_tr^2 = 3 a (a + s')
+    sigma_a = 0.5 * (math.sqrt(sigma_s_prime**2 + 4.0 / 3.0 * sigma_tr**2) - sigma_s_prime)
+    return sigma_a, sigma_s_prime, g
+
+
+def main(arguments: list[str]) -> None:
+    out, first, media = Path(arguments[0]), int(arguments[1]), int(arguments[2])
+    repeats = int(arguments[3]) if len(arguments) > 3 else 1
+    out.mkdir(parents=True, exist_ok=True)
+    if not (out / "calibration").exists():
+        simulate_session("probe", out / "session-phantom", target="phantom", seed=first)
+        calibrate("fibre", [out / "session-phantom"], out / "calibration")
+    rows: list[evaluation.FitError] = []
+    for seed in range(first, first + media):
+        sigma_a, sigma_s_prime, g = medium(seed)
+        session = out / f"session-{seed}"
+        if not truth_folder(session).exists():
+            simulate_session(
+                "probe", session, subject=f"homogeneous:{sigma_a:.6g},{sigma_s_prime:.6g},{g:.3g}",
+                sites=("cheek",), repeats=repeats, seed=seed,
+            )  # fmt: skip
+        pipeline.reconstruct(
+            session, want=("profiles", "subsurface"), out=out / f"appearance-{seed}",
+            calibration=out / "calibration", truth=truth_folder(session).name,
+        )  # fmt: skip
+        truth = store.read(truth_folder(session))
+        own = evaluation.compare_fits(store.read(out / f"appearance-{seed}"), truth)
+        rows += own
+        told = [
+            f"{row.method} {row.channel} {100 * row.relative:+.2f} "
+            f"({'in' if row.covered else 'out'}{'' if row.valid else ', not valid'})"
+            for row in own if row.name == own[0].name and row.channel == "green"
+        ]  # fmt: skip
+        print(f"seed {seed}: sigma_a {sigma_a:.4f} sigma_s' {sigma_s_prime:.3f} g {g:.2f}; "
+              f"{'; '.join(told)}", flush=True)  # fmt: skip
+    print("method          fits  median %  worst %  bias %  68 % interval covers %")
+    for each in evaluation.by_method(rows):
+        print(
+            f"{each.method:15} {each.fits:4d}  {100 * each.median:8.2f}  {100 * each.worst:7.2f}  "
+            f"{100 * each.bias:+6.2f}  {100 * each.coverage:6.1f}"
+        )
+    lost = sum(not row.valid for row in rows)
+    print(f"not valid: {lost} of {len(rows)}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
