@@ -399,7 +399,8 @@ def _summary(
              f" {np.median(second):.1e}")
         )  # fmt: skip
         strays = np.abs(mixed.offset).max()
-        rows.append(("stray light", f"at most {strays:.1e} ± {mixed.offset_stderr.max():.0e} full"
+        strays_error = np.hypot(mixed.offset_stderr, mixed.offset_common).max()
+        rows.append(("stray light", f"at most {strays:.1e} ± {strays_error:.0e} full"
                      " scales per second"))  # fmt: skip
         rows.append(("covers let through", f"{mixed.cover_leak:.1e} ±"
                      f" {mixed.cover_leak_stderr:.0e}"))  # fmt: skip

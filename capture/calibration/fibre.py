@@ -58,7 +58,7 @@ class FibreReflectance:
         1/mm^4, of each fibre by itself: readings, stray light, cross-talk, gain.
     common_per_mm2 : ndarray of float64, shape (T, F, C)
         One pattern for each of T causes at one standard uncertainty of it: what the phantom's
-        certificate leaves uncertain.
+        certificate leaves uncertain, and last the error of stray light that the fibres share.
     valid : ndarray of bool, shape (F, C)
     saturated : ndarray of bool, shape (F, C)
     reasons : mapping of str to str
@@ -186,12 +186,15 @@ class FibreCalibration:
         spread = spread + self.crosstalk.matrix_variance(light, self.light, ratio)
         value = np.where(valid, light / gain, 0.0)
         own = spread / gain**2 + (value * self.gain_stderr / gain) ** 2
+        # the phantom's light has the same error of stray light, which cancels in part
+        stray = -self.crosstalk.offset_common / gain * (1.0 - ratio)
+        common = np.concatenate([value * self.common, stray[None]])
         return FibreReflectance(
             self.names,
             self.radius_mm,
             value,
             np.where(valid, own, 0.0),
-            np.where(valid, value * self.common, 0.0),
+            np.where(valid, common, 0.0),
             valid,
             readings.saturated,
             self._reasons(readings),
@@ -238,6 +241,7 @@ class FibreCalibration:
                 "gain_common": Quantity(self.common[:, i]),
                 "phantom_light": Quantity(self.light[i]),
                 "stray": Quantity(mixed.offset[i], mixed.offset_stderr[i]),
+                "stray_common": Quantity(mixed.offset_common[i]),
                 "crosstalk": Quantity(mixed.matrix[i], mixed.stderr[i]),
                 "valid": Quantity(self.valid[i].astype(np.float64)),
                 "dead": _one(float(self.dead[i])),
@@ -310,6 +314,7 @@ class FibreCalibration:
             value("gain_common").transpose(1, 0, 2), value("phantom_light"),
             CrossTalk(
                 value("crosstalk"), stderr("crosstalk"), value("stray"), stderr("stray"),
+                value("stray_common"),
                 bool(camera("crosstalk_measured")), float(leak.value),
                 0.0 if leak.stderr is None else float(leak.stderr),
             ),
@@ -393,7 +398,7 @@ def calibrate_fibres(
     signal, variance, told = _guessed(phantom)
     light, spread = mixed.unmix(signal, variance)
     doubt = mixed.matrix_variance(light, light, np.zeros_like(light))
-    error = np.sqrt(spread + doubt)
+    error = np.sqrt(spread + doubt + mixed.offset_common**2)
     gain = light / expected.per_mm2
     bright = np.asarray(phantom.valid & told & (light > LEAST_SIGMAS * error), np.bool_)
     usual = np.array([np.median(g[b]) if b.any() else 0.0 for g, b in zip(gain.T, bright.T)])  # noqa: B905
@@ -411,7 +416,7 @@ def calibrate_fibres(
     )
     mixed = CrossTalk(
         mixed.matrix, mixed.stderr, mixed.offset / level, mixed.offset_stderr / level,
-        mixed.measured, mixed.cover_leak, mixed.cover_leak_stderr,
+        mixed.offset_common / level, mixed.measured, mixed.cover_leak, mixed.cover_leak_stderr,
     )  # fmt: skip
     return FibreCalibration(
         spots,

@@ -39,7 +39,10 @@ class CrossTalk:
         X: ``matrix[j, i]`` is what spot j reads of fibre i's light, over what spot i reads of it;
         1 on the diagonal, with error 0.
     offset, offset_stderr : ndarray of float64, shape (F, C)
-        o: stray light in each spot that is no fibre's, full scales per second.
+        o: stray light in each spot that is no fibre's, full scales per second; the error of each
+        by itself.
+    offset_common : ndarray of float64, shape (F, C)
+        By how much one standard error that the spots of a color share changes the offsets.
     measured : bool
         False: no frames told it; the matrix is 1, and its errors are unknown.
     cover_leak, cover_leak_stderr : float
@@ -50,6 +53,7 @@ class CrossTalk:
     stderr: FloatArray
     offset: FloatArray
     offset_stderr: FloatArray
+    offset_common: FloatArray
     measured: bool = True
     cover_leak: float = 0.0
     cover_leak_stderr: float = 0.0
@@ -60,6 +64,7 @@ class CrossTalk:
         for name, shape in (
             ("matrix", (count, count)), ("stderr", (count, count)),
             ("offset", (count, colors)), ("offset_stderr", (count, colors)),
+            ("offset_common", (count, colors)),
         ):  # fmt: skip
             _freeze(self, name, shape)
         if not (np.diagonal(self.matrix) == 1.0).all():
@@ -117,7 +122,7 @@ class CrossTalk:
 def no_crosstalk(count: int, colors: int) -> CrossTalk:
     """Return a matrix of no cross-talk, for where none was measured."""
     nothing = np.zeros((count, colors))
-    return CrossTalk(np.eye(count), np.zeros((count, count)), nothing, nothing, measured=False)
+    return CrossTalk(np.eye(count), np.zeros((count, count)), nothing, nothing, nothing, False)
 
 
 def measure_crosstalk(masks: Mapping[int, FibreReadings], phantom: FibreReadings) -> CrossTalk:
@@ -182,19 +187,19 @@ def measure_crosstalk(masks: Mapping[int, FibreReadings], phantom: FibreReadings
             break
     np.fill_diagonal(matrix, 1.0)
     np.fill_diagonal(variance, 0.0)
-    leak, leak_stderr, offset, offset_variance = _stray(offset, offset_variance, phantom)
+    leak, leak_stderr, offset, offset_stderr, common = _stray(offset, offset_variance, phantom)
     return CrossTalk(
-        matrix, np.sqrt(variance), offset, np.sqrt(offset_variance), True, leak, leak_stderr
+        matrix, np.sqrt(variance), offset, offset_stderr, common, True, leak, leak_stderr
     )
 
 
 def _stray(
     steady: FloatArray, variance: FloatArray, phantom: FibreReadings
-) -> tuple[float, float, FloatArray, FloatArray]:
+) -> tuple[float, float, FloatArray, FloatArray, FloatArray]:
     """Part light that is the same in all masks into a cover's leak and stray light.
 
-    Returns the leak, its standard error, and stray light with its variance, shape (F, C), drawn to
-    the mean of each color's spots.
+    Returns the leak, its standard error, and stray light drawn to the mean of each color's spots,
+    with its errors by itself and in common, shape (F, C).
     """
     count, colors = steady.shape
     good = phantom.valid & (variance > 0)
@@ -219,13 +224,14 @@ def _stray(
             break
     rest = steady - leak * source
     doubt = variance + source**2 * (leak_variance + (UNEVEN_COVER * leak) ** 2)
-    stray, stray_variance = np.tile(level, (count, 1)), np.zeros((count, colors))
+    stray = np.tile(level, (count, 1))
+    own, common = np.zeros((count, colors)), np.zeros((count, colors))
     for c in range(colors):
         if good[:, c].any():
-            stray[:, c], stray_variance[:, c] = shrunk(
+            stray[:, c], own[:, c], common[:, c] = shrunk(
                 rest[:, c], np.where(good[:, c], 1.0 / np.maximum(doubt[:, c], 1e-300), 0.0), 0.0
             )
-    return leak, float(np.sqrt(leak_variance)), stray, stray_variance
+    return leak, float(np.sqrt(leak_variance)), stray, own, common
 
 
 def _pooled(
@@ -238,7 +244,8 @@ def _pooled(
     for number in range(int(group.max(initial=-1)) + 1):
         here = group == number
         if (information[here] > 0).any():
-            matrix[here], variance[here] = shrunk(own[here], information[here], LEAST_SCATTER)
+            matrix[here], alone, common = shrunk(own[here], information[here], LEAST_SCATTER)
+            variance[here] = alone**2 + common**2
             last = float(np.median(np.abs(matrix[here])))
         else:
             # nothing is told of such a distance: no more than of the one before
@@ -248,8 +255,10 @@ def _pooled(
 
 def shrunk(
     value: FloatArray, information: FloatArray, least_scatter: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return values drawn to their mean as far as their own scatter tells, and variances.
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return values drawn to their mean as far as their own scatter tells, and standard errors.
+
+    The first errors are of each by itself, the second what all share by the error of the mean.
 
     Parameters
     ----------
@@ -261,7 +270,7 @@ def shrunk(
 
     Examples
     --------
-    >>> value, variance = shrunk(np.array([1.0, 3.0, 9.0]), np.array([1e4, 1e4, 0.0]), 0.0)
+    >>> value, _, _ = shrunk(np.array([1.0, 3.0, 9.0]), np.array([1e4, 1e4, 0.0]), 0.0)
     >>> value.round(2).tolist()
     [1.0, 3.0, 2.0]
     """
@@ -278,7 +287,8 @@ def shrunk(
     known = np.where(told, value, mean)
     return (
         share * known + (1.0 - share) * mean,
-        (1.0 - share) * between + (1.0 - share) ** 2 * error,
+        np.sqrt((1.0 - share) * between),
+        (1.0 - share) * np.sqrt(error),
     )
 
 
