@@ -56,7 +56,7 @@ class Opening:
     """When the blades had cleared the fibre and the camera's line was pulsed, s since power-up."""
     ended: Shut
     """open: not yet. timed: by its own end. asked: by `ProbeBox.close_shutter`, or the head was
-    taken off. pump: the suction failed. jam: the blades did not close, and the LED was put out.
+    taken off. pump: the suction ended. jam: the blades did not close, and the LED was put out.
     interlock, dark: the box has let go of everything."""
     t_shut_s: float
     """When its light ended, s since power-up; inf when not yet."""
@@ -247,14 +247,16 @@ class ProbeBox(Box):
     def open_shutter(self, seconds: float) -> Opening:
         """Open the shutter for `seconds`; the camera's line is pulsed when the blades are clear.
 
+        With the LED on it opens only while the head is held: an eye might be before the fibre.
         Returns when it has opened. A retry on the line never opens it twice.
 
         Raises
         ------
         CommandRefused
-            Nothing opened: not armed (-203), 108 after the lease ran out, open already or the cover
-            moves (-213), beyond the limits (-222), the blades stuck or made dark meanwhile (-240),
-            the dose of light reached (104), the emergency stop open (107).
+            Nothing opened: not armed (-203), 108 after the lease ran out, open already, the cover
+            moves, or the LED is on and the head not held (-213), beyond the limits (-222), the
+            blades stuck or made dark meanwhile (-240), the dose of light reached (104), the
+            emergency stop open (107).
         """
         span_ms = _decimal("seconds", seconds * 1e3)
         payload = self._port.ask(f"SHUT OPEN,{span_ms}")

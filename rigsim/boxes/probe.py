@@ -2,13 +2,14 @@
 
 Its manual is its command table (`ProbeUnit.commands`) and these rules. Light and suction need an
 armed box and carry their own end; the shutter pulses the camera's line when its blades have cleared
-the fibre, and answers then. Before the pump a person has to say with ``HEAD:SITE`` where the head
+the fibre, and answers then. No light leaves a head that is not held, because an eye may be before
+it: with the LED on, the shutter opens only when the gauge has seen the suction that was asked for,
+and shuts when the pump goes off. Before the pump a person has to say with ``HEAD:SITE`` where the head
 sits, which means after each change, and after each time that the box has let go by itself: what
 makes other boxes dark (``SAFE``, ``ABOR``, ``*RST``, a silent host, the emergency stop, the loss of
 power) shuts the shutter, puts the LED out, vents, and forgets the place, because nobody knows
 whether a head that nothing holds is still there. ``PUMP VENT`` and the pump's own end keep it: the
-skin rests, and is sucked at again. A suction that ends by a fault forgets the place, too, and shuts
-the shutter: no light leaves a head that has come off.
+skin rests, and is sucked at again. A suction that ends by a fault forgets the place, too.
 
 The box does not know what it sits on: it draws at a `SuctionLoad` and has a gauge.
 """
@@ -108,7 +109,7 @@ class ProbeUnit:
             probe,
             load,
             Gauge(rng=rng, dead_after_s=gauge_dead_after),
-            on_fault=lambda now: self.shutter.shut(now, "PUMP"),
+            on_end=lambda now: self.shutter.shut(now, "PUMP"),
             say=self._say,
             clock_us=self._clock_us,
         )
@@ -339,6 +340,8 @@ class ProbeUnit:
             raise Refused(Code.SYNTAX, "expected OPEN,<ms> or CLOSE")
         span_ms = number(length, SHUTTER_MS, self._probe.max_open_s * 1e3, "ms")
         self._require_stop_closed()
+        if self.shutter.level > 0 and not self.pump.holds:
+            raise Refused(Code.IGNORED, "the head is not held; PUMP ON, and wait")
         at_s, outcome = self.shutter.open(span_ms / 1e3, now)
         return Later(at_s, outcome)
 

@@ -111,8 +111,8 @@ class SuctionPump:
         The head on the skin.
     gauge
         Of the suction under it.
-    on_fault
-        Called with the world time in s when the suction has ended by a fault.
+    on_end
+        Called with the world time in s when the suction has ended, whatever the reason.
     say
         Called with name and payload of an event.
     clock_us
@@ -125,14 +125,14 @@ class SuctionPump:
         load: SuctionLoad,
         gauge: Gauge,
         *,
-        on_fault: Callable[[float], None],
+        on_end: Callable[[float], None],
         say: Callable[[str, str], None],
         clock_us: Callable[[float], int],
     ) -> None:
         self._probe = probe
         self._load = load
         self._gauge = gauge
-        self._on_fault = on_fault
+        self._on_end = on_end
         self._say = say
         self._clock_us = clock_us
         self._draw: _Draw | None = None
@@ -148,6 +148,11 @@ class SuctionPump:
     def drawing(self) -> bool:
         """Whether the pump is on."""
         return self._draw is not None
+
+    @property
+    def holds(self) -> bool:
+        """Whether the suction that was asked for is, or was, there since the pump went on."""
+        return self._draw is not None and self._draw.held
 
     def rest_ms(self, now: float) -> int:
         """Return how long the skin rests yet, ms."""
@@ -203,11 +208,11 @@ class SuctionPump:
         self._rested_s = now + self._probe.rest_s
         self.last_report = f"{draw.number},{how},{draw.mbar:.1f},{self._clock_us(now)}"
         self._say("PUMP:END", self.last_report)
+        self._on_end(now)
 
     def _fail(self, draw: _Draw, how: str, now: float) -> None:
         self._end(draw, how, now)
         self.take_away(now)
-        self._on_fault(now)
 
     # what is asked for ------------------------------------------------------------------------
 

@@ -64,12 +64,14 @@ class Host:
         box.place("cheek", 0.0)
         box.listen(0.6)
         box.suck(60.0, 20.0)
+        box.listen(2.2)  # by then the box has given up what is not reached
 
     def measure(self):
         """Open the shutter once: a number for each accepted opening, no light for a refused one."""
         before = self.unit.shutter.count
         try:
-            if not self.box.suction().on:
+            state = self.box.suction()
+            if not state.on or state.left_s < 5.0:
                 self.note_suction()
                 self.ready()
                 return

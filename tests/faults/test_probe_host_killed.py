@@ -25,7 +25,7 @@ box.arm()
 box.place("cheek", 0.0)
 box.set_level(1.0)
 box.suck(60.0, 50.0)
-box.listen(0.3)
+box.listen(0.7)
 box.open_shutter(25.0)
 while True:
     box.listen(0.1)

@@ -92,6 +92,12 @@ def suck(bench, mbar=60, ms=20_000, wait_s=2.0):
     bench.wait(wait_s)
 
 
+def light(bench, level=1000, **more):
+    """Have the head held and the LED on."""
+    suck(bench, **more)
+    bench.ask(f"LED {level}")
+
+
 def nothing_on(bench):
     unit = bench.unit
     return not (unit.lit or unit.shutter.level or unit.shutter.is_open or unit.pump.drawing)
@@ -137,13 +143,13 @@ def test_what_makes_dark_needs_neither_frame_nor_arming(bench, text):
     assert (
         names
         == {
-            "PUMP VENT": {"PUMP:END"},
+            "PUMP VENT": {"PUMP:END", "SHUT:END"},
             "SHUT CLOSE": {"SHUT:END"},
             "LED 0": set(),
             "HEAD:FREE": {"PUMP:END", "SHUT:END"},
         }[text]
     )
-    assert bench.unit.lit == (text == "PUMP VENT")
+    assert not bench.unit.lit
     assert bench.unit.pump.drawing == (text in ("SHUT CLOSE", "LED 0"))
 
 
@@ -220,46 +226,48 @@ def test_nothing_shines_or_sucks_unless_armed(bench, text):
 
 
 def test_the_shutter_opens_pulses_the_camera_line_and_closes_by_itself(bench):
-    say(bench, ("SYST:ARM", "LED 800"))
+    light(bench, 800)
     begin_s = bench.now
     assert open_for(bench, 500) == (1, round(1e6 * (begin_s + LAG_S)))
     assert bench.edges == [begin_s + LAG_S]
     assert bench.ask("SHUT?") == "OPEN,500"
     assert bench.ask("*OPC?") == "0"
     assert int(bench.ask("STAT?")) & 64
-    assert bench.ask("SHUT:LAST?") == "1,OPEN,1001000,-"
+    opened_us = round(1e6 * (begin_s + LAG_S))
+    assert bench.ask("SHUT:LAST?") == f"1,OPEN,{opened_us},-"
     bench.wait(0.6)
     assert bench.ask("SHUT?") == "CLOSED"
     assert bench.ask("*OPC?") == "1"
-    assert bench.events("SHUT:END") == ["1,TIMED,1001000,1501000"]
-    assert bench.ask("SHUT:LAST?") == "1,TIMED,1001000,1501000"
-    (light,) = bench.world.sources
-    assert (light.level, light.fibre) == (0.8, None)
-    assert (light.t_on_s, light.t_off_s) == pytest.approx((1.001, 1.501))
+    assert bench.events("SHUT:END") == [f"1,TIMED,{opened_us},{opened_us + 500_000}"]
+    assert bench.ask("SHUT:LAST?") == f"1,TIMED,{opened_us},{opened_us + 500_000}"
+    (seen,) = bench.world.sources
+    assert (seen.level, seen.fibre) == (0.8, None)
+    assert (seen.t_on_s, seen.t_off_s) == pytest.approx((begin_s + 0.001, begin_s + 0.501))
 
 
 @pytest.mark.parametrize("ms", [1, 1.15, 30_000])
 def test_an_opening_ends_on_time_although_the_host_is_silent(bench, ms):
-    say(bench, ("SYST:WDOG 5000", "SYST:ARM", "LED 1000"))
+    bench.ask("SYST:WDOG 5000")
+    light(bench, ms=60_000)
     open_for(bench, ms)
     bench.silence(4.9)
     if ms < 4000:
-        (light,) = bench.world.sources
-        assert light.t_off_s - light.t_on_s == pytest.approx(ms / 1e3, abs=1e-9)
+        (seen,) = bench.world.sources
+        assert seen.t_off_s - seen.t_on_s == pytest.approx(ms / 1e3, abs=1e-9)
         assert bench.box.armed
     else:
         # a host that stays silent for the lease loses the light before
         bench.silence(30.0)
-        (light,) = bench.world.sources
-        assert light.t_off_s == pytest.approx(light.t_on_s + 5.0)
+        (seen,) = bench.world.sources
+        assert seen.t_off_s == pytest.approx(seen.t_on_s + 5.0)
 
 
 def test_thirty_seconds_of_light_are_the_most_while_the_host_lives(bench):
-    say(bench, ("SYST:ARM", "LED 1000"))
+    light(bench, ms=60_000)
     open_for(bench, 30_000)
     bench.wait(31.0)
-    (light,) = bench.world.sources
-    assert light.t_off_s - light.t_on_s == pytest.approx(30.0, abs=1e-9)
+    (seen,) = bench.world.sources
+    assert seen.t_off_s - seen.t_on_s == pytest.approx(30.0, abs=1e-9)
 
 
 def test_a_shutter_that_opens_in_the_dark_gives_no_light_but_a_pulse(bench):
@@ -275,7 +283,7 @@ def test_a_shutter_that_opens_in_the_dark_gives_no_light_but_a_pulse(bench):
     "text", ["SHUT OPEN,100", "LED 100", "FIB 3", "FIB ALL", "HEAD:SITE chin,0"]
 )
 def test_nothing_is_changed_while_the_shutter_is_open(bench, text):
-    say(bench, ("SYST:ARM", "LED 800"))
+    light(bench, 800)
     open_for(bench, 400)
     assert bench.code(text) == Code.IGNORED
     bench.wait(0.5)
@@ -284,31 +292,63 @@ def test_nothing_is_changed_while_the_shutter_is_open(bench, text):
 
 
 def _span(bench):
-    (light,) = bench.world.sources
-    return light.t_on_s, light.t_off_s
+    (seen,) = bench.world.sources
+    return seen.t_on_s, seen.t_off_s
 
 
 def test_light_that_goes_on_is_told_so_far(bench):
-    say(bench, ("SYST:ARM", "LED 800"))
+    light(bench, 800)
     open_for(bench, 400)
     bench.wait(0.1)
-    (light,) = bench.unit.light_now(bench.now)
-    assert light.t_off_s == bench.now
+    (seen,) = bench.unit.light_now(bench.now)
+    assert seen.t_off_s == bench.now
     assert bench.world.sources == []
 
 
 def test_the_led_is_put_out_under_an_open_shutter(bench):
-    say(bench, ("SYST:ARM", "LED 800"))
+    light(bench, 800)
     open_for(bench, 400)
     bench.wait(0.1)
     bench.ask("LED 0")
     bench.wait(0.5)
-    (light,) = bench.world.sources
-    assert light.t_off_s - light.t_on_s == pytest.approx(0.1, abs=1e-9)
+    (seen,) = bench.world.sources
+    assert seen.t_off_s - seen.t_on_s == pytest.approx(0.1, abs=1e-9)
+
+
+def test_no_light_leaves_a_head_that_is_not_held(bench):
+    say(bench, ("SYST:ARM", "LED 1000"))
+    assert bench.code("SHUT OPEN,100") == Code.IGNORED
+    bench.ask("HEAD:SITE cheek,0")
+    assert bench.code("SHUT OPEN,100") == Code.IGNORED
+    bench.ask("PUMP ON,3000,60")
+    assert bench.code("SHUT OPEN,100") == Code.IGNORED  # the suction is not there yet
+    bench.wait(1.0)
+    assert open_for(bench, 100)[0] == 1
+    bench.wait(0.5)
+    # the pump's own end ends a light that was to be longer
+    assert open_for(bench, 10_000)[0] == 2
+    bench.wait(2.0)
+    assert [light.t_off_s for light in bench.world.sources] == pytest.approx([2.102, 4.0], abs=2e-3)
+    assert bench.events("SHUT:END")[-1].split(",")[1] == "PUMP"
+    assert bench.code("SHUT OPEN,100") == Code.IGNORED
+    assert bench.ask("HEAD:SITE?") == "cheek,0"
+    bench.ask("LED 0")
+    assert open_for(bench, 100)[0] == 3
+    assert len(bench.world.sources) == 2
+
+
+def test_a_light_ends_with_the_suction_that_is_vented(bench):
+    light(bench)
+    open_for(bench, 10_000)
+    bench.wait(0.2)
+    bench.ask("PUMP VENT")
+    (seen,) = bench.world.sources
+    assert seen.t_off_s == bench.now
 
 
 def test_the_cover_takes_its_time_and_leaves_one_fibre(bench):
-    say(bench, ("SYST:ARM", "LED 1000", "FIB 12"))
+    light(bench)
+    bench.ask("FIB 12")
     assert bench.ask("FIB?") == "12"
     assert bench.ask("*OPC?") == "0"
     assert bench.code("SHUT OPEN,100") == Code.IGNORED
@@ -324,7 +364,8 @@ def test_the_cover_takes_its_time_and_leaves_one_fibre(bench):
 
 
 def test_a_retry_of_an_opening_opens_once_and_is_answered_alike(bench):
-    say(bench, ("SYST:WDOG 5000", "SYST:ARM", "LED 1000"))
+    bench.ask("SYST:WDOG 5000")
+    light(bench)
     bench.seq += 1
     frame = wire.encode(Request(bench.seq, bench.box.boot, "SHUT OPEN,50"))
     assert bench.raw(frame) == b""
@@ -350,7 +391,7 @@ def test_a_retry_of_a_suction_sucks_once(bench):
 
 def test_a_shutter_that_does_not_open_says_so_and_pulses_nothing(make):
     bench = make(shutter_stuck=1.0)
-    say(bench, ("SYST:ARM", "LED 1000"))
+    light(bench)
     assert open_for(bench, 100) == Code.HARDWARE
     bench.wait(0.5)
     assert (bench.edges, bench.world.sources) == ([], [])
@@ -361,7 +402,7 @@ def test_a_shutter_that_does_not_open_says_so_and_pulses_nothing(make):
 @pytest.mark.parametrize("end", ["own", "SHUT CLOSE", "SAFE", "silence"])
 def test_blades_that_do_not_close_put_the_led_out(make, end):
     bench = make(shutter_jam=1.0)
-    say(bench, ("SYST:WDOG 1000", "SYST:ARM", "LED 1000"))
+    light(bench)
     open_for(bench, 100 if end == "own" else 5000)
     bench.wait(0.05)
     if end == "own":
@@ -371,9 +412,9 @@ def test_blades_that_do_not_close_put_the_led_out(make, end):
     else:
         bench.ask(end)
         bench.wait(0.5)
-    (light,) = bench.world.sources
+    (seen,) = bench.world.sources
     spent_s = {"own": 0.12, "SHUT CLOSE": 0.07, "SAFE": 0.05, "silence": 1.05}[end]
-    assert light.t_off_s - light.t_on_s == pytest.approx(spent_s, abs=1e-9)
+    assert seen.t_off_s - seen.t_on_s == pytest.approx(spent_s, abs=1e-9)
     assert bench.ask("SHUT?") == "JAM"
     assert bench.events("SHUT:END")[0].split(",")[1] == "JAM"
     bench.ask("SYST:ARM")
@@ -383,7 +424,6 @@ def test_blades_that_do_not_close_put_the_led_out(make, end):
     bench.unit.shutter._jam = 0.0
     assert bench.code("SHUT CLOSE") == Code.OK
     assert bench.ask("SHUT?") == "CLOSED"
-    say(bench, ("LED 500",))
     assert open_for(bench, 100)[0] == 2
 
 
@@ -392,14 +432,14 @@ def test_a_dead_led_is_refused_and_a_weak_one_is_not_noticed(make):
     dead.ask("SYST:ARM")
     assert dead.code("LED 500") == Code.HARDWARE
     weak = make(led_weak="0=0.5")
-    say(weak, ("SYST:ARM", "LED 500"))
+    light(weak, 500)
     open_for(weak, 100)
     weak.wait(0.2)
     assert weak.world.sources[0].level == pytest.approx(0.25)
 
 
 def test_the_dose_of_a_subject_is_counted_and_limited(bench):
-    say(bench, ("SYST:ARM", "LED 500"))
+    light(bench, 500)
     open_for(bench, 2000)
     bench.wait(2.5)
     assert float(bench.ask("DOSE?")) == pytest.approx(0.5 * 1e-3 * 2.0)
@@ -523,8 +563,8 @@ def test_a_silent_host_is_dark_and_vented_within_the_lease(bench):
     bench.ask("SYST:PING?")
     silent_s = bench.now
     bench.silence(2.0)
-    (light,) = bench.world.sources
-    assert light.t_off_s <= silent_s + 0.3 + 0.010
+    (seen,) = bench.world.sources
+    assert seen.t_off_s <= silent_s + 0.3 + 0.010
     vented_s = [t for t, _ in bench.world.heads][-1]
     assert vented_s <= silent_s + 0.3 + 0.010
     assert bench.world.head_at(silent_s + 0.3 + 0.3).suction_mbar < 1.0
@@ -563,8 +603,8 @@ def test_a_head_that_comes_off_is_vented_and_dark_at_once(make):
     bench.ask("LED 1000")
     open_for(bench, 10_000)
     bench.wait(1.5)
-    (light,) = bench.world.sources
-    assert 4.0 < light.t_off_s <= 4.0 + 2.0 * CONTROL_S
+    (seen,) = bench.world.sources
+    assert 4.0 < seen.t_off_s <= 4.0 + 2.0 * CONTROL_S
     assert bench.events("PUMP:END")[0].split(",")[1] == "LOST"
     assert bench.events("SHUT:END")[0].split(",")[1] == "PUMP"
     assert bench.ask("HEAD:SITE?") == "NONE"
@@ -605,8 +645,8 @@ def test_the_emergency_stop_lets_go_and_bars_light_and_suction(make):
     bench.ask("LED 1000")
     open_for(bench, 20_000)
     bench.wait(6.1 - bench.now)
-    (light,) = bench.world.sources
-    assert light.t_off_s == 6.0
+    (seen,) = bench.world.sources
+    assert seen.t_off_s == 6.0
     assert bench.events("PUMP:END")[0].split(",")[1] == "INTERLOCK"
     assert int(bench.ask("STAT?")) & 256
     bench.ask("HEAD:SITE cheek,0")
@@ -628,8 +668,8 @@ def test_the_thermometer_tells_of_a_camera_that_warms(make):
 def test_one_big_step_of_time_equals_many_small_ones(make):
     def play(step_s):
         bench = make(head_lifts_after=4.0, shutter_jam=0.5)
-        say(bench, ("SYST:WDOG 5000", *HEAD, "LED 700"))
-        bench.ask("PUMP ON,20000,150")
+        bench.ask("SYST:WDOG 5000")
+        light(bench, 700, mbar=150, wait_s=1.0)
         open_for(bench, 1500)
         until = bench.now + 4.9
         while bench.now < until - 1e-9:

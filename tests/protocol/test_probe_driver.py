@@ -84,6 +84,13 @@ def hold(box, mbar=60.0, seconds=20.0, site="cheek"):
     return box.suck(mbar, seconds)
 
 
+def light(box, level=1.0, seconds=50.0):
+    """Have the head held and the LED on."""
+    hold(box, seconds=seconds)
+    box.set_level(level)
+    box.listen(0.7)
+
+
 def refused(call, *arguments):
     with pytest.raises(CommandRefused) as caught:
         call(*arguments)
@@ -164,6 +171,19 @@ def test_nothing_shines_or_sucks_unarmed_or_unplaced(bench):
     assert bench.world.sources == []
 
 
+def test_no_light_leaves_a_head_that_is_not_held(bench):
+    box = bench.box
+    box.arm()
+    box.set_level(1.0)
+    assert refused(box.open_shutter, 0.1) == Code.IGNORED
+    light(box)
+    box.open_shutter(20.0)
+    box.vent()
+    assert box.last_opening().ended == "pump"
+    assert len(bench.world.sources) == 1
+    assert refused(box.open_shutter, 0.1) == Code.IGNORED
+
+
 def test_skin_rests_between_two_times_of_suction(bench):
     box = bench.box
     hold(box)
@@ -183,36 +203,33 @@ def test_skin_rests_between_two_times_of_suction(bench):
 
 def test_one_fibre_is_left_uncovered_and_the_light_tells(bench):
     box = bench.box
-    box.arm()
-    box.set_level(1.0)
+    light(box)
     for fibre in (3, 27, None):
         box.cover(fibre)
         assert box.uncovered() == fibre
         box.open_shutter(0.05)
         box.listen(0.1)
-    assert [light.fibre for light in bench.world.sources] == [3, 27, None]
+    assert [seen.fibre for seen in bench.world.sources] == [3, 27, None]
     assert refused(box.cover, 28) == Code.OUT_OF_RANGE
 
 
 def test_the_shutter_is_closed_before_its_end(bench):
     box = bench.box
-    box.arm()
-    box.set_level(1.0)
+    light(box)
     box.open_shutter(20.0)
     assert refused(box.set_level, 0.5) == Code.IGNORED
     assert box.status().busy
     box.close_shutter()
     assert box.last_opening().ended == "asked"
     assert not box.status().busy
-    (light,) = bench.world.sources
-    assert light.t_off_s - light.t_on_s < 2.0
+    (seen,) = bench.world.sources
+    assert seen.t_off_s - seen.t_on_s < 2.0
 
 
 def test_listening_keeps_head_and_light_and_silence_loses_both(bench):
     box = bench.box
     box.set_lease(0.3)
-    hold(box)
-    box.set_level(1.0)
+    light(box)
     box.open_shutter(20.0)
     box.listen(0.5)
     assert box.status().lit
@@ -227,8 +244,7 @@ def test_listening_keeps_head_and_light_and_silence_loses_both(bench):
 
 @pytest.mark.parametrize("end", ["dark", "close", "reset", "take_away"])
 def test_what_lets_go_ends_light_and_suction(bench, end):
-    hold(bench.box)
-    bench.box.set_level(1.0)
+    light(bench.box)
     bench.box.open_shutter(20.0)
     getattr(bench.box, end)()
     assert len(bench.world.sources) == 1
@@ -273,14 +289,12 @@ def test_each_end_of_a_suction_is_told(alone, faults, ended):
 
 def test_a_stuck_shutter_is_refused_and_a_jammed_one_is_told(alone):
     world, box = alone(shutter_stuck=1.0)
-    box.arm()
-    box.set_level(1.0)
+    light(box)
     assert refused(box.open_shutter, 0.1) == Code.HARDWARE
     assert (box.openings(), box.last_opening(), world.sources) == (1, None, [])
     box.close()
     world, box = alone(shutter_jam=1.0)
-    box.arm()
-    box.set_level(1.0)
+    light(box)
     box.open_shutter(0.1)
     box.listen(0.3)
     assert box.last_opening().ended == "jam"

@@ -45,21 +45,29 @@ def make():
         world.unregister()
 
 
+def light(box, level=1.0):
+    """Have the head held and the LED on."""
+    box.arm()
+    box.place("cheek", 0.0)
+    box.set_level(level)
+    box.suck(60.0, 20.0)
+    box.listen(1.0)
+
+
 def test_light_is_clipped_to_the_exposure(make):
     world, box = make()
-    box.arm()
-    box.set_level(0.5)
+    light(box, 0.5)
     box.cover(4)
     box.open_shutter(0.04)
     middle_s = box.last_opening().t_open_s + 0.02
     (still,) = world.light_between(0.0, world.now)
     assert still.t_off_s == world.now
     box.listen(0.2)
-    (light,) = world.sources
-    assert world.light_between(0.0, light.t_on_s) == ()
-    assert world.light_between(light.t_off_s, world.now) == ()
+    (ended,) = world.sources
+    assert world.light_between(0.0, ended.t_on_s) == ()
+    assert world.light_between(ended.t_off_s, world.now) == ()
     (seen,) = world.light_between(middle_s, world.now)
-    assert seen == dataclasses.replace(light, t_on_s=middle_s)
+    assert seen == dataclasses.replace(ended, t_on_s=middle_s)
     assert isinstance(seen, SourceLight)
     assert (seen.level, seen.fibre) == (0.5, 4)
     box.close()
@@ -98,16 +106,15 @@ def test_an_exposure_is_of_what_the_head_touched_when_it_began(make):
 def test_the_camera_is_released_by_the_shutter_and_sees_its_light(make):
     scene = Recorder()
     world, box = make(scene)
-    box.arm()
-    box.set_level(1.0)
+    light(box)
     with_camera = open_camera(f"sim://{world._name}/cam")
     with_camera.configure(Exposure(0.3, 100))
     with_camera.arm(1, Trigger.EDGE)
     box.open_shutter(0.5)
     frame = with_camera.frame(5.0)
-    ((light,), exposure_s, head) = scene.asked[0]
-    assert (light.t_on_s, light.t_off_s) == pytest.approx((frame.t_start_s, frame.t_end_s))
-    assert (exposure_s, head.site) == (0.3, "")
+    ((seen,), exposure_s, head) = scene.asked[0]
+    assert (seen.t_on_s, seen.t_off_s) == pytest.approx((frame.t_start_s, frame.t_end_s))
+    assert (exposure_s, head.site) == (0.3, "cheek")
     box.close()
 
 
