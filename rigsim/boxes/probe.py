@@ -4,12 +4,12 @@ Its manual is its command table (`ProbeUnit.commands`) and these rules. Light an
 armed box and carry their own end; the shutter pulses the camera's line when its blades have cleared
 the fibre, and answers then. No light leaves a head that is not held, because an eye may be before
 it: with the LED on, the shutter opens only when the gauge has seen the suction that was asked for,
-and shuts when the pump goes off. Before the pump a person has to say with ``HEAD:SITE`` where the head
-sits, which means after each change, and after each time that the box has let go by itself: what
-makes other boxes dark (``SAFE``, ``ABOR``, ``*RST``, a silent host, the emergency stop, the loss of
-power) shuts the shutter, puts the LED out, vents, and forgets the place, because nobody knows
-whether a head that nothing holds is still there. ``PUMP VENT`` and the pump's own end keep it: the
-skin rests, and is sucked at again. A suction that ends by a fault forgets the place, too.
+and shuts when the pump goes off. Before the pump a person has to say with ``HEAD:SITE`` where the
+head sits, which means after each change, and after each time that the box has let go by itself:
+what makes other boxes dark (``SAFE``, ``ABOR``, ``*RST``, a silent host, the emergency stop, the
+loss of power) shuts the shutter, puts the LED out, vents, and forgets the place, because nobody
+knows whether a head that nothing holds is still there. ``PUMP VENT`` and the pump's own end keep
+it: the skin rests, and is sucked at again. A suction that ends by a fault forgets the place, too.
 
 The box does not know what it sits on: it draws at a `SuctionLoad` and has a gauge.
 """
