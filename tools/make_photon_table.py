@@ -36,7 +36,7 @@ from numba import njit
 from scipy.interpolate import BSpline
 
 from model import photon_kernels as kernels
-from model import photon_table
+from model.photon_medium import asymptotic_decay, root_spline_matrix
 
 ETAS = np.array([1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6])
 NUMERICAL_APERTURE = 0.22
@@ -46,7 +46,15 @@ PATH_END = 3000.0
 LATE_BIN = 316  # paths of 1541 and longer tell the constant of the law that continues them
 COLLECTIONS = ("all", "fibre")
 # Photons a batch: about equal times but for g = 0 and 0.5, which need fewer.
-PHOTONS = {0.8: 250_000, 0.9: 125_000, 0.95: 50_000, 0.7: 125_000, 0.5: 80_000, 0.0: 80_000}
+PHOTONS = {
+    0.8: 250_000,
+    0.9: 125_000,
+    0.95: 50_000,
+    0.7: 125_000,
+    0.5: 80_000,
+    0.0: 80_000,
+    0.3: 80_000,
+}
 BATCHES = 32
 ROOT_ABSORPTIONS = 0.1 * np.expm1(np.linspace(0.0, log(41.0), 25))  # 0 to 4: sigma_a <= 16
 SPLIT_POWER, SPLIT_LIMIT = 0.6, 15.0
@@ -410,9 +418,7 @@ def choose_roughness(stored, kappas):
 
 def tabulate(stored, g):
     """Return spline coefficients (etas, radii, roots) and ln of errors on every other knot."""
-    kappas = np.array(
-        [0.0, *(photon_table.asymptotic_decay(u * u, g) for u in ROOT_ABSORPTIONS[1:])]
-    )
+    kappas = np.array([0.0, *(asymptotic_decay(u * u, g) for u in ROOT_ABSORPTIONS[1:])])
     roughness = choose_roughness(stored, kappas)
     everything = np.arange(len(stored["rings"]))
     values, used = profiles(stored, everything, kappas, roughness)
@@ -437,7 +443,7 @@ def tabulate(stored, g):
     full = np.zeros((ETAS.size, kernels.RADIUS_COUNT, kernels.ROOT_COUNT))
     full[:, :, : ROOT_ABSORPTIONS.size] = values
     coefficients = np.linalg.solve(
-        photon_table.root_spline_matrix(),
+        root_spline_matrix(),
         np.swapaxes(full, 1, 2).reshape(ETAS.size, -1, kernels.RADIUS_COUNT),
     )
     return np.swapaxes(coefficients, 1, 2), 0.5 * np.log(variance[:, :, ::2])
