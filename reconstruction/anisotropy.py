@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special, stats
 
-from reconstruction import diffusion_ellipse, direction_harmonics
+from reconstruction import diffusion_ellipse, direction_harmonics, profile_stretch
 from reconstruction.direction_harmonics import LEAST_DIRECTIONS
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -110,6 +110,7 @@ def estimate(
     valid: ArrayLike | None = None,
     errors: Errors = "relative",
     outliers: bool = True,
+    log_ratio_error: float = 0.0,
 ) -> Anisotropy:
     """Tell ratio and axis of anisotropy from sigma_tr along several directions.
 
@@ -131,6 +132,9 @@ def estimate(
     outliers : bool
         Leave out directions that contradict the others, one of eight at most: t test of deleted
         residuals, with a chance of `direction_harmonics.OUTLIER_RATE` to lose a good one.
+    log_ratio_error : float
+        Error of the log of the ratio over itself that all directions have in common; it widens
+        the ratio's standard error.
 
     Returns
     -------
@@ -183,6 +187,7 @@ def estimate(
                 -0.5 * power / least / least for power in (linear.axial_power, linear.odd_power)
             )
     covariance = inverse * (factor**2)[:, None, None]
+    covariance[:, 1:3, 1:3] += log_ratio_error**2 * p[:, 1:3, None] * p[:, None, 1:3]
     with np.errstate(over="ignore"):
         told_chi2 = residual / least / least
     chi2 = linear.dof.astype(np.float64) if stderr_per_mm is None else told_chi2
@@ -221,6 +226,105 @@ def estimate(
         parameters=shaped(ellipse, 0.0),
         covariance=shaped(covariance[:, :3, :3], math.inf),
         errors=errors,
+    )
+
+
+def estimate_from_profiles(
+    angle_rad: ArrayLike,
+    radius_mm: ArrayLike,
+    reflectance_per_mm2: ArrayLike,
+    variance: ArrayLike | None = None,
+    *,
+    valid: ArrayLike | None = None,
+    sigma_tr_per_mm: ArrayLike = 1.0,
+    floor: float = 0.01,
+    errors: Errors = "relative",
+    outliers: bool = True,
+) -> Anisotropy:
+    """Tell ratio and axis of anisotropy from the profiles themselves.
+
+    Each profile is compared with the mean one (`profile_stretch`) and asked how much it is drawn
+    in over distance and how well the head coupled. No model of tissue is fitted, and what is wrong
+    with a fibre in all directions cancels: where coupling differs by a few percent from turn to
+    turn, errors are several times smaller than those of sigma_tr fitted direction by direction
+    (bench stage "translucency"). The ratio is that of the distances at which light has fallen off
+    alike; where coefficients along each direction are fitted as if tissue were isotropic, the
+    ratio of their sigma_tr is another.
+
+    Parameters
+    ----------
+    angle_rad : array_like, shape (N,)
+        As of :func:`estimate`.
+    radius_mm : array_like, shape (F,)
+        Distances of the fibres from the source, mm, above 0.
+    reflectance_per_mm2 : array_like, shape (N, ..., F)
+        Profiles, 1/mm^2, or in any other unit.
+    variance : array_like, shape (N, ..., F), optional
+        Of the profiles.
+    valid : array_like of bool, shape (N, ..., F), optional
+        Readings that count; those that are not finite never do.
+    sigma_tr_per_mm : array_like, shape (...)
+        Of the mean profile, 1/mm: only the scale of `Anisotropy.mean_per_mm`.
+    floor : float
+        Relative error of each reading that its variance does not know of, at least 0: coupling
+        that differs from fibre to fibre.
+    errors, outliers
+        As of :func:`estimate`.
+
+    Returns
+    -------
+    Anisotropy
+        Directions with too few readings are not in `used`.
+
+    Raises
+    ------
+    AnisotropyError
+        As of :func:`estimate`, and for distances or a floor out of range.
+
+    Examples
+    --------
+    >>> angle, r = np.deg2rad(np.arange(16) * 22.5), 0.3 + 0.25 * np.arange(28)
+    >>> scale = np.hypot(np.cos(angle - 0.3) / 1.2, np.sin(angle - 0.3))
+    >>> profiles = np.exp(-0.7 * np.outer(scale, r)) / np.outer(scale, r) ** 1.5
+    >>> found = estimate_from_profiles(angle, r, profiles)
+    >>> round(float(found.ratio), 2), round(float(found.axis_rad), 2)
+    (1.2, 0.3)
+    """
+    angle = np.asarray(angle_rad, np.float64)
+    r = np.asarray(radius_mm, np.float64)
+    profiles = np.asarray(reflectance_per_mm2, np.float64)
+    if r.ndim != 1 or not (np.isfinite(r).all() and (r > 0).all()):
+        raise AnisotropyError(f"radius_mm: got shape {r.shape}, expected (F,), finite, above 0")
+    if profiles.ndim < 2 or (profiles.shape[0], profiles.shape[-1]) != (angle.size, r.size):
+        raise AnisotropyError(
+            f"reflectance_per_mm2: got shape {profiles.shape}, expected ({angle.size}, ..., "
+            f"{r.size})"
+        )
+    if not (math.isfinite(floor) and floor >= 0):
+        raise AnisotropyError(f"floor: got {floor}, expected 0 or above, finite")
+    if errors == "absolute" and variance is None:
+        raise AnisotropyError('variance: got none, expected one for "absolute" errors')
+    of_each: Floats = np.zeros_like(profiles)
+    if variance is not None:
+        of_each = np.asarray(variance, np.float64)
+    good = np.ones(profiles.shape, bool) if valid is None else np.array(valid, bool)
+    for name, array in (("variance", of_each), ("valid", good)):
+        if array.shape != profiles.shape:
+            raise AnisotropyError(f"{name}: got shape {array.shape}, expected {profiles.shape}")
+    good = good & np.isfinite(profiles) & np.isfinite(of_each)
+    if (of_each[good] < 0).any():
+        raise AnisotropyError(f"variance: got {of_each[good].min()}, expected 0 or above")
+    found = profile_stretch.compare(r, profiles, of_each, good, floor=floor)
+    scale = np.exp(found.log_scale)
+    told = found.valid
+    return estimate(
+        angle,
+        scale * np.asarray(sigma_tr_per_mm, np.float64),
+        scale * np.where(told, found.stderr, 1.0) * np.asarray(sigma_tr_per_mm, np.float64),
+        valid=told,
+        errors=errors,
+        outliers=outliers,
+        log_ratio_error=profile_stretch.CURVE_ERROR,
     )
 
 
