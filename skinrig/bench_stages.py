@@ -26,6 +26,7 @@ from skinrig import (
     bench_skin_stretch,
     bench_surface,
     bench_tissue,
+    bench_transport,
 )
 from skinrig.benchmark import StageBenchmark, to_document
 from skinrig.console import Console, plain
@@ -53,6 +54,7 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "normal-integration": bench_integration.integration,
     "normal-histogram": bench_kernels.histograms,
     "kernel-fit": bench_kernels.search,
+    "photon-transport": bench_transport.photon_transport,
 }
 
 
