@@ -26,9 +26,8 @@ LEAST_SIGMAS: Final = 20.0
 """Of a pixel's light over its error, to tell how bright the source was in each frame."""
 WIDEST_RIPPLE: Final = 0.1
 """Standard deviation of the source's light from frame to frame, relative, at most."""
-RIPPLE_ROUNDS: Final = 8
-FORESIGHT: Final = 0.1
-"""Of full scale: a prediction worse than this does not decide whether a frame counts."""
+LEAST_EVIDENCE: Final = 3.0
+"""By how much the logarithm of the evidence for a ripple has to be more than for none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,8 +106,8 @@ def merge_series(
       a spot to more than the farthest fibres give;
     - frames that two exposures or more show unsaturated tell how bright the source was in each,
       if it was not steady: see `MergedSeries.scale`;
-    - whether a frame is near saturation is told from the shorter frames, not from its own value,
-      which would leave out its high readings.
+    - whether a pixel is near saturation is told from its neighbors, not from its own value, which
+      would leave out its high readings.
     """
     stack = [np.asarray(frame) for frame in frames]
     times = np.asarray(exposures_s, np.float64)
@@ -121,7 +120,7 @@ def merge_series(
     # what each frame shows without light is the same in all that follows
     base = [noise.black_dn + darks.bias_dn + darks.rate_dn_per_s * t for t in times]
     shape = stack[0].shape
-    usable = _usable(stack, lit, base, noise)
+    usable = _usable(stack, noise)
     hot = darks.hot
     # first by read noise alone, then with the noise of the light that was found
     guess, seen = _weigh(stack, times, lit, base, usable, darks, noise, np.zeros(shape))[:2]
@@ -190,35 +189,17 @@ def _check(
     checks.close()
 
 
-def _usable(
-    stack: list[NDArray[np.integer]],
-    times: FloatArray,
-    base: list[FloatArray],
-    noise: CameraNoise,
-) -> list[NDArray[np.bool_]]:
+def _usable(stack: list[NDArray[np.integer]], noise: CameraNoise) -> list[NDArray[np.bool_]]:
     """Return in which pixels each frame is not saturated, nor would be by chance."""
-    gain, floor, span = noise.gain_e_per_dn, noise.floor_dn2, noise.span_dn
-    shape = stack[0].shape
-    signal = np.zeros(shape)  # weighted DN of light so far
-    time = np.zeros(shape)  # weighted seconds so far
-    information = np.zeros(shape)  # inverse variance of the rate so far, s^2/DN^2
+    spread = np.sqrt(noise.span_dn / noise.gain_e_per_dn + noise.floor_dn2)
+    highest = noise.white_dn - MARGIN_SIGMAS * spread
     result = []
-    for frame, t, dark in zip(stack, times, base, strict=True):
-        unclipped = frame < noise.white_dn
-        rate = np.divide(signal, time, out=np.zeros(shape), where=time > 0)
-        light = np.maximum(rate, 0.0) * t
-        own = floor + light / gain
-        with np.errstate(divide="ignore"):
-            spread = np.sqrt(own + t * t / information)
-        foreseen = spread < FORESIGHT * span
-        below = dark + light + MARGIN_SIGMAS * np.where(foreseen, spread, 0.0) < noise.white_dn
-        use = unclipped & (below | ~foreseen)
+    for frame in stack:
+        use = frame < noise.white_dn
+        if int(frame.max()) > highest:
+            everywhere = np.ones(frame.shape, np.bool_)
+            use &= _smooth(frame.astype(np.float64), everywhere, noise.pattern) < highest
         result.append(use)
-        value = frame - dark
-        weight = np.where(use, t / own, 0.0)
-        signal += weight * value
-        time += weight * t
-        information += weight * t
     return result
 
 
@@ -266,7 +247,7 @@ def _scales(
     """Return the light of each frame over the mean, and its standard error.
 
     Least squares of ``value = rate scale time`` over pixels (K, P) whose rates are free, with a
-    normal prior of the scales about 1, as wide as they turn out to scatter.
+    normal prior of the scales about 1, as wide as their evidence is greatest for.
     """
     variance = (
         noise.floor_dn2
@@ -280,13 +261,17 @@ def _scales(
     mean = (information * miss).sum(axis=0) / total
     normal = np.diag(information.sum(axis=1)) - (information / total) @ information.T
     right = (information * (miss - mean)).sum(axis=1)
-    prior = WIDEST_RIPPLE**2
-    away, covariance = np.zeros(len(times)), np.zeros((len(times), len(times)))
-    for _ in range(RIPPLE_ROUNDS):
-        covariance = np.linalg.inv(normal + np.eye(len(times)) / prior)
-        away = covariance @ right
-        prior = float(np.mean(away**2 + np.diag(covariance)))
-        prior = min(max(prior, 1e-12), WIDEST_RIPPLE**2)
+    # the prior's width of most evidence; where the frames tell little of each other, none
+    values, vectors = np.linalg.eigh(0.5 * (normal + normal.T))
+    values, along = np.maximum(values, 0.0), vectors.T @ right
+    best, width2 = LEAST_EVIDENCE, 0.0
+    for width in np.geomspace(1e-4, WIDEST_RIPPLE, 16):
+        grown = 1.0 + width**2 * values
+        evidence = 0.5 * float(width**2 * (along**2 / grown).sum() - np.log(grown).sum())
+        if evidence > best:
+            best, width2 = evidence, float(width**2)
+    covariance = (vectors * (width2 / (1.0 + width2 * values))) @ vectors.T
+    away = covariance @ right
     return 1.0 + away, np.sqrt(np.diag(covariance))
 
 
