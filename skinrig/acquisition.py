@@ -399,7 +399,7 @@ def _run(
 
 def ask(progress: Callable[[str], None], what: str) -> None:
     """Say what the operator has to make ready, and wait for Enter where there is a keyboard."""
-    what = what if what.startswith(("step ", "tape ", "place ")) else f"make ready: {what}"
+    what = what if what.startswith(("step ", "tape ", "place ", "put ")) else f"make ready: {what}"
     if sys.stdin is None or not sys.stdin.isatty():
         progress(what)
         return

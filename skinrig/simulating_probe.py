@@ -131,10 +131,10 @@ def make_scene(
     from rigsim.scenes.probe import ProbeScene
 
     block: Any = getattr(probe_tissue, "PHANTOM", None)
-    if target is not None and block is None:
+    if target == "phantom" and block is None:
         raise SimulationError(f"target: {target!r} is not simulated yet")
     try:
-        tissue = block if target is not None else parse_subject(subject, seed=seed)
+        tissue = block if target == "phantom" else parse_subject(subject, seed=seed)
     except TissueError as error:
         raise SimulationError(str(error)) from error
     return ProbeScene(rig, tissue, seed=seed, photons=PHOTONS[size])

@@ -25,7 +25,7 @@ from capture.acquire.outcome import (
     steps_to_do,
 )
 from capture.acquire.probe_head import Head, HeadLost, NotHeld, ProbeDriver
-from capture.acquire.source_exposure import Exposed, expose, expose_dark
+from capture.acquire.source_exposure import Exposed, ShutterFault, expose, expose_dark
 from capture.devices.camera import Camera, CameraError, Frame, FrameRefused, FrameTimeout
 from capture.plan import Step, Value
 from capture.plan.probe import all_series
@@ -80,8 +80,8 @@ class BracketSeries:
         """Take the frames without light that are missing, with the head capped."""
         missing = [step for step in steps_to_do(self._session) if step.kind == "dark"]
         if missing:
-            self._box.cover(None)
             self._head.cap()
+            self._box.cover(None)
         for number, step in enumerate(missing, start=1):
             self._operator.stop_if_asked()
             seconds = float(step.settings["exposure_s"])
@@ -92,6 +92,7 @@ class BracketSeries:
         why = ""
         for attempt in range(1, MAX_ATTEMPTS + 1):
             before_c = self._head.temperature_c()
+            self._head.keep_capped()
             self._tokens += 1
             token = f"{self._operator.run_id}.{self._tokens}"
             try:
@@ -100,6 +101,9 @@ class BracketSeries:
                 why = self._not_taken(step, attempt, error)
                 continue
             self.stale += exposed.stale
+            if not self._box.status().placed:
+                why = self._not_taken(step, attempt, ShutterFault("the box has let go of the cap"))
+                continue
             after_c = self._head.temperature_c()
             return exposed, {"light": "none", "camera_c": 0.5 * (before_c + after_c)}, attempt
         raise given_up(f"step {step.id}", why, self._session)

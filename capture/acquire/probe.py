@@ -27,7 +27,7 @@ def run_probe(
     """Capture what the session still lacks of a plan of the fibre probe; see `run_plan`.
 
     Everything that can be refused is, before anything is lit or sucked at. The dark frames come
-    first, with the head anywhere; then a person is asked to place the head, once per series on
+    first, under a cap; then a person is asked to place the head, once per series on
     skin. Whatever happens, the shutter ends up shut, the LED out and the head vented.
 
     Raises

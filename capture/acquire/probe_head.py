@@ -162,8 +162,13 @@ class Head:
         self.let_go()
         self._operator.stop_if_asked()
         self._operator.prompt("put the cap on the head")
-        self._box.arm()
-        self._box.place(CAP, 0.0)
+        self.keep_capped()
+
+    def keep_capped(self) -> None:
+        """Tell a box that has let go of everything meanwhile that the cap is where it was."""
+        if not self._box.status().placed:
+            self._box.arm()
+            self._box.place(CAP, 0.0)
 
     def let_go(self) -> None:
         """Vent, disarm and forget the placement: a person's hands are at the head now."""

@@ -56,9 +56,9 @@ def run_plan(
     prompt
         Called before the first step that needs it with the state ("smile"), with the place of the
         target on the dome ("pose 3"), with how skin is to be taped ("tape the skin at 45
-        degrees"), or with where the probe goes ("place the head on the cheek at 0 degrees");
-        returns when the subject or the target is ready. Called too with what to press when only a
-        hand can release a camera.
+        degrees"), or with where the probe goes ("put the cap on the head", "place the head on the
+        cheek at 0 degrees"); returns when the subject or the target is ready. Called
+        too with what to press when only a hand can release a camera.
     interrupted
         Asked before each step, or each sequence; True stops in good order.
     clock

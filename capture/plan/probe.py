@@ -74,10 +74,10 @@ def probe_plan(
     step_ev : float
         From one exposure to the next, stops, > 0.
     darks : int
-        Frames without light for each of few exposure times, >= 0, before the head is placed. Few
-        times are enough: what a pixel shows in the dark is its offset and a current times the
-        exposure. The shortest gives the one, the longest the other, and one between shows where
-        this is not so.
+        Frames without light for each of few exposure times, >= 0, before the head is placed; a cap
+        keeps the room's light out. Few times are enough: what a pixel shows in the dark is its
+        offset and a current times the exposure. The shortest gives the one, the longest the other,
+        and one between shows where this is not so.
     level : float
         Of the LED behind the source fibre, 0 < level <= 1.
     iso : int

@@ -1,0 +1,251 @@
+"""The fibre probe from the command line: refusals, simulated sessions, and their resume."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from capture.session import Session, verify
+from model import store
+from skinrig import errors, simulating_probe
+from skinrig.cli import main
+
+SUBJECT = "homogeneous:0.05,1.4"
+FEW_PHOTONS = {"small": 2000, "full": 2000}
+
+
+@pytest.fixture
+def few_photons(monkeypatch):
+    monkeypatch.setattr(simulating_probe, "PHOTONS", FEW_PHOTONS)
+
+
+def simulate(out, *more):
+    return ["simulate", "probe", "--subject", SUBJECT, "--out", str(out), *more]
+
+
+# plans ----------------------------------------------------------------------------------------
+
+
+def test_a_dry_run_prints_plan_time_and_light_and_needs_no_address(capsys):
+    arguments = ["capture", "probe", "--dry-run", "--sites", "cheek", "--json"]
+    assert main(arguments) == errors.DONE
+    document = json.loads(capsys.readouterr().out)
+    assert document["steps"] == 6 + 23
+    assert 160.0 < document["estimated_s"] < 175.0  # 66 s of darks, 88 s of brackets, suction
+    assert document["light"]["led_ws"] < document["light"]["limit_ws"]
+    assert main(arguments[:-1]) == errors.DONE
+    printed = capsys.readouterr()
+    assert "not to be looked into" in printed.out + printed.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "match"),
+    [
+        (["--angles", "0,90"], errors.USAGE, "how many directions"),
+        (["--steps", "-1..1"], errors.USAGE, "--steps"),
+        (["--sites", "cheek,cheek"], errors.BAD_INPUT, "none twice"),
+        (["--repeats", "0"], errors.BAD_INPUT, "repeats"),
+        (["--target", "ball"], errors.BAD_INPUT, "expected one of phantom, dark"),
+        (["--target", "phantom", "--sites", "cheek"], errors.USAGE, "own plan of skin"),
+    ],
+)
+def test_a_wrong_option_is_named(capsys, arguments, code, match):
+    assert main(["capture", "probe", "--dry-run", *arguments]) == code
+    assert match in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", [["--sites", "cheek"], ["--all-brackets"]])
+def test_other_rigs_know_nothing_of_the_probe_s_options(capsys, tmp_path, option):
+    assert main(["simulate", "gradient", "--out", str(tmp_path / "s"), *option]) != errors.DONE
+    assert "knows nothing of it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        (["--subject", "homogeneous:1"], "subject: got 'homogeneous:1'"),
+        (["--width", "64"], "width_px: the probe rig knows nothing"),
+        (["--site", "cheek"], "site: the probe rig knows nothing"),
+        (["--target", "chart"], "expected one of phantom, dark"),
+        (["--target", "dark", "--sites", "cheek"], "sites: the target of the probe rig"),
+    ],
+)
+def test_what_cannot_be_simulated_is_named_and_nothing_is_written(
+    capsys, tmp_path, arguments, match
+):
+    out = tmp_path / "session"
+    assert main([*simulate(out), *arguments]) != errors.DONE
+    assert match in capsys.readouterr().err
+    assert not out.exists()
+
+
+# sessions -------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("few_photons")
+def test_tissue_is_captured_with_its_truth_beside_it(capsys, tmp_path):
+    out = tmp_path / "session-probe"
+    assert main([*simulate(out, "--sites", "cheek", "--seed", "3"), "--json"]) == errors.DONE
+    document = json.loads(capsys.readouterr().out)
+    session = Session.open(out)
+    assert document["frames"] == len(session.frames()) == 6 + len(session.frames("fibres"))
+    assert verify(out).ok
+    assert session.todo() == []
+    truth = store.read(tmp_path / "truth-probe")
+    assert truth.parameters["kind"] == "truth"
+    (profile,) = truth.parameters["profiles"]
+    assert (profile["site"], profile["repeat"], profile["angle_deg"]) == ("cheek", 0, 0.0)
+    assert profile["sigma_a_per_mm"] == [0.05] * 3
+    # what the truth says of the suction is not the gauge's word, but near it
+    record = session.frames("fibres")[0]
+    assert profile["suction_mbar"] != record.actual["suction_mbar"]
+    assert abs(profile["suction_mbar"] - record.actual["suction_mbar"]) < 4.0
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+@pytest.mark.usefixtures("few_photons")
+def test_the_same_seed_gives_the_same_bytes(tmp_path):
+    hashes = []
+    for name in ("a", "b"):
+        assert main(simulate(tmp_path / name, "--target", "dark", "--seed", "4")) == errors.DONE
+        session = Session.open(tmp_path / name)
+        hashes.append([record.line.xxh128 for record in session.frames()])
+        # the identity of the session stands in each file: what the sensor saw does not
+        frames = [session.read(record).cfa.tobytes() for record in session.frames()]
+        hashes[-1] = [hash(data) for data in frames]
+    assert hashes[0] == hashes[1]
+
+
+class Killed(BaseException):
+    """The host is gone."""
+
+
+@pytest.mark.usefixtures("few_photons")
+def test_a_simulation_is_resumed_in_the_middle_of_a_series_with_the_truth_of_all(
+    tmp_path, monkeypatch
+):
+    out = tmp_path / "session-probe"
+    words = simulate(out, "--sites", "forehead,cheek", "--seed", "2")
+    honest = simulating_probe.HeadLog.exposure
+    seen = []
+
+    def exposure(self, *args, **more):
+        seen.append(1)
+        if len(seen) == 6 + 23 + 9:
+            raise Killed
+        return honest(self, *args, **more)
+
+    monkeypatch.setattr(simulating_probe.HeadLog, "exposure", exposure)
+    with pytest.raises(Killed):
+        main(words)
+    monkeypatch.setattr(simulating_probe.HeadLog, "exposure", honest)
+    assert {r.index["site"] for r in Session.open(out).frames("fibres")} == {"forehead"}
+    assert main([*words, "--resume"]) == errors.DONE
+    session = Session.open(out)
+    assert session.closed
+    assert verify(out).ok
+    assert {r.attempt for r in session.frames()} == {1}
+    runs = {r.index["site"]: r.actual["run"] for r in session.frames("fibres")}
+    assert runs == {"forehead": "sim1", "cheek": "sim2"}
+    sites = [p["site"] for p in store.read(tmp_path / "truth-probe").parameters["profiles"]]
+    assert sites == ["forehead", "cheek"]
+
+
+def test_a_resume_with_other_settings_is_refused(tmp_path, capsys, few_photons):
+    out = tmp_path / "session"
+    assert main(simulate(out, "--target", "dark")) == errors.DONE
+    assert main(simulate(out, "--target", "dark", "--resume")) != errors.DONE
+    assert "closed" in capsys.readouterr().err
+
+
+HOST = """
+import sys
+from skinrig import simulating_probe
+from skinrig.cli import main
+simulating_probe.PHOTONS = {"small": 2000}
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.long
+def test_a_simulation_that_is_killed_in_a_series_is_resumed(tmp_path):
+    out = tmp_path / "session-probe"
+    words = simulate(out, "--sites", "forehead,cheek", "--seed", "2")
+    command = [sys.executable, "-c", HOST, *words]
+    log = tmp_path / ".truth-probe.heads.jsonl"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(command, **quiet) as host:
+        until_s = time.monotonic() + 90.0
+        # the second series is on its way: the first is committed when it is whole
+        while not (log.is_file() and log.read_text().count("\n") > 23 + 4):
+            assert host.poll() is None
+            assert time.monotonic() < until_s
+            time.sleep(0.01)
+        os.kill(host.pid, signal.SIGKILL)
+        host.wait()
+    before = {r.step_id for r in Session.open(out).frames("fibres")}
+    assert {step.split("-")[0] for step in before} == {"forehead"}
+    done = subprocess.run([*command, "--resume", "--json"], capture_output=True, text=True)
+    assert done.returncode == errors.DONE, done.stderr
+    assert json.loads(done.stdout)["frames"] == 6 + 2 * 23
+    session = Session.open(out)
+    assert session.closed
+    assert verify(out).ok
+    placements = {}
+    for record in session.frames("fibres"):
+        placements.setdefault(record.index["site"], set()).add(record.actual["placement"])
+    assert {len(one) for one in placements.values()} == {1}
+    assert not log.exists()
+
+
+@pytest.mark.long
+def test_a_served_probe_is_captured_by_the_command_that_it_names(tmp_path):
+    command = [sys.executable, "-m", "skinrig.cli"]
+    server = [*command, "serve", "probe", "--subject", SUBJECT, "--seed", "2"]
+    with subprocess.Popen(
+        server, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as served:
+        try:
+            found = dict(served.stdout.readline().split() for _ in range(2))
+            plan = tmp_path / "plan.json"
+            run = subprocess.run(
+                [*command, "capture", "probe", "--dry-run", "--sites", "cheek", "--plan-out",
+                 str(plan)],
+                capture_output=True, text=True,
+            )  # fmt: skip
+            assert run.returncode == errors.DONE, run.stderr
+            # on the rig's own clock a whole series would take its minute and a half
+            document = json.loads(plan.read_text())
+            document["steps"] = [
+                step for step in document["steps"] if step["settings"]["exposure_s"] < 0.05
+            ]
+            plan.write_text(json.dumps(document))
+            out = tmp_path / "session"
+            run = subprocess.run(
+                [*command, "capture", "probe", "--port", f"probe={found['probe']}",
+                 "--camera", f"cam={found['cam']}", "--plan", str(plan), "--out", str(out)],
+                stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=100,
+            )  # fmt: skip
+            assert run.returncode == errors.DONE, run.stderr
+            assert "place the head on the cheek at 0 degrees" in run.stderr
+            session = Session.open(out)
+            assert session.closed
+            assert session.source == "simulated"
+            assert session.todo() == []
+            assert len(session.frames("fibres")) == 9
+            assert verify(out).ok
+        finally:
+            served.terminate()
+
+
+def test_the_next_command_is_named(capsys, tmp_path, few_photons):
+    out = Path(tmp_path) / "session-dark"
+    assert main(simulate(out, "--target", "dark")) == errors.DONE
+    printed = capsys.readouterr()
+    assert re.search(rf"next: skinrig verify {out}", printed.out + printed.err)
