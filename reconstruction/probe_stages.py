@@ -425,7 +425,7 @@ def _translucency(sites: Sequence[SiteValue], evidence: Evidence) -> Mapping[str
     evidence.noted["translucency_conflicts"] = [": ".join(pair) for pair in found.conflicts]
     return {
         "translucency": SkinMap(
-            found.values, "mm", found.stderr, found.valid,
+            found.values, "mm", found.stderr, np.asarray(found.valid.all(axis=-1)),
             "1/sigma_tr of red, green and blue light, between measured sites by kriging",
         )
     }  # fmt: skip

@@ -139,6 +139,8 @@ class Curve:
     """Whether points are marked."""
     line: bool = True
     """Whether they are joined."""
+    color: str | None = None
+    """As matplotlib knows it; None: by the order of the series."""
 
 
 def curves(
@@ -150,7 +152,7 @@ def curves(
     """
     figure, axes = _figure(5.2, 3.4)
     for number, curve in enumerate(series):
-        color = _COLORS[number % len(_COLORS)]
+        color = curve.color or _COLORS[number % len(_COLORS)]
         style = ("o" if curve.marks else "") + ("-" if curve.line else "")
         x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
         if log_y:

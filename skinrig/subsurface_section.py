@@ -18,8 +18,10 @@ from skinrig import figures, page
 from skinrig import subsurface_evaluation as evaluation
 from skinrig.subsurface_evaluation import number, numbers
 
+WIDTH_PX = 200
 SHOWN = 3
 """Measurements drawn; the tables list all."""
+COLORS = {"red": "#c8402f", "green": "#3f8f4f", "blue": "#2a78b8"}
 METHOD_NAMES = {
     "photon_table": "photon table",
     "diffusion": "diffusion",
@@ -48,49 +50,43 @@ def section(
     checks
         Judgements are added to it.
     """
-    body = _plots(appearance, truth)
+    body = _plots(appearance)
     body += _fits(appearance, truth)
     if truth is not None:
         body += _errors(name, appearance, truth, checks)
     body += _anisotropy(appearance)
     body += _sites(appearance)
+    body += _map(appearance)
     return body
 
 
-def _plots(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
+def _plots(appearance: SkinAppearance) -> str:
     measured = evaluation.document_of(appearance, PROFILE_FILE)
     fitted = evaluation.document_of(appearance, SUBSURFACE_FILE)
     if measured is None:
         return ""
     by_name = {} if fitted is None else {entry["name"]: entry for entry in fitted["measurements"]}
-    known = evaluation.true_profiles(truth)
     radius = measured["radius_mm"]
     plots = ""
     for entry in _one_of_each_site(measured["measurements"])[:SHOWN]:
         found = by_name.get(entry["name"])
-        series, residuals = [], []
-        for number_, channel in enumerate(CHANNELS):
+        series = []
+        for channel in CHANNELS:
             one = entry["channels"][channel]
             value, stderr = numbers(one["reflectance_per_mm2"]), numbers(one["stderr"])
             value = np.where(np.asarray(one["valid"], bool), value, np.nan)
             series.append(
                 figures.Curve(f"{channel}, measured", radius, value.tolist(), stderr.tolist(),
-                              line=False)
+                              line=False, color=COLORS[channel])
             )  # fmt: skip
-            true = known.get(entry["name"])
-            if true is not None:
-                real = np.asarray(true["reflectance_per_mm2"], float)[:, number_]
-                residuals.append(
-                    figures.Curve(f"{channel}, truth", radius, (100 * (real / value - 1)).tolist(),
-                                  line=False)
-                )  # fmt: skip
             for fit in [] if found is None else found["fits"]:
                 if fit["channel"] != channel or fit["method"] != evaluation.RECOMMENDED:
                     continue
                 predicted = numbers(fit["predicted_per_mm2"])
                 series.append(
-                    figures.Curve(f"{channel}, fit", radius, predicted.tolist(), marks=False)
-                )
+                    figures.Curve(f"{channel}, fit", radius, predicted.tolist(), marks=False,
+                                  color=COLORS[channel])
+                )  # fmt: skip
         plots += figures.curves(
             f"{_words(entry)}: profile and photon-table fit", "distance from the source, mm",
             "reflectance, 1/mm²", series, log_y=True,
@@ -208,7 +204,7 @@ def _by_channel(rows: Sequence[evaluation.FitError]) -> str:
     for method, words in METHOD_NAMES.items():
         errors = {f"{r.name}, {r.channel}": r.relative for r in rows if r.method == method}
         series[words] = [100.0 * errors.get(label, float("nan")) for label in labels]
-    short = [label.replace("_r0_a000.0", "") for label in labels]
+    short = [label.replace("_r0_a000.0", "").replace(", ", "\n") for label in labels]
     return f"<div class=plots>{figures.bars('error of sigma_tr', short, series, unit='%')}</div>"
 
 
@@ -248,6 +244,34 @@ def _sites(appearance: SkinAppearance) -> str:
          "translucency mm", "standard error"),
         rows,
     )  # fmt: skip
+
+
+def _map(appearance: SkinAppearance) -> str:
+    """Show 1/sigma_tr over the face's texture, each channel beside its standard error."""
+    found = appearance.maps.get("translucency")
+    if found is None:
+        return ""
+    pictures = ""
+    for c, channel in enumerate(CHANNELS):
+        values = found.values[..., c]
+        inside = values if found.valid is None else values[found.valid]
+        if not inside.size:
+            continue
+        pictures += page.scalar_picture(
+            f"translucency, {channel}", values, low=float(inside.min()), high=float(inside.max()),
+            valid=found.valid, unit="mm", width=WIDTH_PX,
+        )  # fmt: skip
+        if found.stderr is not None:
+            spread = found.stderr[..., c]
+            pictures += page.scalar_picture(
+                "standard error", spread, low=0.0, high=float(spread.max()), scale="magma",
+                valid=found.valid, unit="mm", width=WIDTH_PX,
+            )  # fmt: skip
+    note = (
+        "<p class=note>1/sigma_tr over the face's texture, between the measured sites by kriging; "
+        "away from them the error grows to what people differ by.</p>"
+    )
+    return f"<h3>Translucency map</h3>{note}<div class=maps>{pictures}</div>"
 
 
 def _one_of_each_site(measurements: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
