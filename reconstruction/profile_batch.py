@@ -1,0 +1,148 @@
+"""Many radial profiles laid out for the fit: what is used, how it is weighed, where it begins."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import get_num_threads
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from reconstruction import levenberg_marquardt
+from reconstruction.subsurface_models import ProfileModel
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+FEWEST_READINGS = 3
+"""Fibres that must stand out of the noise by `SIGNAL` standard deviations."""
+SIGNAL = 3.0
+ROUNDS, STEPS = 4, 60
+"""Times the model's error is weighed anew, and steps of a round at most."""
+NEIGHBOURS = 7
+"""Fibres to either side whose residuals tell the noise of one, without a variance."""
+LEAST_DEVIATION = 1e-3
+"""Relative deviation of a reading at least, without a variance."""
+INITIAL_DEVIATION = 0.05
+"""Likewise, for the first of the fits without a variance."""
+START_ERROR = 0.1
+"""Relative error added for the comparison with starts."""
+RISE = 50.0
+"""A second valley of the misfit is tried when it begins no higher above the deepest."""
+
+
+@dataclass(slots=True)
+class ProfileBatch:
+    """Profiles as the kernel takes them, and what it makes of them."""
+
+    y: Floats
+    """Reflectance, or its logarithm; 0 where not used."""
+    variance: Floats
+    """Of `y`, infinite where not used."""
+    used: Bools
+    logarithmic: bool
+    prior: Floats
+    seen: Bools
+    """Readings that stand out of their noise."""
+    theta: Floats
+    covariance: Floats
+    chi2: Floats
+    predicted: Floats
+    total: Floats
+    """Variance of `y` with the model's error."""
+    steps: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, y: Floats, variance: Floats | None, used: Bools, prior: Floats) -> ProfileBatch:
+        """Lay out profiles (N, F)."""
+        n, fibres = y.shape
+        clean = np.where(used, y, 0.0)
+        if variance is None:
+            spread = np.where(used, INITIAL_DEVIATION**2, math.inf)
+            seen = used
+            clean = np.log(np.where(used, y, 1.0))
+        else:
+            spread = np.where(used, variance, math.inf)
+            seen = used & (clean > SIGNAL * np.sqrt(spread))
+        return cls(
+            clean, spread, used, variance is None, prior, seen, np.zeros((n, 4)),
+            np.zeros((n, 4, 4)), np.zeros(n), np.zeros((n, fibres)), np.zeros((n, fibres)),
+            np.zeros(n, np.int64),
+        )  # fmt: skip
+
+    def fit(self, model: ProfileModel, chosen: NDArray[np.intp]) -> None:
+        """Fit some of the profiles from the best of the starts on."""
+        y, variance, seen = self.y[chosen], self.variance[chosen], self.seen[chosen]
+        if self.logarithmic:
+            logs, weight = y, seen / START_ERROR**2
+        else:
+            safe = np.where(seen, y, 1.0)
+            logs = np.log(safe)
+            weight = np.zeros(y.shape)
+            np.divide(1.0, variance / safe**2 + START_ERROR**2, out=weight, where=seen)
+        g = float(self.prior[3, 0])
+        best, second, rise = model.starts(logs, weight, g)
+        self._run(model, chosen, y, variance, best)
+        doubt = np.flatnonzero(np.isfinite(rise) & ((rise < RISE) | self._misfits(chosen)))
+        if doubt.size:
+            self._run(model, chosen[doubt], y[doubt], variance[doubt], second[doubt], better=True)
+        for _ in range(2 if self.logarithmic else 0):
+            off = np.where(seen, y - np.log(np.maximum(self.predicted[chosen], 1e-290)), 0.0)
+            variance = _local_variance(model.radius_mm, off, seen)
+            self._run(model, chosen, y, variance, self.theta[chosen])
+
+    def _misfits(self, chosen: NDArray[np.intp]) -> Bools:
+        """Return which fits are so bad that another minimum may be better."""
+        seen = self.seen[chosen].sum(axis=1)
+        dof = np.maximum(seen - 2, 1)
+        return (seen >= FEWEST_READINGS) & (
+            (self.chi2[chosen] > dof + 4.0 * np.sqrt(2.0 * dof)) | (self.steps[chosen] < 0)
+        )
+
+    def _run(
+        self,
+        model: ProfileModel,
+        chosen: NDArray[np.intp],
+        y: Floats,
+        variance: Floats,
+        theta: Floats,
+        *,
+        better: bool = False,
+    ) -> None:
+        """Fit from `theta` on and keep the results; with `better` only the likelier ones."""
+        n = y.shape[0]
+        covariance, chi2 = np.empty((n, 4, 4)), np.empty(n)
+        predicted, total, steps = np.empty(y.shape), np.empty(y.shape), np.empty(n, np.int64)
+        parts = min(get_num_threads(), max(1, n // 64))
+        levenberg_marquardt.fit(
+            model.kind, model.radius_mm, model.constants, model.axes, model.grid, y, variance,
+            model.error, self.logarithmic, self.prior, model.bounds, theta, ROUNDS, STEPS, parts,
+            covariance, chi2, predicted, total, steps,
+        )  # fmt: skip
+        if better:
+            won = chi2 + _log_volume(total) < self.chi2[chosen] + _log_volume(self.total[chosen])
+            chosen, theta, covariance, chi2 = chosen[won], theta[won], covariance[won], chi2[won]
+            predicted, total, steps = predicted[won], total[won], steps[won]
+        self.theta[chosen], self.covariance[chosen], self.chi2[chosen] = theta, covariance, chi2
+        self.predicted[chosen], self.total[chosen], self.steps[chosen] = predicted, total, steps
+
+
+def _log_volume(total: Floats) -> Floats:
+    """Return the sum of the logarithms of the variances of what is used."""
+    return np.asarray(np.log(np.where(np.isfinite(total), total, 1.0) + 1e-300).sum(axis=1))
+
+
+def _local_variance(radius_mm: Floats, residual: Floats, seen: Bools) -> Floats:
+    """Return each fibre's variance from the squared residuals around it, infinite where unseen."""
+    order = np.argsort(radius_mm, kind="stable")
+    width = 2 * NEIGHBOURS + 1
+    squares = uniform_filter1d(residual[:, order] ** 2, width, axis=1, mode="constant")
+    count = uniform_filter1d(seen[:, order].astype(np.float64), width, axis=1, mode="constant")
+    out = np.full(residual.shape, math.inf)
+    total = seen.sum(axis=1, keepdims=True)
+    spared = total / np.maximum(total - 2, 1)  # residuals of a fit are smaller than errors
+    mean = squares / np.maximum(count, 0.5 / width) * spared
+    out[:, order] = np.where(seen[:, order], np.maximum(mean, LEAST_DEVIATION**2), math.inf)
+    return out

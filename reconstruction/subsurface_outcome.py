@@ -1,0 +1,280 @@
+"""What fits of radial profiles tell: estimates with errors and intervals, and what to doubt."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincc, stdtrit
+
+from reconstruction.profile_batch import FEWEST_READINGS, ProfileBatch
+from reconstruction.subsurface_models import Method
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Codes = NDArray[np.uint16]
+
+FEWEST_FIBRES = 4
+LOG_LIMIT = 0.5
+"""Standard error of log sigma_tr above which the profile does not tell it."""
+COEFFICIENT_LIMIT = 0.3
+"""Likewise of log sigma_a and log sigma_s', which is said apart."""
+MISFIT_CHANCE = 1e-3
+"""A chi2 that chance exceeds so rarely is a misfit."""
+FAR_OFF = 0.7
+"""Root mean square of log(reading / model) above which a profile is of no such medium."""
+CLEAR = 0.2
+"""Standard error of log sigma_tr up to which its interval is symmetric in the logarithm."""
+SHARE = 0.6827
+"""Of the interval."""
+
+
+class Outcome(IntFlag):
+    """What became of a fit; the first eight bits make it invalid, the others are remarks."""
+
+    GOOD = 0
+    TOO_FEW_FIBRES = 1
+    NO_SIGNAL = 2
+    NOT_CONVERGED = 4
+    AT_BOUND = 8
+    OUTSIDE_DOMAIN = 16
+    NOT_IDENTIFIED = 32
+    WRONG_PROFILE = 64
+    MISFIT = 256
+    COEFFICIENTS_NOT_IDENTIFIED = 512
+
+
+_INVALID = 255
+REASONS = {
+    Outcome.TOO_FEW_FIBRES: f"fewer than {FEWEST_FIBRES} fibres to use",
+    Outcome.NO_SIGNAL: f"fewer than {FEWEST_READINGS} fibres stand out of their noise",
+    Outcome.NOT_CONVERGED: "the fit did not settle",
+    Outcome.AT_BOUND: "a coefficient runs against its limit",
+    Outcome.OUTSIDE_DOMAIN: "sigma_a / sigma_s' is beyond what the model is good for",
+    Outcome.NOT_IDENTIFIED: "the profile does not tell sigma_tr",
+    Outcome.WRONG_PROFILE: "no medium of this kind has such a profile, or its scale is wrong",
+    Outcome.MISFIT: "residuals exceed their errors; the errors are enlarged",
+    Outcome.COEFFICIENTS_NOT_IDENTIFIED: "sigma_a and sigma_s' are not told apart well",
+}
+LEFT_OUT = ("used", "masked", "not finite", "no variance", "not above zero")
+"""Meaning of `SubsurfaceFit.left_out`."""
+
+
+@dataclass(frozen=True, slots=True)
+class SubsurfaceFit:
+    """Coefficients of the media that profiles come from, leading axes as the profiles'.
+
+    Attributes
+    ----------
+    sigma_a_per_mm, sigma_s_prime_per_mm, sigma_tr_per_mm : ndarray, shape (...)
+        Absorption, reduced scattering, and sqrt(3 sigma_a (sigma_a + sigma_s')), 1/mm; NaN where
+        the fibres do not suffice (`Outcome.TOO_FEW_FIBRES`, `Outcome.NO_SIGNAL`).
+    covariance : ndarray, shape (..., 2, 2)
+        Of (sigma_a, sigma_s'), 1/mm^2, nuisances included; infinite where nothing is told.
+    valid : ndarray of bool, shape (...)
+        sigma_tr can be used. False with a reason in `outcome`.
+    sigma_tr_stderr : ndarray, shape (...)
+        By propagation of `covariance`, and for closed forms with their systematic error, 1/mm.
+    interval_per_mm : ndarray, shape (..., 2)
+        68 % interval of sigma_tr, 1/mm.
+    chi2, p_value : ndarray, shape (...)
+        Squared residuals over their variances, with the nuisances' priors; the chance of more.
+        Without a variance chi2 equals `dof` but for its smoothing and says little.
+    dof : ndarray of int, shape (...)
+        Fibres used less two.
+    inflation : ndarray, shape (...)
+        Factor that enlarged all standard errors, for a misfit; 1 without.
+    used : ndarray of bool, shape (..., F)
+    left_out : ndarray of uint8, shape (..., F)
+        Index into `LEFT_OUT`, 0 where used.
+    outcome : ndarray of uint16, shape (...)
+        Bits of `Outcome`.
+    predicted_per_mm2 : ndarray, shape (..., F)
+        The fitted profile with the common factor, 1/mm^2, at every fibre.
+    residual : ndarray, shape (..., F)
+        (reflectance - predicted) over its standard deviation, model error included; without a
+        variance of logarithms; 0 where not used.
+    scale : ndarray, shape (...)
+        Common factor of the reading, 1 without ``common_error``.
+    asymmetry : ndarray, shape (...)
+        g as fitted, or as given.
+    evaluations : ndarray of int, shape (...)
+        Profiles computed for the fit.
+    method : str
+    """
+
+    sigma_a_per_mm: Floats
+    sigma_s_prime_per_mm: Floats
+    sigma_tr_per_mm: Floats
+    covariance: Floats
+    valid: Bools
+    sigma_tr_stderr: Floats
+    interval_per_mm: Floats
+    chi2: Floats
+    dof: NDArray[np.int64]
+    p_value: Floats
+    inflation: Floats
+    used: Bools
+    left_out: NDArray[np.uint8]
+    outcome: Codes
+    predicted_per_mm2: Floats
+    residual: Floats
+    scale: Floats
+    asymmetry: Floats
+    evaluations: NDArray[np.int64]
+    method: Method
+
+    @property
+    def sigma_a_stderr(self) -> Floats:
+        """Standard error of sigma_a, 1/mm, shape (...)."""
+        return np.asarray(np.sqrt(self.covariance[..., 0, 0]))
+
+    @property
+    def sigma_s_prime_stderr(self) -> Floats:
+        """Standard error of sigma_s', 1/mm, shape (...)."""
+        return np.asarray(np.sqrt(self.covariance[..., 1, 1]))
+
+    @property
+    def correlation(self) -> Floats:
+        """Correlation of sigma_a and sigma_s', shape (...); NaN where nothing is told."""
+        spread = self.sigma_a_stderr * self.sigma_s_prime_stderr
+        known = np.isfinite(spread) & (spread > 0.0)
+        ratio = np.full(spread.shape, np.nan)
+        return np.divide(self.covariance[..., 0, 1], spread, out=ratio, where=known)
+
+    @property
+    def coefficients_identified(self) -> Bools:
+        """Whether sigma_a and sigma_s' are told one by one; `valid` speaks of sigma_tr alone."""
+        unclear = Outcome.COEFFICIENTS_NOT_IDENTIFIED | Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL
+        return np.asarray((self.outcome & np.uint16(unclear)) == 0)
+
+    def reason(self, index: int | tuple[int, ...] = ()) -> str:
+        """Return what is to be said of one fit, empty for a good one.
+
+        Parameters
+        ----------
+        index
+            Of the leading axes; () for a single profile.
+        """
+        code = int(self.outcome[index])
+        return "; ".join(text for bit, text in REASONS.items() if code & bit)
+
+
+def judged(
+    batch: ProfileBatch,
+    bounds: Floats,
+    inside: Bools,
+    bias: Floats,
+    left_out: NDArray[np.uint8],
+    shape: tuple[int, ...],
+    method: Method,
+) -> SubsurfaceFit:
+    """Return estimates with errors, and say which can be used."""
+    a, s = np.exp(batch.theta[:, 0]), np.exp(batch.theta[:, 1])
+    sigma_tr = np.sqrt(3.0 * a * (a + s))
+    fibres = batch.used.sum(axis=1)
+    dof = np.maximum(fibres - 2, 0)
+    p_value = np.where(dof > 0, gammaincc(np.maximum(dof, 1) / 2.0, batch.chi2 / 2.0), 1.0)
+    reduced = batch.chi2 / np.maximum(dof, 1)
+    large = (reduced > 1.0) & ((p_value < MISFIT_CHANCE) | batch.logarithmic)
+    inflation = np.where(large, np.sqrt(reduced), 1.0)
+    logs = batch.covariance[:, :2, :2] * (inflation**2)[:, None, None]
+    slope = 0.5 * np.stack([1.0 + a / (a + s), s / (a + s)], axis=1)  # of log sigma_tr
+    told = np.isfinite(logs).all(axis=(1, 2))
+    safe = np.where(told[:, None, None], logs, 0.0)
+    log_variance = np.einsum("ni,nij,nj->n", slope, safe, slope)
+    log_stderr = np.where(told, np.sqrt(np.maximum(log_variance, 0.0) + bias**2), math.inf)
+    scales = np.stack([a, s], axis=1)
+    covariance = safe * scales[:, :, None] * scales[:, None, :]
+    covariance[~told] = math.inf
+    apart = np.where(told, np.sqrt(np.maximum(safe[:, 0, 0], safe[:, 1, 1])), math.inf)
+
+    seen = batch.seen.sum(axis=1)
+    with np.errstate(divide="ignore"):
+        off = (
+            batch.y - np.log(batch.predicted)
+            if batch.logarithmic
+            else (
+                np.log(np.where(batch.seen, batch.y, 1.0))
+                - np.log(np.maximum(batch.predicted, 1e-290))
+            )
+        )
+    far = np.sqrt(np.where(batch.seen, off**2, 0.0).sum(axis=1) / np.maximum(seen, 1))
+    at_bound = (
+        (batch.theta[:, :2] <= bounds[:2, 0] + 1e-6) | (batch.theta[:, :2] >= bounds[:2, 1] - 1e-6)
+    ).any(axis=1)
+    outcome = np.zeros(a.shape, np.uint16)
+    for bit, where in (
+        (Outcome.TOO_FEW_FIBRES, fibres < FEWEST_FIBRES),
+        (Outcome.NO_SIGNAL, (fibres >= FEWEST_FIBRES) & (seen < FEWEST_READINGS)),
+        (Outcome.NOT_CONVERGED, batch.steps < 0),
+        (Outcome.AT_BOUND, at_bound),
+        (Outcome.OUTSIDE_DOMAIN, ~inside),
+        (Outcome.NOT_IDENTIFIED, log_stderr > LOG_LIMIT),
+        (Outcome.WRONG_PROFILE, far > FAR_OFF),
+        (Outcome.MISFIT, (p_value < MISFIT_CHANCE) & ~np.bool_(batch.logarithmic)),
+        (Outcome.COEFFICIENTS_NOT_IDENTIFIED, apart > COEFFICIENT_LIMIT),
+    ):
+        outcome[where] |= np.uint16(bit)
+    nothing = (outcome & np.uint16(Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL)) != 0
+    outcome[nothing] &= np.uint16(Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL)
+    for estimate in (a, s, sigma_tr, p_value):
+        estimate[nothing] = math.nan
+    covariance[nothing] = math.inf
+    log_stderr[nothing] = math.inf
+    reach = np.full(a.shape, 1.0)
+    if batch.logarithmic:  # the noise itself is known from few residuals
+        reach = stdtrit(np.maximum(dof, 1), 0.5 + 0.5 * SHARE)
+    low, high = _interval(sigma_tr, log_stderr * reach)
+    residual = np.zeros(batch.y.shape)
+    model_value = (
+        np.log(np.maximum(batch.predicted, 1e-290)) if batch.logarithmic else batch.predicted
+    )
+    np.divide(batch.y - model_value, np.sqrt(batch.total), out=residual, where=batch.used)
+    predicted = np.where(nothing[:, None], math.nan, batch.predicted)
+    return SubsurfaceFit(
+        sigma_a_per_mm=a.reshape(shape),
+        sigma_s_prime_per_mm=s.reshape(shape),
+        sigma_tr_per_mm=sigma_tr.reshape(shape),
+        covariance=covariance.reshape((*shape, 2, 2)),
+        valid=((outcome & np.uint16(_INVALID)) == 0).reshape(shape),
+        sigma_tr_stderr=_product(sigma_tr, log_stderr).reshape(shape),
+        interval_per_mm=np.stack([low, high], axis=-1).reshape((*shape, 2)),
+        chi2=batch.chi2.reshape(shape),
+        dof=dof.reshape(shape),
+        p_value=p_value.reshape(shape),
+        inflation=inflation.reshape(shape),
+        used=batch.used.reshape((*shape, -1)),
+        left_out=left_out.reshape((*shape, -1)),
+        outcome=outcome.reshape(shape),
+        predicted_per_mm2=predicted.reshape((*shape, -1)),
+        residual=residual.reshape((*shape, -1)),
+        scale=np.exp(batch.theta[:, 2]).reshape(shape),
+        asymmetry=batch.theta[:, 3].reshape(shape),
+        evaluations=np.abs(batch.steps).reshape(shape),
+        method=method,
+    )
+
+
+def _interval(sigma_tr: Floats, log_stderr: Floats) -> tuple[Floats, Floats]:
+    """Return the ends of the 68 % interval of sigma_tr.
+
+    Symmetric in the logarithm while that is well told; then in sigma_tr^2, which a profile is
+    linear in where the absorption is next to none.
+    """
+    clear = log_stderr < CLEAR
+    spread = np.where(clear, log_stderr, 0.0)
+    low, high = sigma_tr * np.exp(-spread), sigma_tr * np.exp(spread)
+    wide = np.where(np.isfinite(log_stderr), 2.0 * log_stderr, 0.0)
+    low = np.where(clear, low, sigma_tr * np.sqrt(np.maximum(1.0 - wide, 0.0)))
+    high = np.where(clear, high, sigma_tr * np.sqrt(1.0 + wide))
+    nothing = ~np.isfinite(log_stderr)
+    return np.where(nothing, 0.0, low), np.where(nothing, math.inf, high)
+
+
+def _product(value: Floats, log_stderr: Floats) -> Floats:
+    known = np.isfinite(value) & np.isfinite(log_stderr)
+    return np.where(known, np.where(known, value, 0.0) * np.where(known, log_stderr, 0.0), math.inf)
