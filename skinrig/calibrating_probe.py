@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from importlib.resources import files
@@ -246,11 +246,12 @@ class _Series:
 
     def phantoms(self) -> list[MergedSeries]:
         """Return the series with all fibres uncovered, one for each placement."""
-        return [merged for _, merged in sorted(self._merged(self._phantom, "repeat").items())]
+        groups = _grouped(self._phantom, "repeat")
+        return [self._merge(records) for _, records in sorted(groups.items())]
 
-    def masks(self) -> dict[int, MergedSeries]:
-        """Return the series with one fibre uncovered, by its number."""
-        return self._merged(self._session.frames("mask"), "fibre")
+    def masks(self) -> Mapping[int, MergedSeries]:
+        """Return the series with one fibre uncovered, by its number; merged when asked for."""
+        return _Merging(_grouped(self._session.frames("mask"), "fibre"), self._merge)
 
     @property
     def counts(self) -> tuple[int, int, int]:
@@ -259,20 +260,41 @@ class _Series:
         dark, phantom, mask = (len(session.frames(kind)) for kind in ("dark", "phantom", "mask"))
         return dark, phantom, mask
 
-    def _merged(self, records: Sequence[FrameRecord], key: str) -> dict[int, MergedSeries]:
-        groups: dict[int, list[FrameRecord]] = defaultdict(list)
-        for record in records:
-            groups[int(record.index.get(key, 0))].append(record)
-        return {
-            number: merge_series(
-                [self._session.read(record).cfa for record in group],
-                [_exposure_s(record) for record in group],
-                darks=self.darks.at(_temperature(group)),
-                noise=self._noise,
-                light_s=[_light_s(record) for record in group],
-            )
-            for number, group in groups.items()
-        }
+    def _merge(self, records: Sequence[FrameRecord]) -> MergedSeries:
+        return merge_series(
+            [self._session.read(record).cfa for record in records],
+            [_exposure_s(record) for record in records],
+            darks=self.darks.at(_temperature(records)),
+            noise=self._noise,
+            light_s=[_light_s(record) for record in records],
+        )
+
+
+class _Merging(Mapping[int, MergedSeries]):
+    """Series of a session by a number, of which one at a time is held."""
+
+    def __init__(
+        self,
+        groups: Mapping[int, Sequence[FrameRecord]],
+        merge: Callable[[Sequence[FrameRecord]], MergedSeries],
+    ) -> None:
+        self._groups, self._merge = groups, merge
+
+    def __getitem__(self, number: int) -> MergedSeries:
+        return self._merge(self._groups[number])
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._groups)
+
+    def __len__(self) -> int:
+        return len(self._groups)
+
+
+def _grouped(records: Sequence[FrameRecord], key: str) -> dict[int, list[FrameRecord]]:
+    groups: dict[int, list[FrameRecord]] = defaultdict(list)
+    for record in records:
+        groups[int(record.index.get(key, 0))].append(record)
+    return groups
 
 
 def _exposure_s(record: FrameRecord) -> float:

@@ -127,15 +127,20 @@ def merge_series(
     smooth = _smooth(guess, seen & ~hot, noise.pattern)
     light = np.maximum(smooth, 0.0)
     rate, seen, variance = _weigh(stack, times, lit, base, usable, darks, noise, light)
-    clear = seen & ~hot & (rate > LEAST_SIGMAS * np.sqrt(variance))
+    clear = np.flatnonzero(seen & ~hot & (rate > LEAST_SIGMAS * np.sqrt(variance)))
     scale, scale_stderr = np.ones(len(times)), np.zeros(len(times))
-    if len(times) > 1 and clear.any():
+    if len(times) > 1 and clear.size:
         scale, scale_stderr = _scales(
-            np.stack([(frame - dark)[clear] for frame, dark in zip(stack, base, strict=True)]),
-            np.stack([use[clear] for use in usable]),
-            times, lit, rate[clear], light[clear], darks, noise,
+            np.stack(
+                [f.ravel()[clear] - dark.ravel()[clear] for f, dark in zip(stack, base, strict=True)]
+            ),
+            np.stack([use.ravel()[clear] for use in usable]),
+            times, lit, rate.ravel()[clear], light.ravel()[clear], darks, noise,
         )  # fmt: skip
-        rate, seen, variance = _weigh(stack, times, lit * scale, base, usable, darks, noise, light)
+        if (scale != 1.0).any():
+            rate, seen, variance = _weigh(
+                stack, times, lit * scale, base, usable, darks, noise, light
+            )
     valid = seen & ~hot
     rate, variance = np.where(valid, rate, 0.0), np.where(valid, variance, 0.0)
     span = noise.span_dn

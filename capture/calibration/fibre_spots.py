@@ -233,7 +233,8 @@ def _consult_masks(
     size = float(np.median([fit[2] for fit in best if fit is not None]))
     apart = np.linalg.norm(known[:, None] - known[None], axis=-1)
     np.fill_diagonal(apart, np.inf)
-    for i, series in sorted(masks.items()):
+    for i in sorted(masks):
+        series = masks[i]
         fit = best[i]
         doubtful = fit is None or apart[i].min() < 2.2 * size or not 0.8 < fit[2] / size < 1.25
         image = _gray(series, pattern)

@@ -1,0 +1,70 @@
+"""What a perfect probe takes from a phantom, and what its certificate leaves open."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from capture.calibration.phantom import (
+    CertificateError,
+    CertificateUncertainty,
+    PhantomCertificate,
+)
+from capture.rig import load_rig
+from model import photon_table
+from skinrig.calibrating_probe import expected_reflectance
+
+GRAY = PhantomCertificate(
+    eta=1.4, g=0.8, wavelength_nm=(550.0,), sigma_a_per_mm=(0.01,), sigma_s_prime_per_mm=(1.0,),
+    uncertainty=CertificateUncertainty(0.03, 0.02),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return load_rig("probe")
+
+
+def test_a_gray_phantom_gives_the_tables_reflectance_in_every_band(rig):
+    expected = expected_reflectance(GRAY, rig)
+    single = photon_table.reflectance(
+        rig.probe.radius_mm, 0.01, 1.0, g=0.8, collection="fibre", core_mm=0.2, source_core_mm=0.2
+    )
+    np.testing.assert_allclose(expected.per_mm2, np.repeat(single[:, None], 3, axis=1), rtol=1e-9)
+    flat = dataclasses.replace(
+        GRAY, wavelength_nm=(400.0, 700.0), sigma_a_per_mm=(0.01, 0.01),
+        sigma_s_prime_per_mm=(1.0, 1.0),
+    )  # fmt: skip
+    np.testing.assert_allclose(expected_reflectance(flat, rig).per_mm2, expected.per_mm2, rtol=1e-9)
+
+
+def test_a_phantom_that_absorbs_blue_gives_less_of_it(rig):
+    paper = dataclasses.replace(
+        GRAY, wavelength_nm=(400.0, 700.0), sigma_a_per_mm=(0.1, 0.002),
+        sigma_s_prime_per_mm=(1.0, 1.0),
+    )  # fmt: skip
+    far = expected_reflectance(paper, rig).per_mm2[-1]
+    assert far[0] > far[1] > far[2]
+
+
+def test_what_is_uncertain_moves_the_fibres_as_other_coefficients_would(rig):
+    expected = expected_reflectance(GRAY, rig)
+    for number, name in enumerate(("sigma_a_per_mm", "sigma_s_prime_per_mm")):
+        step = 1e-3
+        more = dataclasses.replace(GRAY, **{name: ((1 + step) * getattr(GRAY, name)[0],)})
+        change = (expected_reflectance(more, rig).per_mm2 / expected.per_mm2 - 1) / step
+        unsure = (0.03, 0.02)[number]
+        np.testing.assert_allclose(expected.common[number], unsure * change, rtol=0.02, atol=2e-4)
+
+
+def test_a_phantom_outside_of_the_table_is_refused(rig):
+    with pytest.raises(CertificateError, match="photon table does not hold"):
+        expected_reflectance(dataclasses.replace(GRAY, sigma_a_per_mm=(500.0,)), rig)
+    with pytest.raises(CertificateError, match="eta"):
+        expected_reflectance(dataclasses.replace(GRAY, eta=1.9), rig)
+    short = dataclasses.replace(
+        GRAY, wavelength_nm=(500.0, 600.0), sigma_a_per_mm=(0.01, 0.01),
+        sigma_s_prime_per_mm=(1.0, 1.0),
+    )  # fmt: skip
+    with pytest.raises(CertificateError, match="400"):
+        expected_reflectance(short, rig)
