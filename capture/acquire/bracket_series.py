@@ -16,7 +16,7 @@ import numpy as np
 from capture import raw
 from capture.acquire.fibre_signal import LEVEL, FibreSignal, said_of
 from capture.acquire.frames import encode
-from capture.acquire.mask_choice import serving
+from capture.acquire.mask_choice import masks_not_needed
 from capture.acquire.outcome import (
     MAX_ATTEMPTS,
     Operator,
@@ -24,7 +24,8 @@ from capture.acquire.outcome import (
     given_up,
     steps_to_do,
 )
-from capture.acquire.probe_head import Head, HeadLost, NotHeld, ProbeDriver
+from capture.acquire.probe_driver import ProbeDriver
+from capture.acquire.probe_head import Head, HeadLost, NotHeld
 from capture.acquire.source_exposure import Exposed, ShutterFault, expose, expose_dark
 from capture.devices.camera import Camera, CameraError, Frame, FrameRefused, FrameTimeout
 from capture.plan import Step, Value
@@ -114,7 +115,7 @@ class BracketSeries:
         """Take the series that are missing, in the plan's order, with the head placed as needed."""
         for placement, steps in all_series(self._session.plan):
             if steps[0].kind == "mask" and not self._all_brackets:
-                self._choose_masks()
+                self._leave_out(*masks_not_needed(self._session))
             if self._is_missing(steps):
                 self._series(placement, steps)
 
@@ -242,28 +243,6 @@ class BracketSeries:
         if verdict.saturated:
             reason += f"; {said_of(verdict.saturated, self._probe)} saturated in every exposure"
         return reason
-
-    def _choose_masks(self) -> None:
-        """Leave out those exposures of covered heads that do not serve, once."""
-        session = self._session
-        masks = [step for step in session.plan.steps if step.kind == "mask"]
-        done = {record.step_id for record in session.frames("mask")}
-        left_out = session.left_out()
-        phantom = session.frames("phantom", repeat=0)
-        if not phantom or done or any(step.id in left_out for step in masks):
-            return
-        signal = FibreSignal(self._probe, self._rig.view(masks[0].cameras[0]))
-        for record in phantom:
-            if record.camera == masks[0].cameras[0]:
-                image = np.asarray(session.read(record).cfa)
-                signal.look(image, float(record.settings["exposure_s"]))
-        kept = serving(masks, signal.rate_per_s)
-        rest = [step for step in masks if step.id not in kept]
-        self._leave_out(
-            rest,
-            f"{len(rest)} of {len(masks)} exposures of the covered head left out: per fibre one "
-            "that shows it unsaturated serves, and one that shows light astray from it",
-        )
 
     def _leave_out(self, steps: Sequence[Step], reason: str) -> None:
         if not steps:

@@ -11,7 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.acquire.fibre_signal import FibreSignal
 from capture.plan import Step
+from capture.session import Session
 
 MOST_LEVEL = 0.7
 """Share of full scale up to which a spot is safely unsaturated."""
@@ -51,3 +53,28 @@ def serving(steps: Sequence[Step], rate_per_s: NDArray[np.float64]) -> set[str]:
         others = int(np.count_nonzero(seconds <= 1.01 * OVER * seconds[own])) - 1
         kept |= {ordered[own].id, ordered[others].id}
     return kept
+
+
+def masks_not_needed(session: Session) -> tuple[list[Step], str]:
+    """Return which exposures of covered heads a session can do without, and why.
+
+    They are chosen once: where one was taken or left out before, or where the phantom has not been
+    seen at its first placement, none.
+    """
+    masks = [step for step in session.plan.steps if step.kind == "mask"]
+    left_out = session.left_out()
+    phantom = session.frames("phantom", repeat=0)
+    chosen = session.frames("mask") or any(step.id in left_out for step in masks)
+    if not phantom or chosen or session.rig.probe is None:
+        return [], ""
+    camera = masks[0].cameras[0]
+    signal = FibreSignal(session.rig.probe, session.rig.view(camera))
+    for record in phantom:
+        if record.camera == camera:
+            signal.look(np.asarray(session.read(record).cfa), float(record.settings["exposure_s"]))
+    kept = serving(masks, signal.rate_per_s)
+    rest = [step for step in masks if step.id not in kept]
+    return rest, (
+        f"{len(rest)} of {len(masks)} exposures of the covered head left out: per fibre one that "
+        "shows it unsaturated serves, and one that shows light astray from it"
+    )

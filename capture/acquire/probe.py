@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from capture.acquire.bracket_series import BracketSeries
 from capture.acquire.outcome import Acquired, Operator, tear_down
 from capture.acquire.probe_checks import check_cameras, check_probe
-from capture.acquire.probe_head import LEASE_S, ProbeDriver
+from capture.acquire.probe_driver import LEASE_S, ProbeDriver
 from capture.devices.camera import Camera
 from capture.plan import Plan
 from capture.rig import Rig

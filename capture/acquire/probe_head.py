@@ -8,12 +8,10 @@ anew, and all exposures of the series are taken again.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from typing import Any, Protocol
 
 from capture.acquire.outcome import MAX_ATTEMPTS, AcquisitionError, Operator
+from capture.acquire.probe_driver import ProbeDriver
 from capture.devices.port import CommandRefused
-from capture.devices.probe import Opening, ProbeStatus, SuctionReport, SuctionState
 from capture.devices.wire import Code
 from capture.plan.probe import CAP
 from capture.plan.suction import SLACK_S, Placement
@@ -21,11 +19,7 @@ from capture.rig import Probe
 
 log = logging.getLogger(__name__)
 
-LEASE_S = 5.0
-"""A frame may keep the host busy for a while; after this silence the box lets go."""
 LISTEN_S = 0.1
-RENEW_S = 1.0
-"""Silence between two renewals of the lease while nothing but time is waited for."""
 REACH_MARGIN_S = 1.0
 """Beyond the box's own time for reaching a suction."""
 OFF_SHARE = 0.5
@@ -33,74 +27,6 @@ OFF_SHARE = 0.5
 COOL_S = 180.0
 """How long a camera that is too warm, or too cold, is waited for, s."""
 COOL_LISTEN_S = 1.0
-
-
-class ProbeDriver(Protocol):
-    """The part of the probe's driver that a capture needs."""
-
-    @property
-    def limits(self) -> Mapping[str, Any]:
-        """What the box allows, in its own words and units."""
-
-    def arm(self) -> None:
-        """Allow light and suction."""
-
-    def dark(self) -> None:
-        """Shut the shutter, put the LED out, vent, and disarm."""
-
-    def set_lease(self, lease_s: float) -> None:
-        """Set after how much silence the box does the same."""
-
-    def new_subject(self, pseudonym: str) -> None:
-        """Begin to count the dose of light anew."""
-
-    def status(self) -> ProbeStatus:
-        """Return the status bits."""
-
-    def place(self, site: str, angle_deg: float) -> None:
-        """Pass on where a person has put the head."""
-
-    def suck(self, mbar: float, seconds: float) -> int:
-        """Switch the pump on."""
-
-    def suction(self) -> SuctionState:
-        """Return what the pump does."""
-
-    def last_suction(self) -> SuctionReport | None:
-        """Return how the last suction ended."""
-
-    def vent(self) -> None:
-        """Switch the pump off; the head stays placed."""
-
-    def pressure_mbar(self) -> float:
-        """Return the suction under the head, mbar."""
-
-    def camera_c(self) -> float:
-        """Return the temperature of the camera, degrees Celsius."""
-
-    def set_level(self, level: float) -> None:
-        """Drive the LED behind the closed shutter."""
-
-    def cover(self, fibre: int | None) -> None:
-        """Cover all detection fibres but one; None: none."""
-
-    def open_shutter(self, seconds: float) -> Opening:
-        """Open the shutter, pulsing the camera's line."""
-
-    def close_shutter(self) -> None:
-        """Close the shutter, also one that is stuck."""
-
-    def last_opening(self) -> Opening | None:
-        """Return the last opening and how it ended."""
-
-    def ping(self) -> float:
-        """Return the box's clock, s."""
-
-    def trigger_camera(self, token: str) -> float:
-        """Pulse the camera's line without light."""
-
-    def listen(self, seconds: float, *, every_s: float = ...) -> None:
-        """Let time pass while the lease is renewed."""
 
 
 class HeadLost(Exception):

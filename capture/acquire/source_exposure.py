@@ -11,7 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from capture.acquire.frames import configure, wanted_exposure
-from capture.acquire.probe_head import RENEW_S, HeadLost, ProbeDriver
+from capture.acquire.probe_driver import RENEW_S, ProbeDriver
+from capture.acquire.probe_head import HeadLost
 from capture.devices.camera import Camera, Frame, FrameRefused, Trigger, next_frame
 from capture.devices.port import CommandRefused
 from capture.devices.probe import Opening
