@@ -67,6 +67,46 @@ def distance_rule(
     return node, node_weight * node
 
 
+def distance_rules(
+    radii_mm: FloatArray, core_mm: float, source_core_mm: float
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    """Return the rules of several radii after one another, as compiled loops take them.
+
+    Parameters
+    ----------
+    radii_mm
+        Distances of the cores' centres in mm, shape (n,), > 0 where both cores are points.
+    core_mm, source_core_mm
+        Diameters of the two cores in mm, >= 0.
+
+    Returns
+    -------
+    starts, log_distances, weights : ndarray
+        Radius k has the nodes from starts[k], shape (n + 1,), up to starts[k + 1]; natural
+        logarithms of mm.
+
+    Raises
+    ------
+    ValueError
+        For a radius of 0 between points, where profiles are infinite.
+
+    Examples
+    --------
+    >>> distance_rules(np.array([0.0, 2.5]), 0.2, 0.0)[0].tolist()
+    [0, 8, 11]
+    """
+    if core_mm == 0.0 and source_core_mm == 0.0:
+        if np.any(radii_mm == 0.0):
+            raise ValueError("radius_mm: got 0 between points, where R is infinite; expected > 0")
+        return np.arange(radii_mm.size + 1), np.log(radii_mm), np.ones(radii_mm.size)
+    rules = [distance_rule(float(r), core_mm, source_core_mm) for r in radii_mm]
+    starts = np.cumsum([0, *(node.size for node, _ in rules)]).astype(np.int64)
+    if not rules:
+        return starts, np.empty(0), np.empty(0)
+    node, weight = (np.concatenate(parts) for parts in zip(*rules, strict=True))
+    return starts, np.log(node), weight
+
+
 def _offsets(a: float, b: float) -> tuple[FloatArray, FloatArray]:
     """Return the distribution of the length of the difference of points in concentric discs."""
     small, large = min(a, b), max(a, b)

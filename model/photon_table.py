@@ -20,7 +20,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from model import photon_kernels as kernels
 from model.diffusion import Slopes
-from model.disc_distances import distance_rule
+from model.disc_distances import distance_rules
 from model.photon_medium import Collection, TableDomainError, asymmetries, prepare
 
 FloatArray = NDArray[np.float64]
@@ -152,7 +152,7 @@ def derivatives(
         unique, index = np.unique(radius, return_inverse=True)
         group = index.reshape(-1, 1)
         sigma_a, sigma_s = sigma_a.ravel(), sigma_s.ravel()
-    starts, log_distance, weight = _distances(unique, core_mm, source_core_mm)
+    starts, log_distance, weight = distance_rules(unique, core_mm, source_core_mm)
     scatters = sigma_s > 0.0
     out = np.empty((3, sigma_a.size, group.shape[1]))
     kernels.evaluate(
@@ -276,25 +276,6 @@ def domain(
         & (sigma_a <= MAX_ABSORPTION_RATIO * sigma_s)
         & (rho >= MIN_REDUCED_RADIUS)
         & (rho <= MAX_REDUCED_RADIUS)
-    )
-
-
-def _distances(
-    radii: FloatArray, core_mm: float, source_core_mm: float
-) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
-    """Return starts, logarithms of distances and weights of the averages over the cores."""
-    if core_mm == 0.0 and source_core_mm == 0.0:
-        if np.any(radii == 0.0):
-            raise ValueError("radius_mm: got 0 between points, where R is infinite; expected > 0")
-        return np.arange(radii.size + 1), np.log(radii), np.ones(radii.size)
-    rules = [distance_rule(float(r), core_mm, source_core_mm) for r in radii]
-    starts = np.cumsum([0, *(node.size for node, _ in rules)])
-    if not rules:
-        return starts.astype(np.int64), np.empty(0), np.empty(0)
-    return (
-        starts.astype(np.int64),
-        np.log(np.concatenate([node for node, _ in rules])),
-        np.concatenate([weight for _, weight in rules]),
     )
 
 

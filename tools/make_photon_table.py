@@ -55,6 +55,10 @@ PHOTONS = {
     0.0: 80_000,
     0.3: 80_000,
 }
+# Near the source few photons go into a fibre's cone where the phase function is narrow: paths up to
+# 4 transport lengths are traced again, by so many photons, instead.
+SHORT_PHOTONS = {0.9: 1_000_000, 0.95: 800_000}
+SHORT_BIN = 167
 BATCHES = 32
 ROOT_ABSORPTIONS = 0.1 * np.expm1(np.linspace(0.0, log(41.0), 25))  # 0 to 4: sigma_a <= 16
 SPLIT_POWER, SPLIT_LIMIT = 0.6, 15.0
@@ -117,7 +121,7 @@ def _score(hist, e, radius2, path, weight):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def walk(photons, seed, g, fibre, etas, hist):
+def walk(photons, seed, g, fibre, etas, path_end, hist):
     """Trace photons into `hist`, (etas, radii, paths, 2): weights and weights times path."""
     state = np.empty(4, np.uint64)
     for k in range(3):
@@ -184,7 +188,7 @@ def walk(photons, seed, g, fibre, etas, hist):
             y += uy * step
             z += uz * step
             path += step
-            if path > PATH_END:
+            if path > path_end:
                 alive = False
                 continue
             collisions += 1
@@ -286,7 +290,14 @@ def simulate(folder, g, collection, photons, batches):
         seed = np.random.SeedSequence(entropy).generate_state(3, np.uint64)
         hist = np.zeros((ETAS.size, RADIUS_BINS, PATH_BINS, 2))
         start = time.process_time()
-        walk(photons, seed, g, collection == "fibre", ETAS, hist)
+        walk(photons, seed, g, collection == "fibre", ETAS, PATH_END, hist)
+        more = SHORT_PHOTONS.get(g, 0) if collection == "fibre" else 0
+        if more:
+            short = np.zeros_like(hist)
+            seed = np.random.SeedSequence((*entropy, 1)).generate_state(3, np.uint64)
+            end = exp(LOG_PATH_START + LOG_PATH_STEP * SHORT_BIN)
+            walk(more, seed, g, True, ETAS, end, short)
+            hist[:, :, :SHORT_BIN] = short[:, :, :SHORT_BIN] * (photons / more)
         seconds += time.process_time() - start
         rings.append(absorb(hist, ROOT_ABSORPTIONS**2) / photons)
         late.append(hist[:, :, LATE_BIN:, 0].sum(axis=(1, 2)) / photons)
@@ -349,12 +360,14 @@ def reliable(error):
     return smooth, (smooth < RELIABLE) & (error < 2.0 * RELIABLE)
 
 
-def fit(mean, error, kappa, roughness):
+def fit(mean, error, kappa, roughness, near=None):
     """Fit one profile: spline coefficients of ln(R/reference), and the rings used.
 
     Differences of the slope between knots are taken as drawn from N(0, roughness); beyond six
     transport lengths those of the value from N(0, 0.04), which continues the profile by the
-    diffusion's law where photons end.
+    diffusion's law where photons end. Or, with the coefficients `near` of a profile of light of
+    all directions, those of the two profiles' quotient, and N(0, 0.015) beyond three transport
+    lengths: the directions of the light change little from there on.
     """
     edges = LOG_RADIUS_START + LOG_RADIUS_STEP * np.arange(RADIUS_BINS + 1)
     centre = 0.5 * (edges[1:] + edges[:-1])
@@ -366,8 +379,10 @@ def fit(mean, error, kappa, roughness):
     relative, used = reliable(np.where(error > 0.0, np.maximum(error / safe, 1e-4), 10.0))
     bend = np.diff(np.eye(kernels.RADIUS_COUNT), 2, axis=0) / roughness
     knots = kernels.RADIUS_START + kernels.RADIUS_STEP * np.arange(kernels.RADIUS_COUNT - 1)
-    far = np.diff(np.eye(kernels.RADIUS_COUNT), axis=0)[knots > log(6.0)] / 0.04
+    start, drift = (6.0, 0.04) if near is None else (3.0, 0.015)
+    far = np.diff(np.eye(kernels.RADIUS_COUNT), axis=0)[knots > log(start)] / drift
     penalty = bend.T @ bend + far.T @ far
+    drawn = 0.0 if near is None else penalty @ near
     design, inner_design = basis(centre), basis(inner).reshape(*inner.shape, -1)
     correction = np.zeros(centre.size)  # ln of a ring's mean over the value at its centre
     log_reference = reference(centre, kappa)
@@ -375,7 +390,7 @@ def fit(mean, error, kappa, roughness):
         target = np.log(safe) - log_reference - correction
         weighted = (design / relative[:, None] ** 2)[used]
         coefficients = np.linalg.solve(
-            weighted.T @ design[used] + penalty, weighted.T @ target[used]
+            weighted.T @ design[used] + penalty, weighted.T @ target[used] + drawn
         )
         shape = reference(inner, kappa) - log_reference[:, None]
         shape += inner_design @ coefficients - (design @ coefficients)[:, None]
@@ -383,57 +398,78 @@ def fit(mean, error, kappa, roughness):
     return coefficients, used
 
 
-def profiles(stored, batches, kappas, roughness):
+def profiles(stored, batches, kappas, roughness, near=None):
     """Fit all profiles of some batches: coefficients (etas, radii, roots), and rings used."""
     mean, error = continued(stored, batches)
     out = np.empty((ETAS.size, kernels.RADIUS_COUNT, ROOT_ABSORPTIONS.size))
     used = np.empty(mean.shape, bool)
     for e, k in np.ndindex(ETAS.size, ROOT_ABSORPTIONS.size):
-        out[e, :, k], used[e, :, k] = fit(mean[e, :, k], error[e, :, k], kappas[k], roughness)
+        out[e, :, k], used[e, :, k] = fit(
+            mean[e, :, k],
+            error[e, :, k],
+            kappas[k],
+            roughness,
+            None if near is None else near[e, :, k],
+        )
     return out, used
 
 
-def choose_roughness(stored, kappas):
+def choose_roughness(stored, kappas, near=None):
     """Return the roughness whose fits to one half of the batches predict the other half best."""
     count = len(stored["rings"])
     halves = np.arange(0, count, 2), np.arange(1, count, 2)
     centre = LOG_RADIUS_START + LOG_RADIUS_STEP * (np.arange(RADIUS_BINS) + 0.5)
     best = (np.inf, 0.0)
-    for roughness in (0.01, 0.02, 0.03, 0.05, 0.1, 0.2):
+    for roughness in (0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2):
         loss = 0.0
         for first, second in (halves, halves[::-1]):
             mean, error = continued(stored, second)
-            fitted, used = profiles(stored, first, kappas, roughness)
+            mean_first, error_first = continued(stored, first)
             for e, k in product((0, 4), range(0, ROOT_ABSORPTIONS.size, 3)):
+                fitted, used = fit(
+                    mean_first[e, :, k],
+                    error_first[e, :, k],
+                    kappas[k],
+                    roughness,
+                    None if near is None else near[e, :, k],
+                )
                 # the ring means of smooth profiles and their values at the centre differ alike
                 other, used_too = fit(mean[e, :, k], error[e, :, k], kappas[k], 1.0)
-                both = used[e, :, k] & used_too
+                both = used & used_too
                 relative = (error / np.maximum(mean, 1e-300))[e, both, k]
-                gap = (basis(centre) @ (fitted[e, :, k] - other))[both]
+                gap = (basis(centre) @ (fitted - other))[both]
                 loss += np.sum((gap / np.maximum(relative, 1e-4)) ** 2)
         print(f"  roughness {roughness}: {loss:.0f}", flush=True)
         best = min(best, (loss, roughness))
     return best[1]
 
 
-def tabulate(stored, g):
-    """Return spline coefficients (etas, radii, roots) and ln of errors on every other knot."""
+def tabulate(pair, g):
+    """Return for both collections spline coefficients (etas, radii, roots) and ln of errors.
+
+    The errors stand on every other knot.
+    """
     kappas = np.array([0.0, *(asymptotic_decay(u * u, g) for u in ROOT_ABSORPTIONS[1:])])
-    roughness = choose_roughness(stored, kappas)
-    everything = np.arange(len(stored["rings"]))
-    values, used = profiles(stored, everything, kappas, roughness)
-    knots = kernels.RADIUS_START + kernels.RADIUS_STEP * np.arange(0, kernels.RADIUS_COUNT - 2, 2)
-    at = basis(knots)
-    left_out = np.stack(
-        [
-            np.einsum(
-                "pr,erk->epk",
-                at,
-                profiles(stored, np.delete(everything, np.s_[fold::FOLDS]), kappas, roughness)[0],
-            )
-            for fold in range(FOLDS)
+    folds = [slice(None)]
+    folds += [np.arange(BATCHES) % FOLDS != fold for fold in range(FOLDS)]
+    nears = [None] * len(folds)
+    out = []
+    for stored in pair:
+        roughness = choose_roughness(stored, kappas, nears[0])
+        everything = np.arange(len(stored["rings"]))
+        fits = [
+            profiles(stored, everything[fold], kappas, roughness, near)
+            for fold, near in zip(folds, nears, strict=True)
         ]
-    )
+        nears = [values for values, _ in fits]
+        out.append(packed(nears[0], np.stack(nears[1:]), fits[0][1]))
+    return out
+
+
+def packed(values, left_out, used):
+    """Return coefficients of the bicubic splines, and ln of errors by the jackknife."""
+    knots = kernels.RADIUS_START + kernels.RADIUS_STEP * np.arange(0, kernels.RADIUS_COUNT - 2, 2)
+    left_out = np.einsum("pr,ferk->fepk", basis(knots), left_out)
     variance = (FOLDS - 1) ** 2 / FOLDS * left_out.var(axis=0, ddof=1) + MODEL_ERROR**2
     centre = LOG_RADIUS_START + LOG_RADIUS_STEP * (np.arange(RADIUS_BINS) + 0.5)
     for e, k in np.ndindex(ETAS.size, ROOT_ABSORPTIONS.size):
@@ -459,12 +495,14 @@ def make_table(folder):
         pair = []
         for name in names:
             with np.load(name) as arrays:
-                stored = {key: arrays[key] for key in ("rings", "late")}
-            print(f"{name.name}: {len(stored['rings'])} batches", flush=True)
-            pair.append(tabulate(stored, g))
+                pair.append({key: arrays[key] for key in ("rings", "late")})
+            if len(pair[-1]["rings"]) != BATCHES:
+                raise SystemExit(f"{name}: {len(pair[-1]['rings'])} batches, expected {BATCHES}")
+        print(f"g = {g}", flush=True)
+        tables = tabulate(pair, g)
         held.append(g)
-        coefficients.append([value for value, _ in pair])
-        errors.append([error for _, error in pair])
+        coefficients.append([value for value, _ in tables])
+        errors.append([error for _, error in tables])
     target = Path("model/data/photon_table.npz")
     np.savez_compressed(
         target,
