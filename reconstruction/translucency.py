@@ -21,12 +21,14 @@ import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
+from threadpoolctl import ThreadpoolController
 
 from model.translucency_population import TranslucencyPopulation, weyrich_2005
 
@@ -271,10 +273,14 @@ def interpolate(
         conflicts += places.conflicts
         posterior = _Posterior.of(places, prior, c)
         p_value[c] = posterior.p_value
-        median, deviation = posterior.over(u_mm, v_mm)
-        values[..., c] = np.where(skin, np.exp(median), 0.0)
-        half[..., c] = np.where(skin, np.exp(median) * np.sinh(deviation), 0.0)
-        log_stderr[..., c] = np.where(skin, deviation, 0.0)
+        # products this small take longer on several threads than on one
+        with _blas().limit(limits=1):
+            median, deviation = (a.astype(np.float32) for a in posterior.over(u_mm, v_mm))
+        np.exp(median, out=values[..., c])
+        np.multiply(values[..., c], np.sinh(deviation), out=half[..., c])
+        log_stderr[..., c] = deviation
+    for array in (values, half, log_stderr):
+        array[~skin] = 0.0
     return TranslucencyMap(
         values=values,
         stderr=half,
@@ -285,6 +291,11 @@ def interpolate(
         left_out=tuple(left_out),
         conflicts=tuple(conflicts),
     )
+
+
+@lru_cache(maxsize=1)
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController().select(user_api="blas")
 
 
 def _checked(
@@ -415,17 +426,31 @@ class _Posterior:
         """
         across = np.exp(-0.5 * ((u_mm[:, None] - self.at_mm[:, 0]) / self.length_mm) ** 2)
         along = np.exp(-0.5 * ((v_mm[:, None] - self.at_mm[:, 1]) / self.length_mm) ** 2)
-        mean = self.log_mean + self.shared * self.pull.sum()
-        mean = mean + self.local * (along * self.pull) @ across.T
-        known = self.shared**2 * self.inverse.sum()
-        known = known + 2 * self.shared * self.local * (along * self.inverse.sum(axis=0)) @ across.T
         first, second = np.triu_indices(len(self.pull))
         twice = np.where(first == second, 1.0, 2.0) * self.inverse[first, second]
-        known += self.local**2 * (
-            (along[:, first] * along[:, second] * twice) @ (across[:, first] * across[:, second]).T
-        )
         total = self.shared + self.local
-        return mean, np.sqrt(np.maximum(total - known, ROUNDING * total))
+        level = self.log_mean + self.shared * self.pull.sum()
+        left = total - self.shared**2 * self.inverse.sum()
+        mean = _product(level, self.local * along * self.pull, across)
+        variance = _product(
+            left,
+            np.column_stack(
+                [
+                    -2.0 * self.shared * self.local * along * self.inverse.sum(axis=0),
+                    -(self.local**2) * along[:, first] * along[:, second] * twice,
+                ]
+            ),
+            np.column_stack([across, across[:, first] * across[:, second]]),
+        )
+        np.maximum(variance, ROUNDING * total, out=variance)
+        return mean, np.sqrt(variance, out=variance)
+
+
+def _product(constant: float, rows: Floats, columns: Floats) -> Floats:
+    """Return ``constant + rows columns'``, (H, W), in one pass."""
+    left = np.column_stack([np.full(len(rows), constant), rows])
+    right = np.column_stack([np.ones(len(columns)), columns])
+    return np.asarray(left @ right.T)
 
 
 def sites_of_labels(

@@ -27,6 +27,7 @@ from skinrig import (
     bench_skin_stretch,
     bench_surface,
     bench_tissue,
+    bench_translucency,
     bench_transport,
 )
 from skinrig.benchmark import StageBenchmark, to_document
@@ -56,6 +57,8 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "normal-integration": bench_integration.integration,
     "normal-histogram": bench_kernels.histograms,
     "kernel-fit": bench_kernels.search,
+    "anisotropy": bench_translucency.directions,
+    "translucency": bench_translucency.sites,
     "photon-transport": bench_transport.photon_transport,
 }
 
