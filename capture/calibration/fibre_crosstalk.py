@@ -20,6 +20,8 @@ DISTANCE_EDGES: Final = (1, 2, 3, 4, 6, 9, 14, 21)
 """First distance, in fibres, of each group that is taken to be alike."""
 LEAST_SCATTER: Final = 0.3
 """Of pairs as far apart about their mean, relative: a few of them may agree by chance."""
+OVERLAP: Final = 0.05
+"""Above this a pair's spots overlap: they tell nothing of others as far apart."""
 UNEVEN_COVER: Final = 0.3
 """By how much covers may differ in what they let through, relative."""
 ROUNDS: Final = 30
@@ -241,8 +243,11 @@ def _pooled(
     matrix, variance = np.zeros_like(seen), np.zeros_like(seen)
     own = np.divide(seen, information, out=np.zeros_like(seen), where=information > 0)
     last = 0.0
+    overlap = own > OVERLAP
+    matrix[overlap] = own[overlap]
+    variance[overlap] = 1.0 / information[overlap]
     for number in range(int(group.max(initial=-1)) + 1):
-        here = group == number
+        here = (group == number) & ~overlap
         if (information[here] > 0).any():
             matrix[here], alone, common = shrunk(own[here], information[here], LEAST_SCATTER)
             variance[here] = alone**2 + common**2

@@ -132,7 +132,7 @@ def merge_series(
     if len(times) > 1 and clear.size:
         scale, scale_stderr = _scales(
             np.stack(
-                [f.ravel()[clear] - dark.ravel()[clear] for f, dark in zip(stack, base, strict=True)]
+                [f.ravel()[clear] - b.ravel()[clear] for f, b in zip(stack, base, strict=True)]
             ),
             np.stack([use.ravel()[clear] for use in usable]),
             times, lit, rate.ravel()[clear], light.ravel()[clear], darks, noise,

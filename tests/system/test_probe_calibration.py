@@ -62,7 +62,7 @@ def test_a_wrong_certificate_and_a_wrong_session_are_named(phantom, tmp_path, ca
     assert "expected one" in capsys.readouterr().err
 
 
-def test_a_session_without_darks_or_phantom_is_refused(tmp_path, capsys):
+def test_a_session_without_a_phantom_is_refused(tmp_path, capsys):
     dark = tmp_path / "dark"
     simulate_session("probe", dark, target="dark", seed=3)
     assert main(["calibrate", "fibre", str(dark), "--out", str(tmp_path / "c")]) == 3

@@ -139,6 +139,22 @@ def test_what_leaks_through_covers_is_no_stray_light(rng):
     assert (error < 1e-6).any(axis=0).all()
 
 
+def test_two_spots_that_overlap_are_unmixed_by_frames_with_one_uncovered(rng):
+    matrix = mixing(rng)
+    matrix[8, 9], matrix[9, 8] = 0.5, 0.4
+    probe = Probe(rng, matrix=matrix)
+    calibration = probe.calibrate()
+    result = calibration.reflectance(probe.read(SKIN))
+    pair = [8, 9]
+    assert result.valid[pair].all()
+    np.testing.assert_allclose(result.reflectance_per_mm2[pair], SKIN[pair], rtol=0.02)
+    # the others keep their own small cross-talk, also those that were not measured
+    few = {i: readings for i, readings in probe.masks().items() if i in (7, 8, 9, 10)}
+    found = measure_crosstalk(few, probe.read(PHANTOM))
+    others = (DISTANCE == 1) & (matrix < 0.1)
+    assert found.matrix[others].max() < 5e-3
+
+
 def test_a_weaker_source_gives_the_same_reflectance(rng):
     probe = Probe(rng)
     calibration = probe.calibrate(level=0.5, masks=probe.masks(level=0.5))
