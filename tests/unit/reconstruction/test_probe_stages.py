@@ -1,0 +1,127 @@
+"""From profiles of a fibre probe to documents: errors that are shared, sites, directions."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from capture.calibration.fibre import FibreReflectance
+from capture.plan.suction import Placement
+from capture.rig import load_rig
+from model import diffusion
+from reconstruction import probe_stages
+from reconstruction.probe_images import Measurement, measurement_name
+
+PROBE = load_rig("probe").probe
+RADIUS = np.array(PROBE.radius_mm)
+MEDIUM = (0.08, 1.2)
+SIGMA_TR = math.sqrt(3 * MEDIUM[0] * sum(MEDIUM))
+
+
+def profile(site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0.01, rng=None):
+    value = np.repeat(scale * diffusion.reflectance(RADIUS, *MEDIUM, 1.4)[:, None], 3, axis=1)
+    if rng is not None:
+        value = value * (1 + noise * rng.standard_normal(value.shape))
+    slope = common * (RADIUS - RADIUS.mean())[:, None] * np.ones(3)
+    return probe_stages.Profile(
+        Measurement(Placement(site, angle, repeat), 23, 1.0, 60.0, 5.0),
+        FibreReflectance(
+            tuple(fibre.name for fibre in PROBE.fibres), RADIUS, value, (noise * value) ** 2,
+            (value * slope)[None], np.ones(value.shape, bool), np.zeros(value.shape, bool),
+        ),
+    )  # fmt: skip
+
+
+def documents(profiles):
+    made = probe_stages._subsurface(profiles, PROBE)
+    return made, json.loads(made[probe_stages.SUBSURFACE_FILE])
+
+
+def fit_of(document, method, number=0, channel="green"):
+    fits = document["measurements"][number]["fits"]
+    return next(f for f in fits if (f["method"], f["channel"]) == (method, channel))
+
+
+def test_each_method_is_told_for_each_channel_and_the_fitting_model_comes_back():
+    _, document = documents([profile()])
+    assert len(document["measurements"][0]["fits"]) == 9
+    found = fit_of(document, "diffusion")
+    assert found["sigma_tr_per_mm"] == pytest.approx(SIGMA_TR, rel=2e-3)
+    assert found["valid"]
+    # and the baseline misses it
+    dipole = fit_of(document, "dipole")
+    assert dipole["sigma_tr_per_mm"] / SIGMA_TR < 0.9
+
+
+def test_what_the_phantom_leaves_uncertain_widens_the_interval_and_moves_nothing():
+    _, without = documents([profile()])
+    _, document = documents([profile(common=0.02)])
+    narrow, wide = (fit_of(d, "diffusion") for d in (without, document))
+    assert wide["sigma_tr_per_mm"] == pytest.approx(narrow["sigma_tr_per_mm"], rel=1e-9)
+    assert wide["sigma_tr_stderr_readings"] == pytest.approx(narrow["sigma_tr_stderr"], rel=1e-6)
+    # a tilt of the log profile by .02 a mm is about that much of sigma_tr
+    shared = math.sqrt(wide["sigma_tr_stderr"] ** 2 - narrow["sigma_tr_stderr"] ** 2)
+    assert 0.3 < shared / 0.02 < 1.5
+    low, high = wide["interval_per_mm"]
+    assert math.log(high / low) == pytest.approx(
+        math.log(narrow["interval_per_mm"][1] / narrow["interval_per_mm"][0])
+        * wide["sigma_tr_stderr"] / narrow["sigma_tr_stderr"],
+        rel=1e-6,
+    )  # fmt: skip
+
+
+def test_repeats_average_their_own_errors_but_not_the_phantoms():
+    rng = np.random.default_rng(3)
+    noise = 0.1
+    alone, told = documents([profile(common=0.02, noise=noise, rng=rng)])
+    several, document = documents(
+        [profile(repeat=k, common=0.02, noise=noise, rng=rng) for k in range(9)]
+    )
+    one, nine = alone["_sites"][0], several["_sites"][0]
+    assert (nine.measurements >= 7).all()
+    fit = fit_of(told, "photon_table")
+    own, whole = fit["sigma_tr_stderr_readings"], fit["sigma_tr_stderr"]
+    assert own > 0.3 * whole
+    # what is shared stays: a third of the whole would be wrong
+    assert nine.stderr_per_mm[1] > 0.9 * math.sqrt(whole**2 - own**2)
+    assert nine.stderr_per_mm[1] < 0.95 * one.stderr_per_mm[1]
+    assert [entry["site"] for entry in document["sites"]] == ["cheek"] * 3
+
+
+def test_repeats_that_scatter_more_than_they_say_are_believed_less():
+    calm, _ = documents([profile(repeat=k) for k in range(4)])
+    torn = [profile(repeat=k) for k in range(4)]
+    for k, one in enumerate(torn):
+        tilt = 1 + 0.3 * (k - 1.5) * (RADIUS - RADIUS.mean()) / np.ptp(RADIUS)
+        one.reflectance.reflectance_per_mm2[:] *= tilt[:, None]
+    loose, _ = documents(torn)
+    ratio = loose["_sites"][0].stderr_per_mm / calm["_sites"][0].stderr_per_mm
+    assert (ratio > 2).all()
+
+
+def test_a_site_without_a_valid_fit_has_no_value_and_an_infinite_error():
+    dark = profile()
+    dark.reflectance.valid[:] = False
+    made, document = documents([dark])
+    site = made["_sites"][0]
+    assert np.isnan(site.sigma_tr_per_mm).all()
+    assert np.isinf(site.stderr_per_mm).all()
+    assert document["sites"][0]["sigma_tr_per_mm"] is None
+    assert "fewer than" in fit_of(document, "photon_table")["reason"]
+
+
+def test_directions_are_judged_only_where_there_are_enough():
+    rng = np.random.default_rng(5)
+    turned = [profile(angle=22.5 * k, rng=rng) for k in range(16)]
+    made, _ = documents([*turned, profile("chin")])
+    document = json.loads(probe_stages._anisotropy(made["_fits"]))
+    assert [entry["site"] for entry in document["sites"]] == ["cheek"] * 3
+    assert all(entry["valid"] and entry["directions"] == 16 for entry in document["sites"])
+    assert not any(entry["anisotropic"] for entry in document["sites"])
+    assert document["left_out"] == ["chin, repeat 0: 1 directions, expected at least 5"]
+
+
+def test_a_measurement_is_called_after_its_placement():
+    names = {measurement_name(Placement("cheek", 22.5 * k, r)) for k in range(16) for r in (0, 1)}
+    assert len(names) == 32
