@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from capture import raw
-from capture.acquire.fibre_signal import LEVEL, FibreSignal, said_of
+from capture.acquire.fibre_signal import FibreSignal, said_of, why_enough
 from capture.acquire.frames import encode
 from capture.acquire.mask_choice import masks_not_needed
 from capture.acquire.outcome import (
@@ -164,11 +164,13 @@ class BracketSeries:
                 f"{float(actual['suction_mbar']):.1f} mbar"
             )
             left = wanted[number + 1 :]
-            if fibre is not None or self._all_brackets or not left:
+            if fibre is not None:
                 continue
             first = exposed.frames[step.cameras[0]]
             signal.look(_pixels(first, step), float(step.settings["exposure_s"]))
-            if reason := self._enough(placement, signal, step, left):
+            if not left:
+                self._tell_what_is_missing(placement, signal)
+            elif not self._all_brackets and (reason := self._enough(placement, signal, step, left)):
                 return taken, reason
         return taken, ""
 
@@ -224,25 +226,15 @@ class BracketSeries:
 
     # what is not needed -----------------------------------------------------------------------
 
-    def _enough(
-        self, placement: Placement, signal: FibreSignal, step: Step, left: Sequence[Step]
-    ) -> str:
-        """Return why the exposures that are left can show no more; empty where they can."""
-        verdict = signal.verdict([float(one.settings["exposure_s"]) for one in left])
-        if not verdict.enough:
-            return ""
-        first, last = (int(left[k].index["bracket"]) for k in (0, -1))
-        span = f"bracket {first}" if first == last else f"brackets {first}-{last}"
-        count = len(self._probe.fibres)
-        most = f"{100 * LEVEL:g} % of full scale"
-        at_s = float(step.settings["exposure_s"])
-        what = f"all {count} fibres" + (" that can be measured" if verdict.hopeless else "")
-        reason = f"{placement}: {span} left out: {what} above {most} at {at_s:.2g} s"
-        if verdict.hopeless:
-            reason += f"; {said_of(verdict.hopeless, self._probe)} would stay in the noise"
-        if verdict.saturated:
-            reason += f"; {said_of(verdict.saturated, self._probe)} saturated in every exposure"
-        return reason
+    def _tell_what_is_missing(self, placement: Placement, signal: FibreSignal) -> None:
+        """Say of a whole series which fibres it does not show."""
+        verdict = signal.verdict([])
+        for pairs, what in (
+            (verdict.hopeless, "stays in the noise"),
+            (verdict.saturated, "is saturated in every exposure: less level shows it"),
+        ):
+            if pairs:
+                self._operator.progress(f"{placement}: {said_of(pairs, signal.probe)} {what}")
 
     def _leave_out(self, steps: Sequence[Step], reason: str) -> None:
         if not steps:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.plan import Step
 from capture.rig import Probe, View
 
 LEVEL = 0.5
@@ -57,6 +58,7 @@ class FibreSignal:
 
     Attributes
     ----------
+    probe : Probe
     level : ndarray of float64, shape (F, C)
         Greatest peak above black of an unsaturated exposure so far, of full scale.
     rate_per_s : ndarray of float64, shape (F, C)
@@ -64,6 +66,7 @@ class FibreSignal:
     """
 
     def __init__(self, probe: Probe, view: View) -> None:
+        self.probe = probe
         self._view = view
         spots = np.array([fibre.spot_px for fibre in probe.fibres])
         gaps = np.linalg.norm(spots[:, None] - spots[None, :], axis=-1)
@@ -143,6 +146,33 @@ class FibreSignal:
         return Verdict(
             bool((measured | hopeless | saturated).all()), _pairs(hopeless), _pairs(saturated)
         )
+
+
+def why_enough(signal: FibreSignal, last: Step, left: Sequence[Step]) -> str:
+    """Return why the exposures that are left after the last show no more; empty where they may.
+
+    Parameters
+    ----------
+    signal : FibreSignal
+        Of the exposures up to the last.
+    last : Step
+    left : sequence of Step
+        At least one, by growing exposure.
+    """
+    verdict = signal.verdict([float(one.settings["exposure_s"]) for one in left])
+    if not verdict.enough:
+        return ""
+    first, final = (int(left[k].index["bracket"]) for k in (0, -1))
+    span = f"bracket {first}" if first == final else f"brackets {first}-{final}"
+    what = f"all {len(signal.probe.fibres)} fibres"
+    what += " that can be measured" if verdict.hopeless or verdict.saturated else ""
+    at_s = float(last.settings["exposure_s"])
+    reason = f"{span} left out: {what} above {100 * LEVEL:g} % of full scale at {at_s:.2g} s"
+    if verdict.hopeless:
+        reason += f"; {said_of(verdict.hopeless, signal.probe)} would stay in the noise"
+    if verdict.saturated:
+        reason += f"; {said_of(verdict.saturated, signal.probe)} saturated in every exposure"
+    return reason
 
 
 def said_of(pairs: Sequence[tuple[int, int]], probe: Probe) -> str:

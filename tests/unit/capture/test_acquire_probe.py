@@ -285,6 +285,16 @@ def test_fibres_that_stay_in_the_noise_do_not_hold_up_the_others(make):
     assert all("would stay in the noise" in reason for reason in reasons)
 
 
+def test_a_whole_series_says_which_fibres_it_does_not_show(make):
+    scene = Witness(bright=1e4, fall_mm=0.25)
+    bench = make(short(brackets=6, longest_s=0.5), scene)
+    bench.run()
+    (noise,) = [line for line in bench.told if "stays in the noise" in line]
+    assert re.match(r"cheek at 0 degrees: red of F\d\d", noise)
+    (bright,) = [line for line in bench.told if "saturated in every exposure" in line]
+    assert "red of F01; green of F01; blue of F01" in bright
+
+
 # pressure and temperature ---------------------------------------------------------------------
 
 
