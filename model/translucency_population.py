@@ -2,7 +2,7 @@
 
 The table gives a mean and a "Var." of sigma_tr for three places and three channels. Read as
 variances these numbers contradict the extremes that the same paper prints, so they are taken as
-standard deviations here (decision 9); ``reading="variance"`` takes them by the letter.
+standard deviations here (decision 10); ``reading="variance"`` takes them by the letter.
 
 Everything is labelled by sigma_tr, in 1/mm. Translucency is 1/sigma_tr, so the subject of least
 sigma_tr is the *most* translucent one. The captions of the paper's figures 17 and 18 call the
@@ -159,7 +159,7 @@ def weyrich_2005(*, reading: Reading = "deviation") -> TranslucencyPopulation:
     Parameters
     ----------
     reading : {"deviation", "variance"}
-        What the column "Var." holds: standard deviations (decision 9), or, as printed, variances.
+        What the column "Var." holds: standard deviations (decision 10), or, as printed, variances.
 
     Examples
     --------

@@ -46,6 +46,26 @@ def test_extremes_of_figure_17_contradict_the_printed_variances():
     assert (weyrich_2005(reading="variance").deviation_per_mm[:, 1] ** 2 > green).all()
 
 
+def test_faces_reach_as_far_as_figure_17_only_when_the_column_holds_deviations(rng):
+    faces = {
+        reading: weyrich_2005(reading=reading).sample(87 * 400, rng=rng).mean(axis=1)
+        for reading in ("deviation", "variance")
+    }
+    least = {k: np.median(v.reshape(400, 87, 3).min(axis=1), axis=0) for k, v in faces.items()}
+    most = {k: np.median(v.reshape(400, 87, 3).max(axis=1), axis=0) for k, v in faces.items()}
+    for channel, (low, high) in enumerate(((0.3558, 0.9171), (0.7932, 1.5682))):
+        assert least["deviation"][channel] == pytest.approx(low, rel=0.15)
+        assert most["deviation"][channel] == pytest.approx(high, rel=0.15)
+        assert least["variance"][channel] < 0.65 * low
+        assert most["variance"][channel] > 1.35 * high
+        # of 34,800 faces, how many lie within: to the power of 87, a chance that all do
+        inside = {
+            k: ((v[:, channel] > low) & (v[:, channel] < high)).mean() for k, v in faces.items()
+        }
+        assert inside["deviation"] ** 87 > 1e-3
+        assert inside["variance"] ** 87 < 1e-11
+
+
 def test_a_drawn_population_has_the_moments_of_the_table(rng):
     population = weyrich_2005()
     people = population.sample(40_000, rng=rng)
