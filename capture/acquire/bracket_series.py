@@ -170,8 +170,8 @@ class BracketSeries:
             signal.look(_pixels(first, step), float(step.settings["exposure_s"]))
             if not left:
                 self._tell_what_is_missing(placement, signal)
-            elif not self._all_brackets and (reason := self._enough(placement, signal, step, left)):
-                return taken, reason
+            elif not self._all_brackets and (reason := why_enough(signal, step, left)):
+                return taken, f"{placement}: {reason}"
         return taken, ""
 
     def _exposure(self, placement: Placement, step: Step) -> tuple[Exposed, dict[str, Value], int]:
