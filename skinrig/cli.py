@@ -181,7 +181,7 @@ def _next_step(rig: str, session: Path, target: str | None) -> str:
         kinds = {"phantom": "fibre"}
     if target is None:
         if rig == "probe":
-            want = "sigma_tr --calibration calibration"
+            want = "profiles,subsurface,translucency --calibration calibration"
             return f"skinrig reconstruct {session} --want {want} --out appearance"
         if rig == "gradient":
             want = "normals,height,histograms,kernels --calibration calibration"
