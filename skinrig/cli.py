@@ -248,7 +248,7 @@ def capture(
 
 @app.command()
 def serve(
-    rig: Annotated[str, typer.Argument(help="Name of a rig: flash, dome or gradient.")],
+    rig: Annotated[str, typer.Argument(help="Name of a rig: flash, dome, gradient or probe.")],
     pty: Annotated[bool, typer.Option("--pty", help="Boxes on a pseudo terminal.")] = False,
     tcp: Annotated[str, typer.Option(help="Address for boxes and cameras.")] = "127.0.0.1:0",
     anywhere: Annotated[

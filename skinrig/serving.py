@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from capture.rig import Rig, load_rig
-from skinrig import simulating_dome, simulating_flash, simulating_gradient
+from capture.rig import Probe, Rig, load_rig
+from skinrig import simulating_dome, simulating_flash, simulating_gradient, simulating_probe
 from skinrig.simulation import SIZES, SimulationError
 
 GRADIENT_WIDTH_PX = 96
@@ -29,7 +29,8 @@ def serve_rig(
 
     A dome is served with all its lights and cameras at either size: who captures from it uses the
     rig file, which must fit. Skin in the gradient sphere is served small only: its pictures are
-    made while its caliper waits for the host.
+    made while its caliper waits for the host. The fibre probe's pictures have one
+    size.
 
     Parameters
     ----------
@@ -63,6 +64,8 @@ def serve_rig(
         scene = simulating_gradient.make_scene(rig, site=site, preset=subject, seed=seed)
         # what all states share is made before anybody asks, so that no client waits for it
         scene.lighting()
+    elif rig.probe is not None:
+        scene = _probe_scene(rig, rig.probe, subject, seed, size)
     else:
         dome = "dome" in rig.boxes
         width = (simulating_dome if dome else simulating_flash).WIDTHS_PX[size]
@@ -103,3 +106,15 @@ def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
 
     person = make_subject(subject, seed=seed)
     return DomeScene(rig, person, dome=build(rig, seed=seed), seed=seed)
+
+
+def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int, size: str) -> Any:
+    from capture.plan.probe import SITES
+    from rigsim.suction import HeadState
+
+    scene = simulating_probe.make_scene(rig, subject=subject, seed=seed, size=size)
+    # the photons of the usual places are traced before anybody asks: the box holds the head on the
+    # skin meanwhile, and waits for its host for some seconds only
+    for site in SITES:
+        scene.fibre_light(HeadState(site, 0.0, True, probe.suction_mbar, probe.camera_c))
+    return scene
