@@ -23,21 +23,22 @@ def total(sigma_a, eta, g):
 
 
 def exact_total(sigma_a, eta, g):
-    layer = (np.array([[x]]) for x in (sigma_a, 1.0, np.inf))
-    return float(
-        adding_doubling.reflectance(*layer, eta=eta, anisotropy=g, directions=32).squeeze()
+    absorption = np.atleast_1d(sigma_a)[:, None]
+    scattering, thickness = np.ones_like(absorption), np.full_like(absorption, np.inf)
+    return adding_doubling.reflectance(
+        absorption, scattering, thickness, eta=eta, anisotropy=g, directions=24
     )
 
 
 @pytest.mark.parametrize("g", [0.0, 0.3, 0.5, 0.7, 0.8, 0.85, 0.9, 0.95])
 @pytest.mark.parametrize("eta", [1.0, 1.1, 1.33, 1.4, 1.6])
-@pytest.mark.parametrize(
-    ("ratio", "within"), [(0.001, 3e-3), (0.03, 3e-3), (0.3, 6e-3), (3.0, 2e-2)]
-)
-def test_all_rings_together_reflect_what_adding_doubling_says(ratio, within, eta, g):
+def test_all_rings_together_reflect_what_adding_doubling_says(eta, g):
     # Stated errors of 0.1 to 0.5 % average out over the rings but for what they share. Under
     # strong absorption a fifth comes from 0.02 transport lengths, where the domain begins, or less.
-    assert total(ratio, eta, g) == pytest.approx(exact_total(ratio, eta, g), rel=within)
+    ratio = np.array([0.001, 0.03, 0.3, 3.0])
+    seen = np.array([total(x, eta, g) for x in ratio])
+    gap = seen / exact_total(ratio, eta, g).ravel() - 1.0
+    assert np.all(np.abs(gap) < (3e-3, 3e-3, 6e-3, 2e-2))
 
 
 def test_isotropic_media_reflect_the_published_totals(test_data):
@@ -65,7 +66,7 @@ def test_isotropic_media_reflect_the_published_totals(test_data):
 
 
 def test_that_test_tells_similar_phase_functions_apart():
-    assert abs(total(1.0, 1.4, 0.8) / exact_total(1.0, 1.4, 0.0) - 1.0) > 0.05
+    assert abs(total(1.0, 1.4, 0.8) / exact_total(1.0, 1.4, 0.0).item() - 1.0) > 0.05
 
 
 def test_rings_agree_with_the_simulators_own_transport():
@@ -76,7 +77,7 @@ def test_rings_agree_with_the_simulators_own_transport():
     worst = []
     for sigma_a in (0.01, 0.1, 1.0):
         tissue = LayerStack((Layer(np.inf, sigma_a, 5.0, 0.8, 1.4),))
-        run = transport(tissue, photons=60_000, rng=rng, ring_edges_mm=edges, batches=60)
+        run = transport(tissue, photons=24_000, rng=rng, ring_edges_mm=edges, batches=60)
         node, weight = np.polynomial.legendre.leggauss(8)
         r = 0.5 * (edges[1:, None] * (1 + node) + edges[:-1, None] * (1 - node))
         at = photon_table.reflectance(r, sigma_a, 1.0)
@@ -86,7 +87,7 @@ def test_rings_agree_with_the_simulators_own_transport():
         seen = run.ring_reflectance > 20.0 / run.photons  # Gaussian errors need some photons
         worst.append((power - run.ring_reflectance)[seen] / error[seen])
     gaps = np.concatenate(worst)
-    assert gaps.size > 40
+    assert gaps.size > 35
     assert np.max(np.abs(gaps)) < 4.0
     assert np.max(np.abs(gaps + 0.1 * power[10] / error[10])) > 4.0  # a table 10 % off is found
 
@@ -107,7 +108,7 @@ def test_fibres_take_what_the_simulators_own_fibres_take():
     # batches follow Student's t with 19 degrees of freedom: beyond 5 once in 200 runs of 56.
     rng = np.random.default_rng(3)
     media = ((0.03, 1.0, 0.8), (0.3, 1.5, 0.8))
-    gaps = np.concatenate([z_scores(*medium, 25_000, rng) for medium in media])
+    gaps = np.concatenate([z_scores(*medium, 8_000, rng) for medium in media])
     assert np.max(np.abs(gaps)) < 5.0
 
 
@@ -295,7 +296,9 @@ def test_strong_absorption_no_scattering_and_no_distance_have_clear_outcomes():
     assert photon_table.reflectance(RADII, 5.0, 0.0).tolist() == [0.0] * RADII.size
     dark = photon_table.reflectance(RADII, 10.0, 1.0)
     assert np.all((dark >= 0.0) & (np.diff(dark, prepend=1.0) <= 0.0))
-    assert np.all(np.isfinite(photon_table.reflectance(RADII, 1e6, 1e-3)))
+    for black in ((1e6, 1e-3), (1e300, 1e-300), (1e4, 1.0)):
+        assert np.all(np.array(photon_table.derivatives(RADII, *black)) == 0.0)
+    assert np.all(np.isfinite(photon_table.derivatives(RADII, 1e-300, 1e6)))
     with pytest.raises(ValueError, match="radius_mm: got 0"):
         photon_table.reflectance(0.0, 0.1, 1.0)
     assert 0.0 < photon_table.reflectance(0.0, 0.1, 1.0, core_mm=0.2) < np.inf
