@@ -19,6 +19,7 @@ from skinrig import (
     figures,
     microrelief_section,
     page,
+    population_section,
     subsurface_section,
     surface_section,
 )
@@ -93,11 +94,12 @@ def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
     found = discover([Path(p) for p in paths])
     checks: list[page.Check] = []
     sections: list[str] = []
-    for name, folder in found.appearances.items():
-        appearance = store.read(folder)
+    appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
+    for name, appearance in appearances.items():
         truth_path = _truth_of(appearance, found)
         truth = store.read(truth_path) if truth_path else None
         sections.append(_appearance_section(name, appearance, truth, checks))
+    sections.append(population_section.section(appearances))
     documents = [json.loads(p.read_text(encoding="utf-8")) for p in found.documents]
     for document in documents:
         if document["schema"] == "skinrig.bench/1":
