@@ -1,13 +1,12 @@
 """The fibre probe from the command line: refusals, simulated sessions, and their resume."""
 
+import functools
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -21,8 +20,13 @@ FEW_PHOTONS = {"small": 2000, "full": 2000}
 
 
 @pytest.fixture
-def few_photons(monkeypatch):
+def small(monkeypatch):
+    """Few photons, and series of 8 exposures that end at half a second."""
+    short = {"brackets": 8, "longest_s": 0.5, "darks": 1}
     monkeypatch.setattr(simulating_probe, "PHOTONS", FEW_PHOTONS)
+    for name in ("probe_plan", "probe_calibration_plan"):
+        honest = getattr(simulating_probe, name)
+        monkeypatch.setattr(simulating_probe, name, functools.partial(honest, **short))
 
 
 def simulate(out, *more):
@@ -88,13 +92,13 @@ def test_what_cannot_be_simulated_is_named_and_nothing_is_written(
 # sessions -------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("few_photons")
+@pytest.mark.usefixtures("small")
 def test_tissue_is_captured_with_its_truth_beside_it(capsys, tmp_path):
     out = tmp_path / "session-probe"
     assert main([*simulate(out, "--sites", "cheek", "--seed", "3"), "--json"]) == errors.DONE
     document = json.loads(capsys.readouterr().out)
     session = Session.open(out)
-    assert document["frames"] == len(session.frames()) == 6 + len(session.frames("fibres"))
+    assert document["frames"] == len(session.frames()) == 3 + len(session.frames("fibres"))
     assert verify(out).ok
     assert session.todo() == []
     truth = store.read(tmp_path / "truth-probe")
@@ -109,7 +113,7 @@ def test_tissue_is_captured_with_its_truth_beside_it(capsys, tmp_path):
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
 
 
-@pytest.mark.usefixtures("few_photons")
+@pytest.mark.usefixtures("small")
 def test_the_same_seed_gives_the_same_bytes(tmp_path):
     hashes = []
     for name in ("a", "b"):
@@ -126,7 +130,7 @@ class Killed(BaseException):
     """The host is gone."""
 
 
-@pytest.mark.usefixtures("few_photons")
+@pytest.mark.usefixtures("small")
 def test_a_simulation_is_resumed_in_the_middle_of_a_series_with_the_truth_of_all(
     tmp_path, monkeypatch
 ):
@@ -137,7 +141,7 @@ def test_a_simulation_is_resumed_in_the_middle_of_a_series_with_the_truth_of_all
 
     def exposure(self, *args, **more):
         seen.append(1)
-        if len(seen) == 6 + 23 + 9:
+        if len(seen) == 3 + 8 + 4:
             raise Killed
         return honest(self, *args, **more)
 
@@ -157,10 +161,14 @@ def test_a_simulation_is_resumed_in_the_middle_of_a_series_with_the_truth_of_all
     assert sites == ["forehead", "cheek"]
 
 
-def test_a_resume_with_other_settings_is_refused(tmp_path, capsys, few_photons):
-    out = tmp_path / "session"
-    assert main(simulate(out, "--target", "dark")) == errors.DONE
-    assert main(simulate(out, "--target", "dark", "--resume")) != errors.DONE
+@pytest.mark.usefixtures("small")
+def test_the_next_command_is_named_and_a_closed_session_is_not_gone_on_with(capsys, tmp_path):
+    out = tmp_path / "session-dark"
+    words = simulate(out, "--target", "dark")
+    assert main(words) == errors.DONE
+    printed = capsys.readouterr()
+    assert f"next: skinrig verify {out}" in printed.out + printed.err
+    assert main([*words, "--resume"]) != errors.DONE
     assert "closed" in capsys.readouterr().err
 
 
@@ -242,10 +250,3 @@ def test_a_served_probe_is_captured_by_the_command_that_it_names(tmp_path):
             assert verify(out).ok
         finally:
             served.terminate()
-
-
-def test_the_next_command_is_named(capsys, tmp_path, few_photons):
-    out = Path(tmp_path) / "session-dark"
-    assert main(simulate(out, "--target", "dark")) == errors.DONE
-    printed = capsys.readouterr()
-    assert re.search(rf"next: skinrig verify {out}", printed.out + printed.err)
