@@ -26,7 +26,7 @@ def exact_total(sigma_a, eta, g):
     absorption = np.atleast_1d(sigma_a)[:, None]
     scattering, thickness = np.ones_like(absorption), np.full_like(absorption, np.inf)
     return adding_doubling.reflectance(
-        absorption, scattering, thickness, eta=eta, anisotropy=g, directions=24
+        absorption, scattering, thickness, eta=eta, anisotropy=g, directions=96
     )
 
 
