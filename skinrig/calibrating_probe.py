@@ -6,12 +6,10 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
-from importlib.resources import files
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.calibration import sensor, store
 from capture.calibration.fibre import FibreCalibration, calibrate_fibres
@@ -19,15 +17,9 @@ from capture.calibration.fibre_darks import CameraNoise, DarkModel, measure_dark
 from capture.calibration.fibre_merge import MergedSeries, merge_series
 from capture.calibration.fibre_readings import FibreReadings, sum_spots
 from capture.calibration.fibre_spots import find_fibre_spots
-from capture.calibration.phantom import (
-    CertificateError,
-    ExpectedReflectance,
-    PhantomCertificate,
-    read_certificate,
-)
-from capture.rig import Probe, Rig
+from capture.calibration.phantom import PhantomCertificate
 from capture.session import FrameRecord, Session
-from model import photon_table, spectra
+from skinrig.phantom_reflectance import expected_reflectance, packaged_certificate
 
 KIND: Final = "fibre"
 WORN_GAIN: Final = 0.5
@@ -125,87 +117,6 @@ def calibrate_probe(
         inputs={session.id: session.content_hash},
     )
     return ProbeCalibration(made, fibres, _summary(fibres, series, paper), findings)
-
-
-def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedReflectance:
-    """Return what the fibres of a perfect probe take from a phantom, averaged over the bands.
-
-    Parameters
-    ----------
-    certificate
-        Of the phantom.
-    rig
-        With a probe, a light of known illuminant and a camera of known sensitivity.
-
-    Returns
-    -------
-    ExpectedReflectance
-        Two common causes: the certificate's absorption and its scattering.
-
-    Raises
-    ------
-    CertificateError
-        Where the photon table does not hold the phantom.
-
-    Examples
-    --------
-    >>> from capture.calibration.phantom import CertificateUncertainty
-    >>> from capture.rig import load_rig
-    >>> paper = PhantomCertificate(
-    ...     eta=1.4, g=0.8, wavelength_nm=(550.0,), sigma_a_per_mm=(0.01,),
-    ...     sigma_s_prime_per_mm=(1.2,),
-    ...     uncertainty=CertificateUncertainty(sigma_a=0.02, sigma_s_prime=0.02))
-    >>> expected = expected_reflectance(paper, load_rig("probe"))
-    >>> expected.per_mm2.shape, expected.common.shape
-    ((28, 3), (2, 28, 3))
-    """
-    probe = _probe(rig)
-    light, camera = rig.lights[0].illuminant, rig.views[0].spectral_sensitivity
-    # a certificate of one wavelength calls the phantom gray: any wavelength stands for all
-    gray = len(certificate.wavelength_nm) == 1
-    wavelength = np.array([550.0]) if gray else np.asarray(spectra.WAVELENGTH_NM, np.float64)
-    weights = (
-        np.ones((1, 3)) if gray else spectra.band_weights(camera, light, wavelength_nm=wavelength)
-    )
-    sigma_a, sigma_s = certificate.at(wavelength)
-    radius = np.array(probe.radius_mm)
-    how: dict[str, Any] = {"eta": certificate.eta, "g": certificate.g, "collection": "fibre"}
-    try:
-        held = photon_table.domain(radius, sigma_a[:, None], sigma_s[:, None], **how)
-        slopes = photon_table.derivatives(
-            radius, sigma_a[:, None], sigma_s[:, None], core_mm=probe.fibres[0].core_mm,
-            source_core_mm=probe.source_core_mm, **how,
-        )  # fmt: skip
-        own = photon_table.relative_error(radius, sigma_a[:, None], sigma_s[:, None], **how)
-    except photon_table.TableDomainError as exc:
-        raise CertificateError(f"phantom: {exc}") from exc
-    if not held[:, :3].any():
-        raise CertificateError(
-            "phantom: the photon table does not hold its coefficients"
-            f" (sigma_a {sigma_a.min():g} to {sigma_a.max():g}, sigma_s'"
-            f" {sigma_s.min():g} to {sigma_s.max():g} per mm); use one like skin"
-        )
-
-    def band(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(values.T @ weights)
-
-    value = slopes.reflectance_per_mm2
-    mean = band(value)
-    # the table's errors at neighboring wavelengths are the same ones: they do not average out
-    stderr = band(value * np.where(np.isfinite(own), np.minimum(own, 1.0), 1.0))
-    unsure = certificate.uncertainty
-    common = np.stack(
-        [
-            band(slopes.by_sigma_a * sigma_a[:, None]) * unsure.sigma_a / mean,
-            band(slopes.by_sigma_s_prime * sigma_s[:, None]) * unsure.sigma_s_prime / mean,
-        ]
-    )
-    return ExpectedReflectance(mean, stderr, common)
-
-
-def packaged_certificate() -> PhantomCertificate:
-    """Return the certificate of the simulated phantom."""
-    return read_certificate(Path(str(files("rigsim"))) / "data" / "phantom.json")
 
 
 class _Series:
@@ -354,12 +265,6 @@ def _mean(readings: Sequence[FibreReadings]) -> FibreReadings:
         readings[0].exposures_s,
         readings[0].noise_origin,
     )
-
-
-def _probe(rig: Rig) -> Probe:
-    if rig.probe is None:
-        raise ProbeCalibratingError(f"rig {rig.name!r}: has no probe")
-    return rig.probe
 
 
 def _worn(fibres: FibreCalibration) -> tuple[str, ...]:

@@ -8,31 +8,18 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, maximum_filter
-from scipy.optimize import least_squares
-from scipy.special import erfc
 
-from capture.calibration.fibre_merge import MergedSeries, color_masks
+from capture.calibration.fibre_discs import DiscFit, candidates, distinct, fit_disc, gray_image
+from capture.calibration.fibre_merge import MergedSeries
 from capture.calibration.record import CalibrationError
 
 __all__ = ["FibreSpots", "SpotError", "find_fibre_spots"]
 
 FloatArray = NDArray[np.float64]
-
-SMOOTH_PITCH: Final = 0.12
-"""Blur of the search for spots, in distances between neighbors."""
-SIGMAS: Final = 8.0
-"""What a spot stands out of the noise by."""
-CONTRAST: Final = 0.3
-"""What a spot stands out of the light around it by, at least."""
 GATE_PITCH: Final = 0.35
 """How far a spot may lie from its place in the row."""
 SHIFT_PITCH: Final = 0.5
 """Beyond half a distance between neighbors nobody can tell whose a spot is."""
-STRUCTURE: Final = 0.03
-"""How far pixels of a spot scatter about a smooth disc, relative."""
-UNEVEN: Final = 0.1
-"""Slopes and bend of the light over a spot, relative, as large as they may well be."""
 LEAST_SHARE: Final = 0.5
 """Of the fibres must show, or the image is not one of this probe."""
 EDGES: Final = 2.5
@@ -120,11 +107,11 @@ class FibreSpots:
         shift_px : ndarray of float64, shape (2,)
             0 where too few stand out to tell.
         """
-        image = _gray(merged, pattern)
+        image = gray_image(merged, pattern)
         pitch = _pitch(self.center_px)
         away, errors = [], []
         for i in np.flatnonzero(self.found & ~self.overlapping):
-            fit = _fit(merged, image, pattern, self.center_px[i], pitch)
+            fit = fit_disc(merged, image, pattern, self.center_px[i], pitch)
             if fit is not None and np.hypot(*(fit[0][:2] - self.center_px[i])) < 0.5 * pitch:
                 away.append(fit[0][:2] - self.center_px[i])
                 errors.append(max(float(fit[1][:2].max()), 0.02))
@@ -172,13 +159,13 @@ def find_fibre_spots(
     nominal = np.asarray(nominal_px, np.float64)
     count = len(nominal)
     pitch = _pitch(nominal)
-    image = _gray(merged, pattern)
+    image = gray_image(merged, pattern)
     fits = []
-    for place in _candidates(image, pitch):
-        fit = _fit(merged, image, pattern, place, pitch)
+    for place in candidates(image, pitch):
+        fit = fit_disc(merged, image, pattern, place, pitch)
         if fit is not None:
             fits.append(fit)
-    fits = _distinct(fits, 0.25 * pitch)
+    fits = distinct(fits, 0.25 * pitch)
     if not fits:
         raise SpotError(
             f"fibre spots: found none in the image, expected {count} in a row {pitch:.0f} px apart;"
@@ -205,7 +192,7 @@ def find_fibre_spots(
             f" {int(np.ceil(LEAST_SHARE * count))}; check the phantom's contact, the light and the"
             " exposures"
         )
-    best: list[_Fit | None] = [whole[k] if k >= 0 else None for k in spot]
+    best: list[DiscFit | None] = [whole[k] if k >= 0 else None for k in spot]
     findings = [
         f"{names[i]} and {names[j]} end in one spot, x {places[k][0]:.0f}, y {places[k][1]:.0f} px"
         for k, (i, j) in between.items()
@@ -214,13 +201,8 @@ def find_fibre_spots(
     return _table(best, model, nominal, names, findings)
 
 
-_Fit = tuple[FloatArray, FloatArray, float]
-"""x, y, radius, edge in pixels, their standard errors, and the radius of a disc as large as what is
-brighter than half."""
-
-
 def _consult_masks(
-    best: list[_Fit | None],
+    best: list[DiscFit | None],
     masks: Mapping[int, MergedSeries],
     model: FloatArray,
     names: Sequence[str],
@@ -237,8 +219,8 @@ def _consult_masks(
         series = masks[i]
         fit = best[i]
         doubtful = fit is None or apart[i].min() < 2.2 * size or not 0.8 < fit[2] / size < 1.25
-        image = _gray(series, pattern)
-        alone = _candidates(image, pitch)
+        image = gray_image(series, pattern)
+        alone = candidates(image, pitch)
         if len(alone) == 0:
             continue  # too faint to tell
         brightest = alone[0]
@@ -251,14 +233,14 @@ def _consult_masks(
                 f" {names[nearest]} (x {brightest[0]:.0f}, y {brightest[1]:.0f} px); check the"
                 " cover, and the order of the fibres in the rig's file"
             )
-        fit = _fit(series, image, pattern, brightest, pitch) if doubtful else None
+        fit = fit_disc(series, image, pattern, brightest, pitch) if doubtful else None
         if fit is not None and np.linalg.norm(fit[0][:2] - model[i]) < 0.5 * pitch:
             best[i] = fit
             findings.append(f"{names[i]}: its place is from the frames with it alone uncovered")
 
 
 def _table(
-    best: list[_Fit | None],
+    best: list[DiscFit | None],
     model: FloatArray,
     nominal: FloatArray,
     names: Sequence[str],
@@ -307,146 +289,6 @@ def _table(
                 f"{names[i]} and {names[other]}: their spots overlap, {gaps[other]:.1f} px apart"
             )
     return replace(table, findings=tuple(findings))
-
-
-def _gray(merged: MergedSeries, pattern: str) -> tuple[FloatArray, FloatArray]:
-    """Return the sum of a cell's colors at every pixel, and its variance; gaps are filled."""
-    values = np.where(merged.valid, merged.rate, merged.smooth)
-    # saturated in every frame: brighter than what was measured anywhere near
-    if merged.saturated.any():
-        top = float(values.max(initial=0.0))
-        values = np.where(merged.saturated, max(top, 1e-12), values)
-    if pattern == "MONO":
-        return values, merged.variance
-    total, variance = np.zeros_like(values), np.zeros_like(values)
-    padded = np.pad(values, 1, mode="edge")
-    noisy = np.pad(merged.variance, 1, mode="edge")
-    height, width = values.shape
-    # (1 2 1) x (1 2 1) holds each color of a 2 x 2 cell with the same weight, about the pixel
-    for i, a in enumerate((0.25, 0.5, 0.25)):
-        for j, b in enumerate((0.25, 0.5, 0.25)):
-            total += a * b * padded[i : i + height, j : j + width]
-            variance += (a * b) ** 2 * noisy[i : i + height, j : j + width]
-    return total, variance
-
-
-def _candidates(image: tuple[FloatArray, FloatArray], pitch: float) -> FloatArray:
-    """Return the tops that stand out of noise and surroundings, brightest first, shape (n, 2)."""
-    gray, variance = image
-    blur = SMOOTH_PITCH * pitch
-    smooth = gaussian_filter(gray, blur, mode="nearest")
-    # the blurred noise of a cell's sum, whose neighbors share pixels: at most 4 pixels' worth
-    noise = np.sqrt(gaussian_filter(variance, blur, mode="nearest") * 4.0) / (2.0 * blur)
-    side = 2 * int(0.3 * pitch) + 1
-    top = smooth == maximum_filter(smooth, side, mode="nearest")
-    lift = round(0.65 * pitch)
-    above = np.pad(smooth, ((lift, 0), (0, 0)), mode="edge")[: smooth.shape[0]]
-    below = np.pad(smooth, ((0, lift), (0, 0)), mode="edge")[lift:]
-    around = np.minimum(above, below)
-    stands = (smooth - around > SIGMAS * noise) & (smooth - around > CONTRAST * np.abs(around))
-    rows, columns = np.nonzero(top & stands & (smooth > 0))
-    order = np.argsort(-smooth[rows, columns], kind="stable")[:200]
-    return np.stack([columns, rows], axis=1)[order].astype(np.float64)
-
-
-def _fit(
-    merged: MergedSeries,
-    image: tuple[FloatArray, FloatArray],
-    pattern: str,
-    place: FloatArray,
-    pitch: float,
-) -> _Fit | None:
-    """Fit a disc with a blurred edge to the raw mosaic about a place; None where none fits."""
-    height, width = merged.rate.shape
-    half = int(0.5 * pitch)
-    x0, y0 = (round(float(v)) for v in place)
-    rows = slice(max(y0 - half, 0), min(y0 + half + 1, height))
-    columns = slice(max(x0 - half, 0), min(x0 + half + 1, width))
-    if rows.stop - rows.start < half or columns.stop - columns.start < half:
-        return None
-    y, x = np.mgrid[rows, columns].astype(np.float64)
-    good = merged.valid[rows, columns]
-    if good.sum() < 50:
-        return None
-    colors = [mask[rows, columns] & good for mask in color_masks(merged.rate.shape, pattern)]
-    value, spread = merged.rate[rows, columns], merged.variance[rows, columns]
-    gray = image[0][rows, columns]
-    top = float(np.quantile(gray, 0.98))
-    bottom = float(np.quantile(gray, 0.02))
-    if top <= bottom:
-        return None
-    area = float((gray > 0.5 * (top + bottom)).sum())
-    start_radius = float(np.clip(np.sqrt(area / np.pi), 1.5, 0.5 * pitch))
-    order = [np.flatnonzero(mask.ravel()) for mask in colors]
-    index = np.concatenate(order)
-    color = np.concatenate([np.full(len(part), c) for c, part in enumerate(order)])
-    px, py, data = x.ravel()[index], y.ravel()[index], value.ravel()[index]
-    levels = np.array(
-        [max(float(np.quantile(data[color == c], 0.9)), 0.0) for c in range(len(colors))]
-    )
-    scale = max(float(levels.max()), 1e-30)
-    sigma = np.sqrt(spread.ravel()[index] + (STRUCTURE * levels[color]) ** 2) / scale
-    sigma = np.maximum(sigma, 1e-9)
-    data = data / scale
-
-    parts = [np.flatnonzero(color == c) for c in range(len(colors))]
-    # slopes and bend of a color may be as large as UNEVEN of its level, with a normal prior
-    stiff = [np.array([0.0, 1.0, 1.0, 1.0, 0.0]) / (UNEVEN * max(v / scale, 1e-3)) for v in levels]
-
-    def split(p: FloatArray) -> tuple[list[FloatArray], list[FloatArray], FloatArray]:
-        """Return residuals of each color's best linear model, and their amplitudes.
-
-        A fibre's modes are not filled alike: light over the disc has slopes and a bend.
-        """
-        u, v = (px - p[0]) / p[2], (py - p[1]) / p[2]
-        d = np.hypot(u, v)
-        disc = 0.5 * erfc((d - 1.0) * (p[2] / (np.sqrt(2.0) * p[3])))
-        bend = np.minimum(d, 1.2) ** 2 - 0.5
-        design = np.stack([disc, disc * u, disc * v, disc * bend, np.ones_like(disc)])
-        residuals, priors = [], []
-        amplitude = np.zeros(len(parts))
-        for c, at in enumerate(parts):
-            rows = design[:, at] / sigma[at]
-            value = data[at] / sigma[at]
-            normal = rows @ rows.T + np.diag(stiff[c] ** 2)
-            found = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(5), rows @ value)
-            residuals.append(value - found @ rows)
-            priors.append((stiff[c] * found)[1:4])
-            amplitude[c] = found[0]
-        return residuals, priors, amplitude
-
-    def misfit(p: FloatArray) -> FloatArray:
-        residuals, priors, _ = split(p)
-        return np.concatenate([*residuals, *priors])
-
-    begin = np.array([*place, start_radius, max(0.1 * start_radius, 0.7)])
-    low = np.array([place[0] - 0.5 * pitch, place[1] - 0.5 * pitch, 1.0, 0.2])
-    high = np.array([place[0] + 0.5 * pitch, place[1] + 0.5 * pitch, 0.7 * pitch, 0.3 * pitch])
-    begin = np.clip(begin, low + 1e-6, high - 1e-6)
-    done = least_squares(misfit, begin, bounds=(low, high), x_scale=[1, 1, 1, 0.5], max_nfev=30)
-    amplitude = split(done.x)[2]
-    at_bound = bool(((done.x <= low + 1e-3) | (done.x >= high - 1e-3))[:2].any())
-    if at_bound or amplitude.max() <= 0:
-        return None
-    normal = done.jac.T @ done.jac
-    chi2 = 2.0 * done.cost / max(len(data) - 4 - 5 * len(colors), 1)
-    try:
-        covariance = np.linalg.inv(normal) * max(chi2, 1.0)
-    except np.linalg.LinAlgError:
-        return None
-    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if not np.isfinite(error).all() or error[0] > 0.1 * pitch or error[1] > 0.1 * pitch:
-        return None
-    return done.x, error, start_radius
-
-
-def _distinct(fits: list[_Fit], apart: float) -> list[_Fit]:
-    """Return the fits without those that ended on an earlier one."""
-    kept: list[_Fit] = []
-    for fit in fits:
-        if all(np.hypot(*(fit[0][:2] - other[0][:2])) > apart for other in kept):
-            kept.append(fit)
-    return kept
 
 
 def _assign(

@@ -1,5 +1,7 @@
 """Brackets of a probe give each fibre's light over five decades, with variances that hold."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -214,6 +216,19 @@ def test_the_error_falls_with_exposure_as_counted_electrons_say(fibre_camera):
     # shot noise beside 7 e of read noise and 1 e of offsets, per pixel
     predicted = np.sqrt((400 + 51) / 4**2) / np.sqrt((1600 + 54) / 16**2)
     assert np.median(short / long) == pytest.approx(predicted, rel=0.05)
+
+
+def test_a_camera_without_colors_is_read_as_one(fibre_camera, brackets_s):
+    camera = fibre_camera(np.random.default_rng(31))
+    gray = dataclasses.replace(camera.noise, pattern="MONO")
+    light = np.full((28, 3), 50.0)
+    frames = camera.series(light, brackets_s)
+    readings = read_fibres(
+        frames, brackets_s, spots=spots_of(camera), darks=camera.darks(), noise=gray
+    )
+    truth = camera.own_light(light, spots_of(camera)).sum(axis=1, keepdims=True)
+    assert readings.signal.shape == (28, 1)
+    assert_consistent((readings.signal - truth) / readings.stderr)
 
 
 def test_sums_scale_with_the_aperture_not_with_the_light_around(fibre_camera):
