@@ -434,12 +434,15 @@ def _window_from(
     if reached >= 2:
         peak = int(np.argmax(smooth[:reached]))
         window[peak:reached] = smooth[peak:reached] / smooth[peak]
-        # Where too few came to tell: on as it fell before.
+        # Where too few came to tell: on as it fell before, less steeply, as a fall that chance
+        # made too steep would have photons split for minutes.
         before = max(peak, reached - 2 * len(kernel))
         if reached <= edge and before < reached - 1:
             fall = np.log(window[reached - 1] / window[before]) / (reached - 1 - before)
             further = np.arange(1, edge + 2 - reached)
-            window[reached : edge + 1] = window[reached - 1] * np.exp(min(fall, 0.0) * further)
+            window[reached : edge + 1] = window[reached - 1] * np.exp(
+                0.7 * min(fall, 0.0) * further
+            )
     # Beyond the fibres light comes back the less the farther it is.
     window[edge:] = window[edge] * (s[edge:] / s[edge]) ** 3
     return window
