@@ -208,8 +208,9 @@ class Plan:
         Per step the slowest camera's exposure and read-out, or the recycling of the flash or the
         time that the light stays on where that is longer, and the turning of the analyser where
         its state changes. Where a caliper's position changes its way, and the time in which the
-        skin creeps; where a head is held by suction, pumping and rests. Not the time of the person
-        who tapes the caliper or places the head.
+        skin creeps; where a head is held by suction, pumping and rests, and all exposures of a
+        series, though some may turn out to be not needed. Not the time of the person who tapes the
+        caliper or places the head.
         """
         total = 0.0
         each_s: list[float] = []
