@@ -9,6 +9,7 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
+from scipy.special import gammaincc
 
 from reconstruction import levenberg_marquardt
 from reconstruction.subsurface_models import ProfileModel
@@ -29,6 +30,13 @@ INITIAL_DEVIATION = 0.05
 """Likewise, for the first of the fits without a variance."""
 START_ERROR = 0.1
 """Relative error added for the comparison with starts."""
+MISFIT_CHANCE = 1e-3
+"""A chi2 that chance exceeds so rarely is a misfit."""
+OUTLIER = 6.0
+MOST_OUTLIERS = 0.1
+"""Standard deviations that make a fibre an outlier, and the share of fibres that may be such."""
+NORMAL_MEDIAN = 1.4826
+"""Standard deviation over the median of absolute deviations."""
 RISE = 50.0
 """A second valley of the misfit is tried when it begins no higher above the deepest."""
 
@@ -53,6 +61,10 @@ class ProfileBatch:
     total: Floats
     """Variance of `y` with the model's error."""
     steps: NDArray[np.int64]
+    odd: Bools
+    """Fibres left out as outliers."""
+    spread: Floats
+    """Relative model error found from the residuals, 0 without a misfit."""
 
     @classmethod
     def of(cls, y: Floats, variance: Floats | None, used: Bools, prior: Floats) -> ProfileBatch:
@@ -67,9 +79,9 @@ class ProfileBatch:
             spread = np.where(used, variance, math.inf)
             seen = used & (clean > SIGNAL * np.sqrt(spread))
         return cls(
-            clean, spread, used, variance is None, prior, seen, np.zeros((n, 4)),
+            clean, spread, used.copy(), variance is None, prior, seen, np.zeros((n, 4)),
             np.zeros((n, 4, 4)), np.zeros(n), np.zeros((n, fibres)), np.zeros((n, fibres)),
-            np.zeros(n, np.int64),
+            np.zeros(n, np.int64), np.zeros(y.shape, np.bool_), np.zeros(n),
         )  # fmt: skip
 
     def fit(self, model: ProfileModel, chosen: NDArray[np.intp]) -> None:
@@ -88,10 +100,45 @@ class ProfileBatch:
         doubt = np.flatnonzero(np.isfinite(rise) & ((rise < RISE) | self._misfits(chosen)))
         if doubt.size:
             self._run(model, chosen[doubt], y[doubt], variance[doubt], second[doubt], better=True)
-        for _ in range(2 if self.logarithmic else 0):
-            off = np.where(seen, y - np.log(np.maximum(self.predicted[chosen], 1e-290)), 0.0)
-            variance = _local_variance(model.radius_mm, off, seen)
-            self._run(model, chosen, y, variance, self.theta[chosen])
+        if self.logarithmic:
+            for _ in range(2):
+                off = np.where(seen, y - np.log(np.maximum(self.predicted[chosen], 1e-290)), 0.0)
+                variance = _local_variance(model.radius_mm, off, seen)
+                self._run(model, chosen, y, variance, self.theta[chosen])
+        else:
+            used = self.used[chosen].sum(axis=1)
+            chance = gammaincc(np.maximum(used - 2, 1) / 2.0, self.chi2[chosen] / 2.0)
+            bad = np.flatnonzero((chance < MISFIT_CHANCE) & (seen.sum(axis=1) >= FEWEST_READINGS))
+            if bad.size:
+                self._widen(model, chosen[bad])
+
+    def _widen(self, model: ProfileModel, chosen: NDArray[np.intp]) -> None:
+        """Fit profiles again that the model does not describe, with its error from the residuals.
+
+        The same relative error at all fibres, so that the fit is the best in relative terms; a few
+        fibres far off all others are left out. chi2 becomes that of the errors as they were.
+        """
+        y, variance, used = self.y[chosen], self.variance[chosen], self.used[chosen]
+        most = np.floor(MOST_OUTLIERS * used.sum(axis=1))
+        for _ in range(2):
+            m = np.maximum(self.predicted[chosen], 1e-290)
+            off = np.abs(y - m)
+            relative = np.nanmedian(np.where(self.seen[chosen], off / m, math.nan), axis=1)
+            spread = NORMAL_MEDIAN * relative[:, None] * m
+            stated = variance + model.relative_variance(self.theta[chosen]) * m**2
+            odd = used & (off > OUTLIER * np.sqrt(stated + spread**2))
+            odd &= (odd.sum(axis=1) <= most)[:, None]
+            wide = np.where(odd, math.inf, variance + spread**2)
+            self._run(model, chosen, y, wide, self.theta[chosen])
+        m = self.predicted[chosen]
+        kept = used & ~odd
+        stated = variance + model.relative_variance(self.theta[chosen]) * m**2
+        fitted = self.chi2[chosen] - _sum_over(kept, (y - m) ** 2, self.total[chosen])
+        self.chi2[chosen] = fitted + _sum_over(kept, (y - m) ** 2, stated)
+        self.odd[chosen] = odd
+        self.used[chosen] = kept
+        self.seen[chosen] &= kept
+        self.spread[chosen] = np.median(spread / np.maximum(m, 1e-290), axis=1)
 
     def _misfits(self, chosen: NDArray[np.intp]) -> Bools:
         """Return which fits are so bad that another minimum may be better."""
@@ -127,6 +174,13 @@ class ProfileBatch:
             predicted, total, steps = predicted[won], total[won], steps[won]
         self.theta[chosen], self.covariance[chosen], self.chi2[chosen] = theta, covariance, chi2
         self.predicted[chosen], self.total[chosen], self.steps[chosen] = predicted, total, steps
+
+
+def _sum_over(kept: Bools, squares: Floats, variance: Floats) -> Floats:
+    """Return sums of squares over variances of the fibres kept, (N,)."""
+    ratio = np.zeros(squares.shape)
+    np.divide(squares, variance, out=ratio, where=kept)
+    return np.asarray(ratio.sum(axis=1))
 
 
 def _log_volume(total: Floats) -> Floats:

@@ -16,7 +16,11 @@ How a profile is compared, for all three:
   scale (``common_error``), and for the table the asymmetry g of the phase function, which the
   fibres near the source depend on. They are fitted along, which weighs the near fibres down rather
   than cutting them off.
-- Each profile begins at the best of some hundred pairs on a grid, by logarithms.
+- Each profile begins at the best of some hundred pairs on a grid, by logarithms, and again in a
+  second valley of the misfit where there is one.
+- A misfit (layers, a wrong scale) is reported, and taken up by a relative model error, equal at all
+  fibres, which is found from the residuals; the profile is fitted again with it. As such residuals
+  are alike at neighbouring fibres, standard errors grow by how much they repeat each other.
 
 The paper does not say which fibres it fits nor how it weighs them. Its baseline here takes all
 fibres whose reading means something, and a tenth of the reflectance as the dipole's own error: that

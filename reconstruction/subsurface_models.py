@@ -98,6 +98,13 @@ class ProfileModel:
         """Return where the model is good for parameters (N, 4)."""
         return np.asarray(theta[:, 0] - theta[:, 1] <= np.log(self.most_ratio))
 
+    def relative_variance(self, theta: Floats) -> Floats:
+        """Return the model's own squared relative error at every fibre, (N, F)."""
+        a, s = np.exp(theta[:, :1]), np.exp(theta[:, 1:2])
+        everywhere, near, by_ratio = self.error
+        source = near * np.exp(-self.radius_mm * (a + s))
+        return np.asarray(everywhere**2 + source**2 + (by_ratio * a / s) ** 2)
+
     def systematic(self, theta: Floats) -> Floats:
         """Return by how much log sigma_tr is off for the model's sake, (N,)."""
         ratio = np.minimum(np.exp(theta[:, 0] - theta[:, 1]), 1.0)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincc, stdtrit
 
-from reconstruction.profile_batch import FEWEST_READINGS, ProfileBatch
+from reconstruction.profile_batch import FEWEST_READINGS, MISFIT_CHANCE, ProfileBatch
 from reconstruction.subsurface_models import Method
 
 Floats = NDArray[np.float64]
@@ -22,10 +22,12 @@ LOG_LIMIT = 0.5
 """Standard error of log sigma_tr above which the profile does not tell it."""
 COEFFICIENT_LIMIT = 0.3
 """Likewise of log sigma_a and log sigma_s', which is said apart."""
-MISFIT_CHANCE = 1e-3
-"""A chi2 that chance exceeds so rarely is a misfit."""
 FAR_OFF = 0.7
 """Root mean square of log(reading / model) above which a profile is of no such medium."""
+MOST_SPREAD = 0.5
+"""Relative model error found from the residuals, likewise."""
+MOST_CORRELATION = 0.9
+"""Of residuals of neighbouring fibres."""
 CLEAR = 0.2
 """Standard error of log sigma_tr up to which its interval is symmetric in the logarithm."""
 SHARE = 0.6827
@@ -56,10 +58,10 @@ REASONS = {
     Outcome.OUTSIDE_DOMAIN: "sigma_a / sigma_s' is beyond what the model is good for",
     Outcome.NOT_IDENTIFIED: "the profile does not tell sigma_tr",
     Outcome.WRONG_PROFILE: "no medium of this kind has such a profile, or its scale is wrong",
-    Outcome.MISFIT: "residuals exceed their errors; the errors are enlarged",
+    Outcome.MISFIT: "residuals exceed their errors; a model error takes up the rest",
     Outcome.COEFFICIENTS_NOT_IDENTIFIED: "sigma_a and sigma_s' are not told apart well",
 }
-LEFT_OUT = ("used", "masked", "not finite", "no variance", "not above zero")
+LEFT_OUT = ("used", "masked", "not finite", "no variance", "not above zero", "outlier")
 """Meaning of `SubsurfaceFit.left_out`."""
 
 
@@ -81,12 +83,16 @@ class SubsurfaceFit:
     interval_per_mm : ndarray, shape (..., 2)
         68 % interval of sigma_tr, 1/mm.
     chi2, p_value : ndarray, shape (...)
-        Squared residuals over their variances, with the nuisances' priors; the chance of more.
+        Squared residuals over their stated variances, with the nuisances' priors; and the chance
+        of more.
         Without a variance chi2 equals `dof` but for its smoothing and says little.
     dof : ndarray of int, shape (...)
         Fibres used less two.
     inflation : ndarray, shape (...)
-        Factor that enlarged all standard errors, for a misfit; 1 without.
+        By how much residuals exceed their stated errors, sqrt(chi2/dof), for a misfit; 1 without.
+    model_error : ndarray, shape (...)
+        Relative error of the model at all fibres that explains a misfit; the fit and its standard
+        errors are made with it. 0 without.
     used : ndarray of bool, shape (..., F)
     left_out : ndarray of uint8, shape (..., F)
         Index into `LEFT_OUT`, 0 where used.
@@ -117,6 +123,7 @@ class SubsurfaceFit:
     dof: NDArray[np.int64]
     p_value: Floats
     inflation: Floats
+    model_error: Floats
     used: Bools
     left_out: NDArray[np.uint8]
     outcome: Codes
@@ -179,9 +186,15 @@ def judged(
     dof = np.maximum(fibres - 2, 0)
     p_value = np.where(dof > 0, gammaincc(np.maximum(dof, 1) / 2.0, batch.chi2 / 2.0), 1.0)
     reduced = batch.chi2 / np.maximum(dof, 1)
-    large = (reduced > 1.0) & ((p_value < MISFIT_CHANCE) | batch.logarithmic)
-    inflation = np.where(large, np.sqrt(reduced), 1.0)
-    logs = batch.covariance[:, :2, :2] * (inflation**2)[:, None, None]
+    misfit = p_value < (0.0 if batch.logarithmic else MISFIT_CHANCE)
+    inflation = np.where(
+        (reduced > 1.0) & np.logical_or(misfit, batch.logarithmic), np.sqrt(reduced), 1.0
+    )
+    residual = _residuals(batch)
+    widening = np.where(batch.spread > 0.0, _repeats(residual), 1.0)
+    if batch.logarithmic:
+        widening = inflation**2
+    logs = batch.covariance[:, :2, :2] * widening[:, None, None]
     slope = 0.5 * np.stack([1.0 + a / (a + s), s / (a + s)], axis=1)  # of log sigma_tr
     told = np.isfinite(logs).all(axis=(1, 2))
     safe = np.where(told[:, None, None], logs, 0.0)
@@ -214,8 +227,8 @@ def judged(
         (Outcome.AT_BOUND, at_bound),
         (Outcome.OUTSIDE_DOMAIN, ~inside),
         (Outcome.NOT_IDENTIFIED, log_stderr > LOG_LIMIT),
-        (Outcome.WRONG_PROFILE, far > FAR_OFF),
-        (Outcome.MISFIT, (p_value < MISFIT_CHANCE) & ~np.bool_(batch.logarithmic)),
+        (Outcome.WRONG_PROFILE, (far > FAR_OFF) | (batch.spread > MOST_SPREAD)),
+        (Outcome.MISFIT, misfit),
         (Outcome.COEFFICIENTS_NOT_IDENTIFIED, apart > COEFFICIENT_LIMIT),
     ):
         outcome[where] |= np.uint16(bit)
@@ -229,11 +242,8 @@ def judged(
     if batch.logarithmic:  # the noise itself is known from few residuals
         reach = stdtrit(np.maximum(dof, 1), 0.5 + 0.5 * SHARE)
     low, high = _interval(sigma_tr, log_stderr * reach)
-    residual = np.zeros(batch.y.shape)
-    model_value = (
-        np.log(np.maximum(batch.predicted, 1e-290)) if batch.logarithmic else batch.predicted
-    )
-    np.divide(batch.y - model_value, np.sqrt(batch.total), out=residual, where=batch.used)
+    fibres_in_all = batch.y.shape[1]
+    left_out = np.where(batch.odd, np.uint8(LEFT_OUT.index("outlier")), left_out)
     predicted = np.where(nothing[:, None], math.nan, batch.predicted)
     return SubsurfaceFit(
         sigma_a_per_mm=a.reshape(shape),
@@ -241,22 +251,45 @@ def judged(
         sigma_tr_per_mm=sigma_tr.reshape(shape),
         covariance=covariance.reshape((*shape, 2, 2)),
         valid=((outcome & np.uint16(_INVALID)) == 0).reshape(shape),
-        sigma_tr_stderr=_product(sigma_tr, log_stderr).reshape(shape),
+        sigma_tr_stderr=_deviation(sigma_tr, log_stderr).reshape(shape),
         interval_per_mm=np.stack([low, high], axis=-1).reshape((*shape, 2)),
         chi2=batch.chi2.reshape(shape),
         dof=dof.reshape(shape),
         p_value=p_value.reshape(shape),
         inflation=inflation.reshape(shape),
-        used=batch.used.reshape((*shape, -1)),
-        left_out=left_out.reshape((*shape, -1)),
+        model_error=batch.spread.reshape(shape),
+        used=batch.used.reshape((*shape, fibres_in_all)),
+        left_out=left_out.reshape((*shape, fibres_in_all)),
         outcome=outcome.reshape(shape),
-        predicted_per_mm2=predicted.reshape((*shape, -1)),
-        residual=residual.reshape((*shape, -1)),
+        predicted_per_mm2=predicted.reshape((*shape, fibres_in_all)),
+        residual=residual.reshape((*shape, fibres_in_all)),
         scale=np.exp(batch.theta[:, 2]).reshape(shape),
         asymmetry=batch.theta[:, 3].reshape(shape),
         evaluations=np.abs(batch.steps).reshape(shape),
         method=method,
     )
+
+
+def _residuals(batch: ProfileBatch) -> Floats:
+    """Return residuals over their standard deviations, (N, F), 0 where a fibre is not used."""
+    value = batch.predicted
+    if batch.logarithmic:
+        value = np.log(np.maximum(value, 1e-290))
+    residual = np.zeros(batch.y.shape)
+    np.divide(batch.y - value, np.sqrt(batch.total), out=residual, where=batch.used)
+    return residual
+
+
+def _repeats(residual: Floats) -> Floats:
+    """Return how many neighbours tell the same, from the residuals' correlation, (N,).
+
+    A medium that the model does not describe leaves residuals that are smooth over the fibres;
+    (1 + c)/(1 - c) of them count as one, as in a series of the first order.
+    """
+    squares = np.maximum((residual**2).sum(axis=1), 1e-290)
+    c = (residual[:, 1:] * residual[:, :-1]).sum(axis=1) / squares
+    c = np.clip(c, 0.0, MOST_CORRELATION)
+    return np.asarray((1.0 + c) / (1.0 - c))
 
 
 def _interval(sigma_tr: Floats, log_stderr: Floats) -> tuple[Floats, Floats]:
@@ -275,6 +308,10 @@ def _interval(sigma_tr: Floats, log_stderr: Floats) -> tuple[Floats, Floats]:
     return np.where(nothing, 0.0, low), np.where(nothing, math.inf, high)
 
 
-def _product(value: Floats, log_stderr: Floats) -> Floats:
-    known = np.isfinite(value) & np.isfinite(log_stderr)
-    return np.where(known, np.where(known, value, 0.0) * np.where(known, log_stderr, 0.0), math.inf)
+def _deviation(sigma_tr: Floats, log_stderr: Floats) -> Floats:
+    """Return the standard error, half the interval where that is wide; infinite where unknown."""
+    low, high = _interval(sigma_tr, log_stderr)
+    half = np.full(sigma_tr.shape, math.inf)
+    np.subtract(0.5 * high, 0.5 * low, out=half, where=np.isfinite(high) & np.isfinite(low))
+    known = np.isfinite(sigma_tr) & (log_stderr < CLEAR)
+    return np.where(known, np.where(known, sigma_tr, 0.0) * np.where(known, log_stderr, 0.0), half)
