@@ -92,8 +92,14 @@ def fibre_camera():
 
 
 @pytest.fixture(scope="session")
-def brackets_s():
+def all_brackets_s():
     return EXPOSURES_S
+
+
+@pytest.fixture(scope="session")
+def brackets_s():
+    """Every second one, from the same shortest to the same longest."""
+    return EXPOSURES_S[::2]
 
 
 @pytest.fixture(scope="session")

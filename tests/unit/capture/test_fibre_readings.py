@@ -36,14 +36,14 @@ def assert_consistent(away):
 
 
 @pytest.fixture(scope="module")
-def bench(fibre_camera, brackets_s, five_decades):
+def bench(fibre_camera, all_brackets_s, five_decades):
     camera = fibre_camera(np.random.default_rng(7))
-    return camera, camera.darks(), camera.series(five_decades, brackets_s)
+    return camera, camera.darks(), camera.series(five_decades, all_brackets_s)
 
 
-def test_five_decades_are_read_within_their_errors(bench, brackets_s, five_decades):
+def test_five_decades_are_read_within_their_errors(bench, all_brackets_s, five_decades):
     camera, darks, frames = bench
-    readings = read(camera, frames, brackets_s, darks)
+    readings = read(camera, frames, all_brackets_s, darks)
     assert readings.valid.all()
     truth = camera.own_light(five_decades, spots_of(camera))
     assert truth.max() / truth.min() > 1e5
@@ -53,15 +53,15 @@ def test_five_decades_are_read_within_their_errors(bench, brackets_s, five_decad
     blind = measure_darks(
         [np.full(camera.shape, 64, np.uint16)] * 2, [1e-3, 30], noise=camera.noise
     )
-    raw = read(camera, frames, brackets_s, blind)
+    raw = read(camera, frames, all_brackets_s, blind)
     assert abs((raw.signal - truth) / raw.stderr).max() > 6
 
 
 def test_light_below_the_dark_signal_is_read_without_bias(fibre_camera, brackets_s):
     away, level = [], []
-    for seed in range(4):
+    for seed in range(3):
         camera = fibre_camera(np.random.default_rng(seed))
-        light = np.full((28, 3), 0.05)  # electrons per second: 1.5 in the longest exposure
+        light = np.full((28, 3), 0.06)  # electrons per second: 1.8 in the longest exposure
         readings = read(camera, camera.series(light, brackets_s), brackets_s, camera.darks())
         truth = camera.own_light(light, spots_of(camera))
         away.append((readings.signal - truth) / readings.stderr)
@@ -99,10 +99,10 @@ def test_a_series_that_is_saturated_even_in_its_shortest_exposure_is_flagged(
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_fewer_brackets_read_what_they_can(bench, brackets_s, five_decades, count):
+def test_fewer_brackets_read_what_they_can(bench, all_brackets_s, five_decades, count):
     camera, darks, frames = bench
     chosen = [14, 18, 22][:count]
-    readings = read(camera, [frames[k] for k in chosen], brackets_s[chosen], darks)
+    readings = read(camera, [frames[k] for k in chosen], all_brackets_s[chosen], darks)
     truth = camera.own_light(five_decades, spots_of(camera))
     assert 0 < readings.valid.sum() < readings.valid.size
     assert (readings.saturated == ~readings.valid).all()
@@ -110,11 +110,11 @@ def test_fewer_brackets_read_what_they_can(bench, brackets_s, five_decades, coun
     assert_consistent(((readings.signal - truth) / np.where(good, readings.stderr, 1))[good])
 
 
-def test_the_order_of_the_frames_does_not_matter(bench, brackets_s, rng):
+def test_the_order_of_the_frames_does_not_matter(bench, all_brackets_s, rng):
     camera, darks, frames = bench
     order = rng.permutation(23)
-    one = read(camera, frames, brackets_s, darks)
-    two = read(camera, [frames[k] for k in order], brackets_s[order], darks)
+    one = read(camera, frames, all_brackets_s, darks)
+    two = read(camera, [frames[k] for k in order], all_brackets_s[order], darks)
     np.testing.assert_allclose(one.signal, two.signal, rtol=1e-12)
 
 
@@ -189,12 +189,12 @@ def test_many_hot_pixels_make_a_spot_invalid(fibre_camera, brackets_s):
     assert readings.valid[[19, 21]].all()
 
 
-def test_bright_light_is_merged_as_by_the_merge_of_brackets(bench, brackets_s):
+def test_bright_light_is_merged_as_by_the_merge_of_brackets(bench, all_brackets_s):
     camera, darks, frames = bench
-    merged = merge_series(frames, brackets_s, darks=darks, noise=camera.noise)
+    merged = merge_series(frames, all_brackets_s, darks=darks, noise=camera.noise)
     noise = camera.noise
     radiance, variance, _ = hdr.merge(
-        frames, brackets_s, gain=noise.gain_e_per_dn, read_noise=noise.read_noise_e,
+        frames, all_brackets_s, gain=noise.gain_e_per_dn, read_noise=noise.read_noise_e,
         black=noise.black_dn, white=noise.white_dn,
     )  # fmt: skip
     bright = merged.valid & (radiance > 1e4)
@@ -266,7 +266,7 @@ def test_light_of_other_lengths_than_the_exposures_gives_the_same_rates(fibre_ca
 
 def test_a_source_that_is_not_steady_is_seen_in_the_frames(fibre_camera, brackets_s, five_decades):
     camera = fibre_camera(np.random.default_rng(29))
-    ripple = np.random.default_rng(1).normal(1, 0.01, 23)
+    ripple = np.random.default_rng(1).normal(1, 0.01, 12)
     rate = camera.rate(five_decades)
     frames = [camera.expose(rate * f, t) for f, t in zip(ripple, brackets_s, strict=True)]
     merged = merge_series(frames, brackets_s, darks=camera.darks(), noise=camera.noise)
@@ -282,7 +282,7 @@ def test_a_source_that_is_not_steady_is_seen_in_the_frames(fibre_camera, bracket
     assert np.abs(np.array(steady.scale) - 1).max() < 0.002
 
     # nor are few frames far apart taken for a source that flickers
-    few = [0, 11, 22]
+    few = [0, 5, 11]
     steady = merge_series(
         [frames[k] for k in few], brackets_s[few], darks=camera.darks(), noise=camera.noise
     )
