@@ -208,7 +208,9 @@ class FibreCalibration:
             elif not self.spots.found[i]:
                 reasons[name] = "has no spot of its own in the image"
             elif not self.valid[i].all():
-                reasons[name] = "its gain is not known: too little light from the phantom, or none"
+                reasons[name] = (
+                    "its gain is not known: too little light of the phantom, or saturated"
+                )
             elif readings.saturated[i].any():
                 reasons[name] = "saturated even in the shortest exposure"
             elif not readings.valid[i].all():
@@ -402,6 +404,11 @@ def calibrate_fibres(
     gain = light / expected.per_mm2
     bright = np.asarray(phantom.valid & told & (light > LEAST_SIGMAS * error), np.bool_)
     usual = np.array([np.median(g[b]) if b.any() else 0.0 for g, b in zip(gain.T, bright.T)])  # noqa: B905
+    if phantom.saturated.all():
+        raise FibreError(
+            "phantom: all fibres are saturated in every exposure; take shorter ones, or a lower"
+            " level of the source"
+        )
     if not (usual > 0).any():
         raise FibreError(
             "phantom: no fibre gives light; check the source, its shutter, the head's contact with"

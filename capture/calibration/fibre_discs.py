@@ -27,6 +27,10 @@ SIGMAS: Final = 8.0
 """What a spot stands out of the noise by."""
 CONTRAST: Final = 0.3
 """What a spot stands out of the light around it by, at least."""
+BORDER_PITCH: Final = 0.2
+"""Nearer to the image's border than this no spot is sought, in distances between neighbors."""
+WORST_PITCH: Final = 0.04
+"""Standard error of a place that is no place any more."""
 STRUCTURE: Final = 0.03
 """How far pixels of a spot scatter about a smooth disc, relative."""
 UNEVEN: Final = 0.1
@@ -68,7 +72,11 @@ def candidates(image: GrayImage, pitch: float) -> FloatArray:
     below = np.pad(smooth, ((0, lift), (0, 0)), mode="edge")[lift:]
     around = np.minimum(above, below)
     stands = (smooth - around > SIGMAS * noise) & (smooth - around > CONTRAST * np.abs(around))
-    rows, columns = np.nonzero(top & stands & (smooth > 0))
+    # beside the border the blur doubles what noise there is
+    border = round(BORDER_PITCH * pitch)
+    inner = np.zeros_like(top)
+    inner[border : top.shape[0] - border, border : top.shape[1] - border] = True
+    rows, columns = np.nonzero(top & stands & inner & (smooth > 0))
     order = np.argsort(-smooth[rows, columns], kind="stable")[:200]
     return np.stack([columns, rows], axis=1)[order].astype(np.float64)
 
@@ -159,7 +167,7 @@ def fit_disc(
     except np.linalg.LinAlgError:
         return None
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if not np.isfinite(error).all() or error[0] > 0.1 * pitch or error[1] > 0.1 * pitch:
+    if not np.isfinite(error).all() or error[:2].max() > WORST_PITCH * pitch:
         return None
     return done.x, error, start_radius
 

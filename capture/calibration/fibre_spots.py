@@ -272,7 +272,8 @@ def _table(
         if names[i] in touching:
             continue
         findings.append(
-            f"{names[i]}: no spot at x {model[i, 0]:.0f}, y {model[i, 1]:.0f} px: the fibre is dark"
+            f"{names[i]}: no spot at x {model[i, 0]:.0f}, y {model[i, 1]:.0f} px: the fibre is"
+            " dark, or its light too faint"
         )
     shift = (value[found, :2] - nominal[found]).mean(axis=0)
     turn = np.polyfit(value[found, 0], value[found, 1] - nominal[found, 1], 1)[0]

@@ -231,6 +231,9 @@ def test_readings_of_no_light_cannot_calibrate(rng):
     probe = Probe(rng, dead=range(28), stray=0.0)
     with pytest.raises(FibreError, match="no fibre gives light"):
         probe.calibrate()
+    bright = Probe(rng)
+    with pytest.raises(FibreError, match="saturated in every exposure; take shorter"):
+        bright.calibrate(saturated=range(28))
 
 
 def test_readings_of_another_probe_are_refused(rng):
