@@ -19,6 +19,21 @@ the length of their path, and absorption is put in afterwards. What makes few ph
 - Paths longer than 3000 transport lengths are continued by the diffusion's L^(-5/2) law, whose
   constant is taken from the last factor of two of the histogram.
 
+- Near the source few photons go into a fibre's cone where the phase function is narrow. For
+  g = 0.9 and 0.95 paths up to 4 transport lengths are traced apart by 8 and 16 times the photons.
+- Splines over the rings, as smooth as predicts half of the batches from the others best. Fibres are
+  fitted as the quotient over light of all directions, which changes slowly far from the source.
+
+Tracing takes 20 minutes of one busy core, the table another half minute. It is the same for any
+machine of IEEE arithmetic up to the last digits of its exp, log and sqrt: one thread, fixed seeds.
+A walk's photons, for each collection: 8 million for g = 0.8; 4 for 0.7 and 0.9; 1.6 for 0.95; 2.6 for
+0, 0.3 and 0.5. Standard errors (median over 0.3 to 10 transport lengths, sigma_a up to 0.3 sigma_s',
+from leaving batches out; twice that at 0.05 to 0.3):
+
+    g       0      0.3    0.5    0.7    0.8    0.9    0.95
+    all     0.25   0.28   0.30   0.22   0.14   0.22   0.29 %
+    fibre   0.18   0.18   0.20   0.24   0.20   0.33   0.73 %
+
 The sampler (the generator sfc64, the walk, the scoring) is written for this table alone; the
 simulated rigs have another one.
 """

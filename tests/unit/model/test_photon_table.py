@@ -26,7 +26,7 @@ def exact_total(sigma_a, eta, g):
     absorption = np.atleast_1d(sigma_a)[:, None]
     scattering, thickness = np.ones_like(absorption), np.full_like(absorption, np.inf)
     return adding_doubling.reflectance(
-        absorption, scattering, thickness, eta=eta, anisotropy=g, directions=96
+        absorption, scattering, thickness, eta=eta, anisotropy=g, directions=64
     )
 
 
@@ -105,11 +105,9 @@ def z_scores(sigma_a, sigma_s, g, photons, rng, cores=(0.2, 0.2)):
 
 def test_fibres_take_what_the_simulators_own_fibres_take():
     # Neither walk, scoring in the cone nor averages over the cores are shared. The errors of 20
-    # batches follow Student's t with 19 degrees of freedom: beyond 5 once in 200 runs of 56.
+    # batches follow Student's t with 19 degrees of freedom: beyond 5 once in 400 runs of 28.
     rng = np.random.default_rng(3)
-    media = ((0.03, 1.0, 0.8), (0.3, 1.5, 0.8))
-    gaps = np.concatenate([z_scores(*medium, 8_000, rng) for medium in media])
-    assert np.max(np.abs(gaps)) < 5.0
+    assert np.max(np.abs(z_scores(0.2, 1.5, 0.8, 12_000, rng))) < 5.0
 
 
 @pytest.mark.long
