@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from model import diffusion
+from model import photon_table
 from reconstruction import anisotropy, subsurface, translucency
 from reconstruction.translucency import SITE_UV, TEXTURE_MM, TranslucencyPrior
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure
@@ -23,7 +23,7 @@ Way = Literal["sigma_tr", "profiles"]
 RADIUS_MM = 0.3 + 0.25 * np.arange(28)
 SIGMA_A_PER_MM, SIGMA_S_PRIME_PER_MM, ETA = 0.04, 1.5, 1.4
 RATIO, AXIS_RAD = 1.1, 0.6
-"""Distances along the axis are so many times as long: about what is hard to see by eye."""
+"""Greatest over least 1/sigma_tr."""
 COUPLING, FIBRE, DARK = 0.02, 0.01, 1e-7
 """Relative deviations of a head set down anew and of each of its fibres; noise, 1/mm^2."""
 FALSE_ALARM_RATE = 0.01
@@ -38,10 +38,12 @@ def _directions(count: int) -> Floats:
 
 
 def _profiles(angle: Floats, ratio: float, cases: int, *, rng: np.random.Generator) -> Floats:
-    """Return readings (N, cases, F) of tissue in which one axis is drawn out, heads set down."""
-    scale = np.hypot(np.cos(angle - AXIS_RAD) / ratio, np.sin(angle - AXIS_RAD))
-    truth = diffusion.reflectance(
-        np.outer(scale, RADIUS_MM), SIGMA_A_PER_MM, SIGMA_S_PRIME_PER_MM, ETA
+    """Return readings (N, cases, F) of tissue that scatters less along an axis, heads set down."""
+    sigma_tr = np.hypot(np.cos(angle - AXIS_RAD) / ratio, np.sin(angle - AXIS_RAD))
+    # sigma_tr^2 = 3 sigma_a (sigma_a + sigma_s'), scaled about the middle of its extremes
+    total = (SIGMA_A_PER_MM + SIGMA_S_PRIME_PER_MM) * ratio * sigma_tr**2
+    truth = photon_table.reflectance(
+        RADIUS_MM, SIGMA_A_PER_MM, (total - SIGMA_A_PER_MM)[:, None], eta=ETA
     )
     shape = (angle.size, cases, RADIUS_MM.size)
     seen = truth[:, None] * np.exp(COUPLING * rng.standard_normal((*shape[:2], 1)))
@@ -52,28 +54,35 @@ def _profiles(angle: Floats, ratio: float, cases: int, *, rng: np.random.Generat
 def _told(way: Way, angle: Floats, profiles: Floats) -> anisotropy.Anisotropy:
     variance = np.full(profiles.shape, DARK**2)
     if way == "profiles":
-        return anisotropy.estimate_from_profiles(angle, RADIUS_MM, profiles, variance, floor=FIBRE)
+        return anisotropy.estimate_from_profiles(
+            angle, RADIUS_MM, profiles, variance, sigma_a_per_mm=SIGMA_A_PER_MM,
+            sigma_s_prime_per_mm=SIGMA_S_PRIME_PER_MM, eta=ETA, floor=FIBRE,
+        )  # fmt: skip
     fits = subsurface.invert(
         RADIUS_MM, profiles, eta=ETA, variance=variance + (FIBRE * profiles) ** 2,
-        method="diffusion",
+        common_error=COUPLING, g_error=0.0, model_error=0.0,
     )  # fmt: skip
-    return anisotropy.estimate(angle, fits.sigma_tr_per_mm, valid=fits.valid)
+    return anisotropy.estimate(angle, fits.sigma_tr_per_mm, fits.sigma_tr_stderr, valid=fits.valid)
 
 
 def _bound(count: int) -> float:
-    """Return the least standard deviation of the log ratio over itself, coupling unknown."""
-    r = RADIUS_MM * np.exp([[-1e-4], [0.0], [1e-4]])
-    low, here, high = diffusion.reflectance(r, SIGMA_A_PER_MM, SIGMA_S_PRIME_PER_MM, ETA)
-    slope = (high - low) / 2e-4
-    weight = 1.0 / ((FIBRE * here) ** 2 + DARK**2)
+    """Return the least standard deviation of the log ratio, absorption known, coupling not."""
+    here = photon_table.derivatives(RADIUS_MM, SIGMA_A_PER_MM, SIGMA_S_PRIME_PER_MM, eta=ETA)
+    light = here.reflectance_per_mm2
+    by_log = here.by_sigma_s_prime * SIGMA_S_PRIME_PER_MM
+    # deviations known, as those of readings with weights: coupling is free beside its prior
+    weight = 1.0 / ((FIBRE * light) ** 2 + DARK**2)
+    across = (weight * light * by_log).sum()
     fisher = np.array(
         [
-            [(weight * here * here).sum(), (weight * here * slope).sum()],
-            [(weight * here * slope).sum(), (weight * slope * slope).sum()],
+            [(weight * light * light).sum() + COUPLING**-2.0, across],
+            [across, (weight * by_log * by_log).sum()],
         ]
     )
     of_one = math.sqrt(np.linalg.inv(fisher)[1, 1])
-    return 2.0 * of_one * math.sqrt(2.0 / count) / math.log(RATIO)
+    of_one *= 0.5 * SIGMA_S_PRIME_PER_MM / (SIGMA_A_PER_MM + SIGMA_S_PRIME_PER_MM)
+    # sigma_tr is its mean times 1 - h / 2 cos 2 theta, h the log of the ratio
+    return 2.0 * of_one * math.sqrt(2.0 / count)
 
 
 def directions(*, toy: bool) -> StageBenchmark:
@@ -94,7 +103,7 @@ def directions(*, toy: bool) -> StageBenchmark:
                 memory=False,
             )
             h = np.log(_told(way, angle, profiles).ratio)
-            error = float(h.std(ddof=1) / h.mean())
+            error = float(np.sqrt(((h - math.log(RATIO)) ** 2).mean()))
             errors[way, count] = error
             spread = error / math.sqrt(2.0 * (cases - 1))
             points.append(
@@ -106,10 +115,10 @@ def directions(*, toy: bool) -> StageBenchmark:
     limits = () if toy else _direction_limits(errors, rng=rng)
     return StageBenchmark(
         "anisotropy",
-        "standard deviation of log ratio over its mean",
-        f"diffusion profiles drawn out {RATIO} times along one axis, coupling off by "
-        f"{100 * COUPLING:g} % and fibres by {100 * FIBRE:g} %; the ratio of sigma_tr fitted as if "
-        "tissue were isotropic is another than that of distances, so scatter is compared",
+        "error of the log of the ratio",
+        f"profiles of tissue whose sigma_tr is an ellipse of ratio {RATIO}, coupling off by "
+        f"{100 * COUPLING:g} % and fibres by {100 * FIBRE:g} %; truth and both ways by one "
+        "table, so that errors are those of noise alone",
         0.0,
         tuple(points),
         limits,
