@@ -26,9 +26,9 @@ the length of their path, and absorption is put in afterwards. What makes few ph
 
 Tracing takes 20 minutes of one busy core, the table another half minute. It is the same for any
 machine of IEEE arithmetic up to the last digits of its exp, log and sqrt: one thread, fixed seeds.
-A walk's photons, for each collection: 8 million for g = 0.8; 4 for 0.7 and 0.9; 1.6 for 0.95; 2.6 for
-0, 0.3 and 0.5. Standard errors (median over 0.3 to 10 transport lengths, sigma_a up to 0.3 sigma_s',
-from leaving batches out; twice that at 0.05 to 0.3):
+A walk's photons, for each collection: 8 million for g = 0.8; 4 for 0.7 and 0.9; 1.6 for 0.95; 2.6
+for 0, 0.3 and 0.5. Standard errors (median over 0.3 to 10 transport lengths, sigma_a up to 0.3
+sigma_s', from leaving batches out; about twice that at 0.05 to 0.3):
 
     g       0      0.3    0.5    0.7    0.8    0.9    0.95
     all     0.25   0.28   0.30   0.22   0.14   0.22   0.29 %
