@@ -15,6 +15,8 @@ from capture.rig import Fibre, Probe, Rig
 from model import spectra
 from rigsim.fibre_profile import FibrePaths, Fibres, SpectralStack, fibre_paths, fibre_profile
 from rigsim.probe_tissue import ProbedTissue, TissueError, TissueOptics
+from rigsim.profile_smoothing import smooth_profile
+from rigsim.white_fibre import ETA, G, WhiteFibre
 
 FloatArray = NDArray[np.float64]
 
@@ -100,7 +102,8 @@ class Profiles:
         if isinstance(run, Profile):
             return run
         made = run.profile(optics.amount)
-        return Profile(made.reflectance_per_mm2, made.stderr)
+        value, error = smooth_profile(made.radii_mm, made.batch_reflectance_per_mm2)
+        return Profile(value, error)
 
     def _run(self, optics: TissueOptics) -> FibrePaths | Profile:
         key = (optics.wavelength_nm, optics.stacks)
@@ -121,6 +124,9 @@ class Profiles:
                 stack, kind, photons=self.photons, rng=rng, absorber=optics.absorber,
                 threads=self.threads,
             )  # fmt: skip
+        stored = self._stored(optics, kind)
+        if stored is not None:
+            return stored
         if not any(layer.sigma_s_per_mm for one in optics.stacks for layer in one.layers):
             nothing = np.zeros((len(self.probe.fibres), 3))
             return Profile(nothing, nothing)
@@ -130,6 +136,28 @@ class Profiles:
         value, error = made.reflectance_per_mm2, made.stderr
         if value.ndim == 1:
             value, error = (np.repeat(a[:, None], 3, axis=1) for a in (value, error))
+        return Profile(value, error)
+
+    def _stored(self, optics: TissueOptics, kind: Fibres) -> Profile | None:
+        """Return the profile of a homogeneous medium that the stored photons tell of."""
+        table = WhiteFibre.load()
+        each = []
+        for stack in optics.stacks:
+            layer = stack.layers[0]
+            scattering = layer.sigma_s_per_mm * (1.0 - layer.g)
+            if (
+                len(stack.layers) > 1
+                or abs(layer.g - G) > 1e-12
+                or (layer.eta, stack.eta_above) != (ETA, 1.0)
+                or not table.holds(layer.sigma_a_per_mm, scattering, kind)
+            ):
+                return None
+            each.append(table.profile(layer.sigma_a_per_mm, scattering, kind))
+        weights = np.ones((1, 3))
+        if optics.wavelength_nm:
+            weights = self.spectral(optics).band_weights
+        # errors of similar media are of the same photons: they add up
+        value, error = (np.stack(part).T @ weights for part in zip(*each, strict=True))
         return Profile(value, error)
 
     def spectral(self, optics: TissueOptics) -> SpectralStack:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
+import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal, Protocol, TypeAlias
+from importlib import resources
+from typing import Any, Final, Literal, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rigsim import skin_layers
+from rigsim.pigment import MELANIN_PRESETS
 from rigsim.skin_layers import ANISOTROPY, ETA
 from rigsim.tissue_mc import Layer, LayerStack
 
@@ -18,6 +25,25 @@ Kind: TypeAlias = Literal["homogeneous", "layered", "anisotropic"]
 LEAST_SIGMA_A_PER_MM: Final = 1e-7
 """Absorption that a medium without any is traced with, 1/mm: else photons wander for ever. A path
 of 1 m loses a ten-thousandth."""
+
+BLOOD_AT_REST: Final[Mapping[str, float]] = {
+    "forehead": 0.009, "cheek": 0.009, "chin": 0.02, "abdomen": 0.008,
+}  # fmt: skip
+"""Volume fraction of blood in the dermis at rest, by site; of the whole dermis down to centimetres,
+so less than what colors the face, whose vessels lie under the epidermis."""
+BLOOD_KEPT: Final = 0.25
+"""Share of the blood at rest that no pressure presses out."""
+CAPILLARY_MBAR: Final = 30.0
+"""Pressure in capillaries that the head's works against, mbar: about 23 mm of mercury."""
+TOUCH_MBAR: Final = 3.0
+"""Pressure under a head that is laid on without suction, mbar."""
+
+WAVELENGTH_NM: Final = (440.0, 465.0, 490.0, 515.0, 540.0, 560.0, 580.0, 600.0, 620.0, 650.0)
+"""Wavelengths that skin is traced at, nm; between them reflectance is linear."""
+PHANTOM_NM: Final = tuple(float(nm) for nm in range(400, 701, 20))
+"""The same of the phantom."""
+AS_MADE: Final = (0.8, -0.7)
+"""By how many standard uncertainties the phantom is off its certificate: sigma_a, sigma_s'."""
 
 
 class TissueError(ValueError):
@@ -117,13 +143,157 @@ def half_space(
     )
 
 
+class SkinTissue:
+    """Skin of two layers: an epidermis with melanin on a dermis with blood.
+
+    Layers and coefficients are those of `rigsim.skin_layers`. Under a head the blood that is not
+    held back is pressed out: of the blood at rest there is left
+
+        BLOOD_KEPT + (1 - BLOOD_KEPT) exp(-pressure / CAPILLARY_MBAR),
+
+    with the suction as the pressure, for the rim's force is the suction times the cup's area and
+    the face's area is about that, and `TOUCH_MBAR` of a head that is only laid on.
+
+    Parameters
+    ----------
+    preset
+        One of `rigsim.pigment.MELANIN_PRESETS`.
+    seed
+        Of what differs between subjects and between the sites of one, >= 0.
+
+    Raises
+    ------
+    TissueError
+        The preset is unknown, or the seed negative.
+
+    Notes
+    -----
+    That pressure takes blood out of the skin under a probe is measured (Reif et al. 2008,
+    doi:10.1117/1.2870115; Landis 1930, doi:10.1152/ajplegacy.1930.93.2.353, for the pressure in
+    capillaries); the law's form is this project's choice, and so are the blood at rest and its
+    differences by site. They are such that preset III under 60 mbar comes within two of the
+    deviations of the means in table 2 of Weyrich et al. 2006, doi:10.1145/1141911.1141987.
+
+    Examples
+    --------
+    >>> skin = SkinTissue("III", seed=1)
+    >>> skin.blood("cheek", 60.0) < skin.blood("cheek", 0.0) < skin.blood("chin", 0.0)
+    True
+    """
+
+    def __init__(self, preset: str, *, seed: int = 0) -> None:
+        if preset not in MELANIN_PRESETS:
+            known = ", ".join(MELANIN_PRESETS)
+            raise TissueError(f"preset: got {preset!r}, expected one of {known}")
+        if seed < 0:
+            raise TissueError(f"seed: got {seed}, expected >= 0")
+        self.preset, self.seed = preset, seed
+        self._own = np.random.default_rng([seed, 0x736B]).standard_normal(2)
+
+    @property
+    def kind(self) -> Kind:
+        """Return "layered"."""
+        return "layered"
+
+    def melanin(self, site: str) -> float:
+        """Return the volume fraction of melanosomes in an epidermis of 0.25 mm."""
+        factor = math.exp(0.1 * float(self._own[0]) + 0.05 * self._drawn(site)[0])
+        return min(MELANIN_PRESETS[self.preset] * factor, skin_layers.MAX_C_M)
+
+    def epidermis_mm(self, site: str) -> float:
+        """Return the epidermis's thickness, mm."""
+        return skin_layers.EPIDERMIS_MM * math.exp(0.06 * self._drawn(site)[1])
+
+    def blood(self, site: str, suction_mbar: float) -> float:
+        """Return the volume fraction of blood in the dermis under the head."""
+        pressure = max(suction_mbar, TOUCH_MBAR)
+        left = BLOOD_KEPT + (1.0 - BLOOD_KEPT) * math.exp(-pressure / CAPILLARY_MBAR)
+        return left * self._rest(site)
+
+    def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
+        """Return the layers; the blood above what no pressure takes out is the absorber."""
+        del angle_deg
+        rest = self._rest(site)
+        least = BLOOD_KEPT * rest
+        melanin, thickness = self.melanin(site), self.epidermis_mm(site)
+        stacks, absorber = [], []
+        for wavelength in WAVELENGTH_NM:
+            stack = skin_layers.skin(wavelength, melanin, least)
+            top = dataclasses.replace(stack.layers[0], thickness_mm=thickness)
+            stacks.append(dataclasses.replace(stack, layers=(top, *stack.layers[1:])))
+            # more blood is less of the bloodless rest
+            dermis = skin_layers.blood_per_mm(wavelength) - skin_layers.baseline_per_mm(wavelength)
+            absorber.append([skin_layers.EPIDERMAL_BLOOD_SHARE * dermis, dermis])
+        amount = self.blood(site, suction_mbar) - least
+        return TissueOptics(WAVELENGTH_NM, tuple(stacks), np.array(absorber), amount)
+
+    def _rest(self, site: str) -> float:
+        if site not in BLOOD_AT_REST:
+            known = ", ".join(BLOOD_AT_REST)
+            raise TissueError(f"site: got {site!r}, expected one of {known}")
+        return BLOOD_AT_REST[site] * math.exp(
+            0.15 * float(self._own[1]) + 0.1 * self._drawn(site)[2]
+        )
+
+    def _drawn(self, site: str) -> tuple[float, float, float]:
+        rng = np.random.default_rng([self.seed, 0x7369, zlib.crc32(site.encode())])
+        a, b, c = rng.standard_normal(3)
+        return float(a), float(b), float(c)
+
+
+def phantom_certificate() -> Mapping[str, Any]:
+    """Return the certificate of `PHANTOM`, package data of schema ``skinrig.phantom/1``."""
+    path = resources.files("rigsim").joinpath("data", "phantom.json")
+    loaded: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return loaded
+
+
+def make_phantom(
+    certificate: Mapping[str, Any], *, deviations: tuple[float, float] = AS_MADE
+) -> HomogeneousTissue:
+    """Return a block as it was made, near its certificate.
+
+    Parameters
+    ----------
+    certificate
+        Of schema ``skinrig.phantom/1``.
+    deviations
+        By how many of its standard uncertainties sigma_a and sigma_s' are off.
+
+    Returns
+    -------
+    HomogeneousTissue
+        Spectral; between the certificate's wavelengths both coefficients follow a power.
+
+    Examples
+    --------
+    >>> paper = phantom_certificate()
+    >>> block = make_phantom(paper)
+    >>> block.g == paper["g"], block.eta == paper["eta"]
+    (True, True)
+    """
+    x, known = np.log(PHANTOM_NM), np.log(certificate["wavelength_nm"])
+    factor = [
+        1.0 + count * certificate["uncertainty"][name]
+        for count, name in zip(deviations, ("sigma_a", "sigma_s_prime"), strict=True)
+    ]
+    sigma_a, scattering = (
+        np.exp(np.interp(x, known, np.log(certificate[name]))) * share
+        for name, share in zip(("sigma_a_per_mm", "sigma_s_prime_per_mm"), factor, strict=True)
+    )
+    return HomogeneousTissue(
+        tuple(sigma_a.tolist()), tuple(scattering.tolist()), certificate["g"], certificate["eta"],
+        PHANTOM_NM,
+    )  # fmt: skip
+
+
 def parse_subject(text: str, *, seed: int = 0) -> ProbedTissue:
     """Return the tissue that a subject's text names.
 
     Parameters
     ----------
     text
-        "homogeneous:SIGMA_A,SIGMA_S_PRIME" or "homogeneous:SIGMA_A,SIGMA_S_PRIME,G", in 1/mm.
+        A preset of melanin, "I" to "VI", or "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm.
     seed
         Of what differs between subjects.
 
@@ -136,9 +306,12 @@ def parse_subject(text: str, *, seed: int = 0) -> ProbedTissue:
     --------
     >>> parse_subject("homogeneous:0.04,1.5").sigma_s_prime_per_mm
     1.5
+    >>> parse_subject("III", seed=2).preset
+    'III'
     """
-    del seed
     name, colon, rest = text.partition(":")
+    if not colon and name in MELANIN_PRESETS:
+        return SkinTissue(name, seed=seed)
     if name == "homogeneous" and colon:
         try:
             numbers = [float(word) for word in rest.split(",")]
@@ -147,4 +320,11 @@ def parse_subject(text: str, *, seed: int = 0) -> ProbedTissue:
         if len(numbers) in (2, 3):
             sigma_a, scattering, g = (*numbers, ANISOTROPY)[:3]
             return HomogeneousTissue(sigma_a, scattering, g)
-    raise TissueError(f"subject: got {text!r}, expected homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]")
+    raise TissueError(
+        f"subject: got {text!r}, expected one of {', '.join(MELANIN_PRESETS)} or "
+        "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G] in 1/mm"
+    )
+
+
+PHANTOM: Final = make_phantom(phantom_certificate())
+"""The solid block that sessions of target "phantom" are of, as made."""

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from model.skin import SkinAppearance
+from rigsim.homogeneous_fit import nearest_medium
+from rigsim.probe_profile import fibres_of
 from rigsim.probe_tissue import HomogeneousTissue
 
 if TYPE_CHECKING:
@@ -46,7 +48,9 @@ def appearance(scene: ProbeScene, probings: Sequence[Probing]) -> SkinAppearance
         No maps. ``parameters``: ``profiles``, one for each placement with ``site``, ``repeat``,
         ``angle_deg``, ``suction_mbar``, ``radius_mm``, ``reflectance_per_mm2`` and ``stderr``
         (fibres x 3, of the Monte Carlo), ``sigma_a_per_mm``, ``sigma_s_prime_per_mm``,
-        ``sigma_tr_per_mm`` (3 each) and ``kind``; ``spots_px``, ``gain``, ``crosstalk`` of the
+        ``sigma_tr_per_mm`` (3 each) and ``kind``; of tissue that is not homogeneous and gray the
+        nearest medium by `rigsim.homogeneous_fit`, with ``fit_residual`` and ``fit_fibres``;
+        ``spots_px``, ``gain``, ``crosstalk`` of the
         probe as built.
     """
     profiles = [_profile(scene, probing) for probing in probings]
@@ -75,11 +79,21 @@ def _profile(scene: ProbeScene, probing: Probing) -> dict[str, object]:
         "stderr": made.stderr.tolist(),
         "kind": tissue.kind,
     }
-    if not isinstance(tissue, HomogeneousTissue) or tissue.wavelength_nm:
-        raise NotImplementedError("the best homogeneous medium")
-    sigma_a = float(np.squeeze(tissue.sigma_a_per_mm))
-    scattering = float(np.squeeze(tissue.sigma_s_prime_per_mm))
-    out["sigma_a_per_mm"] = [sigma_a] * 3
-    out["sigma_s_prime_per_mm"] = [scattering] * 3
-    out["sigma_tr_per_mm"] = [math.sqrt(3.0 * sigma_a * (sigma_a + scattering))] * 3
+    if isinstance(tissue, HomogeneousTissue) and not tissue.wavelength_nm:
+        sigma_a = float(np.squeeze(tissue.sigma_a_per_mm))
+        scattering = float(np.squeeze(tissue.sigma_s_prime_per_mm))
+        sigma_tr = math.sqrt(3.0 * sigma_a * (sigma_a + scattering))
+        media = [(sigma_a, scattering, sigma_tr)] * 3
+    else:
+        kind = fibres_of(scene.profiles.probe)
+        fits = [nearest_medium(band, kind) for band in made.reflectance_per_mm2.T]
+        media = [(f.sigma_a_per_mm, f.sigma_s_prime_per_mm, f.sigma_tr_per_mm) for f in fits]
+        out["fit_residual"] = [fit.residual for fit in fits]
+        out["fit_fibres"] = [fit.fibres for fit in fits]
+    for name, values in zip(
+        ("sigma_a_per_mm", "sigma_s_prime_per_mm", "sigma_tr_per_mm"),
+        zip(*media, strict=True),
+        strict=True,
+    ):
+        out[name] = list(values)
     return out

@@ -1,0 +1,103 @@
+"""The nearest homogeneous medium, and what a probe's truth tells."""
+
+from __future__ import annotations
+
+import json
+import math
+from math import inf
+
+import numpy as np
+import pytest
+
+from capture.rig import load_rig
+from model import store
+from rigsim.fibre_profile import Fibres, fibre_profile
+from rigsim.homogeneous_fit import FAINTEST_PER_MM2, FitError, nearest_medium
+from rigsim.probe_tissue import PHANTOM, HomogeneousTissue
+from rigsim.probe_truth import Probing
+from rigsim.scenes.probe import ProbeScene
+from rigsim.tissue_mc import Layer, LayerStack
+from rigsim.white_fibre import WhiteFibre, WhiteFibreError
+
+RIG = load_rig("probe")
+FIBRES = Fibres(RIG.probe.radius_mm)
+FALSE_ALARM = 4.5  # standard deviations; of some 100 normal values one in 1500 runs exceeds it
+
+
+@pytest.mark.parametrize(("sigma_a", "scattering"), [(0.04, 1.5), (0.3, 2.0)])
+def test_the_stored_profile_is_that_of_photons_traced_for_it(sigma_a, scattering):
+    """28 z values; photons of their own with fibres of their own size against scaled points."""
+    layer = Layer(inf, sigma_a, scattering / 0.2, 0.8, 1.4)
+    traced = fibre_profile(
+        LayerStack((layer,)), radii_mm=FIBRES.radii_mm, photons=15_000,
+        rng=np.random.default_rng(7), batches=40,
+    )  # fmt: skip
+    value, error = WhiteFibre.load().profile(sigma_a, scattering, FIBRES)
+    z = (traced.reflectance_per_mm2 - value) / np.hypot(traced.stderr, error)
+    assert np.abs(z).max() < FALSE_ALARM
+    wrong, _ = WhiteFibre.load().profile(1.3 * sigma_a, scattering, FIBRES)
+    assert np.abs((traced.reflectance_per_mm2 - wrong) / traced.stderr).max() > FALSE_ALARM
+
+
+@pytest.mark.parametrize(
+    ("sigma_a", "scattering"), [(0.02, 1.0), (0.1, 2.5), (0.5, 3.0), (0.9, 2.4)]
+)
+def test_the_nearest_medium_of_a_homogeneous_one_is_itself(sigma_a, scattering):
+    """Photons' noise on every fibre; the fit's error is a fraction of one fibre's."""
+    value, _ = WhiteFibre.load().profile(sigma_a, scattering, FIBRES)
+    noise = 0.01
+    noisy = value * (1.0 + noise * np.random.default_rng(3).standard_normal(28))
+    fit = nearest_medium(noisy, FIBRES)
+    true = math.sqrt(3.0 * sigma_a * (sigma_a + scattering))
+    # 1 % noise in 10 or more fibres over at least 2 mm: sigma_tr to well under a per cent
+    assert fit.sigma_tr_per_mm == pytest.approx(true, rel=0.02)
+    assert abs(math.log(fit.sigma_a_per_mm / sigma_a)) < 0.1
+    assert fit.residual == pytest.approx(noise, rel=0.6)
+    assert fit.fibres == int((value >= FAINTEST_PER_MM2).sum())
+
+
+def test_the_fit_finds_out_a_wrong_medium():
+    value, _ = WhiteFibre.load().profile(0.1, 2.0, FIBRES)
+    other, _ = WhiteFibre.load().profile(0.11, 2.0, FIBRES)
+    told = nearest_medium(other, FIBRES)
+    assert abs(told.sigma_a_per_mm / 0.1 - 1.0) > 0.08
+    bent = nearest_medium(value * (1.0 + 0.3 * np.cos(np.arange(28.0))), FIBRES)
+    assert bent.residual > 0.15
+
+
+def test_what_cannot_be_fitted_is_refused():
+    with pytest.raises(FitError, match="bright"):
+        nearest_medium(np.full(28, 1e-9), FIBRES)
+    with pytest.raises(WhiteFibreError, match="inside the table"):
+        WhiteFibre.load().profile(0.1, 9.0, FIBRES)
+
+
+def test_the_truth_of_a_gray_medium_is_its_own(tmp_path):
+    scene = ProbeScene(RIG, HomogeneousTissue(0.1, 2.0), photons=1)
+    truth = scene.truth_appearance([Probing("cheek", 1, 22.5, 59.0)])
+    (entry,) = truth.parameters["profiles"]
+    assert (entry["site"], entry["repeat"], entry["angle_deg"]) == ("cheek", 1, 22.5)
+    assert entry["sigma_a_per_mm"] == [0.1] * 3
+    assert entry["sigma_tr_per_mm"] == pytest.approx([math.sqrt(0.3 * 2.1)] * 3)
+    reflectance, error = (np.array(entry[n]) for n in ("reflectance_per_mm2", "stderr"))
+    assert reflectance.shape == error.shape == (28, 3)
+    assert (error < 0.01 * reflectance).all()
+    # nothing but JSON values, and a folder without maps
+    assert store.read(store.write(tmp_path / "TRUTH", truth)).parameters == json.loads(
+        json.dumps(truth.parameters)
+    )
+    np.testing.assert_allclose(truth.parameters["spots_px"], scene.build.spot_px)
+    assert np.array(truth.parameters["crosstalk"]).shape == (28, 28)
+
+
+def test_the_truth_of_a_spectral_medium_lies_between_its_wavelengths():
+    (entry,) = (
+        ProbeScene(RIG, PHANTOM, photons=1)
+        .truth_appearance([Probing("phantom", 0, 0.0, 60.0)])
+        .parameters["profiles"]
+    )
+    sigma_a = np.array(PHANTOM.sigma_a_per_mm)
+    for value in entry["sigma_a_per_mm"]:
+        assert 0.98 * sigma_a.min() < value < 1.02 * sigma_a.max()
+    assert max(entry["fit_residual"]) < 0.02
+    assert entry["sigma_s_prime_per_mm"] == sorted(entry["sigma_s_prime_per_mm"])

@@ -1,0 +1,231 @@
+"""Make ``rigsim/data/white_fibre_mc.npz``: what fibres take from homogeneous half spaces.
+
+    python tools/make_white_fibre.py WORK [--photons-scale 1] [--threads 1] [--seed 20600]
+
+A few media of increasing absorption are traced with sigma_s' = 1 per mm; the paths of their photons
+give every larger absorption. Estimates of all media that can tell of an absorption are combined by
+their variances. Along the distance, the logarithm of each estimate is fitted by a cubic spline of
+few knots, so that light at neighbouring distances helps; leaving out one batch of photons at a time
+gives the standard errors. Runs are kept in WORK, so that an interrupted one goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import time
+from math import inf
+from pathlib import Path
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from rigsim.fibre_profile import Fibres, fibre_paths
+from rigsim.tissue_mc import Layer, LayerStack
+from rigsim.white_fibre import APERTURE, ETA, FILE, G, _disc, decay, distance_axis
+
+FloatArray = NDArray[np.float64]
+
+ROOT = Path(__file__).resolve().parents[1]
+BATCHES = 20
+NEAREST, FARTHEST = 0.03, 45.0
+LEAST = 1e-7  # absorption of the medium without any
+PHOTONS = {
+    0.0: (300_000, 800_000, 400_000),
+    0.003: (1_000_000, 2_000_000, 2_500_000),
+    0.012: (1_000_000, 4_000_000, 2_500_000),
+    0.04: (4_000_000, 8_000_000, 2_500_000),
+    0.12: (4_000_000, 8_000_000, 2_500_000),
+    0.35: (4_000_000, 8_000_000, 4_000_000),
+    1.0: (4_000_000, 8_000_000, 8_000_000),
+    3.0: (4_000_000, 8_000_000, 8_000_000),
+}
+"""Of the runs near, in the middle and far, by absorption: the darker, the cheaper."""
+BASES = tuple(PHOTONS)
+ABSORPTION = np.concatenate([
+    [0.0, 0.0003, 0.001], np.geomspace(0.003, 0.012, 5)[:-1], np.geomspace(0.012, 0.04, 5)[:-1],
+    np.geomspace(0.04, 0.12, 5)[:-1], np.geomspace(0.12, 0.35, 5)[:-1],
+    np.geomspace(0.35, 1.0, 5)[:-1], np.geomspace(1.0, 3.0, 5)[:-1], np.geomspace(3.0, 12.0, 6),
+])  # fmt: skip
+DISTANCE = np.geomspace(NEAREST, FARTHEST, 81)
+NOISIEST = 0.2  # relative error of a fibre that is still fitted
+LAST_LOG = 26.0  # photons are not asked for where less than exp(-this) of the light is left
+SPAN = 12.0  # a base tells of absorptions up to this multiple of its own
+
+
+def groups(base: float) -> list[tuple[FloatArray, float, int]]:
+    """Return distances, the width that they are averaged over, and photons, of each run."""
+    far = min(FARTHEST, LAST_LOG / max(float(decay(base)), 1e-9))
+    width = float(np.clip(0.4 / max(float(decay(base)), 1e-9), 0.05, 1.2))
+    edge = min(2.5, 0.5 * far)
+    near, middle, beyond = PHOTONS[base]
+    return [
+        (np.geomspace(NEAREST, 0.3, 30), 0.02, near),
+        (np.geomspace(0.3, edge, 30), min(0.1, width), middle),
+        (np.linspace(edge, far, 64), width, beyond),
+    ]
+
+
+def trace(work: Path, scale: float, threads: int, seed: int) -> list[dict[str, FloatArray]]:
+    """Return, of each base, distances, widths, and F by batch, distance and absorption."""
+    out = []
+    for number, base in enumerate(BASES):
+        path = work / f"base{number}.npz"
+        if not path.exists():
+            started = time.process_time()
+            told = ABSORPTION[(base <= ABSORPTION) & (max(base, 0.003) * SPAN >= ABSORPTION)]
+            radii, widths, values = [], [], []
+            for group, (radius, width, photons) in enumerate(groups(base)):
+                stack = LayerStack((Layer(inf, max(base, LEAST), 1.0 / (1.0 - G), G, ETA),))
+                paths = fibre_paths(
+                    stack,
+                    Fibres(tuple(radius.tolist()), width, 0.0, APERTURE, APERTURE),
+                    photons=round(scale * photons),
+                    rng=np.random.default_rng([seed, number, group]),
+                    batches=BATCHES,
+                    threads=threads,
+                )
+                more = np.maximum(told - max(base, LEAST), 0.0)
+                values.append(
+                    np.stack([paths.profile(m).batch_reflectance_per_mm2 for m in more], axis=-1)
+                )
+                radii.append(radius)
+                widths.append(np.full(len(radius), width))
+            np.savez(path, told=told, radius=np.concatenate(radii), width=np.concatenate(widths),
+                     value=np.concatenate(values, axis=1))  # fmt: skip
+            print(f"base {base}: {time.process_time() - started:.0f} s of CPU", flush=True)
+        with np.load(path) as stored:
+            out.append({name: stored[name] for name in stored.files})
+    return out
+
+
+class Curve:
+    """log(F d) + decay d as a spline of few knots, fitted to averages over discs."""
+
+    def __init__(self, radius: FloatArray, width: FloatArray, absorption: float) -> None:
+        points, self.share = _disc()
+        self.apart = np.hypot(
+            radius[:, None] + 0.5 * width[:, None] * points[:, 0],
+            0.5 * width[:, None] * points[:, 1],
+        )
+        self.radius, self.decay = radius, float(decay(absorption))
+        axis = distance_axis(radius)
+        count = max(3, round(4.0 * float(axis[-1] - axis[0])))
+        inner = np.linspace(axis[0], axis[-1], count + 1)[1:-1]
+        self.knots = np.concatenate([[axis[0]] * 4, inner, [axis[-1]] * 4])
+        self.at_radius, self.at_points = self.basis(radius), self.basis(self.apart)
+
+    def basis(self, distance: FloatArray) -> FloatArray:
+        """Return the values of the basis, constant beyond the ends."""
+        axis = np.clip(distance_axis(distance), self.knots[0], self.knots[-1])
+        flat = BSpline.design_matrix(axis.reshape(-1), self.knots, 3).toarray()
+        return np.asarray(flat.reshape(*distance.shape, -1))
+
+    def average(self, beta: FloatArray) -> FloatArray:
+        """Return F averaged over the discs."""
+        shape = self.at_points @ beta - np.log(self.apart) - self.decay * self.apart
+        return np.asarray(np.exp(shape) @ self.share)
+
+    def fit(self, value: FloatArray, error: FloatArray, beta: FloatArray | None) -> FloatArray:
+        """Return the coefficients by Gauss-Newton on relative residuals."""
+        if beta is None:
+            start = np.log(value * self.radius) + self.decay * self.radius
+            beta = np.linalg.lstsq(self.at_radius, start, rcond=None)[0]
+        for _ in range(8):
+            model = self.average(beta)
+            weight = model / error
+            step = np.linalg.lstsq(
+                self.at_radius * weight[:, None], (value - model) / error, rcond=None
+            )[0]
+            beta = beta + step
+        return beta
+
+
+def smoothed(
+    radius: FloatArray, width: FloatArray, value: FloatArray, absorption: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return the shape at DISTANCE, its standard error, and chi^2 per degree of freedom."""
+    order = np.argsort(radius, kind="stable")
+    radius, width, value = radius[order], width[order], value[:, order]
+    mean = value.mean(axis=0)
+    error = value.std(axis=0, ddof=1) / np.sqrt(BATCHES)
+    good = (mean > 0.0) & (error < NOISIEST * mean)
+    last = int(np.flatnonzero(good)[-1])
+    use = np.arange(len(radius)) <= last
+    use &= good
+    curve = Curve(radius[use], width[use], absorption)
+    # errors that follow the light, as single ones are themselves uncertain by a sixth
+    smooth = np.exp(np.convolve(np.pad(np.log(error[use] / mean[use]), 3, "edge"),
+                                np.ones(7) / 7.0, "valid")) * mean[use]  # fmt: skip
+    beta = curve.fit(mean[use], smooth, None)
+    chi2 = float((((mean[use] - curve.average(beta)) / smooth) ** 2).sum())
+    at = curve.basis(DISTANCE)
+    each = np.array([
+        at @ curve.fit(np.delete(value[:, use], b, axis=0).mean(axis=0), smooth, beta)
+        for b in range(BATCHES)
+    ])  # fmt: skip
+    spread = np.sqrt((BATCHES - 1.0) / BATCHES * ((each - each.mean(axis=0)) ** 2).sum(axis=0))
+    spread = np.where(radius[use][-1] < DISTANCE, inf, spread)
+    return at @ beta, spread, chi2 / (use.sum() - len(beta))
+
+
+def combine(runs: list[dict[str, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    """Return shape and relative error at all nodes."""
+    top = np.zeros((len(DISTANCE), len(ABSORPTION)))
+    weight = np.zeros_like(top)
+    for base, run in zip(BASES, runs, strict=True):
+        for column, a in enumerate(run["told"]):
+            shape, spread, chi2 = smoothed(
+                run["radius"], run["width"], run["value"][:, :, column], float(a)
+            )
+            print(f"base {base} a {a:.4f}: chi2/dof {chi2:.2f}, error at "
+                  + ", ".join(f"{d:.1f}: {100 * e:.2f} %" for d, e in
+                              zip(DISTANCE[::16], spread[::16], strict=True)))  # fmt: skip
+            node = int(np.argmin(abs(ABSORPTION - a)))
+            share = 1.0 / np.maximum(spread, 1e-4) ** 2
+            top[:, node] += share * shape
+            weight[:, node] += share
+    known = weight > 0.0
+    shape = np.where(known, top / np.where(known, weight, 1.0), 0.0)
+    error = np.where(known, 1.0 / np.sqrt(np.where(known, weight, 1.0)), 1.0)
+    for column in range(len(ABSORPTION)):
+        last = int(np.flatnonzero(known[:, column])[-1])
+        # beyond what photons reached: on with the last slope over the distance
+        slope = (shape[last, column] - shape[last - 4, column]) / (
+            DISTANCE[last] - DISTANCE[last - 4]
+        )
+        shape[last + 1 :, column] = shape[last, column] + slope * (
+            DISTANCE[last + 1 :] - DISTANCE[last]
+        )
+    return shape, error
+
+
+def main() -> None:
+    """Trace, fit, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--photons-scale", type=float, default=1.0)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=20600)
+    asked = parser.parse_args()
+    asked.work.mkdir(parents=True, exist_ok=True)
+    runs = trace(asked.work, asked.photons_scale, asked.threads, asked.seed)
+    shape, error = combine(runs)
+    recipe = {
+        "g": G, "eta": ETA, "numerical_aperture": APERTURE, "bases": BASES, "batches": BATCHES,
+        "photons": [[round(asked.photons_scale * n) for _, _, n in groups(b)] for b in BASES],
+        "seed": asked.seed, "numpy": np.__version__, "numba": numba.__version__,
+        "python": platform.python_version(),
+    }  # fmt: skip
+    np.savez_compressed(
+        ROOT / "rigsim" / "data" / FILE,
+        distance=DISTANCE, absorption=ABSORPTION, shape=shape.astype(np.float32),
+        relative_error=error.astype(np.float32), recipe=json.dumps(recipe),
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
