@@ -101,10 +101,11 @@ def _cubic(x, count, w, d):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=_FAST, error_model="numpy")
-def _tabled(theta, axes, grid, w, m, jac):  # type: ignore[no-untyped-def]
-    """Fill reflectance and derivatives by all parameters from logs (sigma_s', root, g, fibre).
+def _tabled(theta, radius, axes, grid, w, m, jac):  # type: ignore[no-untyped-def]
+    """Fill reflectance and derivatives by all parameters from a grid (sigma_s', root, g, fibre).
 
-    The second axis is log(1 + 10 sqrt(sigma_a/sigma_s')); axes = first node and spacing of each.
+    It holds log R + sigma_tr r. The second axis is log(1 + 10 sqrt(sigma_a/sigma_s')); axes = first
+    node and spacing of each.
     """
     n_s, n_u, n_g, fibres = grid.shape
     root = 10.0 * math.exp(0.5 * (theta[0] - theta[1]))
@@ -135,12 +136,16 @@ def _tabled(theta, axes, grid, w, m, jac):  # type: ignore[no-untyped-def]
                     jac[0, f] += g_u * row[f]
                     jac[1, f] += g_s * row[f]
                     jac[3, f] += g_g * row[f]
+    a, s = math.exp(theta[0]), math.exp(theta[1])
+    t = a + s
+    k = math.sqrt(3.0 * a * t)
+    k_a, k_s = k * (a + t) / (2.0 * t), k * s / (2.0 * t)
     for f in range(fibres):
-        value = math.exp(max(m[f] + theta[2], -660.0))
+        value = math.exp(max(m[f] + theta[2] - k * radius[f], -660.0))
         by_a = jac[0, f] * slope
         m[f] = value
-        jac[0, f] = value * by_a
-        jac[1, f] = value * (jac[1, f] / axes[0, 1] - by_a)
+        jac[0, f] = value * (by_a - k_a * radius[f])
+        jac[1, f] = value * (jac[1, f] / axes[0, 1] - by_a - k_s * radius[f])
         jac[3, f] = value * jac[3, f] / axes[2, 1]
 
 
@@ -148,7 +153,7 @@ def _tabled(theta, axes, grid, w, m, jac):  # type: ignore[no-untyped-def]
 def evaluate_one(kind, theta, radius, constants, axes, grid, w, m, jac):  # type: ignore[no-untyped-def]
     """Fill one profile and its derivatives by all parameters."""
     if kind == TABLE:
-        _tabled(theta, axes, grid, w, m, jac)
+        _tabled(theta, radius, axes, grid, w, m, jac)
     else:
         _closed(theta, radius, constants, m, jac)
     jac[2, :] = m

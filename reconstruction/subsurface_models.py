@@ -226,7 +226,7 @@ def _tabled(
     g: float,
     g_error: float,
 ) -> ProfileModel:
-    """Lay the photon table out as logarithms over (sigma_s', root, g) for each fibre."""
+    """Lay the photon table out as log R + sigma_tr r over (sigma_s', root, g)."""
     radius_mm = np.frombuffer(radius, np.float64)
     held = photon_table.asymmetries()
     low, high = max(g - 3.0 * g_error, held[0]), min(g + 3.0 * g_error, held[-1])
@@ -239,12 +239,13 @@ def _tabled(
     s = np.exp(logs)[:, None]
     a = s * (0.1 * np.expm1(roots)) ** 2
     grid = np.empty((*a.shape, count, radius_mm.size))
+    decay = np.sqrt(3.0 * a * (a + s))[..., None] * radius_mm  # makes what is left smooth
     for n, each in enumerate(asymmetries):
         profile = photon_table.reflectance(
             radius_mm, a[..., None], s[..., None], eta=eta, g=float(each), collection=collection,
             core_mm=core_mm, source_core_mm=source_core_mm,
         )  # fmt: skip
-        grid[:, :, n] = np.log(np.maximum(profile, 1e-290))
+        grid[:, :, n] = np.log(np.maximum(profile, 1e-290)) + decay
     bounds = np.log(np.array([SIGMA_A_LIMITS, TABLE_SIGMA_S, SCALE_LIMITS, (1.0, 1.0)]))
     bounds[3] = low, high
     axes = np.stack([np.array([logs[0], roots[0], low]), steps], axis=1)

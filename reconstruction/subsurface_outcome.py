@@ -186,7 +186,7 @@ def judged(
     dof = np.maximum(fibres - 2, 0)
     p_value = np.where(dof > 0, gammaincc(np.maximum(dof, 1) / 2.0, batch.chi2 / 2.0), 1.0)
     reduced = batch.chi2 / np.maximum(dof, 1)
-    misfit = p_value < (0.0 if batch.logarithmic else MISFIT_CHANCE)
+    misfit: Bools = np.less(p_value, 0.0 if batch.logarithmic else MISFIT_CHANCE)
     inflation = np.where(
         (reduced > 1.0) & np.logical_or(misfit, batch.logarithmic), np.sqrt(reduced), 1.0
     )
@@ -196,7 +196,7 @@ def judged(
         widening = inflation**2
     logs = batch.covariance[:, :2, :2] * widening[:, None, None]
     slope = 0.5 * np.stack([1.0 + a / (a + s), s / (a + s)], axis=1)  # of log sigma_tr
-    told = np.isfinite(logs).all(axis=(1, 2))
+    told = np.asarray(np.isfinite(logs).all(axis=(1, 2)))
     safe = np.where(told[:, None, None], logs, 0.0)
     log_variance = np.einsum("ni,nij,nj->n", slope, safe, slope)
     log_stderr = np.where(told, np.sqrt(np.maximum(log_variance, 0.0) + bias**2), math.inf)
