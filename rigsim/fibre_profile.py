@@ -45,6 +45,9 @@ PILOTS: Final = 3
 WINDOW_CELLS: Final = 256
 SMOOTHED_CELLS: Final = 8  # to each side
 ENOUGH_TRACKS: Final = 50.0
+MOST_TRACKS: Final = 30.0
+"""Collisions at a distance, as a multiple of the most anywhere without splitting: where nearly all
+light is too deep to be scored, splitting it further is not worth its time."""
 KERNEL_NODES: Final = 400
 SCORED_DEPTH: Final = 1.5
 """Optical depth above which every collision is scored; below, fewer and fewer with more weight."""
@@ -408,7 +411,7 @@ class _Plan:
         fibres = len(self.kernels)
         tally = np.zeros(fibres)
         histogram = np.zeros((fibres, _path_nodes()) if self.counts_paths else (0, 0))
-        visited = np.zeros(len(window))
+        visited = np.zeros((2, len(window)))
         walk_to_fibres(
             self.table, self.fibres.source_numerical_aperture, self.fibres.numerical_aperture,
             self.kernels, self.starts, self.counts, window, self.chances,
@@ -422,30 +425,40 @@ def _window_from(
     visited: FloatArray, used: FloatArray, reach_mm: float, farthest_mm: float
 ) -> FloatArray:
     """Return target weights in proportion to how much weight passes each distance."""
-    s = (np.arange(len(visited)) + 0.5) * reach_mm / WINDOW_CELLS
+    s = (np.arange(len(used)) + 0.5) * reach_mm / WINDOW_CELLS
     kernel = np.ones(2 * SMOOTHED_CELLS + 1)
-    around = np.convolve(np.ones(len(visited) - 1), kernel, "same")
-    smooth = np.convolve(visited[:-1], kernel, "same") / around
-    tracks = np.convolve(visited[:-1] / used[:-1], kernel, "same")
+    around = np.convolve(np.ones(WINDOW_CELLS), kernel, "same")
+    scored, every = (np.convolve(row[:-1], kernel, "same") / around for row in visited)
+    tracks = [np.convolve(row[:-1] / used[:-1], kernel, "same") for row in visited]
     edge = min(int(np.searchsorted(s, farthest_mm)), WINDOW_CELLS - 1)
-    enough = tracks[: edge + 1] > ENOUGH_TRACKS
-    reached = len(enough) if enough.all() else int(np.argmin(enough))
-    window = np.ones(len(visited))
-    if reached >= 2:
-        peak = int(np.argmax(smooth[:reached]))
-        window[peak:reached] = smooth[peak:reached] / smooth[peak]
-        # Where too few came to tell: on as it fell before, less steeply, as a fall that chance
-        # made too steep would have photons split for minutes.
-        before = max(peak, reached - 2 * len(kernel))
-        if reached <= edge and before < reached - 1:
-            fall = np.log(window[reached - 1] / window[before]) / (reached - 1 - before)
-            further = np.arange(1, edge + 2 - reached)
-            window[reached : edge + 1] = window[reached - 1] * np.exp(
-                0.7 * min(fall, 0.0) * further
-            )
+    wanted, peak = _falling(scored[: edge + 1], tracks[0][: edge + 1])
+    least, _ = _falling(every[: edge + 1], tracks[1][: edge + 1])
+    window = np.ones(len(used))
+    window[peak : edge + 1] = np.maximum(wanted, least / MOST_TRACKS)[peak:]
     # Beyond the fibres light comes back the less the farther it is.
     window[edge:] = window[edge] * (s[edge:] / s[edge]) ** 3
     return window
+
+
+def _falling(weight: FloatArray, tracks: FloatArray) -> tuple[FloatArray, int]:
+    """Return weights by distance over their largest, and where that is.
+
+    From where too few tracks came to tell, they go on as they fell before, less steeply, as a fall
+    that chance made too steep would have photons split for minutes.
+    """
+    enough = tracks > ENOUGH_TRACKS
+    reached = len(enough) if enough.all() else int(np.argmin(enough))
+    if reached < 2:
+        return np.ones(len(weight)), 0
+    peak = int(np.argmax(weight[:reached]))
+    relative = weight / weight[peak]
+    before = max(peak, reached - 4 * SMOOTHED_CELLS)
+    fall = 0.0
+    if before < reached - 1:
+        fall = np.log(relative[reached - 1] / relative[before]) / (reached - 1 - before)
+    further = np.arange(1, len(weight) + 1 - reached)
+    relative[reached:] = relative[reached - 1] * np.exp(0.7 * min(fall, 0.0) * further)
+    return relative, peak
 
 
 def _transport_depth_mm(table: FloatArray) -> float:

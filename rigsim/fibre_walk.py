@@ -56,7 +56,7 @@ def _on_fibres(rho, value, path, kernels, starts, counts, log_step, path_scale, 
 @njit(
     "void(float64[:,::1], float64, float64, float64[:,::1], int64[::1], int64[::1], float64[::1],"
     " float64[::1], float64, float64, float64, float64, float64, int64, uint64[::1], float64[::1],"
-    " float64[:,::1], float64[::1])",
+    " float64[:,::1], float64[:,::1])",
     cache=True,
     nogil=True,
     error_model="numpy",
@@ -103,7 +103,8 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
         The same by the path in the counted absorber, each score shared by the two nodes around it
         so that its mean path is kept. float64, shape (F, nodes) or (0, 0), added to.
     visited
-        Weight of scored collisions by distance from the entry, float64, shape (cells,), added to.
+        Weight of scored collisions by distance from the entry; of all, in units of the weight kept
+        at their depth. float64, shape (2, cells), added to.
     """
     s0, s1, s2, s3 = seed[0], seed[1], seed[2], seed[3]
     last = table.shape[0] - 1
@@ -151,7 +152,6 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
 
                     level = int(z * chances_per_mm)
                     chance = chances[level] if level < levels else 0.0
-                    visited[cell] += weight * chance
                     if chance > 0.0:
                         s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
                         if u <= chance:
@@ -196,7 +196,10 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                                 starts, counts, log_step, path_scale, tally, histogram,
                             )  # fmt: skip
 
-                    target = window[cell] * min(1.0 + z * deeper_per_mm, DEEPEST)
+                    deeper = min(1.0 + z * deeper_per_mm, DEEPEST)
+                    target = window[cell] * deeper
+                    visited[0, cell] += weight * chance
+                    visited[1, cell] += weight / deeper
                     if weight < 0.5 * target:
                         s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
                         if u * target > weight:

@@ -1,9 +1,11 @@
 """Profiles seen by fibres against the all-angle walk, each other, closed forms and energy."""
 
+import time
 from math import inf
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from rigsim import fibre_profile as profiles
 from rigsim.fibre_profile import Fibres, SpectralStack, fibre_paths, fibre_profile
@@ -165,3 +167,147 @@ def test_shares_of_rings_are_those_of_random_points_in_the_cores(detector_mm, so
     found = np.histogram(apart, edges)[0]
     # Poisson counts in 20 rings: |z| < 4.5 alarms falsely with a chance below 2e-4.
     assert np.abs((found - expected) / np.sqrt(np.maximum(expected, 1.0))).max() < 4.5
+
+
+def all_angle_z(layer, *, photons=40_000, radii_mm=(0.0, 0.3, 1.0), core_mm=0.2):
+    """Standard errors between fibres that take all angles and the exitance of the plain walk."""
+    stack = LayerStack((layer,))
+    seen = fibre_profile(
+        stack, radii_mm=radii_mm, photons=photons, rng=np.random.default_rng(11), core_mm=core_mm,
+        numerical_aperture=1.0, source_numerical_aperture=0.0, threads=2,
+    )  # fmt: skip
+    mean, error = exit_profile(
+        stack, radii_mm, core_mm=core_mm, source_core_mm=0.2, photons=4 * photons, seed=12
+    )
+    # Forward peaks of g = .99 make rare large scores.
+    known = 0.5 if layer.g > 0.9 else 0.25
+    assert np.all(seen.stderr < known * seen.reflectance_per_mm2)
+    return np.abs((seen.reflectance_per_mm2 - mean) / np.hypot(seen.stderr, error)).max()
+
+
+@pytest.mark.parametrize(
+    "layer",
+    [
+        Layer(inf, 0.1, 7.5, 0.8, 1.0),
+        Layer(inf, 0.1, 7.5, 0.8, 1.6),
+        Layer(inf, 0.5, 1.0, -0.9, 1.4),
+        Layer(inf, 15.0, 7.5, 0.8, 1.4),
+    ],
+    ids=["eta 1", "eta 1.6", "g -.9", "sigma_a = 10 sigma_s'"],
+)
+def test_extreme_media_agree_with_the_plain_walk(layer):
+    # |z| < 4.5 for three radii: false alarms below 8e-4 (t, 19 dof). Fibres touch the source.
+    dark = layer.sigma_a_per_mm > 1.0 or layer.g < 0.0
+    radii = (0.0, 0.2, 0.3) if dark else (0.0, 0.2, 1.0)
+    assert all_angle_z(layer, radii_mm=radii) < 4.5
+
+
+def test_vanishing_absorption_ends_and_changes_nothing_near_the_source():
+    """A half-space without absorption keeps photons for ever; far ones end by roulette here."""
+    runs = [
+        fibre_profile(
+            LayerStack((Layer(inf, sigma_a, 7.5, 0.8, 1.4),)), radii_mm=(0.3, 2.0, 7.0),
+            photons=8000, rng=np.random.default_rng(13 + k), threads=2,
+        )
+        for k, sigma_a in enumerate((1e-5, 1e-12))
+    ]  # fmt: skip
+    both = np.hypot(runs[0].stderr, runs[1].stderr)
+    difference = runs[1].reflectance_per_mm2 - runs[0].reflectance_per_mm2
+    assert np.abs(difference / both).max() < 4.5
+    assert np.all(both < 0.3 * runs[0].reflectance_per_mm2)
+
+
+def test_tissue_that_does_not_scatter_sends_nothing_back():
+    clear = LayerStack((Layer(inf, 0.1, 0.0, 0.8, 1.4),))
+    run = fibre_profile(clear, radii_mm=(0.0, 0.3), photons=1000, rng=np.random.default_rng(15))
+    np.testing.assert_array_equal(run.reflectance_per_mm2, 0.0)
+    np.testing.assert_array_equal(run.stderr, 0.0)
+
+
+def test_little_scattering_goes_as_its_amount():
+    """Single scattering: half the scatterers, half the light (and 1 % of double scattering)."""
+    one, half = (
+        fibre_profile(
+            LayerStack((Layer(inf, 1.0, sigma_s, 0.0, 1.0),)), radii_mm=(0.3,), photons=200_000,
+            rng=np.random.default_rng(16), threads=2,
+        )
+        for sigma_s in (2e-3, 1e-3)
+    )  # fmt: skip
+    ratio = one.reflectance_per_mm2[0] / half.reflectance_per_mm2[0]
+    error = ratio * np.hypot(
+        one.stderr[0] / one.reflectance_per_mm2[0], half.stderr[0] / half.reflectance_per_mm2[0]
+    )
+    assert abs(ratio - 2.0) < 4.5 * error + 0.02
+    assert error < 0.2
+
+
+def test_absorbing_film_of_a_micrometre_weakens_light_twice():
+    """Index matched, parallel light in and a narrow cone out: exp(-2 sigma_a d), nothing else."""
+    tissue = Layer(inf, 0.1, 7.5, 0.8, 1.0)
+    runs = [
+        fibre_profile(
+            LayerStack(layers), radii_mm=(0.3, 1.3), photons=40_000, threads=2,
+            rng=np.random.default_rng(seed), numerical_aperture=0.05,
+            source_numerical_aperture=0.0,
+        )
+        for seed, layers in ((17, (tissue,)), (18, (Layer(0.001, 500.0, 0.0, 0.0, 1.0), tissue)))
+    ]  # fmt: skip
+    ratio = runs[1].reflectance_per_mm2 / runs[0].reflectance_per_mm2
+    error = ratio * np.hypot(*(run.stderr / run.reflectance_per_mm2 for run in runs))
+    assert np.abs((ratio - np.exp(-1.0)) / error).max() < 4.5
+    assert error.max() < 0.1
+
+
+def test_film_of_tissue_on_the_same_tissue_changes_nothing():
+    tissue = Layer(inf, 0.1, 7.5, 0.8, 1.4)
+    runs = [
+        fibre_profile(
+            LayerStack(layers), radii_mm=RADII_MM, photons=30_000, threads=2,
+            rng=np.random.default_rng(seed),
+        )
+        for seed, layers in ((19, (tissue,)), (20, (Layer(0.001, 0.1, 7.5, 0.8, 1.4), tissue)))
+    ]  # fmt: skip
+    difference = runs[1].reflectance_per_mm2 - runs[0].reflectance_per_mm2
+    assert np.abs(difference / np.hypot(runs[0].stderr, runs[1].stderr)).max() < 4.5
+
+
+@pytest.mark.parametrize("stack", [RED, LAYERED])
+def test_light_goes_both_ways_alike(stack):
+    """Helmholtz: a wide source with a wide cone and a thin fibre, or the fibres exchanged."""
+    wide, thin = (0.4, 0.9), (0.1, 0.2)
+    runs = [
+        fibre_profile(
+            stack, radii_mm=(0.3, 0.8), photons=80_000, rng=np.random.default_rng(21 + k),
+            core_mm=detector[0], numerical_aperture=detector[1], source_core_mm=source[0],
+            source_numerical_aperture=source[1], threads=2,
+        )
+        for k, (source, detector) in enumerate(((wide, thin), (thin, wide)))
+    ]  # fmt: skip
+    difference = runs[1].reflectance_per_mm2 - runs[0].reflectance_per_mm2
+    error = np.hypot(runs[0].stderr, runs[1].stderr)
+    assert np.abs(difference / error).max() < 4.5
+    assert np.all(error < 0.05 * runs[0].reflectance_per_mm2)
+
+
+@pytest.mark.long
+def test_standard_error_is_the_spread_of_repeated_profiles():
+    rng = np.random.default_rng(23)
+    runs = [fibre_profile(RED, radii_mm=(0.3, 3.3), photons=2000, rng=rng) for _ in range(60)]
+    spread = np.var([run.reflectance_per_mm2 for run in runs], axis=0, ddof=1)
+    stated = np.mean([run.stderr**2 for run in runs], axis=0)
+    # Near normal batches would follow F(59, 60 x 19); tails are heavier, so this alarms at 1e-3.
+    low, high = stats.f.ppf([5e-5, 1.0 - 5e-5], 59, 60 * 19)
+    assert np.all((low < spread / stated) & (spread / stated < high))
+
+
+def test_one_percent_at_every_fibre_within_seven_millimetres_takes_half_a_minute():
+    """Red tissue (sigma_a .04, sigma_s' 1.5), on 2 cores; a margin of 8 was measured."""
+    radii = 0.3 + 0.25 * np.arange(27)
+    red = LayerStack((Layer(inf, 0.04, 7.5, 0.8, 1.4),))
+    begin = time.process_time()
+    run = fibre_profile(
+        red, radii_mm=radii, photons=20_000, rng=np.random.default_rng(24), batches=100
+    )
+    seconds = time.process_time() - begin
+    worst = (run.stderr / run.reflectance_per_mm2).max()
+    assert 0.5 * seconds * (worst / 0.01) ** 2 < 30.0
