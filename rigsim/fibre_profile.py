@@ -298,7 +298,7 @@ def fibre_paths(
     if not shares.max() > 0.0:
         raise TransportError("absorber: expected a share > 0 in some layer, got none")
     each, traced = _trace(stack, fibres, photons, rng, batches, threads, shares / shares.max())
-    nodes = PATH_SCALE_MM * np.expm1(PATH_STEP * np.arange(_path_nodes())) / shares.max()
+    nodes = PATH_SCALE_MM * np.expm1(PATH_STEP * np.arange(_path_nodes())) * shares.max()
     return FibrePaths(np.array(fibres.radii_mm), nodes, each.astype(np.float32), traced)
 
 
