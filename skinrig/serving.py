@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from capture.rig import Probe, Rig, load_rig
-from skinrig import simulating_dome, simulating_flash, simulating_gradient, simulating_probe
+from skinrig import simulating_dome, simulating_flash, simulating_gradient
 from skinrig.simulation import SIZES, SimulationError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from rigsim.scenes.probe import ProbeScene
+    from rigsim.suction import HeadState
 
 GRADIENT_WIDTH_PX = 96
 """Pixels across the served camera of the gradient rig."""
+PROBE_PHOTONS = 20_000
+"""Photons a site of the served probe: some seconds each, and a few per cent of noise, more in the
+farthest fibres; `skinrig simulate probe` has its truth from ten times as many and more."""
 
 
 def serve_rig(
@@ -29,8 +39,8 @@ def serve_rig(
 
     A dome is served with all its lights and cameras at either size: who captures from it uses the
     rig file, which must fit. Skin in the gradient sphere is served small only: its pictures are
-    made while its caliper waits for the host. The fibre probe's pictures have one
-    size.
+    made while its caliper waits for the host. The fibre probe lies on skin, or on the
+    phantom where it is told so; its pictures have one size.
 
     Parameters
     ----------
@@ -65,7 +75,7 @@ def serve_rig(
         # what all states share is made before anybody asks, so that no client waits for it
         scene.lighting()
     elif rig.probe is not None:
-        scene = _probe_scene(rig, rig.probe, subject, seed, size)
+        scene = _probe_scene(rig, rig.probe, subject, seed)
     else:
         dome = "dome" in rig.boxes
         width = (simulating_dome if dome else simulating_flash).WIDTHS_PX[size]
@@ -108,13 +118,32 @@ def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
     return DomeScene(rig, person, dome=build(rig, seed=seed), seed=seed)
 
 
-def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int, size: str) -> Any:
-    from capture.plan.probe import SITES
+def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
+    from capture.plan.probe import PHANTOM, SITES
+    from rigsim import probe_tissue
+    from rigsim.scenes.probe import ProbeScene
     from rigsim.suction import HeadState
 
-    scene = simulating_probe.make_scene(rig, subject=subject, seed=seed, size=size)
+    try:
+        tissue = probe_tissue.parse_subject(subject, seed=seed)
+    except probe_tissue.TissueError as error:
+        raise SimulationError(str(error)) from error
+    skin = ProbeScene(rig, tissue, seed=seed, photons=PROBE_PHOTONS)
+    block = ProbeScene(rig, probe_tissue.PHANTOM, seed=seed, photons=PROBE_PHOTONS)
     # the photons of the usual places are traced before anybody asks: the box holds the head on the
     # skin meanwhile, and waits for its host for some seconds only
-    for site in SITES:
+    for site in (*SITES, PHANTOM):
+        scene = block if site == PHANTOM else skin
         scene.fibre_light(HeadState(site, 0.0, True, probe.suction_mbar, probe.camera_c))
-    return scene
+    return _SkinAndBlock(skin, block, PHANTOM)
+
+
+class _SkinAndBlock:
+    """Somebody's skin, and the block of known optics where the head is told to be on it."""
+
+    def __init__(self, skin: ProbeScene, block: ProbeScene, block_site: str) -> None:
+        self._skin, self._block, self._block_site = skin, block, block_site
+
+    def exposure(self, view_name: str, *, head: HeadState, **exposed: Any) -> NDArray[np.uint16]:
+        scene = self._block if head.site == self._block_site else self._skin
+        return scene.exposure(view_name, head=head, **exposed)
