@@ -126,15 +126,12 @@ def make_scene(
     SimulationError
         For a subject that is none.
     """
-    from rigsim import probe_tissue
+    from rigsim.probe_tissue import PHANTOM as BLOCK
     from rigsim.probe_tissue import TissueError, parse_subject
     from rigsim.scenes.probe import ProbeScene
 
-    block: Any = getattr(probe_tissue, "PHANTOM", None)
-    if target == "phantom" and block is None:
-        raise SimulationError(f"target: {target!r} is not simulated yet")
     try:
-        tissue = block if target == "phantom" else parse_subject(subject, seed=seed)
+        tissue = BLOCK if target == "phantom" else parse_subject(subject, seed=seed)
     except TissueError as error:
         raise SimulationError(str(error)) from error
     return ProbeScene(rig, tissue, seed=seed, photons=PHOTONS[size])

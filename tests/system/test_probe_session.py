@@ -126,6 +126,21 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
     assert hashes[0] == hashes[1]
 
 
+@pytest.mark.long
+@pytest.mark.usefixtures("small")
+def test_the_phantom_is_captured_with_each_fibre_uncovered(capsys, tmp_path):
+    out = tmp_path / "session-phantom"
+    assert main(simulate(out, "--target", "phantom")) == errors.DONE
+    printed = capsys.readouterr()
+    assert f"skinrig calibrate fibre {out}" in printed.out + printed.err
+    session = Session.open(out)
+    assert verify(out).ok
+    assert {record.index["fibre"] for record in session.frames("mask")} == set(range(28))
+    assert {len(session.frames("mask", fibre=n)) for n in range(28)} <= {1, 2}
+    (profile,) = store.read(tmp_path / "truth-phantom").parameters["profiles"]
+    assert profile["site"] == "phantom"
+
+
 class Killed(BaseException):
     """The host is gone."""
 
