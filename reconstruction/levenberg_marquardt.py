@@ -20,6 +20,8 @@ from reconstruction.subsurface_kernels import decay, evaluate_one
 
 MOST_STEP = 1.5
 """Largest change of a logarithm in one step."""
+CLOSE = 1e-5
+"""A step of the logarithms after which the next would change nothing that matters."""
 _FAST = {"contract", "reassoc", "nsz"}
 _LOWEST = 1e-290
 
@@ -124,7 +126,7 @@ def _fit_share(  # type: ignore[no-untyped-def]
             model_error[0] > 0.0 or model_error[1] > 0.0 or model_error[2] > 0.0
         )
         for round_ in range(rounds):
-            close = max(1e-6, 1e-2 * 0.01**round_) if changing else 1e-6
+            close = max(CLOSE, 1e-2 * 0.01**round_) if changing else CLOSE
             extinction = math.exp(now[0]) + math.exp(now[1])
             base = model_error[0] ** 2 + (model_error[2] * math.exp(now[0] - now[1])) ** 2
             for f in range(fibres):
@@ -138,7 +140,7 @@ def _fit_share(  # type: ignore[no-untyped-def]
                 weight[f] = 1.0 / v
             first = True
             settled = False
-            damping = 1e-3
+            damping = 1e-4
             best = _misfit(y[n], m, weight, logarithmic)
             for r in range(count):
                 p = active[r]
@@ -209,7 +211,7 @@ def _fit_share(  # type: ignore[no-untyped-def]
                     if damping > 1e10:
                         settled = longest < 1e-6
                         break
-            if not changing or (first and close <= 1e-6):
+            if not changing or (first and close <= CLOSE):
                 break
         steps[n] = done if settled else -done
         chi2[n] = best
