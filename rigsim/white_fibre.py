@@ -130,7 +130,7 @@ class WhiteFibre:
         Examples
         --------
         >>> r_f, error = WhiteFibre.load().profile(0.04, 1.5, Fibres((0.3, 3.3)))
-        >>> bool(r_f[0] > 50.0 * r_f[1] > 0.0), bool((error < 0.01 * r_f).all())
+        >>> bool(r_f[0] > 20.0 * r_f[1] > 0.0), bool((error < 0.01 * r_f).all())
         (True, True)
         """
         if not self.holds(sigma_a_per_mm, sigma_s_prime_per_mm, fibres):

@@ -1,0 +1,141 @@
+"""Tissues under the probe by site and suction."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from capture.calibration.phantom import read_certificate
+from capture.rig import load_rig
+from rigsim import probe_tissue, skin_layers
+from rigsim.fibre_profile import fibre_profile
+from rigsim.probe_profile import Profiles, fibres_of
+from rigsim.probe_tissue import (
+    PHANTOM,
+    HomogeneousTissue,
+    SkinTissue,
+    TissueError,
+    make_phantom,
+    parse_subject,
+    phantom_certificate,
+)
+from rigsim.profile_smoothing import smooth_profile
+
+RIG = load_rig("probe")
+FALSE_ALARM = 4.5  # standard deviations; of some 100 normal values one in 1500 runs exceeds it
+
+
+def test_suction_presses_blood_out_down_to_what_is_kept():
+    skin = SkinTissue("III", seed=4)
+    blood = [skin.blood("cheek", p) for p in (0.0, 3.0, 30.0, 60.0, 1e4)]
+    assert blood[0] == blood[1] > blood[2] > blood[3] > blood[4]
+    rest = blood[4] / probe_tissue.BLOOD_KEPT
+    assert blood[2] == pytest.approx(rest * (0.25 + 0.75 * math.exp(-1.0)))
+    assert skin.blood("chin", 60.0) > 1.5 * skin.blood("forehead", 60.0)
+
+
+def test_layers_hold_the_melanin_and_blood_that_were_asked_for():
+    skin = SkinTissue("III", seed=4)
+    optics = skin.optics("cheek", 0.0, 60.0)
+    index = optics.wavelength_nm.index(560.0)
+    got = [layer.sigma_a_per_mm for layer in optics.stacks[index].layers]
+    got += optics.amount * optics.absorber[index]
+    whole = skin_layers.skin(560.0, skin.melanin("cheek"), skin.blood("cheek", 60.0))
+    assert got == pytest.approx([layer.sigma_a_per_mm for layer in whole.layers], rel=1e-12)
+    assert optics.stacks[index].layers[0].thickness_mm == skin.epidermis_mm("cheek")
+
+
+def test_a_profile_under_suction_is_that_of_its_own_blood():
+    """Reweighted paths against photons of the layers themselves."""
+    skin = SkinTissue("II", seed=4)
+    profiles = Profiles(RIG, skin, photons=12_000, seed=2, threads=1)
+    optics = skin.optics("cheek", 0.0, 10.0)
+    run = profiles._run(optics)
+    weighed = run.profile(optics.amount)
+    stacks = [
+        skin_layers.skin(nm, skin.melanin("cheek"), skin.blood("cheek", 10.0))
+        for nm in optics.wavelength_nm
+    ]
+    tops = [stack.layers[0].thickness_mm for stack in optics.stacks]
+    layers = [
+        type(stack)((type(stack.layers[0])(top, *_rest(stack.layers[0])), stack.layers[1]))
+        for stack, top in zip(stacks, tops, strict=True)
+    ]
+    spectral = profiles.spectral(
+        probe_tissue.TissueOptics(optics.wavelength_nm, tuple(layers), None, 0.0)
+    )
+    own = fibre_profile(spectral, radii_mm=RIG.probe.radius_mm, photons=12_000,
+                        rng=np.random.default_rng(9))  # fmt: skip
+
+    def worst(one):
+        # within 3 mm: beyond it some errors are themselves told by a few photons
+        gap = one.reflectance_per_mm2 - own.reflectance_per_mm2
+        return np.abs(gap / np.hypot(one.stderr, own.stderr))[:11].max()
+
+    # 33 values of Student's t of 19 or more degrees of freedom: one in 100 runs exceeds this
+    assert worst(weighed) < 5.0
+    assert worst(run.profile(10.0 * optics.amount)) > 5.0
+
+
+def _rest(layer):
+    return layer.sigma_a_per_mm, layer.sigma_s_per_mm, layer.g, layer.eta
+
+
+def test_profiles_do_not_depend_on_what_was_asked_before():
+    def made(sites):
+        profiles = Profiles(RIG, SkinTissue("II"), photons=200, seed=3, threads=1)
+        return [profiles.profile(site, 0.0, 60.0).reflectance_per_mm2 for site in sites]
+
+    np.testing.assert_array_equal(made(["cheek"])[0], made(["chin", "cheek"])[1])
+
+
+def test_without_scattering_nothing_comes_back_and_without_absorption_the_most():
+    none = Profiles(RIG, HomogeneousTissue(0.1, 0.0), photons=100, seed=0).profile("cheek")
+    assert (none.reflectance_per_mm2 == 0.0).all()
+    clear, grey = (
+        Profiles(RIG, HomogeneousTissue(a, 1.5), photons=100, seed=0).profile("cheek")
+        for a in (0.0, 0.01)
+    )
+    assert (clear.reflectance_per_mm2 > grey.reflectance_per_mm2).all()
+
+
+def test_the_block_is_off_its_certificate_by_less_than_two_uncertainties():
+    paper = phantom_certificate()
+    exact = make_phantom(paper, deviations=(0.0, 0.0))
+    for name, key in (("sigma_a_per_mm", "sigma_a"), ("sigma_s_prime_per_mm", "sigma_s_prime")):
+        ratio = np.array(getattr(PHANTOM, name)) / np.array(getattr(exact, name))
+        assert 0.0 < abs(ratio - 1.0).max() < 2.0 * paper["uncertainty"][key]
+
+
+def test_the_certificate_is_one_that_a_calibration_reads(tmp_path):
+    path = tmp_path / "phantom.json"
+    path.write_text(json.dumps(phantom_certificate()), encoding="utf-8")
+    read = read_certificate(path)
+    sigma_a, scattering = read.at(PHANTOM.wavelength_nm)
+    exact = make_phantom(phantom_certificate(), deviations=(0.0, 0.0))
+    np.testing.assert_allclose(exact.sigma_a_per_mm, sigma_a)
+    np.testing.assert_allclose(exact.sigma_s_prime_per_mm, scattering)
+    assert (read.g, read.eta) == (PHANTOM.g, PHANTOM.eta)
+
+
+def test_smoothing_lowers_noise_and_leaves_a_bump_of_photons_noise_only():
+    rng = np.random.default_rng(5)
+    radii = np.array(fibres_of(RIG.probe).radii_mm)
+    true = np.exp(-radii) / (radii * (radii + 0.5))
+    noisy = true[:, None] * rng.normal(1.0, 0.05 * math.sqrt(20), (20, 28, 1))
+    smooth, error = smooth_profile(radii, np.maximum(noisy, 0.0))
+    z = (smooth - true[:, None]) / error
+    assert np.sqrt(np.mean(z**2)) < 2.0
+    assert np.mean(error / smooth) < 0.04
+
+
+def test_wrong_subjects_are_refused():
+    for text in ("", "VII", "homogeneous", "homogeneous:1", "homogeneous:a,b", "homogeneous:-1,2"):
+        with pytest.raises(TissueError):
+            parse_subject(text)
+    assert parse_subject("homogeneous:0.1,2,0.9").g == 0.9
+    with pytest.raises(TissueError, match="site"):
+        SkinTissue("III").optics("elbow", 0.0, 60.0)
