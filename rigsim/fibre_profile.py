@@ -174,7 +174,7 @@ class FibrePaths:
         _require("extra_per_mm", extra_per_mm, fine, "a finite number >= 0")
         survival = np.exp(-extra_per_mm * self.path_mm)
         each = np.einsum("bfn...,n->bf...", self.score, survival, dtype=np.float64)
-        return _summary(self.radii_mm, each, self.photons)
+        return summary(self.radii_mm, each, self.photons)
 
 
 def fibre_profile(
@@ -238,7 +238,7 @@ def fibre_profile(
         core_mm, source_core_mm, numerical_aperture, source_numerical_aperture,
     )  # fmt: skip
     each, traced = _trace(stack, fibres, photons, rng, batches, threads, None)
-    return _summary(np.array(fibres.radii_mm), each, traced)
+    return summary(np.array(fibres.radii_mm), each, traced)
 
 
 def fibre_paths(
@@ -312,7 +312,8 @@ def _spectral(stack: LayerStack | SpectralStack) -> SpectralStack:
     return SpectralStack((0.0,), (stack,), np.ones((1, 1)))
 
 
-def _summary(radii_mm: FloatArray, each: FloatArray, photons: int) -> FibreProfile:
+def summary(radii_mm: FloatArray, each: FloatArray, photons: int) -> FibreProfile:
+    """Return mean and standard error of independent batches, shape (batches, F, ...)."""
     error = each.std(axis=0, ddof=1) / np.sqrt(len(each))
     return FibreProfile(radii_mm, each.mean(axis=0), error, each, photons)
 
@@ -344,7 +345,7 @@ def _trace(
         count = -(-round(photons * float(shares[index])) // batches) or 1
         traced += count * batches
         plan = _Plan(layers, fibres, kernels, starts, counts, absorber, index)
-        window = plan.flat_window()
+        window = flat_window(plan.reach_mm, plan.farthest_mm)
         pilot = max(200, round(PILOT_SHARE * count * batches))
         for seed in seeds[batches:]:
             window = plan.learned(window, pilot, seed)
@@ -394,15 +395,10 @@ class _Plan:
         self.chances, self.chances_per_mm = _chances(self.table)
         self.deeper_per_mm = 1.0 / _transport_depth_mm(self.table)
 
-    def flat_window(self) -> FloatArray:
-        """Return weights of 1 up to the farthest fibre, and more beyond."""
-        s = (np.arange(WINDOW_CELLS + 1) + 0.5) * self.reach_mm / WINDOW_CELLS
-        return np.asarray(np.maximum(1.0, (s / self.farthest_mm) ** 3))
-
     def learned(self, window: FloatArray, photons: int, seed: NDArray[np.uint64]) -> FloatArray:
         """Return weights at which every distance is visited alike, learned from some photons."""
         visited = self.run(window, photons, seed)[1]
-        return _window_from(visited, window, self.reach_mm, self.farthest_mm)
+        return learned_window(visited, window, self.reach_mm, self.farthest_mm)
 
     def run(
         self, window: FloatArray, photons: int, seed: NDArray[np.uint64]
@@ -421,7 +417,13 @@ class _Plan:
         return (histogram if self.counts_paths else tally), visited
 
 
-def _window_from(
+def flat_window(reach_mm: float, farthest_mm: float) -> FloatArray:
+    """Return weights of 1 up to the farthest fibre, and more beyond."""
+    s = (np.arange(WINDOW_CELLS + 1) + 0.5) * reach_mm / WINDOW_CELLS
+    return np.asarray(np.maximum(1.0, (s / farthest_mm) ** 3))
+
+
+def learned_window(
     visited: FloatArray, used: FloatArray, reach_mm: float, farthest_mm: float
 ) -> FloatArray:
     """Return target weights in proportion to how much weight passes each distance."""
@@ -546,12 +548,12 @@ def _ring_share(
             0.0,
         )
     )
-    area = _overlap(apart, detector_mm, source_mm)
+    area = disc_overlap(apart, detector_mm, source_mm)
     mean = (area * weights).sum(axis=1) * 0.5 * half / pi
     return np.asarray(mean / (pi * detector_mm**2 * pi * source_mm**2))
 
 
-def _overlap(apart: FloatArray, a: float, b: float) -> FloatArray:
+def disc_overlap(apart: FloatArray, a: float, b: float) -> FloatArray:
     """Return the area that two discs of radii a and b share at a distance of their centres."""
     small = min(a, b)
     d = np.clip(apart, abs(a - b) + 1e-12, a + b)
