@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from capture.rig import Fibre, Probe, Rig
 from model import spectra
+from rigsim.anisotropic_tissue import anisotropic_profile
 from rigsim.fibre_profile import FibrePaths, Fibres, SpectralStack, fibre_paths, fibre_profile
-from rigsim.probe_tissue import ProbedTissue, TissueError, TissueOptics
+from rigsim.probe_tissue import FibrousTissue, ProbedTissue, TissueError, TissueOptics
 from rigsim.profile_smoothing import smooth_profile
 from rigsim.white_fibre import ETA, G, WhiteFibre
 
@@ -22,6 +23,10 @@ FloatArray = NDArray[np.float64]
 
 KEPT: Final = 64
 """Profiles and runs of photons that are kept."""
+
+TURNS: Final = 16
+"""Directions over half a turn in which anisotropic tissue is traced; it has harmonics to the 8th,
+so that those between follow from them exactly."""
 
 SUCTION_STEP_MBAR: Final = 0.1
 """Suctions nearer than half of it share a profile: the blood differs by less than a 1000th."""
@@ -64,6 +69,7 @@ class Profiles:
         self.photons, self.seed, self.threads = photons, seed, threads
         self.probe: Probe = rig.probe
         self._runs: OrderedDict[tuple[object, ...], FibrePaths | Profile] = OrderedDict()
+        self._by_turn: FloatArray | None = None
         self._profiles: OrderedDict[tuple[object, ...], Profile] = OrderedDict()
 
     def profile(self, site: str, angle_deg: float = 0.0, suction_mbar: float = 0.0) -> Profile:
@@ -93,9 +99,31 @@ class Profiles:
         if key not in self._profiles:
             while len(self._profiles) >= KEPT:
                 self._profiles.popitem(last=False)
-            self._profiles[key] = self._made(self.tissue.optics(site, angle_deg, suction))
+            if isinstance(self.tissue, FibrousTissue):
+                self._profiles[key] = self._turned(self.tissue, angle_deg)
+            else:
+                self._profiles[key] = self._made(self.tissue.optics(site, angle_deg, suction))
         self._profiles.move_to_end(key)
         return self._profiles[key]
+
+    def _turned(self, tissue: FibrousTissue, angle_deg: float) -> Profile:
+        """Return the profile along one direction, by the Fourier series of those traced."""
+        if self._by_turn is None:
+            run = anisotropic_profile(
+                tissue.medium(),
+                fibres_of(self.probe),
+                azimuth_rad=np.pi * np.arange(TURNS) / TURNS,
+                photons=self.photons,
+                rng=np.random.default_rng([self.seed, zlib.crc32(repr(tissue).encode())]),
+                threads=self.threads,
+            )
+            self._by_turn = run.batch_reflectance_per_mm2
+        order = np.fft.rfftfreq(TURNS, 1.0 / TURNS)
+        share = np.where((order == 0) | (2 * order == TURNS), 1.0, 2.0) / TURNS
+        wave = share * np.exp(2j * order * np.radians(angle_deg))
+        each = (np.fft.rfft(self._by_turn, axis=-1) @ wave).real
+        value, error = smooth_profile(np.array(self.probe.radius_mm), each[..., None])
+        return Profile(np.repeat(value, 3, axis=1), np.repeat(error, 3, axis=1))
 
     def _made(self, optics: TissueOptics) -> Profile:
         run = self._run(optics)

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigsim import skin_layers
+from rigsim.anisotropic_tissue import AnisotropicTissue
 from rigsim.pigment import MELANIN_PRESETS
 from rigsim.skin_layers import ANISOTROPY, ETA
-from rigsim.tissue_mc import Layer, LayerStack
+from rigsim.tissue_mc import Layer, LayerStack, TransportError
 
 FloatArray = NDArray[np.float64]
 Kind: TypeAlias = Literal["homogeneous", "layered", "anisotropic"]
@@ -127,6 +128,48 @@ class HomogeneousTissue:
             for a, s in zip(np.resize(sigma_a, count), np.resize(scattering, count), strict=True)
         )
         return TissueOptics(self.wavelength_nm, stacks, None, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class FibrousTissue:
+    """A gray half space whose fibres run one way, as in abdominal skin; the same at every site."""
+
+    sigma_a_per_mm: float
+    """Absorption coefficient, 1/mm, > 0."""
+    sigma_s_prime_per_mm: float
+    """Reduced scattering coefficient for strength 0, 1/mm, > 0."""
+    strength: float = -1.0
+    """See `rigsim.anisotropic_tissue.AnisotropicTissue`; below 0 light goes farther along."""
+    axis_deg: float = 0.0
+    """Direction of the fibres: the head's angle at which its line lies along them, degrees."""
+
+    def __post_init__(self) -> None:
+        try:
+            self.medium()
+        except TransportError as error:
+            raise TissueError(str(error)) from error
+
+    @property
+    def kind(self) -> Kind:
+        """Return "anisotropic"."""
+        return "anisotropic"
+
+    def medium(self) -> AnisotropicTissue:
+        """Return the tissue as photons meet it."""
+        return AnisotropicTissue(
+            self.sigma_a_per_mm,
+            self.sigma_s_prime_per_mm / (1.0 - ANISOTROPY),
+            ANISOTROPY,
+            ETA,
+            self.strength,
+            math.radians(self.axis_deg),
+        )
+
+    def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
+        """Return the material without its direction, which `medium` tells."""
+        del site, angle_deg, suction_mbar
+        stack = half_space(self.sigma_a_per_mm, self.sigma_s_prime_per_mm, ANISOTROPY, ETA)
+        return TissueOptics((), (stack,), None, 0.0)
 
 
 def half_space(
@@ -298,7 +341,8 @@ def parse_subject(text: str, *, seed: int = 0) -> ProbedTissue:
     Parameters
     ----------
     text
-        A preset of melanin, "I" to "VI", or "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm.
+        A preset of melanin, "I" to "VI", "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" or
+        "anisotropic:SIGMA_A,SIGMA_S_PRIME[,STRENGTH[,AXIS_DEG]]", in 1/mm.
     seed
         Of what differs between subjects.
 
@@ -317,17 +361,19 @@ def parse_subject(text: str, *, seed: int = 0) -> ProbedTissue:
     name, colon, rest = text.partition(":")
     if not colon and name in MELANIN_PRESETS:
         return SkinTissue(name, seed=seed)
-    if name == "homogeneous" and colon:
-        try:
-            numbers = [float(word) for word in rest.split(",")]
-        except ValueError:
-            numbers = []
-        if len(numbers) in (2, 3):
-            sigma_a, scattering, g = (*numbers, ANISOTROPY)[:3]
-            return HomogeneousTissue(sigma_a, scattering, g)
+    try:
+        numbers = [float(word) for word in rest.split(",")]
+    except ValueError:
+        numbers = []
+    if name == "homogeneous" and len(numbers) in (2, 3):
+        sigma_a, scattering, g = (*numbers, ANISOTROPY)[:3]
+        return HomogeneousTissue(sigma_a, scattering, g)
+    if name == "anisotropic" and len(numbers) in (2, 3, 4):
+        return FibrousTissue(*numbers)
     raise TissueError(
-        f"subject: got {text!r}, expected one of {', '.join(MELANIN_PRESETS)} or "
-        "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G] in 1/mm"
+        f"subject: got {text!r}, expected one of {', '.join(MELANIN_PRESETS)}, "
+        "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G] or "
+        "anisotropic:SIGMA_A,SIGMA_S_PRIME[,STRENGTH[,AXIS_DEG]] in 1/mm"
     )
 
 

@@ -15,6 +15,7 @@ from rigsim.fibre_profile import fibre_profile
 from rigsim.probe_profile import Profiles, fibres_of
 from rigsim.probe_tissue import (
     PHANTOM,
+    FibrousTissue,
     HomogeneousTissue,
     SkinTissue,
     TissueError,
@@ -102,6 +103,24 @@ def test_without_scattering_nothing_comes_back_and_without_absorption_the_most()
     assert (clear.reflectance_per_mm2 > grey.reflectance_per_mm2).all()
 
 
+def test_turning_the_head_on_fibrous_tissue_turns_its_profile():
+    photons = 4000
+    tissue = FibrousTissue(0.05, 1.5, -1.0, 30.0)
+    profiles = Profiles(RIG, tissue, photons=photons, seed=1, threads=1)
+    along, across, between, again = (
+        profiles.profile("abdomen", angle).reflectance_per_mm2[:, 0]
+        for angle in (30.0, 120.0, 52.0, 210.0)
+    )
+    # beyond 3 mm light has been turned often enough; nearer noise and singly scattered light rule
+    assert (along[12:] > across[12:]).all()
+    np.testing.assert_allclose(again, along, rtol=1e-9)
+    turned = Profiles(RIG, FibrousTissue(0.05, 1.5, -1.0, 0.0), photons=photons, seed=1)
+    error = turned.profile("abdomen", 22.0).stderr[:, 0]
+    other = turned.profile("abdomen", 22.0).reflectance_per_mm2[:, 0]
+    assert np.abs((between - other) / (math.sqrt(2.0) * error)).max() < 6.0
+    assert np.abs((along - across) / error).max() > 6.0
+
+
 def test_the_block_is_off_its_certificate_by_less_than_two_uncertainties():
     paper = phantom_certificate()
     exact = make_phantom(paper, deviations=(0.0, 0.0))
@@ -133,7 +152,15 @@ def test_smoothing_lowers_noise_and_leaves_a_bump_of_photons_noise_only():
 
 
 def test_wrong_subjects_are_refused():
-    for text in ("", "VII", "homogeneous", "homogeneous:1", "homogeneous:a,b", "homogeneous:-1,2"):
+    for text in (
+        "",
+        "VII",
+        "homogeneous",
+        "homogeneous:1",
+        "homogeneous:a,b",
+        "homogeneous:-1,2",
+        "anisotropic:0,1",
+    ):
         with pytest.raises(TissueError):
             parse_subject(text)
     assert parse_subject("homogeneous:0.1,2,0.9").g == 0.9
