@@ -2,8 +2,10 @@
 
 At each collision the light that would go straight into a fibre's cone is scored: its chance to be
 scattered there, to reach the surface and to pass it. So photons need not happen to leave within a
-narrow cone. Light that reaches the surface only after a reflection at some interface is scored
-when it leaves, and every photon counts once: either way, never both.
+narrow cone. Where scattering is more forward than that cone is narrow, such scores are rare and
+large; so both ways share each direction by their densities (the balance heuristic of Veach and
+Guibas 1995, doi:10.1145/218380.218498): photons that leave within the cone straight from a
+collision count for the rest. After a reflection at some interface they count in full.
 """
 
 from __future__ import annotations
@@ -128,6 +130,10 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
         path = 0.0  # in the counted absorber, mm
         layer = 1
         direct = False  # unreflected since a collision that was scored
+        chance = 0.0  # that collision's: probability to be scored, layer, direction, its cosine
+        from_layer = 1
+        now_z = 1.0
+        turn = 1.0
         alive = 0
 
         while True:
@@ -171,8 +177,10 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                             mu = sqrt(1.0 - norm / (eta * eta))
                             turn = (ux * p + uy * q) / eta - uz * mu
                             spread = 1.0 + g * g - 2.0 * g * turn
-                            value = weight * (1.0 - g * g) / (4.0 * spread * sqrt(spread))
-                            value *= eta_above * eta_above / (eta * eta * mu * chance)
+                            phase = (1.0 - g * g) / (4.0 * spread * sqrt(spread))  # times pi
+                            drawn = chance * eta * eta * mu / (fibre_sine * fibre_sine)
+                            value = weight * phase / (drawn + phase)
+                            value *= eta_above * eta_above / (fibre_sine * fibre_sine)
                             x_out = x
                             y_out = y
                             out_path = path
@@ -220,9 +228,12 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                                 waiting[alive, 7] = path
                                 waiting[alive, 8] = layer
                                 alive += 1
-                    # The light that goes straight on from here has been scored.
-                    direct = chance > 0.0
+                    # The light that goes straight on from here has been scored, in part.
+                    direct = True
+                    was_x, was_y, was_z = ux, uy, uz
                     s0, s1, s2, s3, ux, uy, uz = scatter(s0, s1, s2, s3, ux, uy, uz, g)
+                    from_layer, now_z = layer, uz
+                    turn = was_x * ux + was_y * uy + was_z * uz
                     s0, s1, s2, s3, u = draw(s0, s1, s2, s3)
                     depth_left = -log(u)
                     continue
@@ -249,10 +260,18 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
                     uz = copysign(mu, uz)
                 if beyond == 0:
                     sine2 = (1.0 - uz * uz) * eta_above * eta_above
-                    if not direct and sine2 <= fibre_sine * fibre_sine:
+                    if sine2 <= fibre_sine * fibre_sine:
+                        share = 1.0
+                        if direct:
+                            g = table[from_layer, 4]
+                            eta = table[from_layer, 5]
+                            spread = 1.0 + g * g - 2.0 * g * turn
+                            phase = (1.0 - g * g) / (4.0 * spread * sqrt(spread))
+                            drawn = chance * eta * eta * abs(now_z) / (fibre_sine * fibre_sine)
+                            share = phase / (drawn + phase)
                         _on_fibres(
                             sqrt(x * x + y * y),
-                            weight * eta_above * eta_above / (fibre_sine * fibre_sine),
+                            share * weight * eta_above * eta_above / (fibre_sine * fibre_sine),
                             path, kernels, starts, counts, log_step, path_scale, tally, histogram,
                         )  # fmt: skip
                     break
@@ -273,8 +292,12 @@ def walk_to_fibres(  # type: ignore[no-untyped-def]
             weight = waiting[alive, 6]
             path = waiting[alive, 7]
             layer = int(waiting[alive, 8])
+            level = int(z * chances_per_mm)
+            chance = chances[level] if level < levels else 0.0
             direct = True
+            was_x, was_y, was_z = waiting[alive, 3], waiting[alive, 4], waiting[alive, 5]
             s0, s1, s2, s3, ux, uy, uz = scatter(
-                s0, s1, s2, s3, waiting[alive, 3], waiting[alive, 4], waiting[alive, 5],
-                table[layer, 4],
-            )  # fmt: skip
+                s0, s1, s2, s3, was_x, was_y, was_z, table[layer, 4]
+            )
+            from_layer, now_z = layer, uz
+            turn = was_x * ux + was_y * uy + was_z * uz

@@ -190,10 +190,11 @@ def all_angle_z(layer, *, photons=40_000, radii_mm=(0.0, 0.3, 1.0), core_mm=0.2)
     [
         Layer(inf, 0.1, 7.5, 0.8, 1.0),
         Layer(inf, 0.1, 7.5, 0.8, 1.6),
+        pytest.param(Layer(inf, 0.5, 50.0, 0.99, 1.4), marks=pytest.mark.long),
         Layer(inf, 0.5, 1.0, -0.9, 1.4),
         Layer(inf, 15.0, 7.5, 0.8, 1.4),
     ],
-    ids=["eta 1", "eta 1.6", "g -.9", "sigma_a = 10 sigma_s'"],
+    ids=["eta 1", "eta 1.6", "g .99", "g -.9", "sigma_a = 10 sigma_s'"],
 )
 def test_extreme_media_agree_with_the_plain_walk(layer):
     # |z| < 4.5 for three radii: false alarms below 8e-4 (t, 19 dof). Fibres touch the source.
