@@ -181,7 +181,7 @@ def distances(fibres: Fibres) -> tuple[FloatArray, FloatArray]:
     >>> round(float(apart.min()), 2) >= 0.1, round(float((share * apart**2).sum()), 6)
     (True, 0.1)
     """
-    one, weight = _disc()
+    one, weight = disc_points(DISC_RADII, DISC_TURNS)
     target = 0.5 * fibres.core_mm * one
     source = 0.5 * fibres.source_core_mm * one
     offset = (target[:, None, :] - source[None, :, :]).reshape(-1, 2)
@@ -191,11 +191,17 @@ def distances(fibres: Fibres) -> tuple[FloatArray, FloatArray]:
     return apart, np.broadcast_to(share, apart.shape)
 
 
-def _disc() -> tuple[FloatArray, FloatArray]:
-    """Return points in the unit disc and their shares, exact for polynomials of degree 3."""
-    nodes, weights = np.polynomial.legendre.leggauss(DISC_RADII)
+def disc_points(rings: int, turns: int) -> tuple[FloatArray, FloatArray]:
+    """Return points in the unit disc, shape (rings turns, 2), and their shares of its area.
+
+    Examples
+    --------
+    >>> points, share = disc_points(2, 6)
+    >>> round(float(share @ (points**2).sum(axis=1)), 12)  # the mean of r^2
+    0.5
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(rings)
     radius = np.sqrt(0.5 * (nodes + 1.0))
-    turn = 2.0 * math.pi * (np.arange(DISC_TURNS) + 0.25) / DISC_TURNS
+    turn = 2.0 * math.pi * (np.arange(turns) + 0.25) / turns
     points = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    share = np.repeat(0.5 * weights / DISC_TURNS, DISC_TURNS)
-    return points.reshape(-1, 2), share
+    return points.reshape(-1, 2), np.repeat(0.5 * weights / turns, turns)

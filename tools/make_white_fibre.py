@@ -25,7 +25,7 @@ from scipy.interpolate import BSpline
 
 from rigsim.fibre_profile import Fibres, fibre_paths
 from rigsim.tissue_mc import Layer, LayerStack
-from rigsim.white_fibre import APERTURE, ETA, FILE, G, _disc, decay, distance_axis
+from rigsim.white_fibre import APERTURE, ETA, FILE, G, decay, disc_points, distance_axis
 
 FloatArray = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ class Curve:
     """log(F d) + decay d as a spline of few knots, fitted to averages over discs."""
 
     def __init__(self, radius: FloatArray, width: FloatArray, absorption: float) -> None:
-        points, self.share = _disc()
+        points, self.share = disc_points(4, 9)
         self.apart = np.hypot(
             radius[:, None] + 0.5 * width[:, None] * points[:, 0],
             0.5 * width[:, None] * points[:, 1],
@@ -133,15 +133,17 @@ class Curve:
         """Return the coefficients by Gauss-Newton on relative residuals."""
         if beta is None:
             start = np.log(value * self.radius) + self.decay * self.radius
-            beta = np.linalg.lstsq(self.at_radius, start, rcond=None)[0]
+            found = np.asarray(np.linalg.lstsq(self.at_radius, start, rcond=None)[0])
+        else:
+            found = beta
         for _ in range(8):
-            model = self.average(beta)
+            model = self.average(found)
             weight = model / error
             step = np.linalg.lstsq(
                 self.at_radius * weight[:, None], (value - model) / error, rcond=None
             )[0]
-            beta = beta + step
-        return beta
+            found = found + step
+        return found
 
 
 def smoothed(

@@ -137,6 +137,14 @@ class ProbeScene:
             ("a lens's color error", "spots are summed"),
             ("reflections between the head's face and the skin", "the head is black"),
         ]
+        if self.tissue.kind == "layered":
+            out += [
+                ("another spot of skin at each repeat", "where a head lands again is not known"),
+                ("pressure's effect on scattering and oxygen", "blood's outweighs them"),
+                ("hair, pores and veins under the head", "layers are even within a centimeter"),
+            ]
+        if self.tissue.kind == "anisotropic":
+            out.append(("color of anisotropic tissue", "its direction is what is looked for"))
         if self.tissue.kind == "homogeneous":
             out.append(("layers, sites, pressure", "the tissue was asked for as homogeneous"))
         return out
