@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigsim import fibre_profile as profiles
+from rigsim import photon_splitting as splitting
 from rigsim import tissue_mc
 from rigsim.anisotropic_walk import walk_anisotropic
+from rigsim.fibre_rings import KERNEL_NODES, disc_overlap
 from rigsim.tissue_mc import TransportError
 
 FloatArray = NDArray[np.float64]
@@ -148,14 +150,14 @@ def anisotropic_profile(
         walk_anisotropic(
             medium, fibres.source_numerical_aperture, fibres.numerical_aperture, places, overlap,
             per_mm, starts.astype(np.int64), counts.astype(np.int64), bins_per_mm, rings,
-            window, profiles.WINDOW_CELLS / reach, deeper, traced, seed.copy(), tally, visited,
+            window, splitting.WINDOW_CELLS / reach, deeper, traced, seed.copy(), tally, visited,
         )  # fmt: skip
         return tally / traced, visited
 
-    window = profiles.flat_window(reach, farthest)
+    window = splitting.flat_window(reach, farthest)
     for seed in seeds[batches:]:
         pilot = max(200, round(profiles.PILOT_SHARE * count * batches))
-        window = profiles.learned_window(run(window, pilot, seed)[1], window, reach, farthest)
+        window = splitting.learned_window(run(window, pilot, seed)[1], window, reach, farthest)
     rows = tissue_mc.in_threads(lambda batch: run(window, count, seeds[batch])[0], batches, threads)
     each = np.empty((batches, radii.size, angles.size))
     if harmonics is None:
@@ -174,7 +176,7 @@ def _overlap(fibres: profiles.Fibres) -> tuple[FloatArray, float]:
     if source == 0.0:
         raise TransportError("source_core_mm: expected > 0 on anisotropic tissue, got 0")
     apart = np.linspace(0.0, detector + source, OVERLAP_NODES)
-    area = profiles.disc_overlap(apart, detector, source)
+    area = disc_overlap(apart, detector, source)
     density = area / (np.pi * detector**2 * np.pi * source**2)
     density[-1] = 0.0
     return density, (OVERLAP_NODES - 1) / apart[-1]
@@ -185,7 +187,7 @@ def _harmonics(radius_mm: float, fibres: profiles.Fibres, most: int) -> FloatArr
     detector, source = 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
     both = detector + source
     low = max(0.0, radius_mm - both)
-    rho = np.linspace(low, radius_mm + both, profiles.KERNEL_NODES)
+    rho = np.linspace(low, radius_mm + both, KERNEL_NODES)
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = (rho**2 + radius_mm**2 - both**2) / (2.0 * rho * radius_mm)
     half = np.arccos(np.clip(np.nan_to_num(cosine, nan=-1.0), -1.0, 1.0))
@@ -197,7 +199,7 @@ def _harmonics(radius_mm: float, fibres: profiles.Fibres, most: int) -> FloatArr
             rho[:, None] ** 2 + radius_mm**2 - 2.0 * rho[:, None] * radius_mm * np.cos(angle), 0.0
         )
     )
-    area = profiles.disc_overlap(apart, detector, source)
+    area = disc_overlap(apart, detector, source)
     density = area / (np.pi * detector**2 * np.pi * source**2)
     orders = np.arange(0, most + 1, 2)
     parts = np.einsum("rn,n,rnk->rk", density, weights, np.cos(angle[..., None] * orders))

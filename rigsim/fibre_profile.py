@@ -13,16 +13,23 @@ alike; weights keep all of it unbiased.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf, isfinite, pi
+from math import isfinite
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigsim import tissue_mc
+from rigsim.fibre_rings import ring_kernels
 from rigsim.fibre_walk import walk_to_fibres
+from rigsim.photon_splitting import (
+    WINDOW_CELLS,
+    flat_window,
+    learned_window,
+    scoring_chances,
+    transport_depth_mm,
+)
 from rigsim.tissue_mc import LayerStack, TransportError
 
 FloatArray = NDArray[np.float64]
@@ -41,16 +48,6 @@ PILOT_SHARE: Final = 0.01
 
 PILOTS: Final = 3
 """Each pilot sees farther than the one before it."""
-
-WINDOW_CELLS: Final = 256
-SMOOTHED_CELLS: Final = 8  # to each side
-ENOUGH_TRACKS: Final = 50.0
-MOST_TRACKS: Final = 30.0
-"""Collisions at a distance, as a multiple of the most anywhere without splitting: where nearly all
-light is too deep to be scored, splitting it further is not worth its time."""
-KERNEL_NODES: Final = 400
-SCORED_DEPTH: Final = 1.5
-"""Optical depth above which every collision is scored; below, fewer and fewer with more weight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,6 +222,7 @@ def fibre_profile(
 
     Examples
     --------
+    >>> from math import inf
     >>> from rigsim.tissue_mc import Layer
     >>> red = LayerStack((Layer(inf, 0.04, 7.5, 0.8, 1.4),))
     >>> near_and_far = fibre_profile(
@@ -275,6 +273,7 @@ def fibre_paths(
 
     Examples
     --------
+    >>> from math import inf
     >>> from rigsim.tissue_mc import Layer
     >>> clear = LayerStack((Layer(inf, 0.01, 7.5, 0.8, 1.4),))
     >>> paths = fibre_paths(
@@ -331,7 +330,9 @@ def _trace(
     spectral = _spectral(stack)
     tissue_mc.photons_per_batch(photons, batches, threads)
     order = np.argsort(fibres.radii_mm, kind="stable")
-    kernels, starts, counts = _kernels(fibres, order)
+    kernels, starts, counts = ring_kernels(
+        np.array(fibres.radii_mm)[order], 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
+    )
     shares = spectral.band_weights.max(axis=1)
     shares = shares / shares.sum()
     nodes = (_path_nodes(),) if absorber is not None else ()
@@ -392,8 +393,8 @@ class _Plan:
         farthest = max(fibres.radii_mm) + 0.5 * (fibres.core_mm + fibres.source_core_mm)
         self.reach_mm = 3.0 * max(farthest, 1.0)
         self.farthest_mm = max(farthest, 1.0)
-        self.chances, self.chances_per_mm = _chances(self.table)
-        self.deeper_per_mm = 1.0 / _transport_depth_mm(self.table)
+        self.chances, self.chances_per_mm = scoring_chances(self.table)
+        self.deeper_per_mm = 1.0 / transport_depth_mm(self.table)
 
     def learned(self, window: FloatArray, photons: int, seed: NDArray[np.uint64]) -> FloatArray:
         """Return weights at which every distance is visited alike, learned from some photons."""
@@ -415,154 +416,6 @@ class _Plan:
             PATH_STEP, PATH_SCALE_MM, photons, seed.copy(), tally, histogram, visited,
         )  # fmt: skip
         return (histogram if self.counts_paths else tally), visited
-
-
-def flat_window(reach_mm: float, farthest_mm: float) -> FloatArray:
-    """Return weights of 1 up to the farthest fibre, and more beyond."""
-    s = (np.arange(WINDOW_CELLS + 1) + 0.5) * reach_mm / WINDOW_CELLS
-    return np.asarray(np.maximum(1.0, (s / farthest_mm) ** 3))
-
-
-def learned_window(
-    visited: FloatArray, used: FloatArray, reach_mm: float, farthest_mm: float
-) -> FloatArray:
-    """Return target weights in proportion to how much weight passes each distance."""
-    s = (np.arange(len(used)) + 0.5) * reach_mm / WINDOW_CELLS
-    kernel = np.ones(2 * SMOOTHED_CELLS + 1)
-    around = np.convolve(np.ones(WINDOW_CELLS), kernel, "same")
-    scored, every = (np.convolve(row[:-1], kernel, "same") / around for row in visited)
-    tracks = [np.convolve(row[:-1] / used[:-1], kernel, "same") for row in visited]
-    edge = min(int(np.searchsorted(s, farthest_mm)), WINDOW_CELLS - 1)
-    wanted, peak = _falling(scored[: edge + 1], tracks[0][: edge + 1])
-    least, _ = _falling(every[: edge + 1], tracks[1][: edge + 1])
-    window = np.ones(len(used))
-    window[peak : edge + 1] = np.maximum(wanted, least / MOST_TRACKS)[peak:]
-    # Beyond the fibres light comes back the less the farther it is.
-    window[edge:] = window[edge] * (s[edge:] / s[edge]) ** 3
-    return window
-
-
-def _falling(weight: FloatArray, tracks: FloatArray) -> tuple[FloatArray, int]:
-    """Return weights by distance over their largest, and where that is.
-
-    From where too few tracks came to tell, they go on as they fell before, less steeply, as a fall
-    that chance made too steep would have photons split for minutes.
-    """
-    enough = tracks > ENOUGH_TRACKS
-    reached = len(enough) if enough.all() else int(np.argmin(enough))
-    if reached < 2:
-        return np.ones(len(weight)), 0
-    peak = int(np.argmax(weight[:reached]))
-    relative = weight / weight[peak]
-    before = max(peak, reached - 4 * SMOOTHED_CELLS)
-    fall = 0.0
-    if before < reached - 1:
-        fall = np.log(relative[reached - 1] / relative[before]) / (reached - 1 - before)
-    further = np.arange(1, len(weight) + 1 - reached)
-    relative[reached:] = relative[reached - 1] * np.exp(0.7 * min(fall, 0.0) * further)
-    return relative, peak
-
-
-def _transport_depth_mm(table: FloatArray) -> float:
-    """Return the depth to which light goes before it has turned or been absorbed once."""
-    left = 1.0
-    for top, bottom, sigma_t, albedo, g in table[1:-1, :5]:
-        turned = sigma_t * (1.0 - albedo * g)
-        if turned * (bottom - top) >= left:
-            return float(top + left / turned)
-        left -= turned * (bottom - top) if turned > 0.0 else 0.0
-    bottom = float(table[-1, 0])
-    return bottom if bottom < inf else 1.0
-
-
-def _chances(table: FloatArray) -> tuple[FloatArray, float]:
-    """Return the probability to score a collision by its depth, and the levels per mm."""
-    depths, optical = [0.0], [0.0]
-    for row in table[1:-1]:
-        if row[2] > 0.0:
-            limit = (SCORED_DEPTH + 40.0 - row[6]) / row[2]
-            if limit <= 0.0:
-                break
-            depths.append(min(row[1], row[0] + limit))
-            optical.append(row[6] + row[2] * (depths[-1] - row[0]))
-        elif row[1] < inf:
-            depths.append(row[1])
-            optical.append(row[6])
-    levels = 4096
-    per_mm = levels / depths[-1] if depths[-1] > 0.0 else 1.0
-    at = np.interp(np.arange(levels) / per_mm, depths, optical)
-    return np.exp(np.minimum(SCORED_DEPTH - at, 0.0)), per_mm
-
-
-def _kernels(
-    fibres: Fibres, order: Sequence[int] | NDArray[np.intp]
-) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
-    """Return the densities with which fibres take light by its distance from the entry."""
-    detector, source = 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
-    both = detector + source
-    radii = np.array(fibres.radii_mm)[order]
-    farthest = radii[-1] + both
-    bins_per_mm = 2000.0 / farthest
-    rows = np.zeros((len(radii), 3 + KERNEL_NODES + 1))
-    for row, radius in zip(rows, radii, strict=True):
-        low = max(0.0, radius - both)
-        rho = np.linspace(low, radius + both, KERNEL_NODES)
-        row[:3] = low, (KERNEL_NODES - 1) / (rho[-1] - rho[0]), bins_per_mm
-        density = _ring_share(rho, radius, detector, source)
-        # The walk interpolates: what the interpolant holds in total must be 1.
-        a, b = rho[:-1], rho[1:]
-        da, db = density[:-1], density[1:]
-        held = 2.0 * pi * np.sum((b - a) / 6.0 * (da * (2.0 * a + b) + db * (a + 2.0 * b)))
-        row[3:-1] = density / held
-    edges = np.arange(2001) / bins_per_mm
-    starts = np.searchsorted(radii + both, edges[:-1], side="right")
-    stops = np.searchsorted(radii - both, edges[1:], side="left")
-    return rows, starts.astype(np.int64), np.maximum(stops - starts, 0).astype(np.int64)
-
-
-def _ring_share(
-    rho_mm: FloatArray, radius_mm: float, detector_mm: float, source_mm: float
-) -> FloatArray:
-    """Return the mean over directions of the density of (point in one core - point in the other).
-
-    That density, in 1/mm^2, is the overlap of the two discs at that displacement over the product
-    of their areas; for a point source it is 1 / area within the detector's disc.
-    """
-    if source_mm == 0.0:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            cosine = (rho_mm**2 + radius_mm**2 - detector_mm**2) / (2.0 * rho_mm * radius_mm)
-        inside = rho_mm + radius_mm <= detector_mm
-        cosine = np.where(inside, -1.0, np.nan_to_num(np.clip(cosine, -1.0, 1.0), nan=1.0))
-        return np.asarray(np.arccos(cosine) / pi / (pi * detector_mm**2))
-    # Directions that reach the overlap, densely: the integrand is continuous and zero at its ends.
-    both = detector_mm + source_mm
-    with np.errstate(divide="ignore", invalid="ignore"):
-        cosine = (rho_mm**2 + radius_mm**2 - both**2) / (2.0 * rho_mm * radius_mm)
-    half = np.arccos(np.clip(np.nan_to_num(cosine, nan=-1.0, neginf=-1.0, posinf=1.0), -1.0, 1.0))
-    half = np.where(rho_mm + radius_mm <= both, pi, half)
-    nodes, weights = np.polynomial.legendre.leggauss(96)
-    angle = 0.5 * half[:, None] * (nodes + 1.0)
-    apart = np.sqrt(
-        np.maximum(
-            rho_mm[:, None] ** 2 + radius_mm**2 - 2.0 * rho_mm[:, None] * radius_mm * np.cos(angle),
-            0.0,
-        )
-    )
-    area = disc_overlap(apart, detector_mm, source_mm)
-    mean = (area * weights).sum(axis=1) * 0.5 * half / pi
-    return np.asarray(mean / (pi * detector_mm**2 * pi * source_mm**2))
-
-
-def disc_overlap(apart: FloatArray, a: float, b: float) -> FloatArray:
-    """Return the area that two discs of radii a and b share at a distance of their centres."""
-    small = min(a, b)
-    d = np.clip(apart, abs(a - b) + 1e-12, a + b)
-    first = np.arccos(np.clip((d * d + a * a - b * b) / (2.0 * d * a), -1.0, 1.0))
-    second = np.arccos(np.clip((d * d + b * b - a * a) / (2.0 * d * b), -1.0, 1.0))
-    product = (a + b - d) * (d + a - b) * (d - a + b) * (d + a + b)
-    kite = 0.5 * np.sqrt(np.maximum(product, 0.0))
-    lens = a * a * first + b * b * second - kite
-    return np.where(apart <= abs(a - b), pi * small * small, lens)
 
 
 def _require(name: str, value: float, holds: bool, expected: str) -> None:

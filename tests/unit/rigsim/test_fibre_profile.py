@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rigsim import fibre_profile as profiles
 from rigsim.fibre_profile import Fibres, SpectralStack, fibre_paths, fibre_profile
+from rigsim.fibre_rings import KERNEL_NODES, ring_kernels
 from rigsim.tissue_mc import Layer, LayerStack, TransportError, transport
 
 RED = LayerStack((Layer(inf, 0.1, 7.5, 0.8, 1.4),))
@@ -148,9 +148,8 @@ def test_impossible_requests_are_refused_by_name(request_, field):
 @pytest.mark.parametrize(("detector_mm", "source_mm"), [(0.2, 0.2), (0.4, 0.1), (0.2, 0.0)])
 def test_shares_of_rings_are_those_of_random_points_in_the_cores(detector_mm, source_mm):
     rng = np.random.default_rng(8)
-    fibres = Fibres((0.25,), core_mm=detector_mm, source_core_mm=source_mm)
-    rows, _, _ = profiles._kernels(fibres, np.array([0]))
-    nodes = rows[0, 0] + np.arange(profiles.KERNEL_NODES) / rows[0, 1]
+    rows, _, _ = ring_kernels(np.array([0.25]), 0.5 * detector_mm, 0.5 * source_mm)
+    nodes = rows[0, 0] + np.arange(KERNEL_NODES) / rows[0, 1]
     count = 400_000
     points = []
     for diameter in (detector_mm, source_mm):

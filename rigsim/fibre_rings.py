@@ -1,0 +1,88 @@
+"""How much of the light that leaves at a distance from its entry a fibre takes: two discs, a ring.
+
+Source and detection fibre are discs whose centres are a given distance apart. The densities here
+are those of the displacement between a point in the one and a point in the other.
+"""
+
+from __future__ import annotations
+
+from math import pi
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+KERNEL_NODES: Final = 400
+"""Nodes of a fibre's density over the distance that it takes light from."""
+
+
+def ring_kernels(
+    radii_mm: FloatArray, detector_mm: float, source_mm: float
+) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+    """Return the densities with which fibres take light by its distance from the entry."""
+    both = detector_mm + source_mm
+    radii = radii_mm
+    farthest = radii[-1] + both
+    bins_per_mm = 2000.0 / farthest
+    rows = np.zeros((len(radii), 3 + KERNEL_NODES + 1))
+    for row, radius in zip(rows, radii, strict=True):
+        low = max(0.0, radius - both)
+        rho = np.linspace(low, radius + both, KERNEL_NODES)
+        row[:3] = low, (KERNEL_NODES - 1) / (rho[-1] - rho[0]), bins_per_mm
+        density = _ring_share(rho, radius, detector_mm, source_mm)
+        # The walk interpolates: what the interpolant holds in total must be 1.
+        a, b = rho[:-1], rho[1:]
+        da, db = density[:-1], density[1:]
+        held = 2.0 * pi * np.sum((b - a) / 6.0 * (da * (2.0 * a + b) + db * (a + 2.0 * b)))
+        row[3:-1] = density / held
+    edges = np.arange(2001) / bins_per_mm
+    starts = np.searchsorted(radii + both, edges[:-1], side="right")
+    stops = np.searchsorted(radii - both, edges[1:], side="left")
+    return rows, starts.astype(np.int64), np.maximum(stops - starts, 0).astype(np.int64)
+
+
+def _ring_share(
+    rho_mm: FloatArray, radius_mm: float, detector_mm: float, source_mm: float
+) -> FloatArray:
+    """Return the mean over directions of the density of (point in one core - point in the other).
+
+    That density, in 1/mm^2, is the overlap of the two discs at that displacement over the product
+    of their areas; for a point source it is 1 / area within the detector's disc.
+    """
+    if source_mm == 0.0:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cosine = (rho_mm**2 + radius_mm**2 - detector_mm**2) / (2.0 * rho_mm * radius_mm)
+        inside = rho_mm + radius_mm <= detector_mm
+        cosine = np.where(inside, -1.0, np.nan_to_num(np.clip(cosine, -1.0, 1.0), nan=1.0))
+        return np.asarray(np.arccos(cosine) / pi / (pi * detector_mm**2))
+    # Directions that reach the overlap, densely: the integrand is continuous and zero at its ends.
+    both = detector_mm + source_mm
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = (rho_mm**2 + radius_mm**2 - both**2) / (2.0 * rho_mm * radius_mm)
+    half = np.arccos(np.clip(np.nan_to_num(cosine, nan=-1.0, neginf=-1.0, posinf=1.0), -1.0, 1.0))
+    half = np.where(rho_mm + radius_mm <= both, pi, half)
+    nodes, weights = np.polynomial.legendre.leggauss(96)
+    angle = 0.5 * half[:, None] * (nodes + 1.0)
+    apart = np.sqrt(
+        np.maximum(
+            rho_mm[:, None] ** 2 + radius_mm**2 - 2.0 * rho_mm[:, None] * radius_mm * np.cos(angle),
+            0.0,
+        )
+    )
+    area = disc_overlap(apart, detector_mm, source_mm)
+    mean = (area * weights).sum(axis=1) * 0.5 * half / pi
+    return np.asarray(mean / (pi * detector_mm**2 * pi * source_mm**2))
+
+
+def disc_overlap(apart: FloatArray, a: float, b: float) -> FloatArray:
+    """Return the area that two discs of radii a and b share at a distance of their centres."""
+    small = min(a, b)
+    d = np.clip(apart, abs(a - b) + 1e-12, a + b)
+    first = np.arccos(np.clip((d * d + a * a - b * b) / (2.0 * d * a), -1.0, 1.0))
+    second = np.arccos(np.clip((d * d + b * b - a * a) / (2.0 * d * b), -1.0, 1.0))
+    product = (a + b - d) * (d + a - b) * (d - a + b) * (d + a + b)
+    kite = 0.5 * np.sqrt(np.maximum(product, 0.0))
+    lens = a * a * first + b * b * second - kite
+    return np.where(apart <= abs(a - b), pi * small * small, lens)

@@ -1,0 +1,101 @@
+"""Where photons are split, merged and scored, so that fibres near and far are seen alike.
+
+A photon is kept at a target weight that depends on its distance from the entry and on its depth.
+The targets are learned from pilot runs and change the cost of a result, never its expectation.
+"""
+
+from __future__ import annotations
+
+from math import inf
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+WINDOW_CELLS: Final = 256
+SMOOTHED_CELLS: Final = 8  # to each side
+ENOUGH_TRACKS: Final = 50.0
+MOST_TRACKS: Final = 30.0
+"""Collisions at a distance, as a multiple of the most anywhere without splitting: where nearly all
+light is too deep to be scored, splitting it further is not worth its time."""
+SCORED_DEPTH: Final = 1.5
+"""Optical depth above which every collision is scored; below, fewer and fewer with more weight."""
+
+
+def flat_window(reach_mm: float, farthest_mm: float) -> FloatArray:
+    """Return weights of 1 up to the farthest fibre, and more beyond."""
+    s = (np.arange(WINDOW_CELLS + 1) + 0.5) * reach_mm / WINDOW_CELLS
+    return np.asarray(np.maximum(1.0, (s / farthest_mm) ** 3))
+
+
+def learned_window(
+    visited: FloatArray, used: FloatArray, reach_mm: float, farthest_mm: float
+) -> FloatArray:
+    """Return target weights in proportion to how much weight passes each distance."""
+    s = (np.arange(len(used)) + 0.5) * reach_mm / WINDOW_CELLS
+    kernel = np.ones(2 * SMOOTHED_CELLS + 1)
+    around = np.convolve(np.ones(WINDOW_CELLS), kernel, "same")
+    scored, every = (np.convolve(row[:-1], kernel, "same") / around for row in visited)
+    tracks = [np.convolve(row[:-1] / used[:-1], kernel, "same") for row in visited]
+    edge = min(int(np.searchsorted(s, farthest_mm)), WINDOW_CELLS - 1)
+    wanted, peak = _falling(scored[: edge + 1], tracks[0][: edge + 1])
+    least, _ = _falling(every[: edge + 1], tracks[1][: edge + 1])
+    window = np.ones(len(used))
+    window[peak : edge + 1] = np.maximum(wanted, least / MOST_TRACKS)[peak:]
+    # Beyond the fibres light comes back the less the farther it is.
+    window[edge:] = window[edge] * (s[edge:] / s[edge]) ** 3
+    return window
+
+
+def _falling(weight: FloatArray, tracks: FloatArray) -> tuple[FloatArray, int]:
+    """Return weights by distance over their largest, and where that is.
+
+    From where too few tracks came to tell, they go on as they fell before, less steeply, as a fall
+    that chance made too steep would have photons split for minutes.
+    """
+    enough = tracks > ENOUGH_TRACKS
+    reached = len(enough) if enough.all() else int(np.argmin(enough))
+    if reached < 2:
+        return np.ones(len(weight)), 0
+    peak = int(np.argmax(weight[:reached]))
+    relative = weight / weight[peak]
+    before = max(peak, reached - 4 * SMOOTHED_CELLS)
+    fall = 0.0
+    if before < reached - 1:
+        fall = np.log(relative[reached - 1] / relative[before]) / (reached - 1 - before)
+    further = np.arange(1, len(weight) + 1 - reached)
+    relative[reached:] = relative[reached - 1] * np.exp(0.7 * min(fall, 0.0) * further)
+    return relative, peak
+
+
+def transport_depth_mm(table: FloatArray) -> float:
+    """Return the depth to which light goes before it has turned or been absorbed once."""
+    left = 1.0
+    for top, bottom, sigma_t, albedo, g in table[1:-1, :5]:
+        turned = sigma_t * (1.0 - albedo * g)
+        if turned * (bottom - top) >= left:
+            return float(top + left / turned)
+        left -= turned * (bottom - top) if turned > 0.0 else 0.0
+    bottom = float(table[-1, 0])
+    return bottom if bottom < inf else 1.0
+
+
+def scoring_chances(table: FloatArray) -> tuple[FloatArray, float]:
+    """Return the probability to score a collision by its depth, and the levels per mm."""
+    depths, optical = [0.0], [0.0]
+    for row in table[1:-1]:
+        if row[2] > 0.0:
+            limit = (SCORED_DEPTH + 40.0 - row[6]) / row[2]
+            if limit <= 0.0:
+                break
+            depths.append(min(row[1], row[0] + limit))
+            optical.append(row[6] + row[2] * (depths[-1] - row[0]))
+        elif row[1] < inf:
+            depths.append(row[1])
+            optical.append(row[6])
+    levels = 4096
+    per_mm = levels / depths[-1] if depths[-1] > 0.0 else 1.0
+    at = np.interp(np.arange(levels) / per_mm, depths, optical)
+    return np.exp(np.minimum(SCORED_DEPTH - at, 0.0)), per_mm
