@@ -125,11 +125,18 @@ class ProbeImages:
             [_exposure_s(record) for record in records],
             darks=self.darks.at(measurement.camera_c if known else None),
             noise=self._noise,
+            light_s=[_light_s(record) for record in records],
         )
 
 
 def _exposure_s(record: FrameRecord) -> float:
     return float(record.actual.get("exposure_s", record.settings["exposure_s"]))
+
+
+def _light_s(record: FrameRecord) -> float:
+    """Return how long the source shone into an exposure, s."""
+    exposure_s = _exposure_s(record)
+    return min(float(record.actual.get("open_s", exposure_s)), exposure_s)
 
 
 def _level(records: list[FrameRecord]) -> float:

@@ -41,6 +41,12 @@ MAP_SHAPE = (256, 256)
 FALSE_ALARMS = 0.01
 """Chance at which isotropic tissue is called anisotropic, per site and channel."""
 
+UNLIKE = 0.03
+"""Relative misfit from which a profile is that of no homogeneous medium, but of layered tissue."""
+DIMMING = 1.0
+"""Standard deviation of the log of the factor by which a layer on top may dim all fibres alike. It
+is fitted along where the profile is unlike that of any medium."""
+
 Floats = NDArray[np.float64]
 
 
@@ -247,16 +253,23 @@ def _fitted(profiles: Sequence[Profile], probe: Probe, method: Any) -> list[Prof
     value = np.stack([p.reflectance.reflectance_per_mm2.T for p in profiles])
     common = np.stack([p.reflectance.common_per_mm2.transpose(0, 2, 1) for p in profiles], axis=1)
     every = np.concatenate([value[None], value[None] + common])
-    fit = subsurface.invert(
-        first.radius_mm,
-        every,
-        variance=np.stack([p.reflectance.variance.T for p in profiles]),
-        valid=np.stack([p.reflectance.valid.T for p in profiles]),
-        method=method,
-        collection="fibre",
-        core_mm=probe.fibres[0].core_mm,
-        source_core_mm=probe.source_core_mm,
-    )
+
+    def invert(common_error: float) -> SubsurfaceFit:
+        return subsurface.invert(
+            first.radius_mm,
+            every,
+            variance=np.stack([p.reflectance.variance.T for p in profiles]),
+            valid=np.stack([p.reflectance.valid.T for p in profiles]),
+            method=method,
+            collection="fibre",
+            core_mm=probe.fibres[0].core_mm,
+            source_core_mm=probe.source_core_mm,
+            common_error=common_error,
+        )
+
+    fit = invert(0.0)
+    if np.any(unlike := fit.model_error[0] > UNLIKE):
+        fit = _either(fit, invert(DIMMING), np.broadcast_to(unlike, fit.valid.shape))
     log_tr = np.log(fit.sigma_tr_per_mm)
     change = np.nan_to_num(log_tr[1:] - log_tr[0])
     log_stderr = fit.sigma_tr_stderr[0] / fit.sigma_tr_per_mm[0]
@@ -267,6 +280,16 @@ def _fitted(profiles: Sequence[Profile], probe: Probe, method: Any) -> list[Prof
         )
         for number, profile in enumerate(profiles)
     ]  # fmt: skip
+
+
+def _either(fit: SubsurfaceFit, other: SubsurfaceFit, there: NDArray[np.bool_]) -> SubsurfaceFit:
+    """Return one batch's fits, but another's where told to."""
+    merged = {}
+    for name in (field.name for field in dataclasses.fields(fit) if field.name != "method"):
+        own = getattr(fit, name)
+        mask = there.reshape(there.shape + (1,) * (own.ndim - there.ndim))
+        merged[name] = np.where(mask, getattr(other, name), own)
+    return dataclasses.replace(fit, **merged)
 
 
 def _one(fit: SubsurfaceFit, index: tuple[int, ...]) -> SubsurfaceFit:
@@ -317,6 +340,8 @@ def _fit_document(one: ProfileFit, c: int) -> dict[str, Any]:
         "sigma_tr_stderr": sigma_tr * total,
         "sigma_tr_stderr_readings": sigma_tr * float(one.log_stderr[c]),
         "interval_per_mm": interval,
+        "factor": fit.scale[c],
+        "model_error": fit.model_error[c],
         "sigma_a_per_mm": fit.sigma_a_per_mm[c],
         "sigma_a_stderr": fit.sigma_a_stderr[c],
         "sigma_s_prime_per_mm": fit.sigma_s_prime_per_mm[c],
@@ -370,7 +395,8 @@ def _anisotropy(fits: Sequence[ProfileFit]) -> bytes:
         found = anisotropy.estimate(
             angle, np.where(valid, sigma_tr, 1.0), np.where(valid, stderr, np.inf), valid=valid
         )
-        off = np.where(valid, np.abs(sigma_tr / found.mean_per_mm - 1.0), 0.0).max(axis=0)
+        bias = anisotropy.one_direction_bias(found, angle)
+        off = np.maximum(np.abs(bias.lowest), np.abs(bias.highest))
         for c, channel in enumerate(CHANNELS):
             rows.append(
                 {

@@ -37,6 +37,8 @@ MOST_OUTLIERS = 0.1
 """Standard deviations that make a fibre an outlier, and the share of fibres that may be such."""
 NORMAL_MEDIAN = 1.4826
 """Standard deviation over the median of absolute deviations."""
+UNLIKE = 0.1
+"""Median relative residual from which a profile is compared by its logarithms."""
 RISE = 50.0
 """A second valley of the misfit is tried when it begins no higher above the deepest."""
 
@@ -108,9 +110,13 @@ class ProfileBatch:
         else:
             used = self.used[chosen].sum(axis=1)
             chance = gammaincc(np.maximum(used - 2, 1) / 2.0, self.chi2[chosen] / 2.0)
-            bad = np.flatnonzero((chance < MISFIT_CHANCE) & (seen.sum(axis=1) >= FEWEST_READINGS))
+            told = seen.sum(axis=1) >= FEWEST_READINGS
+            bad = np.flatnonzero((chance < MISFIT_CHANCE) & told)
             if bad.size:
                 self._widen(model, chosen[bad])
+            far = np.flatnonzero((self._relative(chosen) > UNLIKE) & told)
+            if far.size:
+                self._compare_logarithms(model, chosen[far], logs[far], best[far], second[far])
 
     def _widen(self, model: ProfileModel, chosen: NDArray[np.intp]) -> None:
         """Fit profiles again that the model does not describe, with its error from the residuals.
@@ -140,6 +146,54 @@ class ProfileBatch:
         self.seen[chosen] &= kept
         self.spread[chosen] = np.median(spread / np.maximum(m, 1e-290), axis=1)
 
+    def _relative(self, chosen: NDArray[np.intp]) -> Floats:
+        """Return the median of the relative residuals of what stands out of its noise."""
+        off = np.abs(self.y[chosen] / np.maximum(self.predicted[chosen], 1e-290) - 1.0)
+        seen = self.seen[chosen]
+        told = np.asarray(seen.any(axis=1))
+        shown = np.where(seen | ~told[:, None], off, math.nan)
+        return np.asarray(np.where(told, np.nanmedian(shown, axis=1), 0.0))
+
+    def _compare_logarithms(
+        self,
+        model: ProfileModel,
+        chosen: NDArray[np.intp],
+        logs: Floats,
+        best: Floats,
+        second: Floats,
+    ) -> None:
+        """Fit profiles of no such medium by their logarithms, from the best of the starts on.
+
+        A linear residual over a share of the model is small where the model is far too bright, so
+        that a profile that is off by tens of percent everywhere, as of layered tissue, is drawn to
+        media that it does not look like. Logarithms do not care which of the two is larger. What
+        does not stand out of its noise is left out.
+        """
+        y, variance = self.y[chosen], self.variance[chosen]
+        seen = self.seen[chosen]
+        own = np.full(y.shape, math.inf)
+        np.divide(variance, np.where(seen, y, 1.0) ** 2, out=own, where=seen)
+        wide = own + UNLIKE**2
+        self._run(model, chosen, logs, wide, best, logarithmic=True)
+        told = np.flatnonzero(np.isfinite(second).all(axis=1))
+        self._run(
+            model, chosen[told], logs[told], wide[told], second[told], better=True, logarithmic=True
+        )
+        for _ in range(2):
+            off = np.where(seen, logs - np.log(np.maximum(self.predicted[chosen], 1e-290)), 0.0)
+            # of scatter about a fit of two coefficients
+            kept = np.maximum(seen.sum(axis=1), 3)
+            spread = np.sqrt(np.maximum((off**2).sum(axis=1) / (kept - 2), LEAST_DEVIATION**2))
+            wide = own + spread[:, None] ** 2
+            self._run(model, chosen, logs, wide, self.theta[chosen], logarithmic=True)
+        m = self.predicted[chosen]
+        self.total[chosen] = np.where(seen, wide * m**2, math.inf)
+        stated = variance + model.relative_variance(self.theta[chosen]) * m**2
+        self.chi2[chosen] = _sum_over(seen, (y - m) ** 2, stated)
+        self.odd[chosen] = False
+        self.used[chosen] = seen
+        self.spread[chosen] = spread
+
     def _misfits(self, chosen: NDArray[np.intp]) -> Bools:
         """Return which fits are so bad that another minimum may be better."""
         seen = self.seen[chosen].sum(axis=1)
@@ -157,15 +211,17 @@ class ProfileBatch:
         theta: Floats,
         *,
         better: bool = False,
+        logarithmic: bool | None = None,
     ) -> None:
         """Fit from `theta` on and keep the results; with `better` only the likelier ones."""
+        by_logs = self.logarithmic if logarithmic is None else logarithmic
         n = y.shape[0]
         covariance, chi2 = np.empty((n, 4, 4)), np.empty(n)
         predicted, total, steps = np.empty(y.shape), np.empty(y.shape), np.empty(n, np.int64)
         parts = min(get_num_threads(), max(1, n // 64))
         levenberg_marquardt.fit(
             model.kind, model.radius_mm, model.constants, model.axes, model.grid, y, variance,
-            model.error, self.logarithmic, self.prior, model.bounds, theta, ROUNDS, STEPS, parts,
+            model.error, by_logs, self.prior, model.bounds, theta, ROUNDS, STEPS, parts,
             covariance, chi2, predicted, total, steps,
         )  # fmt: skip
         if better:

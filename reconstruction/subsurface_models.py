@@ -40,12 +40,12 @@ DIPOLE_ERROR = np.array([0.1, 0.0, 0.0])
 """Equal weights; the dipole is off by more than that."""
 START_RATIO = 15.0
 """Greatest sigma_a/sigma_s' that a fit begins with."""
-TABLE_SIGMA_S = (0.05, 50.0)
-"""Of the table, 1/mm."""
+TABLE_SIGMA_S = (0.05, 200.0)
+"""Of the table, 1/mm; layered tissue may look like more scattering than any medium has."""
 TABLE_ERROR = np.array([0.005, 0.0, 0.0])
 """Relative: the table's own noise."""
 START_SIGMA_TR = np.geomspace(0.01, 15.0, 40)
-START_SIGMA_S = np.geomspace(0.06, 50.0, 16)
+START_SIGMA_S = np.geomspace(0.06, 190.0, 19)
 """The pairs that each profile is compared with to find its starts, 1/mm."""
 CACHED = 1024
 """Profiles whose misfits stay in the cache."""

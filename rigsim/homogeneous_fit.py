@@ -1,9 +1,11 @@
 """The homogeneous medium whose profile is nearest to a given one.
 
 Definition: of all half spaces of g = 0.8 and eta = 1.4 under air, the one whose reflectance in the
-fibre, by the stored Monte Carlo of `rigsim.white_fibre`, has the least sum of squares of
-log(R_f / R_f of the medium) over the fibres, all of one weight; fibres that take less than
-`FAINTEST_PER_MM2` are left out, as no camera of the probe tells them from noise.
+fibre, by the stored Monte Carlo of `rigsim.white_fibre`, is up to a factor nearest to the given
+one: the logarithms of the ratios have the least variance over the fibres, all of one weight; fibres
+that take less than `FAINTEST_PER_MM2` are left out, as no camera of the probe tells them from
+noise. The factor is for what pigment in a thin layer on top takes from light on its way in and out,
+at all distances alike; without it dark skin has no nearest medium of finite scattering.
 """
 
 from __future__ import annotations
@@ -28,8 +30,15 @@ noise: about ten standard errors of a spot's sum."""
 FEWEST: Final = 4
 """Fibres that must be bright enough."""
 
-STARTS: Final = ((0.03, 1.0), (0.1, 2.0), (0.4, 3.0), (1.0, 1.0))
-"""sigma_a and sigma_s' in 1/mm from which the search begins; the best end counts."""
+STARTS: Final = (
+    (0.03, 1.0), (0.1, 2.0), (0.4, 3.0), (1.0, 1.0), (0.01, 8.0), (0.005, 20.0), (0.004, 60.0),
+)  # fmt: skip
+"""sigma_a and sigma_s' in 1/mm from which the search begins; the best end counts. Layers dim near
+fibres less than far ones, which looks like more scattering than tissue has."""
+MOST_SCATTERING: Final = 200.0
+"""Of the search, 1/mm."""
+UNHELD: Final = 1e3
+"""Residual of media that the table does not hold."""
 
 
 class FitError(ValueError):
@@ -44,8 +53,10 @@ class HomogeneousFit:
     """Absorption coefficient, 1/mm."""
     sigma_s_prime_per_mm: float
     """Reduced scattering coefficient, 1/mm."""
+    factor: float
+    """R_f over that of the medium, geometric mean over the fibres used."""
     residual: float
-    """Root mean square of log(R_f / R_f of the medium) over the fibres used."""
+    """Standard deviation of log(R_f / R_f of the medium) over the fibres used."""
     fibres: int
     """How many were used."""
 
@@ -99,14 +110,16 @@ def nearest_medium(reflectance_per_mm2: ArrayLike, fibres: Fibres) -> Homogeneou
     target = np.log(profile[use])
     both = 0.5 * (fibres.core_mm + fibres.source_core_mm)
     low = table.distance[0] / (min(used.radii_mm) - both)
-    high = table.distance[-1] / (max(used.radii_mm) + both)
     # sigma_a / sigma_s' rather than sigma_a, as the table ends there
-    bounds = np.log([[1e-6, low * 1.0001], [table.absorption[-1] * 0.9999, high * 0.9999]])
+    bounds = np.log([[1e-6, low * 1.0001], [table.absorption[-1] * 0.9999, MOST_SCATTERING]])
 
     def misfit(logs: FloatArray) -> FloatArray:
         scattering = math.exp(logs[1])
+        if not table.holds(math.exp(logs[0]) * scattering, scattering, used):
+            return UNHELD * np.cos(np.arange(target.size))
         value, _ = table.profile(math.exp(logs[0]) * scattering, scattering, used)
-        return np.asarray(np.log(value) - target)
+        off = np.log(value) - target
+        return np.asarray(off - off.mean())
 
     ends = [
         least_squares(
@@ -118,9 +131,12 @@ def nearest_medium(reflectance_per_mm2: ArrayLike, fibres: Fibres) -> Homogeneou
     if (np.minimum(best.x - bounds[0], bounds[1] - best.x)[[1]] < 1e-3).any():
         raise FitError(f"sigma_s': got {math.exp(best.x[1]):.3g} 1/mm, the table's end")
     scattering = math.exp(best.x[1])
+    absorption = math.exp(best.x[0]) * scattering
+    value, _ = table.profile(absorption, scattering, used)
     return HomogeneousFit(
-        math.exp(best.x[0]) * scattering,
+        absorption,
         scattering,
+        math.exp(float(np.mean(target - np.log(value)))),
         math.sqrt(2.0 * float(best.cost) / int(use.sum())),
         int(use.sum()),
     )

@@ -49,8 +49,8 @@ def appearance(scene: ProbeScene, probings: Sequence[Probing]) -> SkinAppearance
         ``angle_deg``, ``suction_mbar``, ``radius_mm``, ``reflectance_per_mm2`` and ``stderr``
         (fibres x 3, of the Monte Carlo), ``sigma_a_per_mm``, ``sigma_s_prime_per_mm``,
         ``sigma_tr_per_mm`` (3 each) and ``kind``; of tissue that is not homogeneous and gray the
-        nearest medium by `rigsim.homogeneous_fit`, with ``fit_residual`` and ``fit_fibres``;
-        ``spots_px``, ``gain``, ``crosstalk`` of the
+        nearest medium by `rigsim.homogeneous_fit`, with ``fit_residual``, ``fit_factor`` and
+        ``fit_fibres``; ``spots_px``, ``gain``, ``crosstalk`` of the
         probe as built.
     """
     profiles = [_profile(scene, probing) for probing in probings]
@@ -89,6 +89,7 @@ def _profile(scene: ProbeScene, probing: Probing) -> dict[str, object]:
         fits = [nearest_medium(band, kind) for band in made.reflectance_per_mm2.T]
         media = [(f.sigma_a_per_mm, f.sigma_s_prime_per_mm, f.sigma_tr_per_mm) for f in fits]
         out["fit_residual"] = [fit.residual for fit in fits]
+        out["fit_factor"] = [fit.factor for fit in fits]
         out["fit_fibres"] = [fit.fibres for fit in fits]
     for name, values in zip(
         ("sigma_a_per_mm", "sigma_s_prime_per_mm", "sigma_tr_per_mm"),

@@ -30,6 +30,10 @@ ETA: Final = 1.4
 APERTURE: Final = 0.22
 FILE: Final = "white_fibre_mc.npz"
 
+DIFFUSES: Final = 0.01
+"""sigma_a / sigma_s' up to which the table is continued beyond its last distance: there its decay
+is that of diffusion to a thousandth."""
+
 DISC_RADII, DISC_TURNS = 2, 6
 """Points in a core: rings, and points on each."""
 
@@ -100,7 +104,10 @@ class WhiteFibre:
         return bool(
             apertures == (APERTURE, APERTURE)
             and near * sigma_s_prime_per_mm >= self.distance[0]
-            and far * sigma_s_prime_per_mm <= self.distance[-1]
+            and (
+                far * sigma_s_prime_per_mm <= self.distance[-1]
+                or sigma_a_per_mm / sigma_s_prime_per_mm <= DIFFUSES
+            )
             and sigma_a_per_mm / sigma_s_prime_per_mm <= self.absorption[-1]
         )
 
@@ -142,9 +149,13 @@ class WhiteFibre:
         scaled = apart * sigma_s_prime_per_mm
         a = sigma_a_per_mm / sigma_s_prime_per_mm
         shape, error = _splines()
-        x = distance_axis(scaled)
+        held = np.minimum(scaled, self.distance[-1])
+        x = distance_axis(held)
         y = np.full_like(x, float(absorption_axis(a)))
-        log_f = shape.ev(x, y) - np.log(scaled) - float(decay(a)) * scaled
+        fall = float(decay(a))
+        log_f = shape.ev(x, y) - np.log(held) - fall * scaled
+        # far from its source diffused light is that of a dipole, (1 + u) exp(-u) / u^3
+        log_f += np.log1p(fall * scaled) - np.log1p(fall * held) - 3.0 * np.log(scaled / held)
         each = share * np.exp(log_f)
         value = sigma_s_prime_per_mm**2 * each.sum(axis=1)
         relative = error(np.stack([x, y], axis=-1))

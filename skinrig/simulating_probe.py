@@ -25,8 +25,8 @@ from skinrig.acquisition import directions_of
 from skinrig.light_safety import light_figures, light_lines
 from skinrig.simulation import Order, Simulated, SimulationError, drive, open_session, truth_folder
 
-PHOTONS = {"small": 200_000, "full": 2_000_000}
-"""Of each site and angle: about a per cent in the far fibres, or a third of that."""
+PHOTONS = {"small": 60_000, "full": 2_000_000}
+"""Of each site and angle of skin: about two percent in the far fibres, or a third of one."""
 NEAR_S = 1e-3
 
 

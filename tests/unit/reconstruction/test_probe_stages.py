@@ -9,7 +9,7 @@ import pytest
 from capture.calibration.fibre import FibreReflectance
 from capture.plan.suction import Placement
 from capture.rig import load_rig
-from model import diffusion
+from model import photon_table
 from reconstruction import probe_stages
 from reconstruction.probe_images import Measurement, measurement_name
 
@@ -20,7 +20,11 @@ SIGMA_TR = math.sqrt(3 * MEDIUM[0] * sum(MEDIUM))
 
 
 def profile(site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0.01, rng=None):
-    value = np.repeat(scale * diffusion.reflectance(RADIUS, *MEDIUM, 1.4)[:, None], 3, axis=1)
+    value = photon_table.reflectance(
+        RADIUS, *MEDIUM, g=0.825, collection="fibre", core_mm=PROBE.fibres[0].core_mm,
+        source_core_mm=PROBE.source_core_mm,
+    )  # fmt: skip
+    value = np.repeat(scale * value[:, None], 3, axis=1)
     if rng is not None:
         value = value * (1 + noise * rng.standard_normal(value.shape))
     slope = common * (RADIUS - RADIUS.mean())[:, None] * np.ones(3)
@@ -46,7 +50,7 @@ def fit_of(document, method, number=0, channel="green"):
 def test_each_method_is_told_for_each_channel_and_the_fitting_model_comes_back():
     _, document = documents([profile()])
     assert len(document["measurements"][0]["fits"]) == 9
-    found = fit_of(document, "diffusion")
+    found = fit_of(document, "photon_table")
     assert found["sigma_tr_per_mm"] == pytest.approx(SIGMA_TR, rel=2e-3)
     assert found["valid"]
     # and the baseline misses it
@@ -57,7 +61,7 @@ def test_each_method_is_told_for_each_channel_and_the_fitting_model_comes_back()
 def test_what_the_phantom_leaves_uncertain_widens_the_interval_and_moves_nothing():
     _, without = documents([profile()])
     _, document = documents([profile(common=0.02)])
-    narrow, wide = (fit_of(d, "diffusion") for d in (without, document))
+    narrow, wide = (fit_of(d, "photon_table") for d in (without, document))
     assert wide["sigma_tr_per_mm"] == pytest.approx(narrow["sigma_tr_per_mm"], rel=1e-9)
     assert wide["sigma_tr_stderr_readings"] == pytest.approx(narrow["sigma_tr_stderr"], rel=1e-6)
     # a tilt of the log profile by .02 a mm is about that much of sigma_tr
@@ -125,3 +129,12 @@ def test_directions_are_judged_only_where_there_are_enough():
 def test_a_measurement_is_called_after_its_placement():
     names = {measurement_name(Placement("cheek", 22.5 * k, r)) for k in range(16) for r in (0, 1)}
     assert len(names) == 32
+
+
+def test_a_profile_dimmed_by_a_layer_on_top_is_fitted_up_to_a_factor():
+    _, document = documents([profile(scale=0.4)])
+    fit = fit_of(document, "photon_table")
+    assert fit["sigma_tr_per_mm"] == pytest.approx(SIGMA_TR, rel=0.02)
+    assert fit["factor"] == pytest.approx(0.4, rel=0.05)
+    # one that is not dimmed keeps its scale
+    assert fit_of(documents([profile()])[1], "photon_table")["factor"] == 1.0
