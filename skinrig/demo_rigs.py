@@ -16,6 +16,7 @@ from skinrig import (
     evaluation,
     microrelief_evaluation,
     reflection_evaluation,
+    subsurface_evaluation,
     surface_evaluation,
 )
 from skinrig.calibrating import calibrate
@@ -34,6 +35,10 @@ DOME_WANT = (
 DOME_WIDTH_PX = 320
 """Pixels across each of the dome's cameras, unless said otherwise."""
 
+PROBE_SUBJECT = "III"
+PROBE_MEDIUM = "homogeneous:0.08,1.2"
+"""A medium whose sigma_tr is known, 0.55 per mm: layers have one by definition only."""
+PROBE_WANT = ("profiles", "subsurface", "translucency")
 GRADIENT_SITE = "forehead"
 GRADIENT_WANT = ("normals", "height", "crossed", "strain", "histograms", "kernels")
 
@@ -172,10 +177,41 @@ def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: F
     )
 
 
+def _probe(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
+    """Calibrate a fibre probe, and measure a medium and three sites of a face."""
+    del width_px  # its camera looks at the ends of fibres
+    calibration, phantom = out / "calibration-probe", out / "session-probe-phantom"
+    with share("probe: capture a phantom"):
+        simulate_session("probe", phantom, target="phantom", seed=seed)
+    with share("probe: calibrate its fibres"):
+        calibrate("fibre", [phantom], calibration)
+    with share("probe: capture a medium and three sites of a face"):
+        captures = [
+            simulate_session("probe", out / "session-probe-medium", subject=PROBE_MEDIUM,
+                             sites=("cheek",), seed=seed),
+            simulate_session("probe", out / f"session-probe-{PROBE_SUBJECT}",
+                             subject=PROBE_SUBJECT, seed=seed),
+        ]  # fmt: skip
+    with share("probe: reconstruct sigma_tr and translucency"):
+        for capture in captures:
+            appearance = out / capture.session.name.replace("session", "appearance")
+            pipeline.reconstruct(
+                capture.session, want=PROBE_WANT, out=appearance, calibration=calibration,
+                truth=capture.truth.name if capture.truth else "",
+            )  # fmt: skip
+            found.errors += _subsurface_rows(appearance, capture.truth)
+    found.tables.append(_left_out("fibre probe", captures[-1]))
+    found.next = (
+        f"skinrig reconstruct {captures[-1].session} --calibration {calibration} "
+        "--want translucency --out maps"
+    )
+
+
 RIGS: Mapping[str, Callable[[Path, int, Share, int | None, Findings], None]] = {
     "flash": _flash,
     "dome": _dome,
     "gradient": _gradient,
+    "probe": _probe,
 }
 """What the demo does with each rig, in this order."""
 
@@ -214,6 +250,22 @@ def _surface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
     if held_out is not None:
         rows.append([name, "reflection, held out", 100 * held_out.median, "%", float("nan"), 0.0])
     return rows
+
+
+def _subsurface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
+    if truth is None:
+        return []
+    name = appearance.name.removeprefix("appearance-")
+    fits = subsurface_evaluation.compare_fits(store.read(appearance), store.read(truth))
+    lost = {
+        method: np.mean([not row.valid for row in fits if row.method == method])
+        for method in dict.fromkeys(row.method for row in fits)
+    }
+    return [
+        [name, f"sigma_tr, {row.method}", 100 * row.median, "%", 100 * row.coverage,
+         100 * float(lost[row.method])]
+        for row in subsurface_evaluation.by_method(fits)
+    ]  # fmt: skip
 
 
 def _microrelief_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:

@@ -10,28 +10,15 @@ intervals. Each repeat is a placement of its own. What lies in OUT already is no
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
-
-import numpy as np
 
 from model import store
 from reconstruction import pipeline
 from skinrig import subsurface_evaluation as evaluation
+from skinrig.bench_probe import medium
 from skinrig.calibrating import calibrate
 from skinrig.simulation import simulate_session, truth_folder
-
-
-def medium(seed: int) -> tuple[float, float, float]:
-    """Return sigma_a, sigma_s' and g of the medium of a seed."""
-    rng = np.random.default_rng(seed)
-    sigma_tr = math.exp(rng.uniform(math.log(0.3), math.log(3.0)))
-    sigma_s_prime = math.exp(rng.uniform(math.log(0.7), math.log(3.0)))
-    g = rng.uniform(0.7, 0.9)
-    # sigma_tr^2 = 3 a (a + s')
-    sigma_a = 0.5 * (math.sqrt(sigma_s_prime**2 + 4.0 / 3.0 * sigma_tr**2) - sigma_s_prime)
-    return sigma_a, sigma_s_prime, g
 
 
 def main(arguments: list[str]) -> None:
@@ -39,7 +26,9 @@ def main(arguments: list[str]) -> None:
     repeats = int(arguments[3]) if len(arguments) > 3 else 1
     out.mkdir(parents=True, exist_ok=True)
     if not (out / "calibration").exists():
-        simulate_session("probe", out / "session-phantom", target="phantom", seed=first)
+        simulate_session(
+            "probe", out / "session-phantom", target="phantom", seed=first, size="full"
+        )
         calibrate("fibre", [out / "session-phantom"], out / "calibration")
     rows: list[evaluation.FitError] = []
     for seed in range(first, first + media):
@@ -48,7 +37,7 @@ def main(arguments: list[str]) -> None:
         if not truth_folder(session).exists():
             simulate_session(
                 "probe", session, subject=f"homogeneous:{sigma_a:.6g},{sigma_s_prime:.6g},{g:.3g}",
-                sites=("cheek",), repeats=repeats, seed=seed,
+                sites=("cheek",), repeats=repeats, seed=seed, size="full",
             )  # fmt: skip
         pipeline.reconstruct(
             session, want=("profiles", "subsurface"), out=out / f"appearance-{seed}",
