@@ -257,6 +257,7 @@ def recipes():
         "subject": "Maps of the flash rig",
         "olat": "Maps of the dome",
         "gradient": "Maps of the gradient rig",
+        "fibres": "Maps of the fibre probe",
     }
     found = {headings[kind]: recipe for kind, recipe in pipeline.RECIPES.items()}
     return {**found, "Maps of pictures under listed lights": pipeline.LIGHT_LIST}
@@ -273,7 +274,7 @@ def test_the_maps_page_lists_every_map_of_every_recipe():
 def test_the_maps_page_lists_the_files_that_go_along():
     listed = {
         SPAN.findall(row[0])[0]
-        for heading in ("Files of the dome", "Files of the gradient rig")
+        for heading in ("Files of the dome", "Files of the gradient rig", "Files of the fibre probe")
         for row in rows(MAPS_PAGE, heading)
     }
     assert listed == {name for recipe in recipes().values() for name in recipe.files}
