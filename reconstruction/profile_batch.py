@@ -97,7 +97,7 @@ class ProfileBatch:
             weight = np.zeros(y.shape)
             np.divide(1.0, variance / safe**2 + START_ERROR**2, out=weight, where=seen)
         g = float(self.prior[3, 0])
-        best, second, rise = model.starts(logs, weight, g)
+        best, second, rise = model.starts(logs, weight, g, float(self.prior[2, 1]))
         self._run(model, chosen, y, variance, best)
         doubt = np.flatnonzero(np.isfinite(rise) & ((rise < RISE) | self._misfits(chosen)))
         if doubt.size:
@@ -113,18 +113,21 @@ class ProfileBatch:
             told = seen.sum(axis=1) >= FEWEST_READINGS
             bad = np.flatnonzero((chance < MISFIT_CHANCE) & told)
             if bad.size:
-                self._widen(model, chosen[bad])
+                self._widen(model, chosen[bad], best[bad])
             far = np.flatnonzero((self._relative(chosen) > UNLIKE) & told)
             if far.size:
                 self._compare_logarithms(model, chosen[far], logs[far], best[far], second[far])
 
-    def _widen(self, model: ProfileModel, chosen: NDArray[np.intp]) -> None:
+    def _widen(self, model: ProfileModel, chosen: NDArray[np.intp], begin: Floats) -> None:
         """Fit profiles again that the model does not describe, with its error from the residuals.
 
-        The same relative error at all fibres, so that the fit is the best in relative terms; a few
-        fibres far off all others are left out. chi2 becomes that of the errors as they were.
+        The same relative error at all fibres, so that the fit is the best in relative terms, as
+        are the starts; a few fibres far off all others are left out. chi2 becomes that of the
+        errors as they were.
         """
         y, variance, used = self.y[chosen], self.variance[chosen], self.used[chosen]
+        wide = variance + (START_ERROR * np.abs(y)) ** 2
+        self._run(model, chosen, y, wide, begin)
         most = np.floor(MOST_OUTLIERS * used.sum(axis=1))
         for _ in range(2):
             m = np.maximum(self.predicted[chosen], 1e-290)

@@ -111,7 +111,7 @@ class ProfileModel:
         return np.asarray(self.bias[0] + self.bias[1] * ratio)
 
     def starts(
-        self, log_reflectance: Floats, weight: Floats, g: float
+        self, log_reflectance: Floats, weight: Floats, g: float, common_error: float = 0.0
     ) -> tuple[Floats, Floats, Floats]:
         """Return where fits begin: the valleys of the misfit of logarithms along sigma_s'.
 
@@ -124,6 +124,9 @@ class ProfileModel:
             Weight 0 where a logarithm means nothing.
         g : float
             Asymmetry to begin with.
+        common_error : float
+            Standard deviation of the log of a common factor, which takes its best value for each
+            pair of the grid; 0: there is none.
 
         Returns
         -------
@@ -153,6 +156,10 @@ class ProfileModel:
             off = (log_reflectance[part] - middle).astype(np.float32)
             with _blas().limit(limits=1):  # threads would wait for one another
                 score = np.concatenate([given * off, given], axis=1) @ grid
+                if common_error > 0.0:
+                    left = (given * off).sum(axis=1, keepdims=True) - given @ curves.T
+                    firm = given.sum(axis=1, keepdims=True) + np.float32(common_error**-2)
+                    score -= left**2 / firm
             score += nowhere
             kernels.valleys(
                 score.reshape(-1, log_s.size, log_k.size), valley[:, part], place[:, part],
@@ -164,6 +171,10 @@ class ProfileModel:
             refined = log_k[0] + at * (log_k[1] - log_k[0])
             start[:, 0] = _log_absorption(refined, log_s[which])
             start[:, 1], start[:, 3] = log_s[which], g
+            if common_error > 0.0:
+                shown = np.log(np.maximum(self.profiles(start)[0], np.exp(LEAST_LOG)))
+                off = (weight * (log_reflectance - shown)).sum(axis=1)
+                start[:, 2] = off / (weight.sum(axis=1) + common_error**-2)
             ends.append(np.clip(start, self.bounds[:, 0], self.bounds[:, 1]))
         rise = np.full(depth.shape[1], np.inf)
         np.subtract(depth[1], depth[0], out=rise, where=np.isfinite(depth[1]))

@@ -5,7 +5,8 @@ fibre, by the stored Monte Carlo of `rigsim.white_fibre`, is up to a factor near
 one: the logarithms of the ratios have the least variance over the fibres, all of one weight; fibres
 that take less than `FAINTEST_PER_MM2` are left out, as no camera of the probe tells them from
 noise. The factor is for what pigment in a thin layer on top takes from light on its way in and out,
-at all distances alike; without it dark skin has no nearest medium of finite scattering.
+at all distances alike. Of dark skin the nearest medium scatters without bounds: its profile is that
+of a dipole at the surface, which tells sigma_tr and no more; the search ends at `MOST_SCATTERING`.
 """
 
 from __future__ import annotations
@@ -128,7 +129,8 @@ def nearest_medium(reflectance_per_mm2: ArrayLike, fibres: Fibres) -> Homogeneou
         for a, s in STARTS
     ]
     best = min(ends, key=lambda end: float(end.cost))
-    if (np.minimum(best.x - bounds[0], bounds[1] - best.x)[[1]] < 1e-3).any():
+    # at the most scattering sigma_tr alone shapes the profile: it stays what it is
+    if best.x[1] - bounds[0, 1] < 1e-3:
         raise FitError(f"sigma_s': got {math.exp(best.x[1]):.3g} 1/mm, the table's end")
     scattering = math.exp(best.x[1])
     absorption = math.exp(best.x[0]) * scattering

@@ -217,10 +217,10 @@ class SkinTissue:
     That pressure takes blood out of the skin under a probe is measured (Reif et al. 2008,
     doi:10.1117/1.2870115; Landis 1930, doi:10.1152/ajplegacy.1930.93.2.353, for the pressure in
     capillaries); the law's form is this project's choice, and so are the blood at rest and its
-    differences by site. Preset III under 60 mbar comes within two of the deviations of the means
-    in table 2 of Weyrich et al. 2006, doi:10.1145/1141911.1141987, but for red on the forehead,
-    whose deviation is narrow: with a tenth of the preset's melanin and no blood it is still
-    0.67 per mm, as the dermis without either absorbs.
+    differences by site. The nearest media of preset III under 60 mbar
+    (`rigsim.homogeneous_fit`) lie below the means in table 2 of Weyrich et al. 2006,
+    doi:10.1145/1141911.1141987: by 0.5 to 0.8 of its deviations in red, 1.3 to 1.6 in green, and
+    2.1 to 3.5 in blue, where a camera's band lets light through that is hardly absorbed.
 
     Examples
     --------
