@@ -86,7 +86,7 @@ def demo(
     out: Out = Path("demo"),
     rigs: Annotated[
         str, typer.Option(help="Rigs, joined by commas: flash, dome, gradient; default all.")
-    ] = "flash,dome,gradient",
+    ] = "flash,dome,gradient,probe",
     seed: Seed = 0,
     json: Json = False,
 ) -> None:

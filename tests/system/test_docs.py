@@ -274,7 +274,11 @@ def test_the_maps_page_lists_every_map_of_every_recipe():
 def test_the_maps_page_lists_the_files_that_go_along():
     listed = {
         SPAN.findall(row[0])[0]
-        for heading in ("Files of the dome", "Files of the gradient rig", "Files of the fibre probe")
+        for heading in (
+            "Files of the dome",
+            "Files of the gradient rig",
+            "Files of the fibre probe",
+        )
         for row in rows(MAPS_PAGE, heading)
     }
     assert listed == {name for recipe in recipes().values() for name in recipe.files}
