@@ -82,12 +82,15 @@ class ProfileFit:
     log_common : ndarray, shape (T, C)
         Change of log sigma_tr for one standard uncertainty of each cause that all fibres and all
         measurements share: what the phantom's certificate leaves uncertain.
+    log_coefficients : ndarray, shape (2, C)
+        Root sum square of such changes of log sigma_a and log sigma_s'.
     """
 
     profile: Profile
     fit: SubsurfaceFit
     log_stderr: Floats
     log_common: Floats
+    log_coefficients: Floats
 
     @property
     def log_total(self) -> Floats:
@@ -270,13 +273,19 @@ def _fitted(profiles: Sequence[Profile], probe: Probe, method: Any) -> list[Prof
     fit = invert(0.0)
     if np.any(unlike := fit.model_error[0] > UNLIKE):
         fit = _either(fit, invert(DIMMING), np.broadcast_to(unlike, fit.valid.shape))
-    log_tr = np.log(fit.sigma_tr_per_mm)
-    change = np.nan_to_num(log_tr[1:] - log_tr[0])
+
+    def change_of(coefficient: Floats) -> Floats:
+        logs = np.log(coefficient)
+        return np.asarray(np.nan_to_num(logs[1:] - logs[0]))
+
+    change = change_of(fit.sigma_tr_per_mm)
+    pair = [change_of(fit.sigma_a_per_mm), change_of(fit.sigma_s_prime_per_mm)]
+    shared = np.sqrt(np.square(pair).sum(axis=1))  # (2, M, C)
     log_stderr = fit.sigma_tr_stderr[0] / fit.sigma_tr_per_mm[0]
     return [
         ProfileFit(
             profile, _one(fit, (0, number)), log_stderr[number],
-            change[:, number].reshape(causes, -1),
+            change[:, number].reshape(causes, -1), shared[:, number],
         )
         for number, profile in enumerate(profiles)
     ]  # fmt: skip
@@ -329,6 +338,7 @@ def _sites(fits: Sequence[ProfileFit]) -> list[SiteValue]:
 def _fit_document(one: ProfileFit, c: int) -> dict[str, Any]:
     fit = one.fit
     sigma_tr, total = float(fit.sigma_tr_per_mm[c]), float(one.log_total[c])
+    shared = one.log_coefficients[:, c]
     # the interval of the readings, widened by what all fibres share
     widen = total / float(one.log_stderr[c]) if one.log_stderr[c] > 0 else 1.0
     with np.errstate(invalid="ignore"):
@@ -343,9 +353,11 @@ def _fit_document(one: ProfileFit, c: int) -> dict[str, Any]:
         "factor": fit.scale[c],
         "model_error": fit.model_error[c],
         "sigma_a_per_mm": fit.sigma_a_per_mm[c],
-        "sigma_a_stderr": fit.sigma_a_stderr[c],
+        "sigma_a_stderr": np.hypot(fit.sigma_a_stderr[c], shared[0] * fit.sigma_a_per_mm[c]),
         "sigma_s_prime_per_mm": fit.sigma_s_prime_per_mm[c],
-        "sigma_s_prime_stderr": fit.sigma_s_prime_stderr[c],
+        "sigma_s_prime_stderr": np.hypot(
+            fit.sigma_s_prime_stderr[c], shared[1] * fit.sigma_s_prime_per_mm[c]
+        ),
         "correlation": fit.correlation[c],
         "coefficients_identified": fit.coefficients_identified[c],
         "chi2": fit.chi2[c],
@@ -448,6 +460,7 @@ def _translucency(sites: Sequence[SiteValue], evidence: Evidence) -> Mapping[str
     left_out = [f"{site}: its place on a face is not known" for site in unplaced]
     left_out += [f"{site}: {why}" for site, why in found.left_out]
     evidence.noted["translucency_left_out"] = left_out
+    evidence.assumed += [f"translucency goes without {text}" for text in left_out]
     evidence.noted["translucency_conflicts"] = [": ".join(pair) for pair in found.conflicts]
     return {
         "translucency": SkinMap(

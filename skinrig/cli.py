@@ -85,7 +85,7 @@ def _root(
 def demo(
     out: Out = Path("demo"),
     rigs: Annotated[
-        str, typer.Option(help="Rigs, joined by commas: flash, dome, gradient; default all.")
+        str, typer.Option(help="Rigs, joined by commas: flash, dome, gradient, probe; default all.")
     ] = "flash,dome,gradient,probe",
     seed: Seed = 0,
     json: Json = False,
@@ -120,7 +120,8 @@ def simulate(
         str,
         typer.Option(
             help="Preset, I to VI, palest or darkest; of the probe also "
-            "homogeneous:SIGMA_A,SIGMA_S_PRIME in 1/mm."
+            "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G] or "
+            "anisotropic:SIGMA_A,SIGMA_S_PRIME[,STRENGTH[,AXIS]], 1/mm and degrees."
         ),
     ] = "III",
     mesh: Annotated[Path | None, typer.Option(help="Face mesh, .npz or .obj.")] = None,

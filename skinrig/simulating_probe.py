@@ -47,10 +47,6 @@ def simulate_probe(order: Order) -> Simulated:
         order.refuse("target of the probe", sites=None, angles=None)
     rig = load_rig("probe")
     plan = plan_of(rig, order)
-    figures = light_figures(plan, rig)
-    if order.progress is not None:
-        for line in light_lines(plan, rig):
-            order.progress(line)
     asked = {
         "rig": "probe", "size": order.size, "subject": order.subject,
         "target": order.target or "", "sites": ",".join(order.sites or SITES),
@@ -58,6 +54,12 @@ def simulate_probe(order: Order) -> Simulated:
         "all_brackets": order.all_brackets,
     }  # fmt: skip
     scene = make_scene(rig, order.target, subject=order.subject, seed=order.seed, size=order.size)
+    if order.target is None:
+        _check_sites(scene.tissue, order.sites or SITES, rig)
+    figures = light_figures(plan, rig)
+    if order.progress is not None:
+        for line in light_lines(plan, rig):
+            order.progress(line)
     session = open_session(order, plan, rig, asked)
     try:
         log = HeadLog(scene, truth_folder(order.out), resume=order.resume, session=session)
@@ -87,6 +89,18 @@ def simulate_probe(order: Order) -> Simulated:
     return Simulated(
         order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures
     )
+
+
+def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
+    """Raise where the tissue has no such site, before anything is captured."""
+    from rigsim.probe_tissue import TissueError
+
+    suction_mbar = rig.probe.suction_mbar if rig.probe is not None else 0.0
+    for site in sites:
+        try:
+            tissue.optics(site, 0.0, suction_mbar)
+        except TissueError as error:
+            raise SimulationError(str(error)) from error
 
 
 def plan_of(rig: Rig, order: Order) -> Plan:

@@ -67,6 +67,8 @@ def test_what_the_phantom_leaves_uncertain_widens_the_interval_and_moves_nothing
     # a tilt of the log profile by .02 a mm is about that much of sigma_tr
     shared = math.sqrt(wide["sigma_tr_stderr"] ** 2 - narrow["sigma_tr_stderr"] ** 2)
     assert 0.3 < shared / 0.02 < 1.5
+    for name in ("sigma_a", "sigma_s_prime"):
+        assert wide[f"{name}_stderr"] > 2.0 * narrow[f"{name}_stderr"]
     low, high = wide["interval_per_mm"]
     assert math.log(high / low) == pytest.approx(
         math.log(narrow["interval_per_mm"][1] / narrow["interval_per_mm"][0])
