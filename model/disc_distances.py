@@ -43,8 +43,8 @@ def distance_rule(
     >>> distance, weight = distance_rule(0.3, 0.2, 0.2)
     >>> round(float(weight @ distance**2), 6)  # r^2 + (a^2 + b^2)/2
     0.1
-    >>> distance_rule(1.0, 0.0, 0.0)
-    (array([1.]), array([1.]))
+    >>> [values.tolist() for values in distance_rule(1.0, 0.0, 0.0)]  # two points
+    [[1.0], [1.0]]
     """
     for name, value in (
         ("radius_mm", radius_mm),
