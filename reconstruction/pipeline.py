@@ -12,14 +12,7 @@ from typing import Any
 from capture.session import Session
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from reconstruction import (
-    dome_stages,
-    flash_stages,
-    gradient_stages,
-    probe_stages,
-    stack_stages,
-    stages,
-)
+from reconstruction import stages
 from reconstruction.evidence import Evidence, EvidenceError
 
 
@@ -43,22 +36,45 @@ class Recipe:
         return [product for name in want for product in meant.get(name, (name,))]
 
 
-RECIPES: Mapping[str, Recipe] = {
-    "subject": Recipe(flash_stages.MAPS, flash_stages.graph),
-    "olat": Recipe(dome_stages.MAPS, dome_stages.graph, dome_stages.FILES, ("position",)),
-    "gradient": Recipe(
-        gradient_stages.MAPS,
-        gradient_stages.graph,
-        gradient_stages.FILES,
-        products=gradient_stages.products,
-    ),
-    "fibres": Recipe(
-        probe_stages.MAPS, probe_stages.graph, probe_stages.FILES, products=probe_stages.products
-    ),
+def _flash() -> Recipe:
+    from reconstruction import flash_stages as stages_of
+
+    return Recipe(stages_of.MAPS, stages_of.graph)
+
+
+def _dome() -> Recipe:
+    from reconstruction import dome_stages as stages_of
+
+    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, ("position",))
+
+
+def _gradient() -> Recipe:
+    from reconstruction import gradient_stages as stages_of
+
+    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, products=stages_of.products)
+
+
+def _probe() -> Recipe:
+    from reconstruction import probe_stages as stages_of
+
+    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, products=stages_of.products)
+
+
+def light_list() -> Recipe:
+    """Return the recipe of pictures under listed lights, imported without a rig."""
+    from reconstruction import stack_stages as stages_of
+
+    return Recipe(stages_of.MAPS, stages_of.graph)
+
+
+# kernels are compiled when a module is first imported: each rig imports its own only
+RECIPES: Mapping[str, Callable[[], Recipe]] = {
+    "subject": _flash,
+    "olat": _dome,
+    "gradient": _gradient,
+    "fibres": _probe,
 }
 """By the kind of step that shows the subject."""
-LIGHT_LIST = Recipe(stack_stages.MAPS, stack_stages.graph)
-"""Pictures under listed lights, imported without a rig."""
 
 
 def recipe_of(session: Session) -> Recipe:
@@ -70,11 +86,11 @@ def recipe_of(session: Session) -> Recipe:
         When no step of its plan shows a subject.
     """
     if "light_list" in session.manifest.extra:
-        return LIGHT_LIST
+        return light_list()
     kinds = {step.kind for step in session.plan.steps}
     for kind, recipe in RECIPES.items():
         if kind in kinds:
-            return recipe
+            return recipe()
     raise EvidenceError(
         f"session {session.id}: shows {', '.join(sorted(kinds))}, expected steps of kind "
         f"{' or '.join(RECIPES)}; `skinrig calibrate` takes sessions of targets"

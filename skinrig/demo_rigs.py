@@ -1,4 +1,8 @@
-"""What the demo does with each rig: simulate, capture, calibrate, reconstruct and measure."""
+"""What the demo does with each rig: simulate, capture, calibrate, reconstruct and measure.
+
+Each rig runs in a process of its own, which compiles the kernels that it imports: what belongs to
+one rig is imported in its function.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +16,6 @@ import numpy as np
 
 from model import store
 from reconstruction import pipeline
-from skinrig import (
-    evaluation,
-    microrelief_evaluation,
-    reflection_evaluation,
-    subsurface_evaluation,
-    surface_evaluation,
-)
 from skinrig.calibrating import calibrate
 from skinrig.simulation import Simulated, simulate_session
 
@@ -225,6 +222,8 @@ def _left_out(rig: str, capture: Simulated) -> dict[str, Any]:
 
 
 def _chromophore_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
+    from skinrig import evaluation
+
     if truth is None:
         return []
     rows = evaluation.compare(
@@ -238,6 +237,8 @@ def _chromophore_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
 
 
 def _surface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
+    from skinrig import reflection_evaluation, surface_evaluation
+
     if truth is None:
         return []
     found, true = store.read(appearance), store.read(truth)
@@ -253,6 +254,8 @@ def _surface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
 
 
 def _subsurface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
+    from skinrig import subsurface_evaluation
+
     if truth is None:
         return []
     name = appearance.name.removeprefix("appearance-")
@@ -269,6 +272,8 @@ def _subsurface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
 
 
 def _microrelief_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
+    from skinrig import microrelief_evaluation
+
     if truth is None:
         return []
     found, true = store.read(appearance), store.read(truth)

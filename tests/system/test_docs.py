@@ -259,8 +259,8 @@ def recipes():
         "gradient": "Maps of the gradient rig",
         "fibres": "Maps of the fibre probe",
     }
-    found = {headings[kind]: recipe for kind, recipe in pipeline.RECIPES.items()}
-    return {**found, "Maps of pictures under listed lights": pipeline.LIGHT_LIST}
+    found = {headings[kind]: recipe() for kind, recipe in pipeline.RECIPES.items()}
+    return {**found, "Maps of pictures under listed lights": pipeline.light_list()}
 
 
 def test_the_maps_page_lists_every_map_of_every_recipe():
