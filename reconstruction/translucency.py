@@ -17,7 +17,6 @@ Weyrich et al. 2005, MERL TR2005-071, published as doi:10.1145/1141911.1141987
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,6 +30,7 @@ from scipy import stats
 from threadpoolctl import ThreadpoolController
 
 from model.translucency_population import TranslucencyPopulation, weyrich_2005
+from reconstruction import landmark_table
 
 Floats: TypeAlias = NDArray[np.float64]
 Float32s: TypeAlias = NDArray[np.float32]
@@ -512,25 +512,16 @@ def read_landmarks(
         texture.
     """
     height, width = texture_px
+    try:
+        places_px = landmark_table.read(path)
+    except landmark_table.LandmarkError as error:
+        raise TranslucencyError(str(error)) from error
     found: dict[str, tuple[float, float]] = {}
-    with Path(path).open(encoding="utf-8", newline="") as file:
-        table = csv.DictReader(line for line in file if not line.lstrip().startswith("#"))
-        header = [name.strip() for name in table.fieldnames or ()]
-        if header != ["name", "x", "y"]:
-            raise TranslucencyError(f"{path}: got columns {header}, expected name, x, y")
-        table.fieldnames = header
-        for row in table:
-            name = (row["name"] or "").strip()
-            try:
-                x, y = float(row["x"]), float(row["y"])
-            except (TypeError, ValueError) as error:
-                raise TranslucencyError(f"{path}: {name!r} has no numbers x, y") from error
-            u, v = (x + 0.5) / width, 1.0 - (y + 0.5) / height
-            if not (0 <= u <= 1 and 0 <= v <= 1):
-                raise TranslucencyError(
-                    f"{path}: {name!r} lies at ({x}, {y}), expected within {width} x {height} px"
-                )
-            if name in found:
-                raise TranslucencyError(f"{path}: {name!r} is there twice")
-            found[name] = (u, v)
+    for name, (x, y) in places_px.items():
+        u, v = (x + 0.5) / width, 1.0 - (y + 0.5) / height
+        if not (0 <= u <= 1 and 0 <= v <= 1):
+            raise TranslucencyError(
+                f"{path}: {name!r} lies at ({x}, {y}), expected within {width} x {height} px"
+            )
+        found[name] = (u, v)
     return found

@@ -302,9 +302,9 @@ def test_landmarks_name_pixels_of_a_texture(tmp_path):
         sites_of_labels(["nose"], found)
     for text, match in (
         ("label,x,y\na,1,1\n", "expected name, x, y"),
-        ("name,x,y\na,1,one\n", "no numbers"),
-        ("name,x,y\na,1\n", "no numbers"),
-        ("name,x,y\na,1,nan\n", "expected within"),
+        ("name,x,y\na,1,one\n", "line 2, column y: got 'one'"),
+        ("name,x,y\na,1\n", "line 2: got 2 cells"),
+        ("name,x,y\na,1,nan\n", "expected a finite number"),
         ("name,x,y\na,1,100\n", "expected within"),
         ("name,x,y\na,1,1\na,2,2\n", "twice"),
     ):

@@ -1,0 +1,82 @@
+"""Named points of a picture, as a user writes them down: a table ``name,x,y``."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+COLUMNS = ("name", "x", "y")
+
+
+class LandmarkError(ValueError):
+    """A table of landmarks that cannot be read."""
+
+
+def read(path: str | Path) -> dict[str, tuple[float, float]]:
+    """Read named points from a CSV file with the header ``name,x,y``.
+
+    Parameters
+    ----------
+    path
+        The table. Lines that begin with ``#`` and empty ones are skipped.
+
+    Returns
+    -------
+    dict
+        Name to (x, y), px: x to the right and y down from the centre of the upper left pixel.
+
+    Raises
+    ------
+    LandmarkError
+        For another header, an empty name, a name twice, or something that is no finite number;
+        it names line and column.
+    """
+    found: dict[str, tuple[float, float]] = {}
+    lines: dict[str, int] = {}
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise LandmarkError(f"{path}: is no UTF-8 text") from error
+    header = False
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        cells = [cell.strip() for cell in next(csv.reader([line]))]
+        if not header:
+            if cells != list(COLUMNS):
+                raise LandmarkError(
+                    f"{path}, line {number}: got columns {cells}, expected name, x, y"
+                )
+            header = True
+            continue
+        if len(cells) != len(COLUMNS):
+            raise LandmarkError(
+                f"{path}, line {number}: got {len(cells)} cells, expected 3: name, x, y"
+            )
+        name = cells[0]
+        if not name:
+            raise LandmarkError(f"{path}, line {number}, column name: got an empty name")
+        if name in found:
+            raise LandmarkError(
+                f"{path}, line {number}, column name: {name!r} is there twice, "
+                f"first in line {lines[name]}"
+            )
+        x, y = (
+            _number(cell, f"{path}, line {number}, column {column}")
+            for column, cell in zip(COLUMNS[1:], cells[1:], strict=True)
+        )
+        found[name], lines[name] = (x, y), number
+    if not header:
+        raise LandmarkError(f"{path}: is empty, expected the columns name, x, y")
+    return found
+
+
+def _number(cell: str, where: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError as error:
+        raise LandmarkError(f"{where}: got {cell!r}, expected a number") from error
+    if not math.isfinite(value):
+        raise LandmarkError(f"{where}: got {cell!r}, expected a finite number")
+    return value
