@@ -1,0 +1,92 @@
+"""Textures of different resolutions over the same square: bilinear reading, and averaging down.
+
+Texel i of n covers [i/n, (i + 1)/n] of the square, its centre at (i + 1/2)/n; beyond the outer
+centres the edge texel holds, as a graphics sampler that clamps does.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+Floats = NDArray[np.floating]
+
+
+def taps(texels: int, pixels: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return each pixel's first texel and the part that the next one has, bilinearly.
+
+    Parameters
+    ----------
+    texels, pixels : int
+        Numbers of texels and of pixels over the same length, each >= 1.
+
+    Examples
+    --------
+    >>> first, part = taps(2, 4)
+    >>> first.tolist(), part.tolist()
+    ([0, 0, 0, 1], [0.0, 0.25, 0.75, 0.0])
+    """
+    if texels < 1 or pixels < 1:
+        raise ValueError(f"texels, pixels: got {texels}, {pixels}, expected at least 1")
+    place = np.clip((np.arange(pixels) + 0.5) * texels / pixels - 0.5, 0.0, texels - 1.0)
+    first = np.floor(place).astype(np.int64)
+    return first, place - first
+
+
+def reading_matrix(texels: int, pixels: int) -> Any:
+    """Return the sparse matrix that reads `texels` bilinearly at `pixels`; rows sum to 1."""
+    first, part = taps(texels, pixels)
+    rows = np.arange(pixels)
+    after = np.minimum(first + 1, texels - 1)
+    values = np.concatenate([1.0 - part, part])
+    places = (np.concatenate([rows, rows]), np.concatenate([first, after]))
+    return sparse.csr_array((values, places), shape=(pixels, texels))
+
+
+def averaging_matrix(pixels: int, texels: int) -> Any:
+    """Return the sparse matrix that averages `pixels` over each of `texels`; rows sum to 1."""
+    edges = np.arange(texels + 1) * (pixels / texels)
+    values, rows, columns = [], [], []
+    for i in range(texels):
+        inside = np.arange(int(edges[i]), min(int(np.ceil(edges[i + 1] - 1e-9)), pixels))
+        share = np.minimum(inside + 1, edges[i + 1]) - np.maximum(inside, edges[i])
+        values.append(share / share.sum())
+        rows.append(np.full(inside.size, i))
+        columns.append(inside)
+    places = (np.concatenate(rows), np.concatenate(columns))
+    return sparse.csr_array((np.concatenate(values), places), shape=(texels, pixels))
+
+
+def resampled(texture: Floats, shape: tuple[int, int]) -> Floats:
+    """Return a texture at another resolution: averaged where finer, read bilinearly where coarser.
+
+    Parameters
+    ----------
+    texture : ndarray, shape (..., h, w)
+        Real and finite; channels lead.
+    shape : (int, int)
+        Rows and columns wanted.
+
+    Returns
+    -------
+    ndarray, shape (..., *shape)
+        Of the texture's type.
+
+    Examples
+    --------
+    >>> resampled(np.arange(4.0)[None], (1, 2)).tolist()
+    [[0.5, 2.5]]
+    """
+    out = np.asarray(texture)
+    for axis, pixels in ((-2, shape[0]), (-1, shape[1])):
+        texels = out.shape[axis]
+        if texels != pixels:
+            finer = texels > pixels
+            matrix = averaging_matrix(texels, pixels) if finer else reading_matrix(texels, pixels)
+            moved = np.moveaxis(out, axis, 0)
+            flat = matrix.astype(out.dtype) @ moved.reshape(texels, -1)
+            out = np.moveaxis(flat.reshape(pixels, *moved.shape[1:]), 0, axis)
+    return out

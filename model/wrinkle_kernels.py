@@ -1,0 +1,66 @@
+"""The compiled sum of wrinkle maps on a base map (see `model.wrinkles`).
+
+Textures are widened to the base's columns beforehand, so that the inner loop only blends two
+rows of each and runs without look-ups. Kernels are parallel over rows and called from one thread.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def add(total: Any, wx: Any, wy: Any, w_rows: Any, w_part: Any, a: Any, a_rows: Any,
+        a_part: Any) -> None:  # fmt: skip
+    """Add a wrinkle map times its strength to derivatives in place.
+
+    Parameters
+    ----------
+    total : (H, W, 2) real
+        Derivatives; changed.
+    wx, wy : (h, W) real
+        Wrinkle derivatives, widened to W columns.
+    w_rows, w_part : (H,) int64 and real
+        Upper texel row of each row, and the part of the row below it.
+    a, a_rows, a_part
+        The same of the zones' summed strength.
+    """
+    rows, columns = total.shape[0], total.shape[1]
+    for y in prange(rows):
+        w0, a0 = w_rows[y], a_rows[y]
+        w1, a1 = min(w0 + 1, wx.shape[0] - 1), min(a0 + 1, a.shape[0] - 1)
+        f, g = w_part[y], a_part[y]
+        for x in range(columns):
+            s = a[a0, x] + g * (a[a1, x] - a[a0, x])
+            total[y, x, 0] += s * (wx[w0, x] + f * (wx[w1, x] - wx[w0, x]))
+            total[y, x, 1] += s * (wy[w0, x] + f * (wy[w1, x] - wy[w0, x]))
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def add_and_normalize(base: Any, wx: Any, wy: Any, w_rows: Any, w_part: Any, a: Any, a_rows: Any,
+                      a_part: Any, normals: Any) -> None:  # fmt: skip
+    """Write unit normals of the base's derivatives plus a wrinkle map times its strength.
+
+    Parameters as of :func:`add`; `normals` (H, W, 3) is written, 0 where a derivative is not
+    finite.
+    """
+    rows, columns = base.shape[0], base.shape[1]
+    one = np.ones(1, base.dtype)[0]
+    zero = one - one
+    for y in prange(rows):
+        w0, a0 = w_rows[y], a_rows[y]
+        w1, a1 = min(w0 + 1, wx.shape[0] - 1), min(a0 + 1, a.shape[0] - 1)
+        f, g = w_part[y], a_part[y]
+        for x in range(columns):
+            s = a[a0, x] + g * (a[a1, x] - a[a0, x])
+            p = base[y, x, 0] + s * (wx[w0, x] + f * (wx[w1, x] - wx[w0, x]))
+            q = base[y, x, 1] + s * (wy[w0, x] + f * (wy[w1, x] - wy[w0, x]))
+            z = one / sqrt(p * p + q * q + one)
+            good = z > zero  # false for NaN and infinity
+            normals[y, x, 0] = p * z if good else zero
+            normals[y, x, 1] = q * z if good else zero
+            normals[y, x, 2] = z if good else zero

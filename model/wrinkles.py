@@ -1,0 +1,375 @@
+"""Wrinkles added to a face's normals: partial derivative maps, masked zones, signed weights.
+
+A tangent-space normal n is stored as (n_x/n_z, n_y/n_z), whose sum adds up relief as
+displacement would: the base map, plus one wrinkle map times the strength of its zones. Frames:
++X right, +Y up, +Z outward; row 0 is the top. For a height h over x right and y up the stored
+values are -dh/dx and -dh/dy (the paper drops the sign of the original encoding twice).
+
+Examples
+--------
+>>> normals = np.array([[[0.6, 0.0, 0.8]]])
+>>> encode(normals).round(12).tolist(), decode(encode(normals)).round(12).tolist()
+([[[0.75, 0.0]]], [[[0.6, 0.0, 0.8]]])
+
+References
+----------
+Jimenez, Echevarria, Oat, Gutierrez 2011, Practical and Realistic Facial Wrinkles Animation,
+GPU Pro 2, chapter 1. ISBN 978-1-56881-718-7. Listing 1.1 lost an operator in print:
+``mask = weights`` is ``mask *= weights``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model import texture_resampling as resampling
+from model import wrinkle_kernels as kernels
+from model.wrinkle_expressions import (
+    CLAMPS,
+    JIMENEZ2011,
+    Clamp,
+    Table,
+    Weights,
+    WrinkleError,
+    clamped,
+    zone_sums,
+)
+
+Floating: TypeAlias = NDArray[np.floating]
+Masks: TypeAlias = Floating | Sequence[Floating]
+
+ZONES = JIMENEZ2011.zones
+LIMIT = 1.0
+"""Largest derivative that a texture of [0, 1] holds: slopes of 45 degrees along x and y."""
+
+__all__ = [
+    "CLAMPS", "JIMENEZ2011", "LIMIT", "ZONES", "Encoding", "Layer", "WrinkleError", "combine",
+    "combine_layers", "decode", "encode", "encoding_report", "from_unit", "mask_stack",
+    "mask_textures", "to_unit",
+]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Encoding:
+    """Derivatives with what was lost on the way.
+
+    Attributes
+    ----------
+    derivatives : ndarray, shape (..., 2)
+        n_x/n_z and n_y/n_z; 0 where not valid.
+    valid : ndarray of bool, shape (...)
+        The normal is finite and points out of the surface (n_z > 0).
+    clamped : ndarray of bool, shape (...)
+        A derivative was held at the limit; valid pixels only.
+    clamped_fraction : float
+        Of the valid pixels; 0 where there is none.
+    """
+
+    derivatives: Floating
+    valid: NDArray[np.bool_]
+    clamped: NDArray[np.bool_]
+    clamped_fraction: float
+
+
+def encode(normals: ArrayLike, *, limit: float | None = LIMIT) -> Floating:
+    """Return partial derivatives of tangent-space normals.
+
+    Parameters
+    ----------
+    normals : array_like, shape (..., 3)
+        +X right, +Y up, +Z outward, of any positive length.
+    limit : float, optional
+        Derivatives are clamped to [-limit, limit]; None keeps them as they are. How many were
+        clamped says :func:`encoding_report`, which returns the same derivatives.
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        Dimensionless; float32 for float32 and float16 normals, float64 otherwise. 0 where a
+        normal is not finite, zero, or does not point outward: nothing represents it.
+    """
+    return encoding_report(normals, limit=limit).derivatives
+
+
+def encoding_report(normals: ArrayLike, *, limit: float | None = LIMIT) -> Encoding:
+    """Encode as :func:`encode` does, and say which pixels were clamped or have no derivative.
+
+    Examples
+    --------
+    >>> report = encoding_report([[0, 0, 1.0], [0.8, 0, 0.6], [0, 0, -1.0]])
+    >>> report.derivatives.tolist(), report.clamped_fraction, report.valid.tolist()
+    ([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]], 0.5, [True, True, False])
+    """
+    n = _real(normals)
+    if n.ndim == 0 or n.shape[-1] != 3:
+        raise WrinkleError(f"normals: got shape {n.shape}, expected (..., 3)")
+    if limit is not None and not limit > 0:
+        raise WrinkleError(f"limit: got {limit}, expected above 0 or None")
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        d = n[..., :2] / n[..., 2:]
+        # an infinite quotient is a slope beyond any limit; without one nothing represents it
+        outward = np.asarray(np.isfinite(n).all(axis=-1) & (n[..., 2] > 0))
+        valid = outward if limit is not None else np.asarray(outward & np.isfinite(d).all(axis=-1))
+        beyond = np.zeros(valid.shape, np.bool_)
+        if limit is not None:
+            beyond = np.asarray(valid & (np.abs(d) > limit).any(axis=-1))
+            np.clip(d, -limit, limit, out=d)
+    d[~valid] = 0.0
+    count = int(np.count_nonzero(valid))
+    share = float(np.count_nonzero(beyond)) / count if count else 0.0
+    return Encoding(d, valid, beyond, share)
+
+
+def decode(derivatives: ArrayLike) -> Floating:
+    """Return unit normals of partial derivatives.
+
+    Parameters
+    ----------
+    derivatives : array_like, shape (..., 2)
+        n_x/n_z and n_y/n_z, of any size.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Unit vectors with n_z > 0; (0, 0, 0) where a derivative is not finite.
+    """
+    d = _real(derivatives)
+    if d.ndim == 0 or d.shape[-1] != 2:
+        raise WrinkleError(f"derivatives: got shape {d.shape}, expected (..., 2)")
+    out = np.empty((*d.shape[:-1], 3), d.dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        squares = np.square(d[..., 0]) + np.square(d[..., 1])
+        z = 1.0 / np.sqrt(squares + d.dtype.type(1.0))
+        np.multiply(d, z[..., None], out=out[..., :2])
+        out[..., 2] = z
+    lost = np.asarray(~np.isfinite(squares))
+    if lost.any():  # squares overflow before derivatives do: scale these few first
+        out[lost] = _decoded_huge(d[lost])
+    return out
+
+
+def _decoded_huge(d: Floating) -> Floating:
+    good = np.asarray(np.isfinite(d).all(axis=-1))
+    d = np.where(good[:, None], d, 0.0)
+    scale = np.maximum(np.abs(d).max(axis=-1, keepdims=True), d.dtype.type(1.0))
+    n = np.concatenate([d / scale, 1.0 / scale], axis=-1)
+    n /= np.linalg.norm(n, axis=-1, keepdims=True)
+    return np.where(good[:, None], n, 0.0)
+
+
+def to_unit(derivatives: ArrayLike, *, limit: float = LIMIT) -> Floating:
+    """Return derivatives in [-limit, limit] as texture values in [0, 1]; 0 becomes 0.5."""
+    d = _real(derivatives)
+    if not np.isfinite(d).all() or (d.size and float(np.abs(d).max()) > limit):
+        raise WrinkleError(
+            f"derivatives: got values beyond {limit:g} or not finite, expected encode's with "
+            f"that limit"
+        )
+    return d * d.dtype.type(0.5 / limit) + d.dtype.type(0.5)
+
+
+def from_unit(values: ArrayLike, *, limit: float = LIMIT) -> Floating:
+    """Return the derivatives that texture values in [0, 1] stand for (listing 1.1)."""
+    t = _real(values)
+    return (t * t.dtype.type(2.0) - t.dtype.type(1.0)) * t.dtype.type(limit)
+
+
+def mask_stack(masks: Masks) -> Floating:
+    """Return masks as (Z, h, w), from that or from RGBA textures (h, w, 4), four zones each.
+
+    Parameters
+    ----------
+    masks : ndarray (Z, h, w), ndarray (T, h, w, 4), or sequence of (h, w) or of (h, w, 4)
+        Finite; 1 where a zone's weight counts in full.
+
+    Raises
+    ------
+    WrinkleError
+        For other shapes, or a value that is not finite.
+    """
+    try:
+        stack = _real(np.stack([_real(one) for one in masks]))
+    except ValueError as error:
+        raise WrinkleError(f"masks: got arrays of different shapes: {error}") from error
+    if stack.ndim == 4 and stack.shape[3] == 4:
+        stack = np.moveaxis(stack, 3, 1).reshape(-1, *stack.shape[1:3])
+    if stack.ndim != 3 or 0 in stack.shape:
+        raise WrinkleError(
+            f"masks: got shape {stack.shape}, expected (zones, h, w) or textures (h, w, 4)"
+        )
+    if not np.isfinite(stack).all():
+        raise WrinkleError("masks: got NaN or infinity, expected finite values")
+    return stack
+
+
+def mask_textures(masks: Masks) -> Floating:
+    """Return masks as RGBA textures (T, h, w, 4), four zones each; unused channels are 0.
+
+    Examples
+    --------
+    >>> mask_textures(np.ones((8, 2, 3))).shape
+    (2, 2, 3, 4)
+    """
+    stack = mask_stack(masks)
+    zones, h, w = stack.shape
+    out = np.zeros((math.ceil(zones / 4), 4, h, w), stack.dtype)
+    out.reshape(-1, h, w)[:zones] = stack
+    return np.ascontiguousarray(np.moveaxis(out, 1, 3))
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One wrinkle map with its zones, and what expressions ask of them.
+
+    Attributes
+    ----------
+    wrinkle : ndarray, shape (h, w, 2)
+        Derivatives that a weight of 1 adds to the base; finite.
+    masks : ndarray, shape (Z, h, w)
+        Or RGBA textures, see :func:`mask_stack`; any resolution.
+    table : ExpressionTable or mapping
+        Rows of Z weights; expressions that other layers know and this does not are refused
+        unless listed, so give them rows of 0.
+    """
+
+    wrinkle: Floating
+    masks: Floating
+    table: Table = JIMENEZ2011
+
+    def __post_init__(self) -> None:
+        """Refuse maps of other shapes or with NaN."""
+        object.__setattr__(self, "wrinkle", _derivative_map("wrinkle", self.wrinkle, finite=True))
+        object.__setattr__(self, "masks", mask_stack(self.masks))
+
+
+def combine(
+    base: ArrayLike,
+    wrinkle: ArrayLike,
+    masks: Masks,
+    weights: Weights,
+    *,
+    clamp: Clamp = "unit",
+    table: Table = JIMENEZ2011,
+) -> Floating:
+    """Return the normals of a base map with wrinkles: listing 1.1.
+
+    Parameters
+    ----------
+    base : array_like, shape (H, W, 2)
+        Derivatives of the neutral face.
+    wrinkle : array_like, shape (h, w, 2)
+        Derivatives to add, at any resolution over the same square; read bilinearly, averaged
+        first where finer than the base.
+    masks : array_like, shape (8, h, w), or two RGBA textures (h, w, 4)
+        In the order of `ZONES`, at any resolution.
+    weights : mapping of str to float, or array_like, shape (8,)
+        Any number of blend shapes by name, or the zones' sums.
+    clamp : {"unit", "signed"}
+        Each zone's sum over blend shapes is held in [0, 1], the paper's words, or in [-1, 1].
+    table : ExpressionTable or mapping, optional
+        Zones' weights of each blend shape.
+
+    Returns
+    -------
+    ndarray, shape (H, W, 3)
+        Unit tangent-space normals of the base's type; (0, 0, 0) where the base is not finite
+        (or beyond 1e18, whose square float32 does not hold).
+
+    Examples
+    --------
+    >>> base, wrinkle, masks = np.zeros((4, 4, 2)), np.full((2, 2, 2), 0.5), np.ones((8, 1, 1))
+    >>> n = combine(base, wrinkle, masks, {"surprise": 1, "anger": 1}, table={
+    ...     "surprise": [0.8, 0, 0, 0, 0, 0, 0, 0], "anger": [-0.6, 0, 0, 0, 0, 0, 0, 0]})
+    >>> encode(n)[0, 0].round(9).tolist()
+    [0.1, 0.1]
+    """
+    return combine_layers(base, [Layer(wrinkle, masks, table)], weights, clamp=clamp)  # type: ignore[arg-type]
+
+
+def combine_layers(
+    base: ArrayLike,
+    layers: Sequence[Layer],
+    weights: Weights,
+    *,
+    clamp: Clamp = "unit",
+) -> Floating:
+    """Return the normals of a base map with several wrinkle maps, such as one of a lemon pose.
+
+    Parameters
+    ----------
+    base : array_like, shape (H, W, 2)
+    layers : sequence of Layer
+        Any number, none included.
+    weights : mapping of str to float, or array_like (Z,)
+        Blend shapes by name, looked up in each layer's table; or sums that hold for every layer,
+        whose numbers of zones must then agree.
+    clamp : {"unit", "signed"}
+
+    Returns
+    -------
+    ndarray, shape (H, W, 3)
+    """
+    total = _derivative_map("base", base, finite=False)
+    if not layers:
+        return decode(total)
+    for last, layer in zip([False] * (len(layers) - 1) + [True], layers, strict=True):
+        strength = zone_strength(layer, clamped(zone_sums(weights, layer.table), clamp))
+        parts = _widened(layer, strength, total)
+        if last:
+            normals = np.empty((*total.shape[:2], 3), total.dtype)
+            kernels.add_and_normalize(total, *parts, normals)
+            return normals
+        if total is base or np.shares_memory(total, np.asarray(base)):
+            total = total.copy()
+        kernels.add(total, *parts)
+    raise AssertionError("a last layer returns")
+
+
+def zone_strength(layer: Layer, sums: Floating) -> Floating:
+    """Return the masks summed with their zones' weights, (h, w), at the masks' resolution.
+
+    Bilinear reading is linear, so that one map is read instead of as many as there are zones.
+    """
+    if sums.shape[0] != layer.masks.shape[0]:
+        raise WrinkleError(
+            f"weights: got {sums.shape[0]} zones, expected the {layer.masks.shape[0]} of the masks"
+        )
+    return np.tensordot(sums, layer.masks.astype(np.float64, copy=False), axes=1)
+
+
+def _widened(layer: Layer, strength: Floating, base: Floating) -> tuple[Any, ...]:
+    """Return what the kernels read: textures with the base's columns, and rows' taps."""
+    height, width = base.shape[:2]
+    parts: list[Any] = []
+    for texture in (np.moveaxis(layer.wrinkle, 2, 0), strength):
+        h = min(texture.shape[-2], height)
+        wide = resampling.resampled(texture.astype(base.dtype, copy=False), (h, width))
+        first, part = resampling.taps(h, height)
+        planes = np.ascontiguousarray(wide, base.dtype)
+        parts += list(planes) if planes.ndim == 3 else [planes]
+        parts += [first, part.astype(base.dtype)]
+    return tuple(parts)
+
+
+def _derivative_map(name: str, values: ArrayLike, *, finite: bool) -> Floating:
+    d = _real(values)
+    if d.ndim != 3 or d.shape[2] != 2 or 0 in d.shape:
+        hint = "; encode normals first" if d.ndim == 3 and d.shape[2] == 3 else ""
+        raise WrinkleError(f"{name}: got shape {d.shape}, expected (H, W, 2){hint}")
+    if finite and not np.isfinite(d).all():
+        raise WrinkleError(f"{name}: got NaN or infinity, expected finite derivatives")
+    return np.ascontiguousarray(d)
+
+
+def _real(values: ArrayLike) -> Floating:
+    """Return float32 arrays as they are, half as float32, and everything else as float64."""
+    given = np.asarray(values)
+    if given.dtype in (np.float16, np.float32):
+        return given.astype(np.float32, copy=False)
+    return given.astype(np.float64, copy=False)
