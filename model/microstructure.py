@@ -141,6 +141,20 @@ class KernelTable:
         m, c = np.asarray(self.alpha_lines).T
         return m[line] * r + c[line]
 
+    def sigma_lines_um(self) -> tuple[Line, Line]:
+        """Return sigma's lines for r < 1 and r >= 1; a side that was not measured has the other's.
+
+        Raises
+        ------
+        KernelTableError
+            For a table with neither.
+        """
+        below = self.sigma_compression_um or self.sigma_stretch_um
+        above = self.sigma_stretch_um or self.sigma_compression_um
+        if below is None or above is None:
+            raise KernelTableError("table: got no line for sigma")
+        return below, above
+
     def inside(self, stretch: ArrayLike) -> NDArray[np.bool_]:
         """Return whether each stretch ratio lies in the fitted range."""
         r = np.asarray(stretch, np.float64)
@@ -228,7 +242,7 @@ def kernel_parameters(
     stretch: ArrayLike,
     table: KernelTable = FOREHEAD,
     *,
-    outside: Literal["refuse", "clamp"] = "refuse",
+    extrapolate: Literal["hold", "formula", "refuse"] = "hold",
 ) -> tuple[Floats, Floats]:
     """Return the kernel that a stretch ratio asks for.
 
@@ -238,16 +252,18 @@ def kernel_parameters(
         Ratios r > 0 of lengths along the axis: above 1 stretched, below 1 compressed.
     table : KernelTable
         Of the skin in question; the paper's forehead by default (eqs. 8 and 9).
-    outside : {"refuse", "clamp"}
-        What is done beyond the fitted range, where a line means nothing (eq. 9 gives sigma = 0
-        at r = 0.665): an error, or the values of the nearest end; ``table.inside(stretch)``
-        tells which ones were clamped.
+    extrapolate : {"hold", "formula", "refuse"}
+        What is done beyond the fitted range; ``table.inside(stretch)`` tells which ones are.
+        "hold" gives the values of the nearest end. "formula" goes on along the lines: eq. (9) then
+        has sigma = 0 at and below r = 0.665, which switches sharpening off where skin is most
+        compressed. "refuse" is an error.
 
     Returns
     -------
     alpha, sigma_um : ndarray of float64
-        Of the shape of ``stretch``: strength in [-2, 1], standard deviation in um, > 0.
-        alpha is 0 at r = 1, where sigma jumps from one line to the other.
+        Of the shape of ``stretch``: strength in [-2, 1], standard deviation in um, >= 0 (0 by
+        "formula" only, and then nothing is convolved). alpha is exactly 0 at r = 1, where sigma
+        jumps from one line to the other.
 
     Raises
     ------
@@ -256,26 +272,27 @@ def kernel_parameters(
 
     Examples
     --------
-    >>> alpha, sigma_um = kernel_parameters([0.8, 1.0, 1.2])
+    >>> alpha, sigma_um = kernel_parameters([0.5, 0.8, 1.0, 1.2])
     >>> alpha.round(3).tolist(), sigma_um.round(2).tolist()
-    ([-1.48, 0.0, 0.618], [9.5, 11.7, 19.34])
+    ([-2.0, -1.48, 0.0, 0.618], [4.56, 9.5, 11.7, 19.34])
     """
-    if outside not in ("refuse", "clamp"):
-        raise ValueError(f'outside: got {outside!r}, expected "refuse" or "clamp"')
+    if extrapolate not in ("hold", "formula", "refuse"):
+        raise ValueError(
+            f'extrapolate: got {extrapolate!r}, expected "hold", "formula" or "refuse"'
+        )
     r = np.asarray(stretch, np.float64)
     if not (np.isfinite(r).all() and (r > 0).all()):
         raise KernelTableError("stretch: got NaN, infinity or a ratio <= 0")
     low, high = table.stretch_range
-    if outside == "refuse" and not table.inside(r).all():
+    if extrapolate == "refuse" and not table.inside(r).all():
         raise KernelTableError(
             f"stretch: got {r.min():g}...{r.max():g}, expected {low:g}...{high:g}, where "
-            'the table was measured; outside="clamp" gives the values at its ends'
+            'the table was measured; extrapolate="hold" gives the values at its ends'
         )
-    r = np.clip(r, low, high)
-    alpha = np.clip(table.unlimited_alpha(r), *ALPHA_LIMITS)
-    below = table.sigma_compression_um or table.sigma_stretch_um
-    above = table.sigma_stretch_um or table.sigma_compression_um
-    if below is None or above is None:
-        raise KernelTableError("table: got no line for sigma")
+    if extrapolate == "hold":
+        r = np.clip(r, low, high)
+    # a table's alpha(1) may be off by a rounding; nothing at all happens to neutral skin
+    alpha = np.where(r == 1.0, 0.0, np.clip(table.unlimited_alpha(r), *ALPHA_LIMITS))
+    below, above = table.sigma_lines_um()
     sigma = np.where(r < 1.0, below[0] * r + below[1], above[0] * r + above[1])
-    return alpha, sigma
+    return alpha, np.maximum(sigma, 0.0)

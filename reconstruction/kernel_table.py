@@ -389,7 +389,7 @@ def direction_dependence(
         )
     count = np.bincount(group, minlength=k)
     offsets, errors, chances = [], [], []
-    for value, told in zip((a, s), kernel_parameters(r, table), strict=True):
+    for value, told in zip((a, s), kernel_parameters(r, table, extrapolate="refuse"), strict=True):
         residual = value - told
         mean = np.bincount(group, residual, k) / count
         within = float(np.sum((residual - mean[group]) ** 2)) / (r.size - k)
@@ -413,5 +413,5 @@ def alpha_rms(table: KernelTable, stretch: ArrayLike, alpha: ArrayLike) -> float
     >>> round(alpha_rms(FOREHEAD, points.stretch, points.alpha), 3)  # eq. (8) on fig. 11
     0.199
     """
-    found, _ = kernel_parameters(stretch, table)
+    found, _ = kernel_parameters(stretch, table, extrapolate="refuse")
     return float(np.sqrt(np.mean((found - np.asarray(alpha, np.float64)) ** 2)))

@@ -29,15 +29,39 @@ def test_neutral_skin_keeps_its_relief_and_sigma_jumps_there():
     np.testing.assert_allclose(sigma_um, [23.6, 11.7])
 
 
-def test_beyond_the_measured_range_a_table_refuses_or_holds_its_ends():
-    with pytest.raises(KernelTableError, match=r"0\.73\.\.\.1\.28"):
-        kernel_parameters(0.665)  # eq. (9) would give sigma = 0
-    held = kernel_parameters([0.5, 2.0], outside="clamp")
+def test_beyond_the_measured_range_a_table_holds_its_ends_or_goes_on_or_refuses():
+    held = kernel_parameters([0.5, 2.0])
     np.testing.assert_array_equal(held, kernel_parameters([0.73, 1.28]))
+    alpha, sigma_um = kernel_parameters([0.5, 0.665, 2.0], extrapolate="formula")
+    np.testing.assert_array_equal(alpha, [-2.0, -2.0, 1.0])
+    np.testing.assert_allclose(sigma_um, [0.0, 0.0, 49.9], atol=0.02)  # eq. (9) ends at r = 0.665
+    with pytest.raises(KernelTableError, match=r"0\.73\.\.\.1\.28"):
+        kernel_parameters(0.665, extrapolate="refuse")
+    with pytest.raises(ValueError, match="extrapolate"):
+        kernel_parameters(1.0, extrapolate="clamp")
     np.testing.assert_array_equal(FOREHEAD.inside([0.5, 0.73, 1.0, 1.28, 2.0]), [0, 1, 1, 1, 0])
     for bad in (np.nan, 0.0, -1.0, np.inf):
         with pytest.raises(KernelTableError):
-            kernel_parameters(bad, outside="clamp")
+            kernel_parameters(bad)
+
+
+def test_the_neutral_kernel_is_nothing_at_all_in_every_table():
+    m = 1.0 / 3.0
+    rounded = dataclasses.replace(
+        FOREHEAD, alpha_breaks=(), alpha_lines=((m, -np.nextafter(m, 1.0)),)
+    )
+    assert rounded.unlimited_alpha(np.ones(1))[0] != 0.0
+    for table in (FOREHEAD, rounded):
+        assert kernel_parameters(1.0, table)[0] == 0.0
+
+
+def test_kernels_keep_to_their_ranges_for_any_stretch():
+    r = np.geomspace(1e-3, 1e3, 4001)
+    for extrapolate in ("hold", "formula"):
+        alpha, sigma_um = kernel_parameters(r, extrapolate=extrapolate)
+        assert alpha.min() == -2.0
+        assert alpha.max() <= 1.0
+        assert sigma_um.min() >= 0.0
 
 
 def test_a_table_goes_through_json_and_damage_is_named():
