@@ -236,16 +236,27 @@ class Layer:
     table : ExpressionTable or mapping
         Rows of Z weights; expressions that other layers know and this does not are refused
         unless listed, so give them rows of 0.
+    stderr : ndarray, shape (h, w, 2), optional
+        Standard error of `wrinkle`; None for one that was painted or is a truth.
+    valid : ndarray of bool, shape (h, w), optional
+        Where `wrinkle` was measured; elsewhere it is 0. None: everywhere.
     """
 
     wrinkle: Floating
     masks: Floating
     table: Table = JIMENEZ2011
+    stderr: Floating | None = None
+    valid: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         """Refuse maps of other shapes or with NaN."""
         object.__setattr__(self, "wrinkle", _derivative_map("wrinkle", self.wrinkle, finite=True))
         object.__setattr__(self, "masks", mask_stack(self.masks))
+        shape = self.wrinkle.shape
+        if self.stderr is not None and np.shape(self.stderr) != shape:
+            raise WrinkleError(f"stderr: got shape {np.shape(self.stderr)}, expected {shape}")
+        if self.valid is not None and np.shape(self.valid) != shape[:2]:
+            raise WrinkleError(f"valid: got shape {np.shape(self.valid)}, expected {shape[:2]}")
 
 
 def combine(
