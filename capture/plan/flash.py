@@ -20,6 +20,7 @@ def flash_plan(
     *,
     states: Sequence[str] = ("neutral",),
     repeats: int = 1,
+    interleave: bool = False,
     darks: int = 4,
     power: float = 1.0,
     exposure_s: float = 0.008,
@@ -34,6 +35,9 @@ def flash_plan(
         Expressions or physiological states, captured one after the other.
     repeats : int
         Image pairs per state, >= 1.
+    interleave : bool
+        Whether all other states come between two repeats of one, as in Jimenez et al. 2010: the
+        repeats then tell how well a state is repeated, not only how well it is held.
     darks : int
         Frames with no light at the beginning, >= 0.
     power : float
@@ -46,7 +50,8 @@ def flash_plan(
     -------
     Plan
         Darks, then per state and repeat a parallel and a crossed image; the order of the two
-        alternates, so that the analyser turns once per pair.
+        alternates, so that the analyser turns once per pair. The repeats of a state follow each
+        other, or with ``interleave`` each repeat goes through all states.
 
     Examples
     --------
@@ -57,7 +62,10 @@ def flash_plan(
     [('D000', 'parallel'), ('S000', 'parallel'), ('S001', 'crossed'), ('S002', 'crossed'),
      ('S003', 'parallel')]
     >>> round(plan.estimated_s(rig), 2)
-    29.04
+    28.79
+    >>> plan = flash_plan(rig, states=("neutral", "anger"), repeats=2, darks=0, interleave=True)
+    >>> [s.index["state"] for s in plan.steps[::2]]
+    ['neutral', 'anger', 'neutral', 'anger']
     """
     require(repeats >= 1, "repeats", repeats, ">= 1")
     require(darks >= 0, "darks", darks, ">= 0")
@@ -65,13 +73,15 @@ def flash_plan(
     series = _Series(rig, exposure_s=exposure_s, iso=iso)
     series.darks(darks)
     pair: list[Polarizer] = ["parallel", "crossed"]
-    for state in states:
-        for repeat in range(repeats):
-            for polarizer in pair:
-                index: dict[str, str | int | float] = {"state": state, "polarizer": polarizer}
-                index["repeat"] = repeat
-                series.add("S", "subject", index, polarizer=polarizer, power=power)
-            pair.reverse()
+    order = [(state, repeat) for state in states for repeat in range(repeats)]
+    if interleave:
+        order = [(state, repeat) for repeat in range(repeats) for state in states]
+    for state, repeat in order:
+        for polarizer in pair:
+            index: dict[str, str | int | float] = {"state": state, "polarizer": polarizer}
+            index["repeat"] = repeat
+            series.add("S", "subject", index, polarizer=polarizer, power=power)
+        pair.reverse()
     return series.plan()
 
 

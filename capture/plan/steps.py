@@ -44,6 +44,7 @@ _SETTINGS: Mapping[str, tuple[tuple[type, ...], Any, str]] = {
     "dwell_s": ((int, float), lambda v: 0 < v < math.inf, "seconds > 0"),
     "suction_mbar": ((int, float), lambda v: 0 < v < math.inf, "mbar > 0"),
     "fibre": ((int,), lambda v: v >= 0, "a fibre's number >= 0, or none for all"),
+    "start_s": ((int, float), lambda v: 0 <= v < math.inf, "seconds >= 0"),
 }
 
 
@@ -73,7 +74,8 @@ class Step:
         crossed) takes precedence over ``polarizer``. On the dome ``light`` (its name), or ``leds``
         (names joined by +), at ``level`` (0 to 1) for ``dwell_s``; in the gradient sphere
         ``pattern`` instead of lights; of the fibre probe ``suction_mbar`` and ``fibre`` (number of
-        the only fibre that is not covered). A rig may bring further names.
+        the only fibre that is not covered). Of a sequence ``start_s``, when, s after its beginning.
+        A rig may bring further names.
     cameras : tuple of str
         Views that take a frame.
 

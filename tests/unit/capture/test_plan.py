@@ -75,7 +75,7 @@ def test_a_plan_survives_its_json_and_a_pickle(flash, target):
 def test_the_estimate_is_the_read_out_of_every_frame_and_the_turns_between(flash):
     plan = flash_plan(flash, darks=1, exposure_s=0.5)
     # dark, parallel, crossed: three read-outs and exposures, the analyser set twice
-    assert plan.estimated_s(flash) == pytest.approx(3 * (5.5 + 0.5) + 2 * 0.5)
+    assert plan.estimated_s(flash) == pytest.approx(3 * (5.45 + 0.5) + 2 * 0.5)
 
 
 def test_the_estimate_never_undercuts_the_pop_limit(flash):
