@@ -78,13 +78,42 @@ def on_mean_head(points_mm: Float32Array, mesh: Mesh) -> Float32Array:
         Shape (..., 3): scaled so that the face is as wide, moved so that the tips of the noses
         coincide.
     """
+    tip, scale = _tip_and_scale(mesh)
+    mean_tip = np.array(LANDMARKS_MM["nose tip"])
+    return np.asarray((points_mm - tip) * scale + mean_tip, np.float32)
+
+
+def from_mean_head(points_mm: NDArray[np.floating], mesh: Mesh) -> NDArray[np.float64]:
+    """Move points of the mean head to a face mesh, the inverse of `on_mean_head`.
+
+    Parameters
+    ----------
+    points_mm
+        Positions on the mean head, shape (..., 3).
+    mesh
+        A face that looks towards +z.
+
+    Returns
+    -------
+    ndarray of float64
+        Shape (..., 3), rig frame.
+    """
+    tip, scale = _tip_and_scale(mesh)
+    mean_tip = np.array(LANDMARKS_MM["nose tip"])
+    return np.asarray((points_mm - mean_tip) / scale + tip, np.float64)
+
+
+def mean_head_scale(mesh: Mesh) -> float:
+    """Return mm on the mean head for each mm on a face mesh."""
+    return _tip_and_scale(mesh)[1]
+
+
+def _tip_and_scale(mesh: Mesh) -> tuple[NDArray[np.float64], float]:
     vertices = mesh.vertices_mm.astype(np.float64)
     tip = vertices[np.argmax(vertices[:, 2])]
     level = np.abs(vertices[:, 1] - tip[1]) < 25.0
     width = np.ptp(vertices[level, 0]) if level.any() else np.ptp(vertices[:, 0])
-    scale = MEAN_WIDTH_MM / max(float(width), 1e-6)
-    mean_tip = np.array(LANDMARKS_MM["nose tip"])
-    return np.asarray((points_mm - tip) * scale + mean_tip, np.float32)
+    return tip, MEAN_WIDTH_MM / max(float(width), 1e-6)
 
 
 MEAN_WIDTH_MM: Final = 158.0

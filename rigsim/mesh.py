@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -36,6 +37,8 @@ class Mesh:
     """Texture coordinates, shape (V, 2), in [0, 1]; (0, 0) is bottom left."""
     normals: Float32Array
     """Unit shading normals, shape (V, 3), outward."""
+    shapes: Mapping[str, Float32Array] = field(default_factory=dict)
+    """Blend shapes that came with the mesh: how each vertex moves at weight 1, mm, (V, 3) each."""
 
     def __post_init__(self) -> None:
         """Check shapes, ranges and finiteness."""
@@ -46,6 +49,7 @@ class Mesh:
             ("uv", self.uv, (count, 2)),
             ("normals", self.normals, (count, 3)),
             ("faces", faces, (len(faces), 3)),
+            *((f"shapes[{name!r}]", deltas, (count, 3)) for name, deltas in self.shapes.items()),
         ):
             if array.shape != shape:
                 raise MeshError(f"{name}: got shape {array.shape}, expected {shape}")
@@ -69,13 +73,18 @@ class Mesh:
 
 
 def build_mesh(
-    vertices_mm: ArrayLike, faces: ArrayLike, uv: ArrayLike, normals: ArrayLike | None = None
+    vertices_mm: ArrayLike,
+    faces: ArrayLike,
+    uv: ArrayLike,
+    normals: ArrayLike | None = None,
+    *,
+    shapes: Mapping[str, ArrayLike] | None = None,
 ) -> Mesh:
     """Return a checked mesh, with angle-weighted normals where none are given.
 
     Parameters
     ----------
-    vertices_mm, faces, uv, normals
+    vertices_mm, faces, uv, normals, shapes
         As the fields of `Mesh`; any real or integer type.
 
     Returns
@@ -106,6 +115,7 @@ def build_mesh(
         triangles,
         np.ascontiguousarray(uv, np.float32),
         np.ascontiguousarray(shading, np.float32),
+        {name: np.ascontiguousarray(deltas, np.float32) for name, deltas in (shapes or {}).items()},
     )
 
 
@@ -157,8 +167,9 @@ def load_mesh(path: str | Path) -> Mesh:
     Parameters
     ----------
     path
-        An .npz with arrays ``vertices_mm`` (V, 3), ``faces`` (F, 3) and ``uv`` (V, 2), or an
-        .obj with texture coordinates whose unit is the millimetre.
+        An .npz with arrays ``vertices_mm`` (V, 3), ``faces`` (F, 3) and ``uv`` (V, 2), and, where
+        it has blend shapes, ``shape_names`` (S,) and ``shape_deltas_mm`` (S, V, 3); or an .obj with
+        texture coordinates whose unit is the millimetre.
 
     Returns
     -------
@@ -197,7 +208,7 @@ def centered(mesh: Mesh, *, nose_tip_mm: tuple[float, float, float] = (0.0, -8.0
     """
     foremost = mesh.vertices_mm[int(np.argmax(mesh.vertices_mm[:, 2]))]
     shift = np.array(nose_tip_mm, np.float32) - foremost
-    return Mesh(mesh.vertices_mm + shift, mesh.faces, mesh.uv, mesh.normals)
+    return Mesh(mesh.vertices_mm + shift, mesh.faces, mesh.uv, mesh.normals, mesh.shapes)
 
 
 def _load_npz(path: Path) -> Mesh:
@@ -206,7 +217,11 @@ def _load_npz(path: Path) -> Mesh:
             missing = {"vertices_mm", "faces", "uv"} - set(arrays.files)
             if missing:
                 raise MeshFileError(f"{path}: lacks {', '.join(sorted(missing))}")
-            return build_mesh(arrays["vertices_mm"], arrays["faces"], arrays["uv"])
+            shapes: dict[str, ArrayLike] = {}
+            if {"shape_names", "shape_deltas_mm"} <= set(arrays.files):
+                names = [str(name) for name in arrays["shape_names"]]
+                shapes = dict(zip(names, arrays["shape_deltas_mm"], strict=True))
+            return build_mesh(arrays["vertices_mm"], arrays["faces"], arrays["uv"], shapes=shapes)
     except MeshError:
         raise
     except Exception as error:  # zip, pickle and header errors have no common base

@@ -174,6 +174,38 @@ def relief_normals(atlas: Atlas, height: NDArray[np.floating]) -> Float32Array:
     return np.where(length > 0.0, tilted / np.maximum(length, 1e-12), 0.0).astype(np.float32)
 
 
+def tangent_normals(atlas: Atlas, normal: Float32Array) -> Float32Array:
+    """Turn normals into the frame of the texture.
+
+    Parameters
+    ----------
+    atlas
+        Surface under each texel.
+    normal
+        Unit normals, shape (N, N, 3), rig frame.
+
+    Returns
+    -------
+    ndarray of float32
+        Unit normals, shape (N, N, 3): +x runs along u on the surface, +z is the surface's own
+        shading normal, +y is across both on the side of growing v; (0, 0, 1) where the texture has
+        no surface.
+    """
+    up = atlas.normal.astype(np.float64)
+    along = atlas.dp_du_mm.astype(np.float64)
+    along = along - np.sum(along * up, axis=-1, keepdims=True) * up
+    length = np.linalg.norm(along, axis=-1, keepdims=True)
+    along /= np.maximum(length, 1e-12)
+    across = np.cross(up, along)
+    side = np.sign(np.sum(across * atlas.dp_dv_mm, axis=-1, keepdims=True))
+    across *= np.where(side == 0.0, 1.0, side)  # a mirrored texture
+    turned = np.stack([np.sum(axis * normal, axis=-1) for axis in (along, across, up)], axis=-1)
+    known = atlas.covered & (length[..., 0] > 1e-9)
+    turned[~known] = (0.0, 0.0, 1.0)
+    turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-12)
+    return turned.astype(np.float32)
+
+
 def _furrows(
     points: Float32Array,
     cell_mm: float,

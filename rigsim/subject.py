@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
+from weakref import WeakValueDictionary
 
 import numpy as np
 
-from rigsim import face_regions, pigment, relief
+from rigsim import expression_wrinkles, expressions, face_regions, landmarks, pigment, relief
 from rigsim.atlas import Atlas, unwrap
 from rigsim.head import LANDMARKS_MM, build_head
 from rigsim.mesh import Float32Array, Mesh, centered, load_mesh
-from rigsim.perfusion import STATES, Perfusion, perfuse
+from rigsim.perfusion import STATES, Perfusion, StateError, perfuse
 
 PRESETS: Final = tuple(pigment.MELANIN_PRESETS)
 """Names of the presets, pale to dark."""
@@ -24,6 +26,28 @@ SIZE_RANGE: Final = (64, 8192)
 
 class SubjectError(ValueError):
     """A subject is asked for that cannot be made."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class Pose:
+    """The surface of a face in an expression, on the texture of the face at rest."""
+
+    state: str
+    """Name of the expression."""
+    amount: float
+    """How far it goes, 0 to 1.5."""
+    origin: tuple[Mesh, Float32Array]
+    """Mesh and relief of the face at rest."""
+    mesh: Mesh
+    """The face moved; the same triangles and texture coordinates."""
+    atlas: Atlas
+    """Its surface under each texel."""
+    wrinkles: expression_wrinkles.Wrinkles
+    """What rises where the skin is shortened."""
+    height_um: Float32Array
+    """Relief at rest and wrinkles, um, shape (N, N)."""
+    normal: Float32Array
+    """Unit normals of mesh, relief and wrinkles, shape (N, N, 3), rig frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +74,10 @@ class Subject:
     """Part of each texel that brows and lashes cover, 0 to 1."""
     normal: Float32Array
     """Unit normals of mesh and relief, shape (N, N, 3), rig frame."""
+    pose: Pose | None = None
+    """The expression that the geometry is in; ``None`` at rest."""
+    rest: Subject | None = None
+    """The same face at rest; ``None`` for a face that is at rest itself."""
 
     @property
     def size(self) -> int:
@@ -66,17 +94,114 @@ class Subject:
         """
         return self.perfusion.blood(state)
 
+    def posed(self, state: str, amount: float = 1.0) -> Subject:
+        """Return this face in an expression: moved, with its wrinkles.
+
+        Parameters
+        ----------
+        state
+            One of `rigsim.perfusion.STATES`; those that are no expression do not move the face.
+        amount
+            0 (rest) to 1 (full) and 1.5 (an extreme).
+
+        Returns
+        -------
+        Subject
+            The same person with another mesh, atlas, relief and normals; triangles, texture
+            coordinates and what the skin is made of stay. A posed face is posed from its rest. The
+            blood stays that of every state, see `hemoglobin`.
+
+        Raises
+        ------
+        rigsim.perfusion.StateError
+            The state is unknown.
+        rigsim.expressions.ExpressionError
+            The amount is out of range.
+        """
+        if state not in STATES:
+            raise StateError(f"state: got {state!r}, expected one of {', '.join(STATES)}")
+        low, high = expressions.AMOUNT_RANGE
+        if not low <= amount <= high:
+            raise expressions.ExpressionError(f"amount: got {amount}, expected {low:g} to {high}")
+        rest = self if self.rest is None else self.rest
+        if amount == 0.0 or not expressions.moves(state):
+            return rest
+        pose = _pose(rest, state, float(amount))
+        return dataclasses.replace(
+            rest,
+            mesh=pose.mesh,
+            atlas=pose.atlas,
+            height_um=pose.height_um,
+            normal=pose.normal,
+            pose=pose,
+            rest=rest,
+        )
+
+    def blend_shapes(self) -> dict[str, Float32Array]:
+        """Return how each expression moves the vertices, {state: (V, 3) in mm}, rig frame."""
+        rest = self if self.rest is None else self.rest
+        return expressions.blend_shapes(rest.mesh, seed=self.seed)
+
+    def tangent_normal(self) -> Float32Array:
+        """Return the normals in the frame of the texture, see `rigsim.relief.tangent_normals`.
+
+        Returns
+        -------
+        ndarray of float32
+            Unit vectors, shape (N, N, 3): relief and wrinkles without the mesh's own bends.
+        """
+        return relief.tangent_normals(self.atlas, self.normal)
+
     def landmarks_mm(self) -> dict[str, tuple[float, float, float]]:
-        """Return named points of the mean head, moved to this face, mm in the rig frame."""
-        tips = self.mesh.vertices_mm[np.argmax(self.mesh.vertices_mm[:, 2])].astype(np.float64)
-        mapped = face_regions.on_mean_head(self.mesh.vertices_mm[:2], self.mesh)
-        span = np.linalg.norm(self.mesh.vertices_mm[1] - self.mesh.vertices_mm[0])
-        scale = float(np.linalg.norm(mapped[1] - mapped[0]) / max(float(span), 1e-9))
-        tip = np.array(LANDMARKS_MM["nose tip"])
+        """Return named points of the mean head, moved to this face, mm in the rig frame.
+
+        They move with the expression as the skin nearest to them does.
+        """
+        rest = self.mesh if self.rest is None else self.rest.mesh
+        points = face_regions.from_mean_head(np.array(list(LANDMARKS_MM.values())), rest)
+        if self.rest is not None:
+            away = np.linalg.norm(points[:, None] - rest.vertices_mm[None], axis=-1)
+            nearest = np.argmin(away, axis=1)
+            points = points + self.mesh.vertices_mm[nearest] - rest.vertices_mm[nearest]
         return {
-            name: tuple(((np.array(point) - tip) / scale + tips).tolist())
-            for name, point in LANDMARKS_MM.items()
+            name: (float(x), float(y), float(z))
+            for name, (x, y, z) in zip(LANDMARKS_MM, points, strict=True)
         }
+
+    def surface_landmarks(self) -> landmarks.SurfacePoints:
+        """Return named points of the skin itself; ``.on(mesh)`` says where they are."""
+        return landmarks.find(self.mesh if self.rest is None else self.rest.mesh)
+
+
+_poses: WeakValueDictionary[tuple[int, int, int, str, float], Pose] = WeakValueDictionary()
+"""Poses that somebody holds, by what they are made of; a pose holds its origin, so that an id
+stays that of the same object."""
+
+
+def _pose(rest: Subject, state: str, amount: float) -> Pose:
+    """Return a pose of a face at rest; the same object as long as anybody holds it."""
+    key = (id(rest.mesh), id(rest.height_um), rest.seed, state, amount)
+    pose = _poses.get(key)
+    if pose is None:
+        deltas = expressions.displacement_mm(rest.mesh, state, amount=amount, seed=rest.seed)
+        mesh = expressions.moved(rest.mesh, deltas)
+        atlas = unwrap(mesh, rest.size)
+        points = face_regions.on_mean_head(rest.atlas.position_mm, rest.mesh)
+        lines = expression_wrinkles.wrinkle_lines(points, rest.atlas.covered, seed=rest.seed)
+        wrinkles = expression_wrinkles.raise_wrinkles(lines, rest.atlas, atlas)
+        height = rest.height_um + wrinkles.height_um
+        pose = Pose(
+            state=state,
+            amount=amount,
+            origin=(rest.mesh, rest.height_um),
+            mesh=mesh,
+            atlas=atlas,
+            wrinkles=wrinkles,
+            height_um=height,
+            normal=relief.relief_normals(atlas, height),
+        )
+        _poses[key] = pose
+    return pose
 
 
 def make_subject(

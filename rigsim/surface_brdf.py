@@ -113,7 +113,8 @@ def skin_surface(
     SkinSurface
         Textures; oil gathers on forehead, nose and chin, vellus hair on cheeks, temples and jaw.
     """
-    points = face_regions.on_mean_head(subject.atlas.position_mm, subject.mesh)
+    resting = subject if subject.rest is None else subject.rest
+    points = face_regions.on_mean_head(resting.atlas.position_mm, resting.mesh)
     regions = face_regions.region_masks(points)
     reflectance = skin_color(camera, light).rgb(subject.melanin, subject.hemoglobin(state))
     hair = subject.hair[..., None]

@@ -55,7 +55,8 @@ def simulate_flash(order: Order) -> Simulated:
         truth = truth_folder(order.out)
         for state, scene in scenes.items():
             folder = truth if state == states[0] else truth.with_name(f"{truth.name}-{state}")
-            store.write(folder, _truth(scene.truth(), seed, session.content_hash, state))
+            appearance = _truth(scene, seed, session.content_hash, state)
+            store.write(folder, appearance)
     blur = () if target else tuple(float(width) for width in first.resolution_mm())
     left_out = tuple(first.left_out)
     return Simulated(order.out, truth, len(session.frames()), rig_seconds, left_out, blur)
@@ -123,24 +124,56 @@ _TRUTH_NAMES = {"diffuse": "diffuse_radiance", "specular": "specular_radiance", 
 """The simulator's light is in its own unit; an estimate's is relative to a white tile."""
 
 
-def _truth(maps: Mapping[str, NDArray[Any]], seed: int, session: str, state: str) -> SkinAppearance:
+def landmarks_at_superpixels(pixels: Mapping[str, tuple[float, float]]) -> dict[str, list[float]]:
+    """Return where points are after 2 x 2 pixels have been averaged.
+
+    Parameters
+    ----------
+    pixels
+        (x, y) on the sensor; the centre of pixel (0, 0) is (0, 0).
+
+    Returns
+    -------
+    dict
+        [x, y] on the averaged map, whose first pixel's centre lies amid four of the sensor's.
+
+    Examples
+    --------
+    >>> landmarks_at_superpixels({"chin": (0.5, 2.5)})
+    {'chin': [0.0, 1.0]}
+    """
+    return {name: [0.5 * (x - 0.5), 0.5 * (y - 0.5)] for name, (x, y) in pixels.items()}
+
+
+def _truth(scene: Any, seed: int, session: str, state: str) -> SkinAppearance:
+    maps: Mapping[str, NDArray[Any]] = scene.truth()
     mask = np.asarray(maps["mask"], bool)
     # a superpixel on the outline mixes skin and background: no truth is claimed for it
     # and where hair covers the skin there is none
     bare = mask & (np.asarray(maps["melanin"]) > 0)
     whole = to_superpixels(bare.astype(float)) == 1.0
+    at_rest = np.asarray(maps.get("mask_at_rest", mask), bool)
+    whole_at_rest = to_superpixels(at_rest.astype(float)) == 1.0
     kept = {}
     for name, values in maps.items():
-        if name == "mask" or (np.ndim(values) == 3 and np.shape(values)[2] != 3):
+        if name.startswith("mask") or (np.ndim(values) == 3 and np.shape(values)[2] != 3):
             continue
-        small = to_superpixels(np.asarray(values, np.float64), mask).astype(np.float32)
-        unit = "mm" if name.endswith("_mm") else UNITS.get(name.removesuffix("_blurred"), "1")
-        kept[_TRUTH_NAMES.get(name, name)] = SkinMap(small, unit, valid=whole)
+        unmoved = name in ("melanin_at_rest", "hemoglobin_at_rest")
+        inside, valid = (at_rest, whole_at_rest) if unmoved else (mask, whole)
+        small = to_superpixels(np.asarray(values, np.float64), inside).astype(np.float32)
+        known = name.removesuffix("_blurred").removesuffix("_at_rest")
+        unit = "mm" if name.endswith("_mm") else UNITS.get(known, "1")
+        kept[_TRUTH_NAMES.get(name, name)] = SkinMap(small, unit, valid=valid)
     kept["mask"] = SkinMap(whole.astype(np.float32), "1")
     return SkinAppearance(
         kept,
         "simulated",
-        parameters={"kind": "truth", "state": state},
+        parameters={
+            "kind": "truth",
+            "state": state,
+            "movement": scene.movement,
+            "landmarks_px": landmarks_at_superpixels(scene.landmarks_px()),
+        },
         inputs={"session": session},
         seed=seed,
     )

@@ -12,20 +12,22 @@ behind crossed films, whatever stands there later.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Final, Protocol
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capture.rig import Rig, RigError, View
 from model import spectra
-from rigsim import shading
+from rigsim import landmarks, shading
 from rigsim.films import Films, films_of
 from rigsim.lateral import line_spread_mm
-from rigsim.mesh import Float32Array
+from rigsim.mesh import Float32Array, Mesh
 from rigsim.render import Caster, camera_rays
 from rigsim.scenes.picture import Look, Picture
-from rigsim.scenes.skin_glow import SkinGlow, light_skin
+from rigsim.scenes.skin_glow import SkinGlow, SurfaceLight, light_skin, light_surface
 from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.subject import Subject
 from rigsim.targets import Target
@@ -68,8 +70,35 @@ class Pop(Protocol):
         """Reading of the analyser's rotator in degrees; ``None`` for that of the state."""
 
 
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class _Stage:
+    """What scenes of one geometry have in common, whatever the blood does."""
+
+    held: tuple[Mesh, object]
+    """The mesh and the normals; while they are held their ids are theirs."""
+    caster: Caster
+    light: dict[object, SurfaceLight] = field(default_factory=dict)
+    """Light on the face, by what it comes from."""
+
+
+_stages: WeakValueDictionary[tuple[object, ...], _Stage] = WeakValueDictionary()
+
+
+def _stage(subject: Subject | Target, choice: VariantChoice | None) -> _Stage:
+    """Return the stage of a geometry; the same as long as any scene holds it."""
+    normal = subject.normal if isinstance(subject, Subject) else None
+    key = (id(subject.mesh), id(normal), choice)
+    stage = _stages.get(key)
+    if stage is None:
+        stage = _Stage((subject.mesh, normal), Caster(subject.mesh, choice=choice))
+        _stages[key] = stage
+    return stage
+
+
 class FlashScene:
     """One subject or target before the flash rig, in one state.
+
+    Scenes that differ in the blood alone share what they trace, as long as one of them lives.
 
     Parameters
     ----------
@@ -78,7 +107,11 @@ class FlashScene:
     subject
         A face or a target.
     state
-        State of the face's blood, see `rigsim.perfusion.STATES`; targets have none.
+        State of the face, see `rigsim.perfusion.STATES`: its blood, and its expression where the
+        state is one; targets have none.
+    movement
+        Whether the face moves and wrinkles with the state; else it stays as it is given. A subject
+        that is already posed (`Subject.posed`) stays in its pose.
     sensor
         Sensor of every view; ``None`` takes what each view states.
     films
@@ -99,6 +132,7 @@ class FlashScene:
         subject: Subject | Target,
         *,
         state: str = "neutral",
+        movement: bool = True,
         sensor: Sensor | None = None,
         films: Films | None = None,
         seed: int = 0,
@@ -113,9 +147,12 @@ class FlashScene:
             )
         if subpixels < 1:
             raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
+        if movement and isinstance(subject, Subject) and subject.pose is None:
+            subject = subject.posed(state)
         self.rig = rig
         self.subject = subject
         self.state = state
+        self.movement = movement
         self.films = films_of(rig) if films is None else films
         self.seed = seed
         self.lateral = lateral
@@ -125,7 +162,9 @@ class FlashScene:
             view.name: sensor_of(view) if sensor is None else sensor for view in rig.views
         }
         self._weights = _light_weights(rig)
-        self._caster = Caster(subject.mesh, choice=choice)
+        self._choice = choice
+        self._stage = _stage(subject, choice)
+        self._caster = self._stage.caster
         self._glow: dict[str, SkinGlow] = {}
         self._pictures: dict[str, Picture] = {}
 
@@ -146,10 +185,19 @@ class FlashScene:
         if isinstance(self.subject, Subject):
             out += [
                 ("eyes, teeth and hair on the head", "the eyes are closed; only skin is estimated"),
-                ("movement of the face with the states", "states change the blood only"),
                 ("kernels that vary over the face", "one lateral profile, of its median skin"),
                 ("polarized single scattering", "light from inside is taken as depolarized"),
             ]
+            if not self.movement:
+                out.append(("movement of the face with the states", "movement=False asks for it"))
+            elif self.subject.pose is not None:
+                out += [
+                    ("shadows of wrinkles", "they tilt the surface only"),
+                    ("parted lips and open eyes", "a mesh without an opening stretches instead"),
+                ]
+                if self.subject.pose.wrinkles.left_out:
+                    zones = ", ".join(self.subject.pose.wrinkles.left_out)
+                    out.append((f"fine wrinkles ({zones})", "the texture's texels are too coarse"))
             if not self.lateral:
                 out.append(("light spreading sideways in skin", "lateral=False asks for it"))
         return out
@@ -262,6 +310,12 @@ class FlashScene:
             ``hair``: part covered by hair (brows, lashes);
             ``mask``: bool, pixels wholly on skin.
 
+            All are of the face as it has moved. For a state other than "neutral" there are also
+            ``melanin_at_rest``, ``hemoglobin_at_rest``: the fractions of this state as they would
+            be seen on the face at rest, sharp; ``mask_at_rest``: bool, for those two. Where the
+            face has moved also ``position_at_rest_mm``: where the skin in a pixel is at rest, rig
+            frame.
+
         Raises
         ------
         SceneError
@@ -277,8 +331,43 @@ class FlashScene:
         truth["shading"] = self._analysed(picture.shading, view, passes_deg)
         truth["diffuse"] = picture.diffuse[:, :, 0] * white
         truth["specular"] = picture.specular[:, :, :1] * white
-        truth["mask"] = (picture.coverage > 1.0 - 1e-6) & (picture.maps["hair"] < HAIR_LIMIT)
+        truth["mask"] = _whole_skin(picture)
+        if self.state != "neutral":
+            truth |= self._at_rest(view, truth)
         return truth
+
+    def landmarks_px(self, view_name: str | None = None) -> dict[str, tuple[float, float]]:
+        """Return where named points of the skin are in the image.
+
+        Parameters
+        ----------
+        view_name
+            Which camera; ``None`` takes the first.
+
+        Returns
+        -------
+        dict
+            Name to (x, y) on the sensor, px: x to the right, y down, the centre of pixel (0, 0) is
+            (0, 0); see `rigsim.landmarks.POINTS_MM`. Points that the camera does not see are
+            missing. They go with the skin from state to state.
+
+        Raises
+        ------
+        SceneError
+            A target stands there.
+        """
+        if not isinstance(self.subject, Subject):
+            raise SceneError(f"landmarks: got the target {self.subject.name!r}, expected a face")
+        view = self._view(view_name)
+        points = self.subject.surface_landmarks()
+        places = points.on(self.subject.mesh)
+        pixels = landmarks.project(places, view)
+        visible = landmarks.seen(places, view, self._caster)
+        return {
+            name: (float(x), float(y))
+            for name, (x, y), shown in zip(points.names, pixels, visible, strict=True)
+            if shown
+        }
 
     def resolution_mm(self, view_name: str | None = None) -> NDArray[np.float64]:
         """Return the widths from 10 to 90 % of an edge that lateral transport blurs, mm, (3,)."""
@@ -316,14 +405,43 @@ class FlashScene:
             self._glow[camera] = light_skin(
                 self.subject,
                 self.state,
-                self.rig.lights,
-                self._weights,
-                self.films,
-                caster=self._caster,
+                self._surface_light(self.subject),
                 camera=camera,
+                illuminant=self._illuminant,
                 lateral_transport=self.lateral,
             )
         return self._glow[camera]
+
+    def _surface_light(self, subject: Subject) -> SurfaceLight:
+        key = (self.rig.lights, tuple(self._weights.tolist()), self.films)
+        known = self._stage.light
+        if key not in known:
+            known[key] = light_surface(
+                subject, self.rig.lights, self._weights, self.films, caster=self._caster
+            )
+        return known[key]
+
+    def _at_rest(
+        self, view: View, moved: dict[str, NDArray[np.generic]]
+    ) -> dict[str, NDArray[np.generic]]:
+        """Return the fractions of this state as seen on the face at rest."""
+        subject = self.subject
+        if not isinstance(subject, Subject) or subject.rest is None:
+            return {f"{name}_at_rest": moved[name] for name in ("melanin", "hemoglobin", "mask")}
+        rest = subject.rest
+        look = Look(self.rig, view, self.films, self._weights, self.subpixels)
+        layers = {
+            "melanin": rest.melanin,
+            "hemoglobin": rest.hemoglobin(self.state),
+            "hair": rest.hair,
+        }
+        stage = _stage(rest, self._choice)
+        picture = look.at_maps(stage.caster, rest, layers)
+        return {
+            "melanin_at_rest": picture.maps["melanin"],
+            "hemoglobin_at_rest": picture.maps["hemoglobin"],
+            "mask_at_rest": _whole_skin(picture),
+        }
 
     def _picture(self, view: View) -> Picture:
         if view.name not in self._pictures:
@@ -340,6 +458,11 @@ class FlashScene:
                 picture = look.at_target(self._caster, self.subject)
             self._pictures[view.name] = picture
         return self._pictures[view.name]
+
+
+def _whole_skin(picture: Picture) -> NDArray[np.bool_]:
+    """Return the pixels that are wholly on skin."""
+    return (picture.coverage > 1.0 - 1e-6) & (picture.maps["hair"] < HAIR_LIMIT)
 
 
 def _light_weights(rig: Rig) -> NDArray[np.float64]:

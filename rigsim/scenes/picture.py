@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -146,12 +146,12 @@ class Look:
             melanin_blurred, blood_blurred = table.nearest(blurred, melanin, blood)
         layers = {
             "glow": glow.spread,
-            "visible": glow.visible,
+            "visible": glow.surface.visible,
             "reflectance": glow.reflectance,
             "reflectance_blurred": blurred,
             "normals": subject.normal,
-            "irradiance": glow.irradiance,
-            "entered": glow.entered,
+            "irradiance": glow.surface.irradiance,
+            "entered": glow.surface.entered,
             "roughness": subject.roughness,
             "hair": subject.hair,
             "melanin": melanin,
@@ -159,8 +159,42 @@ class Look:
             "melanin_blurred": melanin_blurred,
             "hemoglobin_blurred": blood_blurred,
         }
-        covered = subject.atlas.covered
-        return {name: spread(np.atleast_3d(layer), covered) for name, layer in layers.items()}
+        if subject.rest is not None:
+            layers["position_at_rest_mm"] = subject.rest.atlas.position_mm
+        return _fillings(layers, subject)
+
+    def at_maps(
+        self, caster: Caster, subject: Subject, maps: Mapping[str, Float32Array]
+    ) -> Picture:
+        """Look at maps of a face without light.
+
+        Parameters
+        ----------
+        caster
+            The face's mesh.
+        subject
+            Whose face.
+        maps
+            Textures of shape (N, N[, C]).
+
+        Returns
+        -------
+        Picture
+            With these truth maps only; no light.
+        """
+        textures = _fillings(maps, subject)
+        return self._in_bands(caster, lambda buffers: self._see_maps(buffers, textures))
+
+    def _see_maps(self, buffers: GBuffer, textures: dict[str, Float32Array]) -> Parts:
+        inside = np.flatnonzero(buffers.mask.reshape(-1))
+        uv = buffers.uv.reshape(-1, 2)[inside]
+        everywhere = np.ones(len(inside), np.bool_)
+        parts = {"diffuse": np.zeros((len(inside), 3, 3), np.float32)}
+        parts |= {name: np.zeros((len(inside), 3), np.float32) for name in _LIGHT_NAMES[1:]}
+        for name, layer in textures.items():
+            values = sample(layer, uv, everywhere)
+            parts[name] = values[:, 0] if values.shape[1] == 1 else values
+        return {name: _scatter(values, inside, buffers.mask) for name, values in parts.items()}
 
     def _see_skin(self, buffers: GBuffer, textures: dict[str, Float32Array]) -> Parts:
         inside = np.flatnonzero(buffers.mask.reshape(-1))
@@ -237,6 +271,12 @@ class Look:
                 diffuse[:, 0] += passed[:, None] * rgb
         parts = {"diffuse": diffuse, "specular": specular, "shading": np.zeros_like(specular)}
         return {name: _scatter(values, inside, buffers.mask) for name, values in parts.items()}
+
+
+def _fillings(layers: Mapping[str, Float32Array], subject: Subject) -> dict[str, Float32Array]:
+    """Return textures whose borders are filled, so that sampling may blend, (N, N, C) each."""
+    covered = subject.atlas.covered
+    return {name: spread(np.atleast_3d(layer), covered) for name, layer in layers.items()}
 
 
 def _scatter(values: Float32Array, inside: NDArray[np.int_], mask: BoolArray) -> Float32Array:

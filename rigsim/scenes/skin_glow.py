@@ -36,8 +36,8 @@ SHADOW_SAMPLES: Final = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SkinGlow:
-    """Light on and out of a face; textures of shape (N, N[, C])."""
+class SurfaceLight:
+    """Light on a face, whatever its skin is made of; textures of shape (N, N[, L])."""
 
     visible: Float32Array
     """Part of each light's disc that is seen, shape (N, N, L), 0 to 1."""
@@ -46,6 +46,14 @@ class SkinGlow:
     the camera, without any film, shape (N, N)."""
     entered: Float32Array
     """Filtered light that enters, in the same unit, shape (N, N)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SkinGlow:
+    """Light on and out of a face; textures of shape (N, N[, C])."""
+
+    surface: SurfaceLight
+    """Light on it."""
     reflectance: Float32Array
     """Sharp white-balanced diffuse reflectance of the skin, shape (N, N, 3)."""
     sharp: Float32Array
@@ -57,23 +65,20 @@ class SkinGlow:
     """Lateral profile of each channel at the face's typical skin."""
 
 
-def light_skin(
+def light_surface(
     subject: Subject,
-    state: str,
     lights: tuple[Light, ...],
     weights: NDArray[np.float64],
     films: Films,
     *,
     caster: Caster,
-    camera: str,
-    lateral_transport: bool,
-) -> SkinGlow:
-    """Light a face.
+) -> SurfaceLight:
+    """Light the surface of a face.
 
     Parameters
     ----------
-    subject, state
-        Whose skin, in which state.
+    subject
+        Whose face, as its geometry stands.
     lights
         The flashes; all of one spectrum.
     weights
@@ -82,15 +87,11 @@ def light_skin(
         The lights' films.
     caster
         The face's mesh.
-    camera
-        Name of the camera's sensitivity.
-    lateral_transport
-        Whether light spreads inside the skin.
 
     Returns
     -------
-    SkinGlow
-        Textures.
+    SurfaceLight
+        Textures that no state of the blood changes.
     """
     atlas = subject.atlas
     size = atlas.size
@@ -123,30 +124,56 @@ def light_skin(
     covered = atlas.covered.reshape(-1)
     irradiance[~covered] = 0.0
     entered[~covered] = 0.0
+    return SurfaceLight(
+        visible.reshape(size, size, len(lights)),
+        irradiance.reshape(size, size),
+        entered.reshape(size, size),
+    )
+
+
+def light_skin(
+    subject: Subject,
+    state: str,
+    surface: SurfaceLight,
+    *,
+    camera: str,
+    illuminant: str,
+    lateral_transport: bool,
+) -> SkinGlow:
+    """Let the light on a face into its skin and out again.
+
+    Parameters
+    ----------
+    subject, state
+        Whose skin, in which state of its blood.
+    surface
+        Light on the face.
+    camera, illuminant
+        Names of the camera's sensitivity and of the flashes' spectrum.
+    lateral_transport
+        Whether light spreads inside the skin.
+
+    Returns
+    -------
+    SkinGlow
+        Textures.
+    """
     melanin, blood = subject.melanin, subject.hemoglobin(state)
-    reflectance = skin_color(camera, lights[0].illuminant).rgb(melanin, blood)
-    within = entered.reshape(size, size)
+    reflectance = skin_color(camera, illuminant).rgb(melanin, blood)
+    within = surface.entered
     scale = np.float32(shading.interior_scale(ETA))
     sharp = scale * within[..., None] * reflectance
-    kernels = typical_kernels(subject, state, camera, lights[0].illuminant)
+    kernels = typical_kernels(subject, state, camera, illuminant)
     spread = sharp
     if lateral_transport:
         spread = scale * spread_through_pigment(
-            subject, state, reflectance, within, kernels, camera, lights[0].illuminant
+            subject, state, reflectance, within, kernels, camera, illuminant
         )
     hair = subject.hair[..., None]
     # Hair is dark and matt, and lets no light into the skin below it.
     over = scale * within[..., None] * np.asarray(HAIR_REFLECTANCE, np.float32) * hair
     spread = (1.0 - hair) * spread + over
-    return SkinGlow(
-        visible.reshape(size, size, len(lights)),
-        irradiance.reshape(size, size),
-        within,
-        reflectance,
-        sharp,
-        spread,
-        kernels,
-    )
+    return SkinGlow(surface, reflectance, sharp, spread, kernels)
 
 
 def spread_through_pigment(

@@ -1,0 +1,380 @@
+"""Wrinkles that rise where an expression shortens the skin, by buckling along fixed lines.
+
+Skin is a stiff layer on a soft one and rests under tension. Shortening first spends the tension;
+from then on the layer buckles across the shortening, and the length that finds no more room in the
+surface goes into the wrinkle: what is measured along a wrinkled line stays the skin's slack length.
+Where wrinkles can rise is drawn once for a person, so every expression that shortens a zone raises
+the same lines.
+
+Notes
+-----
+The wavelength of the buckles is 2 pi h (E / 3 E_s)^(1/3) for a layer of thickness h and modulus E
+on a base of modulus E_s (Genzer and Groenewold 2006, doi:10.1039/b516741h). `MODULUS_RATIO` and the
+zones' thicknesses are chosen to give the distances between furrows that faces show, 2.5 mm beside
+the eyes to 8 mm on the forehead; the furrows are narrower than the ridges between them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigsim.atlas import Atlas
+from rigsim.face_regions import soft_step
+from rigsim.mesh import Float32Array
+from rigsim.surface_noise import smooth_noise
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+MODULUS_RATIO: Final = 100.0
+"""Stiffness of the layer that buckles over that of what lies below it."""
+
+TENSION_RANGE: Final = (0.07, 0.14)
+"""Part of its length by which a person's skin at rest is stretched."""
+
+FURROW: Final = 1.2
+"""How much narrower furrows are than ridges; 0 is a cosine."""
+
+FINEST_TEXELS: Final = 3.0
+"""Texels that a wave needs; finer wrinkles are left out."""
+
+_STEPS: Final = 2048
+
+
+@dataclass(frozen=True, slots=True)
+class Zone:
+    """A part of the face whose wrinkles run along one family of lines."""
+
+    name: str
+    thickness_mm: float
+    """Thickness of the layer that buckles."""
+    across_mm: Callable[[FloatArray], FloatArray]
+    """Distance across the lines, of points on the mean head with x >= 0, mm."""
+    share: Callable[[FloatArray], FloatArray]
+    """Part of the shortening beyond the tension that goes into wrinkles, 0 to 1."""
+    mirrored: bool = True
+    """Whether both halves of the face have lines of their own kind; else lines cross the middle."""
+    tension: float = 1.0
+    """Part of the person's tension that must be spent here; folds that are tethered need little."""
+    single: bool = False
+    """Whether there is one furrow, where ``across_mm`` is 0, instead of a family."""
+
+    @property
+    def wavelength_mm(self) -> float:
+        """Distance from furrow to furrow at rest, mm."""
+        return 2.0 * math.pi * self.thickness_mm * (MODULUS_RATIO / 3.0) ** (1.0 / 3.0)
+
+
+def _plateau(points: FloatArray, center: tuple[float, ...], reach: tuple[float, ...]) -> FloatArray:
+    """Return 1 well inside a ball of unequal radii, 0 well outside."""
+    q = (points - np.array(center)) / np.array(reach)
+    return np.asarray(soft_step((1.0 - np.sqrt(np.sum(q * q, axis=-1))) / 0.22))
+
+
+def _x(p: FloatArray) -> FloatArray:
+    return np.asarray(p[..., 0])
+
+
+def _y(p: FloatArray) -> FloatArray:
+    return np.asarray(p[..., 1])
+
+
+_FOLD = (np.array([17.0, -10.0]), np.array([31.0, -41.0]))
+"""Ends of the fold between nose and cheek, mm on the mean head."""
+
+
+def _off_fold(p: FloatArray) -> FloatArray:
+    way = (_FOLD[1] - _FOLD[0]) / np.linalg.norm(_FOLD[1] - _FOLD[0])
+    along = (p[..., :2] - _FOLD[0]) @ way
+    # a slight bow towards the cheek
+    side = (p[..., :2] - _FOLD[0]) @ np.array([-way[1], way[0]])
+    return np.asarray(side - 2.5 * np.sin(np.pi * np.clip(along / 34.0, 0.0, 1.0)))
+
+
+def _near_fold(p: FloatArray) -> FloatArray:
+    way = (_FOLD[1] - _FOLD[0]) / np.linalg.norm(_FOLD[1] - _FOLD[0])
+    along = (p[..., :2] - _FOLD[0]) @ way
+    inside = soft_step((along - 1.0) / 3.0) * soft_step((32.0 - along) / 3.0)
+    return np.asarray(inside * (p[..., 2] > -25.0))
+
+
+def _fan(p: FloatArray) -> FloatArray:
+    """Return the distance along circles about the corner of the eye, counted at 12 mm from it."""
+    return np.asarray(12.0 * np.arctan2(p[..., 1] - 24.0, np.maximum(p[..., 0] - 42.0, 1.0)))
+
+
+ZONES: Final = (
+    Zone(
+        "forehead",
+        0.36,
+        lambda p: _y(p) - 0.0035 * _x(p) ** 2,
+        lambda p: _plateau(p, (0.0, 64.0, 0.0), (46.0, 19.0, 55.0)),
+        mirrored=False,
+    ),
+    Zone(
+        "glabella",
+        0.34,
+        lambda p: _x(p) * (1.0 + 0.008 * (_y(p) - 44.0)),
+        lambda p: _plateau(p, (0.0, 43.0, 4.0), (14.0, 13.0, 40.0)),
+        mirrored=False,
+    ),
+    Zone(
+        "nasal root",
+        0.22,
+        lambda p: _y(p) - 0.03 * _x(p) ** 2,
+        lambda p: _plateau(p, (0.0, 22.0, 9.0), (10.0, 8.0, 25.0)),
+        mirrored=False,
+    ),
+    Zone(
+        "nose sides",
+        0.17,
+        lambda p: 0.86 * _y(p) - 0.5 * _x(p),
+        lambda p: _plateau(p, (9.0, 7.0, 11.0), (7.0, 9.0, 25.0)),
+    ),
+    Zone(
+        "crow's feet",
+        0.13,
+        _fan,
+        lambda p: _plateau(p, (55.0, 23.0, -26.0), (11.0, 15.0, 30.0)),
+    ),
+    Zone(
+        "lower lids",
+        0.13,
+        lambda p: _y(p) - 0.012 * (_x(p) - 31.0) ** 2,
+        lambda p: _plateau(p, (34.0, 9.0, -4.0), (15.0, 6.5, 30.0)),
+        tension=0.6,
+    ),
+    Zone("nasolabial fold", 0.5, _off_fold, _near_fold, tension=0.2, single=True),
+    Zone(
+        "mouth corners",
+        0.30,
+        lambda p: np.hypot(_x(p) - 22.0, 0.8 * (_y(p) + 41.0)),
+        lambda p: 0.35 * _plateau(p, (38.0, -42.0, -8.0), (8.0, 11.0, 30.0)),
+    ),
+    Zone(
+        "chin",
+        0.26,
+        lambda p: _y(p) + 0.006 * _x(p) ** 2,
+        lambda p: _plateau(p, (0.0, -57.0, 8.0), (15.0, 7.0, 25.0)),
+        mirrored=False,
+    ),
+)
+"""The zones of a face; where they overlap they share the shortening."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WrinkleLines:
+    """Where a person's skin can buckle, at texels of the face's texture."""
+
+    texel: NDArray[np.intp]
+    """Flat indices of the texels, shape (n,)."""
+    phase_rad: tuple[FloatArray, ...]
+    """For each zone 2 pi times the number of waves across the lines, shape (n,); 0 in a furrow."""
+    slope: tuple[FloatArray, ...]
+    """Its change along u and v, rad per unit of u and v, shape (n, 2)."""
+    share: tuple[FloatArray, ...]
+    """Part of the excess length that each zone takes, shape (n,)."""
+    tension: float
+    """Part of its length by which the skin at rest is stretched."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Wrinkles:
+    """What an expression raises; maps of shape (N, N), row 0 is the top."""
+
+    height_um: Float32Array
+    """Height added to the relief, um; zero on average over a wave."""
+    excess: Float32Array
+    """Length that the wrinkles take in, relative to the surface they lie on; 0 where smooth."""
+    left_out: tuple[str, ...]
+    """Zones whose waves are too short for the texture."""
+
+
+def wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int) -> WrinkleLines:
+    """Draw where a person's skin can buckle.
+
+    Parameters
+    ----------
+    points_mm
+        Points on the mean head under each texel, shape (N, N, 3).
+    covered
+        Texels with a surface, shape (N, N).
+    seed
+        Seed of the person, >= 0.
+
+    Returns
+    -------
+    WrinkleLines
+        The lines of `ZONES`.
+    """
+    rng = np.random.default_rng([seed, 22])
+    tension = float(rng.uniform(*TENSION_RANGE))
+    size = points_mm.shape[0]
+    front = covered & (points_mm[..., 2] > -60.0)
+    # neighbours on both sides, for the slopes; a seam of the texture has none
+    front[[0, -1]] = front[:, [0, -1]] = False
+    front[1:-1, 1:-1] &= covered[2:, 1:-1] & covered[:-2, 1:-1]
+    front[1:-1, 1:-1] &= covered[1:-1, 2:] & covered[1:-1, :-2]
+    texel = np.flatnonzero(front)
+    flat = points_mm.reshape(-1, 3)
+    # the texel, its neighbours at larger and smaller u, at larger and smaller v
+    around = texel[None] + np.array([0, 1, -1, -size, size])[:, None]
+    points = flat[around].astype(np.float64)
+    phases, slopes, shares = [], [], []
+    for zone in ZONES:
+        wave = zone.wavelength_mm * float(rng.uniform(0.88, 1.14))
+        offset = rng.uniform(0.0, 2.0 * math.pi, 2)
+        lifts = rng.uniform(0.8, 1.0, 2)
+        half = points.copy()
+        half[..., 0] = np.abs(half[..., 0])
+        share = zone.share(half[0])
+        near = share > 0.01
+        p = half[:, near] if zone.mirrored else points[:, near]
+        right = (points[0, near, 0] > 0.0).astype(np.intp)
+        wobble = smooth_noise(points[:, near].astype(np.float32), (24.0, 11.0), seed=seed + 95)
+        across = zone.across_mm(p) / wave + 0.07 * wobble
+        phase = 2.0 * math.pi * across
+        if zone.single:
+            # one wave with its furrow on the line; beside it the skin is smooth
+            lone = np.abs(across[0]) < 0.5
+            share[near] *= np.where(lone, np.cos(math.pi * across[0]) ** 2, 0.0)
+        elif zone.name == "glabella":
+            phase -= 2.0 * math.pi * 0.55  # furrows on both sides of the middle, a little off it
+        else:
+            phase += offset[right] if zone.mirrored else offset[0]
+        full = np.zeros(len(texel))
+        full[near] = phase[0]
+        slope = np.zeros((len(texel), 2))
+        slope[near, 0] = 0.5 * size * (phase[1] - phase[2])
+        slope[near, 1] = 0.5 * size * (phase[3] - phase[4])
+        share[near] *= lifts[right] if zone.mirrored else lifts[0]
+        phases.append(full)
+        slopes.append(slope)
+        shares.append(np.where(near, share, 0.0))
+    together = np.maximum(np.sum(shares, axis=0), 1.0)
+    return WrinkleLines(
+        texel,
+        tuple(phases),
+        tuple(slopes),
+        tuple(share / together for share in shares),
+        tension,
+    )
+
+
+def raise_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
+    """Raise the wrinkles of a face whose surface has moved.
+
+    Parameters
+    ----------
+    lines
+        Where the skin can buckle.
+    rest, posed
+        The surface before and after, on the same texture.
+
+    Returns
+    -------
+    Wrinkles
+        Smooth where the lines of a zone have not come nearer to each other by more than the
+        tension.
+    """
+    size = rest.size
+    height = np.zeros(len(lines.texel))
+    total = np.zeros(len(lines.texel))
+    before, after = _metric(rest, lines.texel), _metric(posed, lines.texel)
+    texel_mm = _texel_mm(posed, lines.texel)
+    left_out = []
+    for zone, phase, slope, share in zip(
+        ZONES, lines.phase_rad, lines.slope, lines.share, strict=True
+    ):
+        here = np.flatnonzero(share > 0.0)
+        if not len(here):
+            continue
+        # waves per mm across the lines, before and after
+        dense_before = _density(before[here], slope[here])
+        dense_after = _density(after[here], slope[here])
+        steady = (dense_before > 1e-6) & (dense_after > 1e-6)
+        stretch = np.where(steady, dense_before / np.maximum(dense_after, 1e-9), 1.0)
+        slack = (1.0 - zone.tension * lines.tension) / np.maximum(stretch, 1e-3) - 1.0
+        excess = share[here] * np.maximum(slack, 0.0)
+        wave_mm = 2.0 * math.pi / np.maximum(dense_after, 1e-9)
+        fine = soft_step((wave_mm / texel_mm[here] - FINEST_TEXELS) / 0.5)
+        if (excess > 0.0).any() and float(np.median(fine)) < 0.5:
+            left_out.append(zone.name)
+        excess *= fine
+        height[here] += 1e3 * wave_mm * depth_of(excess) * _profile(phase[here])
+        total[here] += excess
+    maps = []
+    for values in (height, total):
+        full = np.zeros(size * size, np.float32)
+        full[lines.texel] = values
+        maps.append(full.reshape(size, size))
+    return Wrinkles(maps[0], maps[1], tuple(left_out))
+
+
+def depth_of(excess: ArrayLike) -> FloatArray:
+    """Return how deep a wave is that takes in an excess of length.
+
+    Parameters
+    ----------
+    excess
+        Length along the wave over its wavelength, minus one, 0 or more.
+
+    Returns
+    -------
+    ndarray
+        From furrow to ridge, over the wavelength.
+
+    Examples
+    --------
+    >>> bool(depth_of(0.0) == 0.0)
+    True
+    """
+    return np.interp(np.asarray(excess, np.float64), _EXCESS, _DEPTH)
+
+
+def _profile(phase: FloatArray) -> FloatArray:
+    """Return the height of a wave of depth 1, with zero mean and its furrow at phase 0."""
+    low, high = math.exp(-2.0 * FURROW), 1.0
+    return np.asarray((_BELL_MEAN - np.exp(FURROW * (np.cos(phase) - 1.0))) / (high - low))
+
+
+def _waves() -> tuple[float, FloatArray, FloatArray]:
+    """Return the mean of the furrow's bell, and excess of length against depth."""
+    phase = 2.0 * math.pi * (np.arange(_STEPS) + 0.5) / _STEPS
+    bell = np.exp(FURROW * (np.cos(phase) - 1.0))
+    slope = 2.0 * math.pi * FURROW * np.sin(phase) * bell / (1.0 - math.exp(-2.0 * FURROW))
+    depth = np.concatenate([[0.0], np.geomspace(1e-4, 3.0, 400)])
+    length = np.sqrt(1.0 + (depth[:, None] * slope) ** 2).mean(axis=1)
+    return float(bell.mean()), length - 1.0, depth
+
+
+_BELL_MEAN, _EXCESS, _DEPTH = _waves()
+
+
+def _metric(atlas: Atlas, texel: NDArray[np.intp]) -> FloatArray:
+    """Return the inverse metric of the texture, (n, 3): of du du, du dv, dv dv."""
+    du = atlas.dp_du_mm.reshape(-1, 3)[texel].astype(np.float64)
+    dv = atlas.dp_dv_mm.reshape(-1, 3)[texel].astype(np.float64)
+    e, f = np.sum(du * du, axis=-1), np.sum(du * dv, axis=-1)
+    g = np.sum(dv * dv, axis=-1)
+    determinant = np.maximum(e * g - f * f, 1e-9 * np.maximum(e, g) ** 2 + 1e-30)
+    return np.stack([g, -f, e], axis=-1) / determinant[:, None]
+
+
+def _density(inverse: FloatArray, slope: FloatArray) -> FloatArray:
+    """Return the length of a phase's gradient on the surface, rad/mm."""
+    u, v = slope[:, 0], slope[:, 1]
+    squared = inverse[:, 0] * u * u + 2.0 * inverse[:, 1] * u * v + inverse[:, 2] * v * v
+    return np.sqrt(np.maximum(squared, 0.0))
+
+
+def _texel_mm(atlas: Atlas, texel: NDArray[np.intp]) -> FloatArray:
+    along_u, along_v = atlas.texel_mm()
+    longer = np.maximum(along_u, along_v).reshape(-1)[texel]
+    return np.asarray(longer, np.float64)
