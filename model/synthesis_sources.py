@@ -1,0 +1,210 @@
+"""Measured patches made ready for synthesis: level, without holes, at the scales that are asked.
+
+References
+----------
+ISO 16610-21:2011, Geometrical product specifications, filtration: linear profile filters, Gaussian
+filters (a wave of the cut-off's length keeps half its height).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+Float32Array = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
+MAX_SOURCE_PX = 150_000_000
+"""Pixels of all patches at all scales, 16 bytes each with their transposes and tables."""
+
+
+class SynthesisError(ValueError):
+    """Patches, sizes, regions or knobs that nothing can be grown from."""
+
+
+def leveled(
+    height_um: ArrayLike,
+    *,
+    pixel_um: float,
+    valid: ArrayLike | None = None,
+    cutoff_um: float = 1000.0,
+) -> Float32Array:
+    """Take a patch's bulge and tilt away: what is longer than a cut-off.
+
+    Parameters
+    ----------
+    height_um : array_like, shape (H, W)
+        Measured heights, um; NaN where there is none.
+    pixel_um : float
+        Side of a pixel, um, > 0.
+    valid : array_like of bool, shape (H, W), optional
+        Heights to use.
+    cutoff_um : float
+        Waves of this length keep half their height (ISO 16610-21); the paper removes detail
+        beyond a millimetre (Nagano2015 section 4).
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W)
+        Heights about zero, um; NaN where the patch has none.
+
+    Raises
+    ------
+    SynthesisError
+        For a patch without heights, or a pixel or cut-off that is not positive.
+
+    Notes
+    -----
+    The mean is a Gaussian's over the heights that are there, normalised by its weight there, so a
+    border or a hole does not count as height 0.
+
+    Examples
+    --------
+    >>> ramp = np.add.outer(np.arange(50.0), np.arange(50.0))
+    >>> bool(abs(leveled(ramp, pixel_um=10.0, cutoff_um=100.0)[20:30, 20:30]).max() < 1e-3)
+    True
+    """
+    height, known = _checked(height_um, valid, "height_um")
+    for name, value in (("pixel_um", pixel_um), ("cutoff_um", cutoff_um)):
+        if not (math.isfinite(value) and value > 0):
+            raise SynthesisError(f"{name}: got {value}, expected a finite number above 0")
+    sigma_px = math.sqrt(0.5 * math.log(2.0)) / math.pi * cutoff_um / pixel_um
+    mean = height[known].mean()
+    about = np.where(known, height - mean, 0.0)
+    weight = gaussian_filter(known.astype(np.float64), sigma_px, mode="constant")
+    slow = gaussian_filter(about, sigma_px, mode="constant") / np.maximum(weight, 1e-12)
+    return np.where(known, about - slow, np.nan).astype(np.float32)
+
+
+def _checked(
+    height: ArrayLike, valid: ArrayLike | None, name: str
+) -> tuple[NDArray[np.float64], Bools]:
+    values = np.asarray(height, np.float64)
+    if values.ndim != 2 or min(values.shape) < 2:
+        raise SynthesisError(f"{name}: got shape {values.shape}, expected (H, W)")
+    known = np.isfinite(values)
+    if valid is not None:
+        mask = np.asarray(valid)
+        if mask.dtype != np.bool_ or mask.shape != values.shape:
+            raise SynthesisError(f"valid: got {mask.dtype} {mask.shape}, expected {values.shape}")
+        known &= mask
+    if not known.any():
+        raise SynthesisError(f"{name}: got no valid height")
+    return values, known
+
+
+def filled(height: NDArray[np.floating], known: Bools) -> Float32Array:
+    """Return heights with each hole bridged by means of what surrounds it, the nearest first."""
+    values = np.where(known, height, 0.0).astype(np.float64)
+    weight = known.astype(np.float64)
+    sigma = 1.0
+    while not (weight > 0).all():
+        near = gaussian_filter(weight, sigma, truncate=3.0)
+        mean = gaussian_filter(values * weight, sigma, truncate=3.0)
+        take = (weight == 0) & (near > 0.05)
+        values[take] = mean[take] / near[take]
+        weight[take] = 1.0
+        sigma *= 2.0
+    return values.astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sources:
+    """All patches of a site at all scales, in one flat array."""
+
+    table: Integers
+    """(S, 5): first pixel in ``heights``, height, width, first entry in ``filled``, first pixel in
+    ``turned``."""
+    level_first: Integers
+    """(L + 1,): sources of scale l begin at level_first[l]."""
+    heights: Float32Array
+    """(N,) heights, um."""
+    turned: Float32Array
+    """(N,) the same with each source transposed."""
+    filled: Integers
+    """(M,) summed-area tables, (height + 1, width + 1) each, of pixels without a height of their
+    own."""
+
+
+def gather(
+    patches: Sequence[ArrayLike], zooms: Sequence[float], *, window: int, name: str
+) -> Sources:
+    """Resample patches to all scales and put them into one array.
+
+    Parameters
+    ----------
+    patches : sequence of array_like, each (H, W)
+        Heights, um; NaN: hole.
+    zooms : sequence of float
+        Pixels of the result per pixel of a patch, one a scale.
+    window : int
+        Patches that are smaller at some scale are not used there.
+    name : str
+        Of the argument, for messages.
+
+    Raises
+    ------
+    SynthesisError
+        When a scale has no patch that is large enough, or all are too large together.
+    """
+    if not len(patches):
+        raise SynthesisError(f"{name}: got no patch")
+    checked = [_checked(patch, None, f"{name}[{n}]") for n, patch in enumerate(patches)]
+    whole = [(filled(height, known), known) for height, known in checked]
+    if sum(h.size * z * z for h, _ in whole for z in zooms) > MAX_SOURCE_PX:
+        raise SynthesisError(
+            f"{name}: got more than {MAX_SOURCE_PX} pixels at {len(zooms)} scales, expected fewer "
+            "or smaller patches, or a narrower range of pixel_um"
+        )
+    rows, firsts = [], [0]
+    flat, turned, tables = [], [], []
+    pixel = entry = 0
+    for zoom in zooms:
+        for height, known in whole:
+            scaled, missing = _scaled(height, known, zoom)
+            high, wide = scaled.shape
+            if min(high, wide) < window:
+                continue
+            rows.append((pixel, high, wide, entry, pixel))
+            flat.append(scaled.reshape(-1))
+            turned.append(np.ascontiguousarray(scaled.T).reshape(-1))
+            sums = np.zeros((high + 1, wide + 1), np.int64)
+            sums[1:, 1:] = missing.cumsum(0, dtype=np.int64).cumsum(1)
+            tables.append(sums.reshape(-1))
+            pixel += scaled.size
+            entry += sums.size
+        if len(rows) == firsts[-1]:
+            largest = max(min(h.shape) for h, _ in whole)
+            raise SynthesisError(
+                f"{name}: got at most {int(largest * zoom)} px a side at the result's scale, "
+                f"expected at least {window}: give larger patches or smaller cell_px, overlap_px"
+            )
+        firsts.append(len(rows))
+    return Sources(
+        table=np.array(rows, np.int64),
+        level_first=np.array(firsts, np.int64),
+        heights=np.concatenate(flat),
+        turned=np.concatenate(turned),
+        filled=np.concatenate(tables),
+    )
+
+
+def _scaled(height: Float32Array, known: Bools, zoom: float) -> tuple[Float32Array, Bools]:
+    """Return heights with ``zoom`` times the pixels a side, and which of them were filled."""
+    if abs(zoom - 1.0) < 1e-9:
+        return height, ~known
+    size = [max(1, int(n * zoom)) for n in height.shape]
+    places = [(np.arange(n) + 0.5) / zoom - 0.5 for n in size]
+    grid = np.meshgrid(*places, indexing="ij")
+    smooth = height
+    if zoom < 1.0:
+        smooth = gaussian_filter(height, 0.5 * math.sqrt(zoom**-2 - 1.0), mode="nearest")
+    values = map_coordinates(smooth, grid, order=3, mode="nearest")
+    share = map_coordinates((~known).astype(np.float32), grid, order=1, mode="nearest")
+    return values.astype(np.float32), share > 0.25
