@@ -140,8 +140,17 @@ def simulate(
     steps: Steps = None,
     state: Annotated[
         list[str] | None,
-        typer.Option(help="State of the face before the flash rig; repeatable."),
+        typer.Option(
+            help="State of the face, such as smile or exercise; repeatable for the flash rig."
+        ),
     ] = None,
+    movement: Annotated[
+        bool,
+        typer.Option(
+            "--movement/--no-movement",
+            help="Whether the face moves and wrinkles with its states, or its blood changes only.",
+        ),
+    ] = True,
     consent: Consent = None,
     consent_expires: ConsentExpires = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
@@ -161,7 +170,7 @@ def simulate(
         states=tuple(state or ("neutral",)), resume=resume, lights=lights, views=views, move=move,
         site=site, angles=numbers_of(angles, "--angles"), steps=range_of(steps, "--steps"),
         sites=names_of(sites), repeats=repeats, all_brackets=all_brackets,
-        progress=console.progress,
+        movement=movement, progress=console.progress,
         person=subject_of(pseudonym(subject, seed), consent or USES, consent_expires),
     )  # fmt: skip
     console.say(

@@ -35,9 +35,9 @@ def simulate_dome(order: Order) -> Simulated:
     if order.target is not None and order.target not in targets:
         raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
     order.refuse(
-        "dome", states=("neutral",), repeats=1, site=None, angles=None, steps=None, sites=None,
-        all_brackets=False,
+        "dome", repeats=1, site=None, angles=None, steps=None, sites=None, all_brackets=False,
     )  # fmt: skip
+    state = _state(order)
     rig = small_dome(
         load_rig("dome"),
         lights=order.lights or LIGHTS[order.size],
@@ -52,7 +52,7 @@ def simulate_dome(order: Order) -> Simulated:
     asked = {
         "rig": "dome", "width_px": rig.views[0].width_px, "subject": order.subject,
         "target": order.target or "", "mesh": str(order.mesh or ""), "lights": len(rig.lights),
-        "views": len(rig.views), "move": order.move,
+        "views": len(rig.views), "move": order.move, "state": state, "movement": order.movement,
     }  # fmt: skip
     scene = _scene(rig, order)
     session = open_session(order, plan, rig, asked)
@@ -78,7 +78,13 @@ def simulate_dome(order: Order) -> Simulated:
         appearance = scene.truth_appearance()
         appearance = dataclasses.replace(
             appearance,
-            parameters={"kind": "truth", "state": "neutral", **appearance.parameters, **scan},
+            parameters={
+                "kind": "truth",
+                "state": state,
+                "movement": order.movement,
+                **appearance.parameters,
+                **scan,
+            },
             inputs={"session": session.content_hash},
             files=_truth_files(scene, appearance, order.seed),
             seed=order.seed,
@@ -87,6 +93,24 @@ def simulate_dome(order: Order) -> Simulated:
     return Simulated(
         order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures
     )
+
+
+def _state(order: Order) -> str:
+    """Return the state of the one face that a session of the dome shows."""
+    from rigsim.perfusion import STATES
+
+    if len(order.states) != 1:
+        raise SimulationError(
+            f"states: got {', '.join(order.states) or 'none'}, expected one; a session of the dome "
+            "shows one face, capture each state into a session of its own"
+        )
+    if order.states[0] not in STATES:
+        raise SimulationError(
+            f"state: got {order.states[0]!r}, expected one of {', '.join(STATES)}"
+        )
+    if order.target is not None and order.states[0] != "neutral":
+        raise SimulationError(f"state: got {order.states[0]!r}, but a target has none")
+    return order.states[0]
 
 
 def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, bytes]:
@@ -196,7 +220,10 @@ def _scene(rig: Rig, order: Order) -> Any:
         return target_scene(order.target, rig, seed=order.seed, dome=built)  # type: ignore[arg-type]
     person = make_subject(order.subject, seed=order.seed, mesh=order.mesh)
     motion = head_motion(order.seed) if order.move else None
-    return DomeScene(rig, person, dome=built, motion=motion, seed=order.seed)
+    return DomeScene(
+        rig, person, dome=built, motion=motion, state=order.states[0], movement=order.movement,
+        seed=order.seed,
+    )  # fmt: skip
 
 
 def _attach_scan(session: Any, scene: Any, order: Order) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,9 +39,10 @@ def simulate_flash(order: Order) -> Simulated:
     asked = {
         "rig": "flash", "width_px": width, "subject": order.subject, "target": target or "",
         "mesh": str(order.mesh or ""), "states": list(states), "repeats": order.repeats,
+        "movement": order.movement,
     }  # fmt: skip
     # what cannot be built must fail before a folder is made
-    scenes = _scenes(rig, target, order.subject, order.mesh, states, seed)
+    scenes = _scenes(rig, order)
     session = open_session(order, _plan(rig, target, states, order.repeats), rig, asked)
 
     def prompt(world: Any, state: str) -> None:
@@ -70,23 +70,20 @@ def _plan(rig: Rig, target: str | None, states: tuple[str, ...], repeats: int) -
     return flash_calibration_plan(rig, target)  # type: ignore[arg-type]
 
 
-def _scenes(
-    rig: Rig,
-    target: str | None,
-    subject: str,
-    mesh: str | Path | None,
-    states: tuple[str, ...],
-    seed: int,
-) -> dict[str, Any]:
+def _scenes(rig: Rig, order: Order) -> dict[str, Any]:
     from rigsim import targets
     from rigsim.scenes.flash import FlashScene
     from rigsim.subject import make_subject
 
-    if target is not None:
-        state = "white" if target == "white" else ""
-        return {state: FlashScene(rig, targets.make_target(target), seed=seed)}
-    person = make_subject(subject, seed=seed, mesh=mesh)
-    return {state: FlashScene(rig, person, state=state, seed=seed) for state in states}
+    seed = order.seed
+    if order.target is not None:
+        state = "white" if order.target == "white" else ""
+        return {state: FlashScene(rig, targets.make_target(order.target), seed=seed)}
+    person = make_subject(order.subject, seed=seed, mesh=order.mesh)
+    return {
+        state: FlashScene(rig, person, state=state, movement=order.movement, seed=seed)
+        for state in order.states
+    }
 
 
 def to_superpixels(values: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> NDArray[Any]:

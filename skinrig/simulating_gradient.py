@@ -40,8 +40,8 @@ def simulate_gradient(order: Order) -> Simulated:
     if order.target is not None and order.target not in targets:
         raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
     order.refuse(
-        "gradient", states=("neutral",), repeats=1, mesh=None, lights=None, views=None, move=False,
-        sites=None, all_brackets=False,
+        "gradient", states=("neutral",), movement=True, repeats=1, mesh=None, lights=None,
+        views=None, move=False, sites=None, all_brackets=False,
     )  # fmt: skip
     if order.target is not None:
         order.refuse("target of the gradient", site=None, angles=None, steps=None)

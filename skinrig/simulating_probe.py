@@ -40,7 +40,7 @@ def simulate_probe(order: Order) -> Simulated:
     if order.target is not None and order.target not in targets:
         raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
     order.refuse(
-        "probe", states=("neutral",), mesh=None, lights=None, views=None, move=False,
+        "probe", states=("neutral",), movement=True, mesh=None, lights=None, views=None, move=False,
         width_px=None, site=None, steps=None,
     )  # fmt: skip
     if order.target is not None:

@@ -112,6 +112,7 @@ class Order:
     steps: tuple[int, int] | None
     sites: tuple[str, ...] | None
     all_brackets: bool
+    movement: bool
     created: datetime | None
     person: Subject | None
     progress: Callable[[str], None] | None
@@ -152,6 +153,7 @@ def simulate_session(
     steps: tuple[int, int] | None = None,
     sites: Sequence[str] | None = None,
     all_brackets: bool = False,
+    movement: bool = True,
     created: datetime | None = None,
     person: Subject | None = None,
     progress: Callable[[str], None] | None = None,
@@ -181,7 +183,8 @@ def simulate_session(
         "malus"; of the dome "charuco", "mirror", "white" or "dark"; of the gradient sphere "ball",
         "flat" or "dark"; of the probe "phantom" or "dark".
     states
-        Expressions and physiological states, captured one after the other by the flash rig.
+        Expressions and physiological states: the flash rig captures one after the other, a session
+        of the dome has one.
     repeats
         Image pairs a state of the flash rig, or placements of the probe a site and angle.
     resume
@@ -203,6 +206,8 @@ def simulate_session(
         Where the probe is placed; None: forehead, cheek and chin.
     all_brackets
         Whether the probe takes exposures that can show no more.
+    movement
+        Whether the face moves and wrinkles with its states; else they change the blood only.
     created
         Date of the session; None: now.
     person
@@ -222,7 +227,7 @@ def simulate_session(
         states=tuple(states), repeats=repeats, resume=resume, width_px=width_px, lights=lights,
         views=views, move=move, site=site, angles=None if angles is None else tuple(angles),
         steps=steps, sites=None if sites is None else tuple(sites), all_brackets=all_brackets,
-        created=created, person=person, progress=progress,
+        movement=movement, created=created, person=person, progress=progress,
     )  # fmt: skip
     if rig_name == "dome":
         from skinrig.simulating_dome import simulate_dome

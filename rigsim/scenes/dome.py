@@ -94,6 +94,12 @@ class DomeScene:
         The dome as it stands; ``None`` stands as drawn.
     motion
         How the head moves; ``None`` holds it still. Targets stand still.
+    state
+        State of the face, see `rigsim.perfusion.STATES`: its blood, and its expression where the
+        state is one; targets have none.
+    movement
+        Whether the face moves and wrinkles with the state. A subject that is already posed
+        (`Subject.posed`) stays in its pose.
     sensor
         Sensor of every view; ``None`` takes what each view states.
     seed
@@ -115,6 +121,8 @@ class DomeScene:
         *,
         dome: BuiltDome | None = None,
         motion: HeadMotion | None = None,
+        state: str = "neutral",
+        movement: bool = True,
         sensor: Sensor | None = None,
         seed: int = 0,
         interreflections: bool = False,
@@ -137,7 +145,11 @@ class DomeScene:
             dome = BuiltDome(rig, rig, axes)
         self.dome = dome
         self.rig = dome.rig
+        if movement and isinstance(subject, Subject) and subject.pose is None:
+            subject = subject.posed(state)
         self.subject = subject
+        self.state = state
+        self.movement = movement
         self.motion = motion
         self.seed = seed
         self.interreflections = interreflections
@@ -170,6 +182,10 @@ class DomeScene:
                 ("eyes, teeth and hair on the head", "the eyes are closed; only skin is estimated"),
                 ("dependence of the boundary on its roughness", "light enters a smooth boundary"),
             ]
+            if not self.movement:
+                out.append(("movement of the face with the state", "movement=False asks for it"))
+            elif self.subject.pose is not None:
+                out.append(("shadows of wrinkles", "they tilt the surface only"))
             if not self.interreflections:
                 out.append(("light from skin to skin", "interreflections=False asks for it"))
             else:
@@ -339,8 +355,10 @@ class DomeScene:
         SkinAppearance
             ``position`` in mm and ``normals`` with relief (rig frame), ``r_d``, ``r_d_floor``
             (`rigsim.surface_brdf.surface_floor`: by how much eq. (6)'s minimum lies above r_d even
-            without noise), ``reflectance`` (at normal incidence), ``roughness``, ``oil``, ``fuzz``;
-            valid on bare skin.
+            without noise), ``reflectance`` (at normal incidence), ``roughness``, ``oil``, ``fuzz``,
+            ``normals_tangent`` (`Subject.tangent_normal`: texture frame, relief and wrinkles alone;
+            comparable between states texel by texel); of a face that has moved also
+            ``position_at_rest``; valid on bare skin.
         """
         subject = self._face()
         surface = self.surface(self._view(view_name))
@@ -357,7 +375,15 @@ class DomeScene:
             "roughness": (surface.roughness, UNITS["roughness"], "Beckmann, skin below the oil"),
             "oil": (surface.oil, "1", "share covered by oil, GGX of half the roughness"),
             "fuzz": (surface.fuzz, "1", "optical depth of vellus hair"),
+            "normals_tangent": (
+                subject.tangent_normal(),
+                "1",
+                "texture frame, relief and wrinkles: +x along u, +y along v, +z off the mesh",
+            ),
         }
+        if subject.rest is not None:
+            where = "rig frame, the same skin before it moved"
+            maps["position_at_rest"] = (subject.rest.atlas.position_mm, "mm", where)
         return SkinAppearance(
             {
                 name: SkinMap(values, unit, valid=valid, description=text)
@@ -421,7 +447,9 @@ class DomeScene:
         """Return how the face reflects for a camera."""
         camera = view.spectral_sensitivity
         if camera not in self._surfaces:
-            self._surfaces[camera] = skin_surface(self._face(), camera, self._illuminant)
+            self._surfaces[camera] = skin_surface(
+                self._face(), camera, self._illuminant, state=self.state
+            )
         return self._surfaces[camera]
 
     def _texture(self, view: View) -> Float32Array:

@@ -86,7 +86,10 @@ def test_a_simulation_goes_on_where_it_was_stopped_with_the_same_settings_only(t
 
 @pytest.mark.parametrize(
     ("more", "match"),
-    [({"target": "chart"}, "charuco, mirror, white, dark"), ({"states": ("anger",)}, "states"),
+    [({"target": "chart"}, "charuco, mirror, white, dark"),
+     ({"states": ("anger", "fear")}, "states: got anger, fear"),
+     ({"states": ("angry",)}, "state: got 'angry'"),
+     ({"states": ("anger",), "target": "mirror"}, "a target has none"),
      ({"repeats": 2}, "repeats"), ({"size": "huge"}, "size"), ({"seed": -1}, "seed")],
 )  # fmt: skip
 def test_what_the_dome_cannot_do_is_refused_before_a_folder_is_made(tmp_path, more, match):
