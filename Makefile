@@ -1,6 +1,8 @@
 .DEFAULT_GOAL := help
 SKINRIG := .venv/bin/skinrig
 PYTEST := .venv/bin/python -m pytest
+# a process for each core, four at most: kernels use several threads as well
+WORKERS := -n auto --maxprocesses 4 --dist loadfile
 
 .PHONY: help setup demo test test-long lint bench clean
 
@@ -27,10 +29,10 @@ lint: .venv/.ready
 	@.venv/bin/lint-imports
 
 test: .venv/.ready
-	@$(PYTEST) -q -m "not long"
+	@$(PYTEST) -q $(WORKERS) -m "not long"
 
 test-long: .venv/.ready
-	@$(PYTEST) -q -m long
+	@$(PYTEST) -q $(WORKERS) -m long
 
 bench: .venv/.ready
 	@$(SKINRIG) bench
