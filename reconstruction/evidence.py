@@ -33,6 +33,8 @@ class Evidence:
         CALIBRATION/ folder; None: everything is assumed.
     state
         Which state of the subject.
+    repeat
+        Which of its repeats; None: all of them together.
     on_date
         The date that calibrations must be valid on.
     assumed
@@ -58,6 +60,7 @@ class Evidence:
     scan: bytes | None = None
     basis: Path | None = None
     landmarks: Path | None = None
+    repeat: int | None = None
     assumed: list[str] = field(default_factory=list)
     hashes: dict[str, str] = field(default_factory=dict)
     noted: dict[str, Any] = field(default_factory=dict)

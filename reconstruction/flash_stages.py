@@ -59,6 +59,7 @@ class Inputs:
 
     session: Session
     state: str
+    repeat: int | None
     sensor: SensorCalibration | None
     white: WhiteReference | None
     polarization: PolarizationCalibration | None
@@ -79,7 +80,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     return [
         stages.Stage(
             "frames", (), ("parallel", "crossed"), lambda: _frames(inputs),
-            base | {"state": inputs.state},
+            base | {"state": inputs.state, "repeat": inputs.repeat},
         ),
         stages.Stage(
             "separation", ("parallel", "crossed"), ("diffuse", "specular"),
@@ -129,6 +130,7 @@ def _inputs(evidence: Evidence) -> Inputs:
     return Inputs(
         session=session,
         state=evidence.state,
+        repeat=evidence.repeat,
         sensor=SensorCalibration.from_calibration(sensor, view.serial) if sensor else None,
         white=WhiteReference.from_calibration(white, view.serial) if white else None,
         polarization=PolarizationCalibration.from_calibration(malus, view.serial)
@@ -165,7 +167,10 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
     )
     images: dict[str, Image | None] = {}
     for polarizer in ("parallel", "crossed"):
-        shots = session.frames("subject", state=inputs.state, polarizer=polarizer)
+        which: dict[str, str | int | float] = {"state": inputs.state, "polarizer": polarizer}
+        if inputs.repeat is not None:
+            which["repeat"] = inputs.repeat
+        shots = session.frames("subject", **which)
         linear = [linear_light(record) for record in shots]
         if not linear:
             images[polarizer] = None
