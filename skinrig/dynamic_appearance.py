@@ -1,0 +1,167 @@
+"""An APPEARANCE/ folder that moves: facial color, wrinkles and microstructure, fitted one by one.
+
+Each fit adds its part to the folder and replaces an older one of its kind; the other parts stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from model import store
+from model.skin import SkinAppearance, SkinMap
+
+KIND = "dynamic"
+FACIAL_COLOR, WRINKLES, MICROSTRUCTURE = "facial_color", "wrinkles", "microstructure"
+PARTS = (FACIAL_COLOR, WRINKLES, MICROSTRUCTURE)
+FIT_COMMANDS: Mapping[str, str] = {
+    FACIAL_COLOR: "skinrig fit facial-color",
+    WRINKLES: "skinrig fit wrinkles",
+    MICROSTRUCTURE: "skinrig fit microstructure",
+}
+
+
+class DynamicAppearanceError(ValueError):
+    """A folder that holds no part that can be evaluated, or another kind of maps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One fitted model, as it goes into the folder.
+
+    Attributes
+    ----------
+    maps, files
+        What it is stored as, by name.
+    parameters
+        JSON values: settings and figures of the fit.
+    inputs
+        SHA-256 of what was read.
+    source
+        "measured" or "simulated".
+    left_out
+        What was not fitted, and why.
+    seed
+        Of a simulation; None: measured.
+    """
+
+    maps: Mapping[str, SkinMap]
+    files: Mapping[str, bytes]
+    parameters: Mapping[str, Any]
+    inputs: Mapping[str, str]
+    source: str
+    left_out: tuple[tuple[str, str], ...] = ()
+    seed: int | None = None
+
+
+def check_target(out: Path) -> None:
+    """Raise where a fit could not be written, before it is computed.
+
+    Raises
+    ------
+    DynamicAppearanceError
+        ``out`` holds maps of another kind.
+    """
+    _previous(out)
+
+
+def add(out: Path, name: str, part: Part) -> SkinAppearance:
+    """Write a part beside those that the folder holds already.
+
+    Parameters
+    ----------
+    out
+        The folder; made where there is none.
+    name
+        Of `PARTS`.
+    part
+        What was fitted.
+
+    Raises
+    ------
+    DynamicAppearanceError
+        ``out`` holds maps of another kind, or another part has a map of the same name.
+    """
+    previous = _previous(out)
+    parts: dict[str, Any] = {}
+    maps: dict[str, SkinMap] = {}
+    files: dict[str, bytes] = {}
+    inputs: dict[str, str] = {}
+    left_out: list[tuple[str, str]] = []
+    sources, seed = {part.source}, part.seed
+    if previous is not None:
+        for other, entry in _parts_of(previous).items():
+            if other == name:
+                continue
+            parts[other] = entry
+            maps |= {n: previous.maps[n] for n in entry["maps"]}
+            files |= {n: previous.files[n] for n in entry["files"]}
+            sources.add(str(entry["source"]))
+        inputs = {k: v for k, v in previous.inputs.items() if k.partition(": ")[0] in parts}
+        left_out = [row for row in previous.left_out if row[0].partition(": ")[0] in parts]
+        seed = previous.seed if seed is None else seed
+    double = sorted({*maps, *files} & {*part.maps, *part.files})
+    if double:
+        raise DynamicAppearanceError(f"{double[0]}: another part of {out} has a map of that name")
+    parts[name] = {
+        "maps": sorted(part.maps), "files": sorted(part.files), "source": part.source,
+        **part.parameters,
+    }  # fmt: skip
+    appearance = SkinAppearance(
+        maps={**maps, **part.maps},
+        source="simulated" if "simulated" in sources else "measured",
+        parameters={"kind": KIND, "parts": parts},
+        inputs={**inputs, **{f"{name}: {key}": value for key, value in part.inputs.items()}},
+        versions={n: metadata.version(n) for n in ("skinrig", "numpy", "scipy", "numba")},
+        left_out=(*left_out, *((f"{name}: {what}", why) for what, why in part.left_out)),
+        files={**files, **part.files},
+        seed=seed,
+    )
+    store.write(out, appearance)
+    return appearance
+
+
+def read(path: Path, *, parts: Sequence[str] = PARTS) -> tuple[SkinAppearance, dict[str, Any]]:
+    """Return a dynamic appearance and what it says of its parts.
+
+    Parameters
+    ----------
+    path
+        The folder.
+    parts
+        Those of which at least one is needed.
+
+    Raises
+    ------
+    DynamicAppearanceError
+        It holds none of them.
+    """
+    appearance = store.read(path)
+    found = _parts_of(appearance) if appearance.parameters.get("kind") == KIND else {}
+    if not set(parts) & set(found):
+        commands = " or ".join(f"`{FIT_COMMANDS[name]}`" for name in parts)
+        raise DynamicAppearanceError(
+            f"{path}: got {', '.join(found) or 'maps that nothing was fitted to'}, expected "
+            f"{' or '.join(parts)}; {commands} makes it"
+        )
+    return appearance, found
+
+
+def _previous(out: Path) -> SkinAppearance | None:
+    if not (out / store.DOCUMENT).is_file():
+        return None
+    kind = store.read_document(out).parameters.get("kind")
+    if kind != KIND:
+        raise DynamicAppearanceError(
+            f"{out}: holds maps of kind {kind!r}, expected a new folder or one that a fit wrote; "
+            "nothing was touched: name another with --out"
+        )
+    return store.read(out)
+
+
+def _parts_of(appearance: SkinAppearance) -> dict[str, Any]:
+    parts = appearance.parameters.get("parts")
+    return dict(parts) if isinstance(parts, dict) else {}
