@@ -1,5 +1,8 @@
 """Microstructure of skin under strain: kernels of displacement maps, and which one a stretch asks.
 
+The strain of a mesh is `model.mesh_strain`, its fields on a texture `model.strain_fields`, the
+convolution `model.displacement_convolution`; `strain` and `convolve` are found here too.
+
 A neutral displacement map is convolved along the axis of strain with
 ``k = (1 - alpha) delta + alpha G(sigma)`` (eq. 6): alpha > 0 blurs, alpha < 0 sharpens. A
 :class:`KernelTable` says which alpha and sigma belong to a stretch ratio.
@@ -22,14 +25,35 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.convolution_kernels import TRUNCATE
+from model.displacement_convolution import ConvolutionError, convolve, convolve_tiled
+from model.mesh_strain import MeshStrain, StrainError, strain
+
+__all__ = [
+    "ALPHA_LIMITS",
+    "FOREHEAD",
+    "TABLE_SCHEMA",
+    "TRUNCATE",
+    "ConvolutionError",
+    "KernelPoints",
+    "KernelTable",
+    "KernelTableError",
+    "MeshStrain",
+    "StrainError",
+    "convolve",
+    "convolve_tiled",
+    "forehead_points",
+    "gaussian_weights",
+    "kernel_parameters",
+    "strain",
+]
+
 Floats: TypeAlias = NDArray[np.float64]
 Line: TypeAlias = tuple[float, float]
 """Slope and intercept of a line over the stretch ratio."""
 
 ALPHA_LIMITS = (-2.0, 1.0)
 """Range of the kernel's strength (Nagano2015, below eq. 6)."""
-TRUNCATE = 4.0
-"""The discrete Gaussian ends at the whole number of pixels next to so many sigmas."""
 TABLE_SCHEMA = "skinrig.kernel-table/1"
 
 

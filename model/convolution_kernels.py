@@ -1,0 +1,326 @@
+"""Inner loops of convolution along lines that turn from pixel to pixel.
+
+Kernels are parallel over rows and called from one thread. None uses fast-math, and what a pixel
+becomes depends neither on the number of threads nor on the window it is computed in.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+TRUNCATE = 4.0
+"""The discrete Gaussian ends at the whole number of pixels next to so many sigmas."""
+FAR = 255
+"""Distances to what is not valid are told up to so many pixels."""
+LINEAR, CUBIC = 1, 2
+"""How many pixels to a side the sample between pixels takes from."""
+MIRROR, OPEN = 0, 1
+"""Beyond the border the map is mirrored about the edges of its outermost pixels, or nothing."""
+FINE, NOT_FINITE, ALPHA, SIGMA, AXIS = range(5)
+"""What may be wrong with a row's parameters."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def distance_to_invalid(valid: Any) -> Any:
+    """Return how many king's moves each pixel is from the nearest one that is not valid.
+
+    Parameters
+    ----------
+    valid : (H, W) bool
+
+    Returns
+    -------
+    (H, W) uint8
+        0 where not valid, at most `FAR`. The map's border counts for nothing.
+    """
+    rows, columns = valid.shape
+    out = np.empty((rows, columns), np.uint8)
+    for y in range(rows):
+        for x in range(columns):
+            d = FAR
+            if not valid[y, x]:
+                d = 0
+            else:
+                if x > 0:
+                    d = min(d, out[y, x - 1] + 1)
+                if y > 0:
+                    d = min(d, out[y - 1, x] + 1)
+                    if x > 0:
+                        d = min(d, out[y - 1, x - 1] + 1)
+                    if x < columns - 1:
+                        d = min(d, out[y - 1, x + 1] + 1)
+            out[y, x] = d
+    for y in range(rows - 1, -1, -1):
+        for x in range(columns - 1, -1, -1):
+            d = int(out[y, x])
+            if x < columns - 1:
+                d = min(d, out[y, x + 1] + 1)
+            if y < rows - 1:
+                d = min(d, out[y + 1, x] + 1)
+                if x < columns - 1:
+                    d = min(d, out[y + 1, x + 1] + 1)
+                if x > 0:
+                    d = min(d, out[y + 1, x - 1] + 1)
+            out[y, x] = d
+    return out
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def check_rows(alpha: Any, sigma: Any, axis: Any, rows: Any, columns: Any, most: Any) -> Any:
+    """Return what is wrong with each row's parameters, and the largest sigma that is used there.
+
+    Parameters
+    ----------
+    alpha, sigma : (1 or rows, 1 or columns) float32
+    axis : (1 or rows, 1 or columns, 2) float32
+    rows, columns : int
+    most : float
+        Largest sigma allowed, px.
+
+    Returns
+    -------
+    code : (rows,) int64
+    largest : (rows,) float64
+        0 in rows where nothing is convolved.
+    """
+    code = np.zeros(rows, np.int64)
+    largest = np.zeros(rows)
+    ah, aw = alpha.shape[0] > 1, alpha.shape[1] > 1
+    sh, sw = sigma.shape[0] > 1, sigma.shape[1] > 1
+    xh, xw = axis.shape[0] > 1, axis.shape[1] > 1
+    for y in prange(rows):
+        wrong = FINE
+        top = 0.0
+        for x in range(columns):
+            a = alpha[y * ah, x * aw]
+            s = sigma[y * sh, x * sw]
+            if not (math.isfinite(a) and math.isfinite(s)):
+                wrong = NOT_FINITE
+            elif a < -2.0 or a > 1.0:
+                wrong = ALPHA
+            elif s < 0.0 or s > most:
+                wrong = SIGMA
+            elif a != 0.0 and s > 0.0:
+                u = axis[y * xh, x * xw, 0]
+                v = axis[y * xh, x * xw, 1]
+                if not abs(u * u + v * v - 1.0) < 2e-3:
+                    wrong = AXIS
+                top = max(top, s)
+        code[y] = wrong
+        largest[y] = top
+    return code, largest
+
+
+@njit(inline="always")
+def _cubic(f):  # type: ignore[no-untyped-def]
+    """Return Keys' weights (a = -1/2) of the pixels at -1, 0, 1, 2 for a sample at f."""
+    f2 = f * f
+    f3 = f2 * f
+    half = np.float32(0.5)
+    a = f2 - half * (f + f3)
+    b = np.float32(1.0) - np.float32(2.5) * f2 + np.float32(1.5) * f3
+    c = half * f + np.float32(2.0) * f2 - np.float32(1.5) * f3
+    d = half * (f3 - f2)
+    return a, b, c, d
+
+
+@njit(inline="always")
+def _mirrored(i, n):  # type: ignore[no-untyped-def]
+    """Return the index within n that i comes to, mirrored about the edges of the end pixels."""
+    j = i % (2 * n)
+    return j if j < n else 2 * n - 1 - j
+
+
+@njit
+def _slow_sample(  # type: ignore[no-untyped-def]
+    source, clear, top, left, rows, columns, border, y, x, fy, fx, reach
+):
+    """Return a sample between the pixels y, y + 1 and x, x + 1 and whether all it needs is valid.
+
+    `reach` pixels to each side are weighed; a weight of 0 needs nothing.
+    """
+    total = np.float32(0.0)
+    for l in range(1 - reach, reach + 1):  # noqa: E741
+        wy = _tap(fy, l, reach)
+        if wy == 0.0:
+            continue
+        gy = y + l
+        if gy < 0 or gy >= rows:
+            if border == OPEN:
+                return np.float32(0.0), False
+            gy = _mirrored(gy, rows)
+        for k in range(1 - reach, reach + 1):
+            wx = _tap(fx, k, reach)
+            if wx == 0.0:
+                continue
+            gx = x + k
+            if gx < 0 or gx >= columns:
+                if border == OPEN:
+                    return np.float32(0.0), False
+                gx = _mirrored(gx, columns)
+            if clear.size > 0 and clear[gy - top, gx - left] == 0:
+                return np.float32(0.0), False
+            total += wy * wx * source[gy - top, gx - left]
+    return total, True
+
+
+@njit
+def _tap(f, k, reach):  # type: ignore[no-untyped-def]
+    if reach == LINEAR:
+        return f if k == 1 else np.float32(1.0) - f
+    a, b, c, d = _cubic(f)
+    if k == -1:
+        return a
+    if k == 0:
+        return b
+    return c if k == 1 else d
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def along_lines(
+    source: Any,
+    clear: Any,
+    source_at: Any,
+    size: Any,
+    axis: Any,
+    alpha: Any,
+    sigma: Any,
+    out_at: Any,
+    reach: Any,
+    border: Any,
+    out: Any,
+) -> None:
+    """Write ``h + alpha (G * h - h)`` with the Gaussian along each pixel's own line (eqs. 3 and 6).
+
+    Two samples at the same distance to both sides are one pair; a pair of which one cannot be
+    taken counts as the pixel itself.
+
+    Parameters
+    ----------
+    source : (h, w) float32
+        A window of the map.
+    clear : (h, w) uint8 or (0, 0)
+        Of `distance_to_invalid` there; empty: all is valid.
+    source_at, out_at : (2,) int64
+        Row and column in the map of the windows' first pixels.
+    size : (2,) int64
+        Of the map.
+    axis, alpha, sigma : (m or 1, n or 1[, 2]) float32
+        Where the output is; unit vectors (right, down), strength, px.
+    reach, border : int
+        `LINEAR` or `CUBIC`; `MIRROR` or `OPEN`.
+    out : (m, n) float32, written
+        Pixels that are not valid keep their value.
+    """
+    rows, columns = size[0], size[1]
+    top, left = source_at[0], source_at[1]
+    ah, aw = alpha.shape[0] > 1, alpha.shape[1] > 1
+    sh, sw = sigma.shape[0] > 1, sigma.shape[1] > 1
+    xh, xw = axis.shape[0] > 1, axis.shape[1] > 1
+    masked = clear.size > 0
+    zero, one, two = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+    for row in prange(out.shape[0]):
+        gy = row + out_at[0]
+        y = gy - top
+        for column in range(out.shape[1]):
+            gx = column + out_at[1]
+            x = gx - left
+            own = source[y, x]
+            out[row, column] = own
+            a = alpha[row * ah, column * aw]
+            s = sigma[row * sh, column * sw]
+            radius = int(TRUNCATE * s + 0.5)
+            if a == zero or radius == 0 or (masked and clear[y, x] == 0):
+                continue
+            ax = axis[row * xh, column * xw, 0]
+            ay = axis[row * xh, column * xw, 1]
+            # w(i) = e^(i^2), by w(i + 1) = w(i) e^(2 i + 1)
+            e = math.exp(-0.5 / (float(s) * float(s)))
+            w, grow, grow_by = e, e * e * e, e * e
+            norm = 1.0
+            total = zero
+            need = radius + reach
+            quick = gy >= need and gx >= need and gy + need < rows and gx + need < columns
+            if masked:
+                quick = quick and clear[y, x] > need
+            if quick and abs(ax) == one and ay == zero:
+                for i in range(1, radius + 1):
+                    total += np.float32(w) * (source[y, x + i] + source[y, x - i] - two * own)
+                    norm += 2.0 * w
+                    w *= grow
+                    grow *= grow_by
+            elif quick and abs(ay) == one and ax == zero:
+                for i in range(1, radius + 1):
+                    total += np.float32(w) * (source[y + i, x] + source[y - i, x] - two * own)
+                    norm += 2.0 * w
+                    w *= grow
+                    grow *= grow_by
+            elif quick and reach == CUBIC:
+                for i in range(1, radius + 1):
+                    dx, dy = i * ax, i * ay
+                    bx, by = math.floor(dx), math.floor(dy)
+                    cx = _cubic(np.float32(dx - bx))
+                    cy = _cubic(np.float32(dy - by))
+                    jx, jy = int(bx), int(by)
+                    sample = zero
+                    for m in range(4):
+                        above = source[y + jy - 1 + m]
+                        below = source[y - jy + 1 - m]
+                        p, q = x + jx - 1, x - jx + 1
+                        part = cx[0] * (above[p] + below[q])
+                        part += cx[1] * (above[p + 1] + below[q - 1])
+                        part += cx[2] * (above[p + 2] + below[q - 2])
+                        part += cx[3] * (above[p + 3] + below[q - 3])
+                        sample += cy[m] * part
+                    total += np.float32(w) * (sample - two * own)
+                    norm += 2.0 * w
+                    w *= grow
+                    grow *= grow_by
+            elif quick:
+                for i in range(1, radius + 1):
+                    dx, dy = i * ax, i * ay
+                    bx, by = math.floor(dx), math.floor(dy)
+                    fx, fy = np.float32(dx - bx), np.float32(dy - by)
+                    jx, jy = int(bx), int(by)
+                    p, q = x + jx, x - jx
+                    above, below = source[y + jy], source[y - jy]
+                    sample = (one - fy) * (
+                        (one - fx) * (above[p] + below[q]) + fx * (above[p + 1] + below[q - 1])
+                    )
+                    above, below = source[y + jy + 1], source[y - jy - 1]
+                    sample += fy * (
+                        (one - fx) * (above[p] + below[q]) + fx * (above[p + 1] + below[q - 1])
+                    )
+                    total += np.float32(w) * (sample - two * own)
+                    norm += 2.0 * w
+                    w *= grow
+                    grow *= grow_by
+            else:
+                for i in range(1, radius + 1):
+                    good = False
+                    pair = zero
+                    for finer in range(reach, 0, -1):  # cubic, then linear where a hole is near
+                        pair = zero
+                        good = True
+                        for side in (1, -1):
+                            dx, dy = side * i * ax, side * i * ay
+                            bx, by = math.floor(dx), math.floor(dy)
+                            value, there = _slow_sample(
+                                source, clear, top, left, rows, columns, border,
+                                gy + int(by), gx + int(bx),
+                                np.float32(dy - by), np.float32(dx - bx), finer,
+                            )  # fmt: skip
+                            pair += value
+                            good = good and there
+                        if good:
+                            break
+                    if good:
+                        total += np.float32(w) * (pair - two * own)
+                    norm += 2.0 * w
+                    w *= grow
+                    grow *= grow_by
+            out[row, column] = own + a * total / np.float32(norm)

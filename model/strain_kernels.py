@@ -1,0 +1,466 @@
+"""Inner loops of the strain of a mesh: at its vertices, and filled into a texture.
+
+Symmetric 2 x 2 tensors are three numbers (11, 12, 22).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+SLIVER = 1e-6
+"""A triangle lower than this part of its longest edge is degenerate; so is one in the texture."""
+EVEN = 1e-6
+"""Relative difference of the two stretch ratios below which no axis is preferred."""
+FINE, DEGENERATE, NO_TEXTURE, TURNED = range(4)
+"""What triangles are: usable, without area, without area in the texture, against their own."""
+BAND = 32
+"""Rows of the texture filled by one thread at a time."""
+EMPTY, COVERED, PADDED = range(3)
+
+
+@njit(inline="always")
+def _cross(a, b):  # type: ignore[no-untyped-def]
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+
+
+@njit(inline="always")
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(inline="always")
+def _edge(points, i, j):  # type: ignore[no-untyped-def]
+    return (
+        points[j, 0] - points[i, 0],
+        points[j, 1] - points[i, 1],
+        points[j, 2] - points[i, 2],
+    )
+
+
+@njit(inline="always")
+def principal(p, q, r):  # type: ignore[no-untyped-def]
+    """Return mean and half the difference of the eigenvalues of (p, q, r), and the larger's axis.
+
+    The axis is the first one where there is no difference.
+    """
+    mean, d = 0.5 * (p + r), 0.5 * (p - r)
+    h = math.hypot(d, q)
+    if h == 0.0:
+        return mean, h, 1.0, 0.0
+    # half of the angle atan2(q, d), by the root that does not cancel
+    if d >= 0.0:
+        c = math.sqrt(0.5 * (1.0 + d / h))
+        return mean, h, c, 0.5 * q / (h * c)
+    s = math.sqrt(0.5 * (1.0 - d / h))
+    return mean, h, 0.5 * q / (h * s), s
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def triangle_strain(rest: Any, moved: Any, faces: Any, uv: Any) -> Any:
+    """Return what each triangle does, in its own plane.
+
+    Parameters
+    ----------
+    rest, moved : (V, 3) float64
+    faces : (F, 3) int64
+    uv : (V, 2) float64
+
+    Returns
+    -------
+    kind : (F,) uint8
+    basis : (F, 3, 3) float64
+        Unit axes in the rest triangle's plane, and its normal.
+    area : (F,) float64
+        Twice the rest area.
+    change : (F, 3) float64
+        Right stretch tensor less 1, ``sqrt(F^T F) - 1``, on these axes: 0 to the bit where no
+        edge changes.
+    to_uv : (F, 2, 2) float64
+        From these axes to the texture (Q of eq. 13's text, on the plane).
+    """
+    count = faces.shape[0]
+    kind = np.zeros(count, np.uint8)
+    basis = np.zeros((count, 3, 3))
+    area = np.zeros(count)
+    change = np.zeros((count, 3))
+    to_uv = np.zeros((count, 2, 2))
+    for f in range(count):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        a, b, c = _edge(rest, i, j), _edge(rest, i, k), _edge(rest, j, k)
+        aa, bb = _dot(a, a), _dot(b, b)
+        longest = max(aa, max(bb, _dot(c, c)))
+        n = _cross(a, b)
+        twice = math.sqrt(_dot(n, n))
+        if not twice > SLIVER * longest:
+            kind[f] = DEGENERATE
+            continue
+        # on axes e1 = a / |a|, e2 = n x e1: a = (x, 0), b = (u, v)
+        x = math.sqrt(aa)
+        u, v = _dot(a, b) / x, twice / x
+        for m in range(3):
+            basis[f, 0, m] = a[m] / x
+            basis[f, 2, m] = n[m] / twice
+        e2 = _cross(basis[f, 2], basis[f, 0])
+        for m in range(3):
+            basis[f, 1, m] = e2[m]
+        area[f] = twice
+        # changes of the edges' inner products, without cancellation
+        A, B = _edge(moved, i, j), _edge(moved, i, k)
+        da = (A[0] - a[0], A[1] - a[1], A[2] - a[2])
+        db = (B[0] - b[0], B[1] - b[1], B[2] - b[2])
+        gaa = _dot(da, (A[0] + a[0], A[1] + a[1], A[2] + a[2]))
+        gab = _dot(da, B) + _dot(a, db)
+        gbb = _dot(db, (B[0] + b[0], B[1] + b[1], B[2] + b[2]))
+        # C - 1 = X^-T [gaa gab; gab gbb] X^-1 with X = [x u; 0 v]
+        p = gaa / (x * x)
+        q = (gab / x - p * u) / v
+        r = (gbb / v - u * (p * u / v + 2.0 * q)) / v
+        # U - 1 of U = sqrt(C), Cayley-Hamilton: (C + J) / s, s^2 = tr C + 2 J
+        trace, det = p + r, p * r - q * q
+        J = math.sqrt(max(1.0 + trace + det, 0.0))
+        s = math.sqrt(max(2.0 + trace + 2.0 * J, 0.0))
+        if s > 0.0:
+            rest_of_it = det / (1.0 + J + s)
+            change[f, 0], change[f, 1], change[f, 2] = (
+                (p + rest_of_it) / s,
+                q / s,
+                (r + rest_of_it) / s,
+            )
+        else:
+            change[f, 0], change[f, 2] = -1.0, -1.0
+        ua, va = uv[j, 0] - uv[i, 0], uv[j, 1] - uv[i, 1]
+        ub, vb = uv[k, 0] - uv[i, 0], uv[k, 1] - uv[i, 1]
+        cu, cv = ub - ua, vb - va
+        longest = max(ua * ua + va * va, max(ub * ub + vb * vb, cu * cu + cv * cv))
+        if not abs(ua * vb - va * ub) > SLIVER * longest:
+            kind[f] = NO_TEXTURE
+            continue
+        to_uv[f, 0, 0], to_uv[f, 1, 0] = ua / x, va / x
+        to_uv[f, 0, 1] = (ub - to_uv[f, 0, 0] * u) / v
+        to_uv[f, 1, 1] = (vb - to_uv[f, 1, 0] * u) / v
+    return kind, basis, area, change, to_uv
+
+
+@njit(inline="always")
+def _carried(basis, normal):  # type: ignore[no-untyped-def]
+    """Return a triangle's axes turned by the shortest way into the plane across `normal`."""
+    n = (basis[2, 0], basis[2, 1], basis[2, 2])
+    c = _dot(n, normal)
+    sign = 1.0 if c >= 0.0 else -1.0
+    scale = 1.0 / (1.0 + abs(c))
+    out = np.empty((2, 3))
+    for axis in range(2):
+        lean = _dot(basis[axis], normal) * scale
+        for m in range(3):
+            out[axis, m] = basis[axis, m] - lean * (sign * n[m] + normal[m])
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def vertex_strain(
+    faces: Any, place: Any, places: Any, kind: Any, basis: Any, area: Any, change: Any, to_uv: Any
+) -> Any:
+    """Average triangles at vertices, weighed by their rest areas.
+
+    Parameters
+    ----------
+    faces : (F, 3) int64
+    place : (V,) int64
+        Which vertices are one on the skin: equal numbers below ``places``.
+    places : int
+    kind, basis, area, change, to_uv
+        Of `triangle_strain`; triangles that oppose a vertex's texture become `TURNED`.
+
+    Returns
+    -------
+    stretch : (V, 2) float64
+        r_s >= r_t >= 0.
+    column_s, column_t : (V, 2) float64
+        S = Q R^T V (eq. 13), texture per length along the principal axes.
+    tensor, metric : (V, 3) float64
+        T - 1 in the tangent frame, and Q R^T, both symmetric: R is the rotation closest to Q.
+    even, valid : (V,) bool
+        No axis is preferred; there is a triangle, and one with a texture.
+    """
+    count = place.size
+    normal = np.zeros((places, 3))
+    widest = np.full(places, -1)
+    for f in range(faces.shape[0]):
+        if kind[f] != DEGENERATE:
+            for corner in range(3):
+                w = place[faces[f, corner]]
+                if widest[w] < 0 or area[f] > area[widest[w]]:
+                    widest[w] = f
+                for m in range(3):
+                    normal[w, m] += area[f] * basis[f, 2, m]
+    axes = np.zeros((places, 2, 3))
+    for w in range(places):
+        if widest[w] < 0:
+            continue
+        length = math.sqrt(_dot(normal[w], normal[w]))
+        if length <= 1e-6 * area[widest[w]]:  # triangles that face all ways
+            normal[w] = basis[widest[w], 2]
+        else:
+            for m in range(3):
+                normal[w, m] /= length
+        axes[w] = _carried(basis[widest[w]], normal[w])
+    tensor_at = np.zeros((places, 3))
+    weight = np.zeros(places)
+    # textures seen from both sides apart: what is folded there would cancel
+    both = np.zeros((count, 2, 2, 2))
+    share = np.zeros((count, 2))
+    for f in range(faces.shape[0]):
+        if kind[f] == DEGENERATE:
+            continue
+        p, q, r = change[f, 0], change[f, 1], change[f, 2]
+        for corner in range(3):
+            vertex = faces[f, corner]
+            w = place[vertex]
+            here = _carried(basis[f], normal[w])
+            b00, b01 = _dot(axes[w, 0], here[0]), _dot(axes[w, 0], here[1])
+            b10, b11 = _dot(axes[w, 1], here[0]), _dot(axes[w, 1], here[1])
+            tensor_at[w, 0] += area[f] * (b00 * b00 * p + 2.0 * b00 * b01 * q + b01 * b01 * r)
+            tensor_at[w, 1] += area[f] * (
+                b00 * b10 * p + (b00 * b11 + b01 * b10) * q + b01 * b11 * r
+            )
+            tensor_at[w, 2] += area[f] * (b10 * b10 * p + 2.0 * b10 * b11 * q + b11 * b11 * r)
+            weight[w] += area[f]
+            if kind[f] == NO_TEXTURE:
+                continue
+            m00 = to_uv[f, 0, 0] * b00 + to_uv[f, 0, 1] * b01
+            m01 = to_uv[f, 0, 0] * b10 + to_uv[f, 0, 1] * b11
+            m10 = to_uv[f, 1, 0] * b00 + to_uv[f, 1, 1] * b01
+            m11 = to_uv[f, 1, 0] * b10 + to_uv[f, 1, 1] * b11
+            side = 0 if m00 * m11 - m01 * m10 > 0.0 else 1
+            share[vertex, side] += area[f]
+            both[vertex, side, 0, 0] += area[f] * m00
+            both[vertex, side, 0, 1] += area[f] * m01
+            both[vertex, side, 1, 0] += area[f] * m10
+            both[vertex, side, 1, 1] += area[f] * m11
+    for f in range(faces.shape[0]):
+        if kind[f] == FINE:
+            for corner in range(3):
+                vertex = faces[f, corner]
+                w = place[vertex]
+                here = _carried(basis[f], normal[w])
+                det = to_uv[f, 0, 0] * to_uv[f, 1, 1] - to_uv[f, 0, 1] * to_uv[f, 1, 0]
+                det *= _dot(axes[w, 0], here[0]) * _dot(axes[w, 1], here[1]) - _dot(
+                    axes[w, 0], here[1]
+                ) * _dot(axes[w, 1], here[0])
+                side = 0 if det > 0.0 else 1
+                if share[vertex, side] < share[vertex, 1 - side]:
+                    kind[f] = TURNED
+    stretch = np.ones((count, 2))
+    column_s, column_t = np.zeros((count, 2)), np.zeros((count, 2))
+    tensor, metric = np.zeros((count, 3)), np.zeros((count, 3))
+    even, valid = np.ones(count, np.bool_), np.zeros(count, np.bool_)
+    for vertex in range(count):
+        w = place[vertex]
+        side = 0 if share[vertex, 0] >= share[vertex, 1] else 1
+        if weight[w] == 0.0 or share[vertex, side] == 0.0:
+            continue
+        t = tensor_at[w] / weight[w]
+        m = both[vertex, side] / share[vertex, side]
+        # m = metric turn: the turn closest to m, a mirror image where the texture is one
+        if side == 0:
+            c, s = m[0, 0] + m[1, 1], m[1, 0] - m[0, 1]
+        else:
+            c, s = m[0, 0] - m[1, 1], m[1, 0] + m[0, 1]
+        length = math.hypot(c, s)
+        c, s = c / length, s / length
+        o00, o10 = c, s
+        o01, o11 = (-s, c) if side == 0 else (s, -c)
+        metric[vertex, 0] = m[0, 0] * o00 + m[0, 1] * o01
+        metric[vertex, 2] = m[1, 0] * o10 + m[1, 1] * o11
+        metric[vertex, 1] = 0.5 * (m[0, 0] * o10 + m[0, 1] * o11 + m[1, 0] * o00 + m[1, 1] * o01)
+        tensor[vertex, 0] = o00 * o00 * t[0] + 2.0 * o00 * o01 * t[1] + o01 * o01 * t[2]
+        tensor[vertex, 1] = o00 * o10 * t[0] + (o00 * o11 + o01 * o10) * t[1] + o01 * o11 * t[2]
+        tensor[vertex, 2] = o10 * o10 * t[0] + 2.0 * o10 * o11 * t[1] + o11 * o11 * t[2]
+        # ratios from what the vertices of one place share, for the same ones to the bit
+        mean, h, ax, ay = principal(t[0], t[1], t[2])
+        stretch[vertex, 0] = max(1.0 + mean + h, 0.0)
+        stretch[vertex, 1] = max(1.0 + mean - h, 0.0)
+        even[vertex] = 2.0 * h <= EVEN * stretch[vertex, 0]
+        if even[vertex]:
+            vx, vy = 1.0, 0.0
+        else:
+            vx, vy = o00 * ax + o01 * ay, o10 * ax + o11 * ay
+        column_s[vertex, 0] = metric[vertex, 0] * vx + metric[vertex, 1] * vy
+        column_s[vertex, 1] = metric[vertex, 1] * vx + metric[vertex, 2] * vy
+        column_t[vertex, 0] = -metric[vertex, 0] * vy + metric[vertex, 1] * vx
+        column_t[vertex, 1] = -metric[vertex, 1] * vy + metric[vertex, 2] * vx
+        valid[vertex] = True
+    return stretch, column_s, column_t, tensor, metric, even, valid
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def fill_texture(
+    faces: Any, x: Any, y: Any, values: Any, valid: Any, top: Any, left: Any,
+    width: Any, height: Any, state: Any, stretch: Any, axes: Any, scale: Any,
+) -> None:  # fmt: skip
+    """Fill a window of a texture: tensors between vertices, their principal axes at each pixel.
+
+    The triangle of the lowest number has a pixel that several hold. What a pixel becomes does
+    not depend on the window.
+
+    Parameters
+    ----------
+    faces : (F, 3) int64
+    x, y : (V,) float64
+        Vertices in pixels of the whole texture, y down.
+    values : (V, 6) float64
+        T - 1 and the metric, texture per length.
+    valid : (V,) bool
+    top, left : int
+        First row and column of the window.
+    width, height : float
+        Pixels per unit of the texture's u and v.
+    state : (m, n) uint8, of 0
+    stretch : (m, n, 2) float32
+        r_s, r_t.
+    axes : (m, n, 2, 2) float32
+        Unit vectors (right, down) of s and t.
+    scale : (m, n, 2) float32
+        Pixels per length along s and t.
+    """
+    rows, columns = state.shape
+    bands = (rows + BAND - 1) // BAND
+    for band in prange(bands):
+        first, last = top + band * BAND, top + min(rows, (band + 1) * BAND) - 1
+        for f in range(faces.shape[0]):
+            i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+            low, high = min(y[i], min(y[j], y[k])), max(y[i], max(y[j], y[k]))
+            if high < first or low > last:
+                continue
+            if max(x[i], max(x[j], x[k])) < left or min(x[i], min(x[j], x[k])) > left + columns - 1:
+                continue
+            if not (valid[i] and valid[j] and valid[k]):
+                continue
+            det = (x[j] - x[i]) * (y[k] - y[i]) - (x[k] - x[i]) * (y[j] - y[i])
+            if det == 0.0:
+                continue
+            # weights of corners j and k, linear in x and y from corner i
+            jx, jy = (y[k] - y[i]) / det, -(x[k] - x[i]) / det
+            kx, ky = -(y[j] - y[i]) / det, (x[j] - x[i]) / det
+            for row in range(max(first, math.ceil(low)), min(last, math.floor(high)) + 1):
+                dy = row - y[i]
+                a, b = -np.inf, np.inf
+                for part in range(3):
+                    if part == 0:
+                        slope, at = jx, jy * dy
+                    elif part == 1:
+                        slope, at = kx, ky * dy
+                    else:
+                        slope, at = -jx - kx, 1.0 - (jy + ky) * dy
+                    if slope > 0.0:
+                        a = max(a, -at / slope)
+                    elif slope < 0.0:
+                        b = min(b, -at / slope)
+                    elif at < -1e-9:
+                        b = -np.inf
+                # pixels on an edge belong to both sides: the first triangle has them
+                begin = max(math.ceil(a + x[i] - 1e-6), left) if b >= a - 2e-6 else left
+                end = min(math.floor(b + x[i] + 1e-6), left + columns - 1) if b >= a - 2e-6 else -1
+                for column in range(begin, end + 1):
+                    r, c = row - top, column - left
+                    if state[r, c] != EMPTY:
+                        continue
+                    dx = column - x[i]
+                    wj, wk = jx * dx + jy * dy, kx * dx + ky * dy
+                    p = values[i, 0] + wj * (values[j, 0] - values[i, 0])
+                    p += wk * (values[k, 0] - values[i, 0])
+                    q = values[i, 1] + wj * (values[j, 1] - values[i, 1])
+                    q += wk * (values[k, 1] - values[i, 1])
+                    s = values[i, 2] + wj * (values[j, 2] - values[i, 2])
+                    s += wk * (values[k, 2] - values[i, 2])
+                    mean, h, vx, vy = principal(p, q, s)
+                    if 2.0 * h <= EVEN * (1.0 + mean + h):
+                        vx, vy = 1.0, 0.0
+                    p = values[i, 3] + wj * (values[j, 3] - values[i, 3])
+                    p += wk * (values[k, 3] - values[i, 3])
+                    q = values[i, 4] + wj * (values[j, 4] - values[i, 4])
+                    q += wk * (values[k, 4] - values[i, 4])
+                    s = values[i, 5] + wj * (values[j, 5] - values[i, 5])
+                    s += wk * (values[k, 5] - values[i, 5])
+                    sx, sy = width * (p * vx + q * vy), -height * (q * vx + s * vy)
+                    tx, ty = width * (q * vx - p * vy), -height * (s * vx - q * vy)
+                    ls, lt = math.sqrt(sx * sx + sy * sy), math.sqrt(tx * tx + ty * ty)
+                    if not (ls > 0.0 and lt > 0.0):
+                        continue
+                    state[r, c] = COVERED
+                    stretch[r, c, 0] = max(1.0 + mean + h, 0.0)
+                    stretch[r, c, 1] = max(1.0 + mean - h, 0.0)
+                    axes[r, c, 0, 0], axes[r, c, 0, 1] = sx / ls, sy / ls
+                    axes[r, c, 1, 0], axes[r, c, 1, 1] = tx / lt, ty / lt
+                    scale[r, c, 0], scale[r, c, 1] = ls, lt
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def pad_once(state: Any, before: Any, stretch: Any, axes: Any, scale: Any) -> None:
+    """Give empty pixels the values of a neighbour that had some; `before` is a copy of `state`."""
+    rows, columns = state.shape
+    for r in prange(rows):
+        for c in range(columns):
+            if before[r, c] != EMPTY:
+                continue
+            found = False
+            for straight in (True, False):  # sides before corners, then in order
+                for dr in range(-1, 2):
+                    for dc in range(-1, 2):
+                        y, x = r + dr, c + dc
+                        if found or (dr == 0 or dc == 0) != straight:
+                            continue
+                        if 0 <= y < rows and 0 <= x < columns and before[y, x] != EMPTY:
+                            found = True
+                            state[r, c] = PADDED
+                            stretch[r, c] = stretch[y, x]
+                            axes[r, c] = axes[y, x]
+                            scale[r, c] = scale[y, x]
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def look_up(
+    stretch: Any, state: Any, breaks: Any, alpha_lines: Any, sigma_lines: Any, ends: Any,
+    limits: Any, scale: Any, alpha: Any, sigma: Any,
+) -> None:  # fmt: skip
+    """Write strength and sigma in pixels for each pixel's two stretch ratios (eqs. 8 and 9).
+
+    Parameters
+    ----------
+    stretch, scale : (m, n, 2) float32
+        Ratios, and pixels per length.
+    state : (m, n) uint8
+        Nothing is convolved where `EMPTY`.
+    breaks, alpha_lines : (L - 1,), (L, 2) float64
+        Slope and intercept of alpha's lines.
+    sigma_lines : (2, 2) float64
+        Of sigma, in the length of `scale`, below and above a ratio of 1.
+    ends, limits : (2,) float64
+        Ratios are held within the first, alpha within the second.
+    alpha, sigma : (2, m, n) float32, written
+    """
+    for r in prange(state.shape[0]):
+        for c in range(state.shape[1]):
+            for axis in range(2):
+                alpha[axis, r, c] = 0.0
+                sigma[axis, r, c] = 0.0
+                if state[r, c] == EMPTY:
+                    continue
+                ratio = min(max(float(stretch[r, c, axis]), ends[0]), ends[1])
+                line = 0
+                while line < breaks.size and ratio > breaks[line]:
+                    line += 1
+                a = alpha_lines[line, 0] * ratio + alpha_lines[line, 1]
+                a = min(max(a, limits[0]), limits[1])
+                side = 0 if ratio < 1.0 else 1
+                s = sigma_lines[side, 0] * ratio + sigma_lines[side, 1]
+                alpha[axis, r, c] = 0.0 if ratio == 1.0 else a
+                sigma[axis, r, c] = max(s, 0.0) * scale[r, c, axis]
