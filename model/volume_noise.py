@@ -1,0 +1,210 @@
+"""Band-limited noise in space, for skin without a measured patch and without an atlas.
+
+A sum of plane waves of random direction, wave number and phase. It is a function of the place
+alone, so a surface that is evaluated point by point has neither seams nor a preferred direction
+(the volume noise of Nagano et al. 2015, fig. 5 top, doi:10.1145/2766894, whose kind they leave
+open).
+
+The spectrum is stated: power is spread over wave numbers k (waves per mm) between two ends with a
+density proportional to ``k^slope``. The noise at distance r then has the covariance
+``variance * integral of p(k) sin(2 pi k r) / (2 pi k r) dk`` with that density p.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+CHUNK = 512
+"""Points whose sums stay in the cache while all waves pass over them."""
+_NODES = 2001
+
+
+class VolumeNoiseError(ValueError):
+    """A spectrum or places that make no noise."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sum_of_waves(points: Any, waves: Any, phases: Any, amplitude: Any, out: Any) -> None:
+    """Write the sum of cosines at each point.
+
+    Parameters
+    ----------
+    points : (N, 3) float64
+    waves : (M, 3) float64, waves per unit of length
+    phases : (M,) float64, in turns
+    amplitude : float
+    out : (N,) float64, written
+    """
+    x, y, z = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
+    total = np.empty(CHUNK)
+    for begin in range(0, out.size, CHUNK):
+        count = min(CHUNK, out.size - begin)
+        for i in range(count):
+            x[i], y[i], z[i] = points[begin + i, 0], points[begin + i, 1], points[begin + i, 2]
+            total[i] = 0.0
+        for m in range(phases.size):
+            a, b, c, phase = waves[m, 0], waves[m, 1], waves[m, 2], phases[m]
+            for i in range(count):
+                turn = a * x[i] + b * y[i] + c * z[i] + phase
+                turn -= math.floor(turn)
+                # cos(2 pi turn) = sin(2 pi q) for turn in [0, 1): Taylor's series, 6e-12 off
+                q = abs(turn - 0.5) - 0.25
+                s = q * q
+                total[i] += q * (
+                    6.283185307179586
+                    + s * (-41.34170224039975 + s * (81.60524927607504 + s * (
+                        -76.70585975306136 + s * (42.05869394489765 + s * (
+                            -15.094642576822984 + s * (3.8199525848482803
+                            - s * 0.7181223017785001))))))
+                )  # fmt: skip
+        for i in range(count):
+            out[begin + i] = amplitude * total[i]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VolumeNoise:
+    """Noise of a stated spectrum and variance; see :meth:`draw`."""
+
+    waves_per_mm: Floats
+    """(M, 3) wave vectors."""
+    phases: Floats
+    """(M,) phases, in turns."""
+    rms_um: float
+    """Root mean square over all space, um."""
+    band_per_mm: tuple[float, float]
+    """Least and largest wave number, waves per mm."""
+    slope: float
+    """Power's density over wave numbers is proportional to k to this power."""
+
+    @classmethod
+    def draw(
+        cls,
+        *,
+        rms_um: float,
+        band_per_mm: tuple[float, float],
+        slope: float = -1.0,
+        waves: int = 256,
+        rng: np.random.Generator,
+    ) -> VolumeNoise:
+        """Draw a noise.
+
+        Parameters
+        ----------
+        rms_um : float
+            Root mean square, um, >= 0.
+        band_per_mm : (float, float)
+            Least and largest wave number, waves per mm, 0 < least < largest. A map shows what is
+            below one wave in two of its pixels; keep the largest one below that.
+        slope : float
+            -1 has as much power in each octave.
+        waves : int
+            Plane waves; with more, values are nearer to a normal distribution, and time grows.
+        rng
+            Draws directions, wave numbers and phases.
+
+        Raises
+        ------
+        VolumeNoiseError
+
+        Examples
+        --------
+        >>> rng = np.random.default_rng(0)
+        >>> noise = VolumeNoise.draw(rms_um=5.0, band_per_mm=(1.0, 8.0), rng=rng)
+        >>> noise.at(np.zeros((4, 2, 3))).shape
+        (4, 2)
+        """
+        low, high = (float(v) for v in band_per_mm)
+        if not (math.isfinite(high) and 0 < low < high):
+            raise VolumeNoiseError(
+                f"band_per_mm: got {band_per_mm}, expected 0 < least < largest wave number"
+            )
+        if not (math.isfinite(rms_um) and rms_um >= 0):
+            raise VolumeNoiseError(f"rms_um: got {rms_um}, expected a finite number >= 0")
+        if not math.isfinite(slope) or abs(slope) > 20:
+            raise VolumeNoiseError(f"slope: got {slope}, expected -20...20")
+        if not 8 <= waves <= 65_536:
+            raise VolumeNoiseError(f"waves: got {waves}, expected 8...65536")
+        # One wave in each of M equal parts of the power, each direction by itself: every part of
+        # the spectrum is there in each draw, and each wave is uniform over directions.
+        share = (np.arange(waves) + rng.random(waves)) / waves
+        if slope == -1.0:
+            k = low * (high / low) ** share
+        else:
+            power = slope + 1.0
+            ratio = (high / low) ** power
+            k = low * (1.0 + share * (ratio - 1.0)) ** (1.0 / power)
+        cosine = 2.0 * (rng.permutation(waves) + rng.random(waves)) / waves - 1.0
+        turn = 2.0 * np.pi * (rng.permutation(waves) + rng.random(waves)) / waves
+        sine = np.sqrt(1.0 - cosine**2)
+        directions = np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=1)
+        return cls(
+            waves_per_mm=k[:, None] * directions,
+            phases=rng.random(waves),
+            rms_um=float(rms_um),
+            band_per_mm=(low, high),
+            slope=float(slope),
+        )
+
+    def at(self, points_mm: ArrayLike) -> Floats:
+        """Return the noise at places.
+
+        Parameters
+        ----------
+        points_mm : array_like, shape (..., 3)
+            Places in space, mm, such as those of an atlas' pixels on the undeformed skin.
+
+        Returns
+        -------
+        ndarray of float64, shape (...)
+            Heights, um, of mean 0 over space.
+
+        Raises
+        ------
+        VolumeNoiseError
+            For places that are not finite or have no 3 coordinates.
+        """
+        points = np.ascontiguousarray(points_mm, np.float64)
+        if points.ndim < 1 or points.shape[-1] != 3:
+            raise VolumeNoiseError(f"points_mm: got shape {points.shape}, expected (..., 3)")
+        if not np.isfinite(points).all():
+            raise VolumeNoiseError("points_mm: got NaN or infinity")
+        out = np.empty(points.shape[:-1])
+        amplitude = self.rms_um * math.sqrt(2.0 / self.phases.size)
+        flat = points.reshape(-1, 3)
+        _sum_of_waves(flat, self.waves_per_mm, self.phases, amplitude, out.reshape(-1))
+        return out
+
+    def covariance(self, distance_mm: ArrayLike) -> Floats:
+        """Return the covariance of the noise at two places, over all draws.
+
+        Parameters
+        ----------
+        distance_mm : array_like
+            Distance of the places, mm.
+
+        Returns
+        -------
+        ndarray of float64
+            um^2.
+        """
+        distance = np.asarray(distance_mm, np.float64)
+        low, high = self.band_per_mm
+        log_k = np.linspace(math.log(low), math.log(high), _NODES)
+        density = np.exp((self.slope + 1.0) * (log_k - log_k[-1]))
+        density /= np.trapezoid(density, log_k)
+        values = density * np.sinc(2.0 * np.exp(log_k) * distance[..., None])
+        return np.asarray(self.rms_um**2 * np.trapezoid(values, log_k, axis=-1))
+
+    @property
+    def slope_variance(self) -> float:
+        """Expected square of the slope along any direction of a plane, dimensionless."""
+        k2 = float((self.waves_per_mm**2).sum(axis=1).mean())
+        return (2.0 * math.pi * self.rms_um * 1e-3) ** 2 * k2 / 3.0
