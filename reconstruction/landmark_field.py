@@ -1,0 +1,226 @@
+"""A smooth displacement through landmarks, as smooth as their uncertainty leaves open.
+
+Thin-plate splines are the most probable fields when displacements are a Gaussian process whose
+generalized covariance is ``strength * r^2 log r`` over an unknown affine map. How strongly a face
+deforms (the strength) is estimated from the landmarks themselves by restricted maximum likelihood,
+given how precisely they were placed; their ratio is the spline's smoothing. The same process says
+how far the field may be off between landmarks.
+
+References
+----------
+Wahba 1990, Spline Models for Observational Data, chapters 2 and 4, doi:10.1137/1.9781611970128
+Cressie 1993, Statistics for Spatial Data, section 3.4, doi:10.1002/9781119115151
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RBFInterpolator
+from scipy.optimize import minimize_scalar
+
+from reconstruction.registration import RegistrationError
+
+Floats = NDArray[np.float64]
+
+LEAST = 4
+"""Fewer points than these leave nothing to tell noise from deformation by."""
+GRID_PX = 8
+"""Distance of the nodes at which a field is evaluated before it is interpolated."""
+ROUNDING_PX = 1e-3
+"""No landmark is placed more precisely."""
+_STRONGEST = 1e8
+
+
+class LandmarkFieldError(RegistrationError):
+    """Landmarks that no displacement can be drawn through."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkField:
+    """Displacement of a picture's points, known at landmarks.
+
+    Attributes
+    ----------
+    points_px : ndarray of float64, shape (K, 2)
+        Landmarks in the first picture, column and row.
+    moved_px : ndarray of float64, shape (K, 2)
+        The same in the second picture.
+    stderr_px : float
+        Of a landmark's displacement along each axis.
+    strength : float
+        Of the deformation: factor of the generalized covariance, px^2, with lengths in units of
+        `scale_px`; 0 when an affine map explains all.
+    scale_px : float
+        Unit of length: root mean square distance of the landmarks from their middle.
+    leave_one_out_px : ndarray of float64, shape (K,)
+        How far each landmark lies from where the others put it.
+    """
+
+    points_px: Floats
+    moved_px: Floats
+    stderr_px: float
+    strength: float
+    scale_px: float
+    leave_one_out_px: Floats
+    _inverse: Floats
+
+    @property
+    def smoothing(self) -> float:
+        """Smoothing of the thin-plate spline: noise over strength."""
+        return self.stderr_px**2 / max(self.strength, self.stderr_px**2 / _STRONGEST)
+
+    def on_grid(self, shape: tuple[int, int]) -> tuple[Floats, Floats]:
+        """Return the displacement (H, W, 2) and its standard error along each axis (H, W), px.
+
+        Parameters
+        ----------
+        shape
+            Rows and columns of the first picture.
+        """
+        rows = np.arange(0.0, shape[0] - 1 + GRID_PX, GRID_PX)
+        columns = np.arange(0.0, shape[1] - 1 + GRID_PX, GRID_PX)
+        nodes = np.stack(np.meshgrid(columns, rows), axis=-1)
+        moved, error = self.at(nodes.reshape(-1, 2))
+        coarse = np.dstack([moved.reshape(*nodes.shape[:2], 2), error.reshape(nodes.shape[:2])])
+        x, y = np.meshgrid(
+            np.arange(shape[1], dtype=np.float32) / GRID_PX,
+            np.arange(shape[0], dtype=np.float32) / GRID_PX,
+        )
+        fine = cv2.remap(
+            coarse.astype(np.float32), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+        ).astype(np.float64)
+        return fine[..., :2], np.maximum(fine[..., 2], 0.0)
+
+    def at(self, points_px: ArrayLike) -> tuple[Floats, Floats]:
+        """Return displacement (N, 2) and standard error along each axis (N,) at some points, px.
+
+        Parameters
+        ----------
+        points_px
+            Shape (N, 2), column and row in the first picture.
+        """
+        points = np.asarray(points_px, np.float64).reshape(-1, 2)
+        middle = self.points_px.mean(axis=0)
+        at = (points - middle) / self.scale_px
+        known = (self.points_px - middle) / self.scale_px
+        spline = RBFInterpolator(
+            known,
+            self.moved_px - self.points_px,
+            smoothing=self.smoothing,
+            kernel="thin_plate_spline",
+        )
+        away = np.linalg.norm(at[:, None] - known, axis=-1)
+        row = np.hstack([_kernel(away), np.ones((len(at), 1)), at])
+        # kriging: what the process may do besides, with the affine map estimated
+        rest = np.maximum(-np.einsum("ni,ij,nj->n", row, self._inverse, row), 0.0)
+        variance = rest * self.stderr_px**2 / self.smoothing
+        return np.asarray(spline(at)), np.sqrt(variance)
+
+
+def fit(points_px: ArrayLike, moved_px: ArrayLike, *, stderr_px: float) -> LandmarkField:
+    """Draw a smooth displacement through landmarks.
+
+    Parameters
+    ----------
+    points_px, moved_px : array_like, shape (K, 2)
+        Column and row of the same points in two pictures, K at least `LEAST`.
+    stderr_px : float
+        Standard error of a displacement along each axis, above 0.
+
+    Returns
+    -------
+    LandmarkField
+
+    Raises
+    ------
+    LandmarkFieldError
+        For too few points, points on one line, or something that is not finite.
+
+    Examples
+    --------
+    >>> corners = np.array([[0, 0], [0, 90], [90, 0], [90, 90], [40, 50]], float)
+    >>> field = fit(corners, 1.1 * corners + 3, stderr_px=0.5)
+    >>> field.at([[45, 45]])[0].round(2).tolist()
+    [[7.5, 7.5]]
+    """
+    first = np.array(points_px, np.float64)
+    second = np.array(moved_px, np.float64)
+    if first.ndim != 2 or first.shape[1:] != (2,) or first.shape != second.shape:
+        raise LandmarkFieldError(
+            f"landmarks: got shapes {first.shape} and {second.shape}, expected (K, 2) twice"
+        )
+    if len(first) < LEAST:
+        raise LandmarkFieldError(f"landmarks: got {len(first)}, expected at least {LEAST}")
+    if not (np.isfinite(first).all() and np.isfinite(second).all()):
+        raise LandmarkFieldError("landmarks: got a place that is not finite")
+    if not (math.isfinite(stderr_px) and stderr_px > 0):
+        raise LandmarkFieldError(f"stderr_px: got {stderr_px}, expected above 0")
+    noise = max(stderr_px, ROUNDING_PX)
+    middle = first.mean(axis=0)
+    scale = float(np.sqrt(((first - middle) ** 2).sum(axis=1).mean()))
+    known = (first - middle) / max(scale, 1e-12)
+    affine = np.column_stack([np.ones(len(first)), known])
+    if scale == 0.0 or np.linalg.svd(affine, compute_uv=False)[-1] < 1e-3:
+        raise LandmarkFieldError("landmarks: lie on one line, expected points all over the face")
+    kernel = _kernel(np.linalg.norm(known[:, None] - known, axis=-1))
+    displacement = second - first
+    strength = _likeliest_strength(kernel, affine, displacement, noise)
+    smoothing = noise**2 / max(strength, noise**2 / _STRONGEST)
+    system = np.zeros((len(first) + 3,) * 2)
+    system[: len(first), : len(first)] = kernel + smoothing * np.eye(len(first))
+    system[: len(first), len(first) :] = affine
+    system[len(first) :, : len(first)] = affine.T
+    inverse: Floats = np.asarray(np.linalg.inv(system), np.float64)
+    own = inverse[: len(first), : len(first)]
+    left_out = (own @ displacement) / np.maximum(np.diag(own), 1e-300)[:, None]
+    return LandmarkField(
+        first,
+        second,
+        noise,
+        strength,
+        scale,
+        np.linalg.norm(left_out, axis=1),
+        inverse,
+    )
+
+
+def _kernel(away: Floats) -> Floats:
+    """Return r^2 log r, 0 at 0."""
+    return np.asarray(away**2 * np.log(np.where(away > 0, away, 1.0)))
+
+
+def _likeliest_strength(
+    kernel: Floats, affine: Floats, displacement: Floats, noise: float
+) -> float:
+    """Return the strength of deformation by restricted maximum likelihood."""
+    count = len(kernel)
+    free = np.linalg.qr(affine, mode="complete")[0][:, affine.shape[1] :]
+    if not free.shape[1]:
+        return 0.0
+    values, vectors = np.linalg.eigh(free.T @ kernel @ free)
+    values = np.maximum(values, 0.0)
+    parts = (vectors.T @ (free.T @ displacement)) ** 2
+
+    def cost(log_strength: float) -> float:
+        variance = math.exp(log_strength) * values + noise**2
+        return float(
+            displacement.shape[1] * np.log(variance).sum() + (parts / variance[:, None]).sum()
+        )
+
+    unit = noise**2
+    low, high = math.log(unit / _STRONGEST), math.log(_STRONGEST * unit)
+    # the likelihood may have more than one hill: begin at the best of a coarse row
+    tried = np.linspace(low, high, 2 * count if count < 40 else 80)
+    best = int(np.argmin([cost(x) for x in tried]))
+    found = minimize_scalar(
+        cost,
+        bounds=(tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]),
+        method="bounded",
+        options={"xatol": 1e-4},
+    )
+    return math.exp(float(found.x))
