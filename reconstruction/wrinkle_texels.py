@@ -1,0 +1,274 @@
+"""Wrinkle maps from full-resolution derivatives: texels whose bilinear reading fits best.
+
+A wrinkle map is read bilinearly and multiplied by each expression's strength; its texels solve
+the normal equations of that reading, a matrix of nine neighbours. Where everything is measured
+and strengths are 1 this is the low-pass of the map to its resolution, and the best one for that
+reading.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
+from scipy.sparse.linalg import cg
+
+from model import texture_resampling as resampling
+from model import wrinkles
+from model.wrinkles import WrinkleError
+from reconstruction.normal_maps import NormalMaps
+
+Floats: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
+
+STEEPEST = 4.0
+"""Derivatives beyond this, slopes of 76 degrees, are measured by too grazing light to count."""
+LEAST_COVERAGE = 0.1
+"""Part of a texel's weight that must be measured."""
+LEAST_STRENGTH = 1e-3
+"""Sum of squared strengths, relative to the largest, below which a texel is not determined."""
+TOLERANCE = 1e-12
+DAMPING = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Derivatives:
+    """Measured partial derivatives of one state of a face.
+
+    Attributes
+    ----------
+    values : ndarray, shape (H, W, 2), float32
+        n_x/n_z and n_y/n_z; 0 where not valid.
+    variance : ndarray, shape (H, W, 2), float32
+        Of `values`; 0 everywhere when no error is known.
+    valid : ndarray of bool, shape (H, W)
+    too_steep_fraction : float
+        Of the pixels that were valid as normals.
+    """
+
+    values: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    valid: Bools
+    too_steep_fraction: float
+
+
+def derivatives_of(
+    normals: ArrayLike | NormalMaps | Derivatives,
+    *,
+    stderr_rad: ArrayLike | None = None,
+    valid: ArrayLike | None = None,
+) -> Derivatives:
+    """Return derivatives of measured normals with their variance.
+
+    Parameters
+    ----------
+    normals : array_like (H, W, 3), or NormalMaps
+        Tangent-space normals, +X right, +Y up; NormalMaps bring errors and mask with them.
+    stderr_rad : array_like, shape (H, W), optional
+        Root mean square angle to the truth, rad, as `NormalMaps.stderr_rad`; half its square
+        lies along each direction.
+    valid : array_like of bool, shape (H, W), optional
+
+    Returns
+    -------
+    Derivatives
+    """
+    if isinstance(normals, Derivatives):
+        return normals
+    if isinstance(normals, NormalMaps):
+        stderr_rad = normals.stderr_rad if stderr_rad is None else stderr_rad
+        mask = np.asarray(normals.valid)
+        valid = mask if valid is None else mask & np.asarray(valid, bool)
+        normals = normals.normals
+    n = np.asarray(normals, np.float64)
+    if n.ndim != 3 or n.shape[2] != 3:
+        raise WrinkleError(f"normals: got shape {n.shape}, expected (H, W, 3)")
+    report = wrinkles.encoding_report(n, limit=None)
+    good = report.valid.copy()
+    for name, given in (("valid", valid), ("stderr_rad", stderr_rad)):
+        if given is not None and np.shape(given) != n.shape[:2]:
+            raise WrinkleError(f"{name}: got shape {np.shape(given)}, expected {n.shape[:2]}")
+    if valid is not None:
+        good &= np.asarray(valid, bool)
+    steep = good & (np.abs(report.derivatives) > STEEPEST).any(axis=2)
+    count = int(np.count_nonzero(good))
+    share = float(np.count_nonzero(steep)) / count if count else 0.0
+    good &= ~steep
+    variance = np.zeros(report.derivatives.shape, np.float32)
+    if stderr_rad is not None:
+        s = np.asarray(stderr_rad, np.float64)
+        good &= np.isfinite(s) & (s >= 0)
+        # the gradient of n_x/n_z on the sphere has squared length (1 + d_x^2)(1 + |d|^2)
+        d2 = report.derivatives**2
+        scale = 0.5 * (1.0 + d2) * (1.0 + d2.sum(axis=2, keepdims=True))
+        variance[good] = (s[good] ** 2)[:, None] * scale[good]
+    values = np.where(good[..., None], report.derivatives, 0.0).astype(np.float32)
+    return Derivatives(values, variance, good, share)
+
+
+@dataclass(frozen=True, slots=True)
+class Texels:
+    """Texels fitted to derivatives.
+
+    Attributes
+    ----------
+    values : ndarray, shape (h, w, 2)
+        0 where not valid.
+    stderr : ndarray, shape (h, w, 2)
+        From the variances of the derivatives, taken as independent from pixel to pixel and as
+        even over a texel; infinite where not valid, 0 when no variance was given.
+    valid : ndarray of bool, shape (h, w)
+        Enough of the texel's weight was measured, by expressions that show it.
+    """
+
+    values: Floats
+    stderr: Floats
+    valid: Bools
+
+
+def fit_texels(
+    weight: NDArray[np.floating],
+    product: NDArray[np.floating],
+    noise: NDArray[np.floating],
+    covered: NDArray[np.floating],
+    shape: tuple[int, int],
+) -> Texels:
+    """Return texels t whose bilinear reading B t makes sum_x weight (B t)^2 - 2 product B t least.
+
+    Parameters
+    ----------
+    weight : ndarray, shape (H, W)
+        Sum over expressions of the squared strength (times a pixel's weight).
+    product : ndarray, shape (H, W, 2)
+        Sum over expressions of strength times derivative (times the same weight).
+    noise : ndarray, shape (H, W, 2)
+        Variance of `product`.
+    covered : ndarray, shape (H, W)
+        Part of the pixel that was measured, 0 or 1.
+    shape : (int, int)
+        Rows and columns of texels, at most those of the pixels.
+    """
+    height, width = weight.shape
+    if shape[0] > height or shape[1] > width or min(shape) < 1:
+        raise WrinkleError(f"size: got {shape}, expected 1 to {(height, width)} texels")
+    by, bx = (resampling.reading_matrix(t, p) for t, p in zip(shape, (height, width), strict=True))
+    A = normal_matrix(by, bx, np.asarray(weight, np.float64), shape)
+    summed = gathered(by, bx, weight)
+    full = gathered(by, bx, np.ones((1, 1)))
+    coverage = gathered(by, bx, covered) / full
+    relative = summed / (full * max(float(np.max(weight, initial=0.0)), 1e-300))
+    valid = (coverage >= LEAST_COVERAGE) & (relative >= LEAST_STRENGTH)
+    values = np.zeros((*shape, 2))
+    stderr = np.full((*shape, 2), np.inf)
+    if not valid.any():
+        return Texels(values, stderr, valid)
+    diagonal = A.diagonal()
+    matrix = A + sparse.diags_array(np.full(diagonal.size, DAMPING * diagonal.max()))
+    scaling = sparse.diags_array(1.0 / matrix.diagonal())
+    spread = _inverse_diagonal(by) * _inverse_diagonal(bx)
+    for c in (0, 1):
+        b = gathered(by, bx, product[..., c]).ravel()
+        first = np.divide(b, summed.ravel(), out=np.zeros_like(b), where=summed.ravel() > 0)
+        solved, _ = cg(matrix, b, x0=first, rtol=TOLERANCE, maxiter=500, M=scaling)
+        values[..., c] = np.where(valid, solved.reshape(shape), 0.0)
+        scatter = gathered(by, bx, noise[..., c])
+        variance = np.divide(scatter, summed**2, out=np.zeros_like(scatter), where=valid)
+        stderr[..., c] = np.where(valid, np.sqrt(spread * variance), np.inf)
+    return Texels(values, stderr, valid)
+
+
+def low_passed(
+    derivatives: NDArray[np.floating],
+    shape: tuple[int, int],
+    *,
+    variance: NDArray[np.floating] | None = None,
+    valid: ArrayLike | None = None,
+) -> Texels:
+    """Return a map of derivatives at a lower resolution, invalid pixels left out.
+
+    Parameters
+    ----------
+    derivatives : ndarray, shape (H, W, 2)
+    shape : (int, int)
+        Rows and columns of texels.
+    variance : ndarray, shape (H, W, 2), optional
+    valid : array_like of bool, shape (H, W), optional
+
+    Examples
+    --------
+    >>> low_passed(np.full((8, 8, 2), 0.25), (2, 2)).values[..., 0].round(9).tolist()
+    [[0.25, 0.25], [0.25, 0.25]]
+    """
+    d = np.asarray(derivatives, np.float64)
+    good = np.asarray(np.isfinite(d).all(axis=2))
+    if valid is not None:
+        good = good & np.asarray(valid, bool)
+    kept = good[..., None]
+    spread = np.zeros(d.shape) if variance is None else np.where(kept, variance, 0.0)
+    ones: Floats = good.astype(np.float64)
+    return fit_texels(ones, np.where(kept, d, 0.0), spread, ones, shape)
+
+
+def gathered(by: Any, bx: Any, image: NDArray[np.floating]) -> Floats:
+    """Return what each texel's weights gather from an image: B^T image.
+
+    Parameters
+    ----------
+    by, bx : sparse (H, h) and (W, w)
+        Of `texture_resampling.reading_matrix`.
+    image : ndarray, shape (H, W)
+
+    Returns
+    -------
+    ndarray, shape (h, w), float64
+    """
+    whole = np.broadcast_to(np.asarray(image, np.float64), (by.shape[0], bx.shape[0]))
+    return np.asarray((by.T @ whole) @ bx)
+
+
+def normal_matrix(by: Any, bx: Any, weight: Floats, shape: tuple[int, int]) -> Any:
+    """Return the sparse (h w, h w) matrix B^T diag(weight) B: texels meet neighbours only."""
+    h, w = shape
+    total = sparse.csr_array((h * w, h * w))
+    index = np.arange(h * w).reshape(h, w)
+    for dy in (0, 1):
+        rows = _overlap(by, dy)
+        if rows.shape[1] == 0:
+            continue
+        partly = rows.T @ weight
+        for dx in (0, 1) if dy == 0 else (-1, 0, 1):
+            columns = _overlap(bx, abs(dx))
+            if columns.shape[1] == 0:
+                continue
+            values = np.asarray(partly @ columns)
+            here = index[: h - dy, : w - abs(dx)]
+            there = index[dy:, abs(dx) :]
+            if dx < 0:
+                here, there = index[: h - dy, -dx:], index[dy:, : w + dx]
+            one = sparse.csr_array(
+                (values.ravel(), (here.ravel(), there.ravel())), shape=(h * w, h * w)
+            )
+            total = total + (one if (dy, dx) == (0, 0) else one + one.T)
+    return total.tocsr()
+
+
+def _overlap(b: Any, step: int) -> Any:
+    """Return products of each texel's weights with those of the texel `step` further on."""
+    c = b.tocsc()
+    return c.multiply(c) if step == 0 else c[:, :-1].multiply(c[:, 1:])
+
+
+def _inverse_diagonal(b: Any) -> float:
+    """Return a texel's variance over that of the mean of its weights, away from borders.
+
+    B^T B has a on its diagonal and b beside it; its inverse has 1/sqrt(a^2 - 4 b^2) there.
+    """
+    middle = slice(b.shape[1] // 4, max(3 * b.shape[1] // 4, 1))
+    a = float(np.mean(_overlap(b, 0).sum(axis=0)[middle]))
+    beside = float(np.mean(_overlap(b, 1).sum(axis=0))) if b.shape[1] > 1 else 0.0
+    summed = float(np.mean(b.sum(axis=0)[middle]))
+    return summed / math.sqrt(max(a * a - 4.0 * beside * beside, 1e-30))

@@ -1,0 +1,360 @@
+"""Wrinkle maps and weights fitted to normals that the model made: round trips, errors, extremes."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.ndimage import gaussian_filter
+
+from model import texture_resampling as resampling
+from model import wrinkles
+from model.wrinkles import JIMENEZ2011, Layer, WrinkleError
+from reconstruction import wrinkle_fit, wrinkle_texels, wrinkle_weights
+from reconstruction.normal_maps import NormalMaps
+
+SIDE = 128
+CENTRES = [(0.2, 0.15), (0.8, 0.15), (0.2, 0.4), (0.8, 0.4),
+           (0.2, 0.65), (0.8, 0.65), (0.3, 0.9), (0.7, 0.9)]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def face():
+    """Return neutral derivatives and a layer with soft, overlapping zones."""
+    rng = np.random.default_rng(7)
+    base = gaussian_filter(rng.standard_normal((SIDE, SIDE, 2)), (2, 2, 0))
+    wrinkle = gaussian_filter(rng.standard_normal((32, 32, 2)), (1.2, 1.2, 0))
+    y, x = np.mgrid[:16, :16] / 15.0
+    masks = np.stack([np.exp(-((x - a) ** 2 + (y - b) ** 2) / 0.02) for a, b in CENTRES])
+    masks /= masks.sum(axis=0) + 0.05
+    return base * 0.2 / base.std(), Layer(0.5 * wrinkle / np.abs(wrinkle).max(), masks)
+
+
+def shown(face, weights):
+    base, layer = face
+    return wrinkles.combine_layers(base, [layer], weights, clamp="signed")
+
+
+def disturbed(normals, sigma_rad, rng):
+    """Return unit normals turned by independent angles along two directions of the surface."""
+    helper = np.where(np.abs(normals[..., :1]) < 0.5, [1.0, 0, 0], [0, 1.0, 0])
+    u = np.cross(normals, helper)
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    v = np.cross(normals, u)
+    a, b = sigma_rad * rng.standard_normal((2, *normals.shape[:2], 1)) / np.sqrt(2)
+    n = normals + a * u + b * v
+    return n / np.linalg.norm(n, axis=-1, keepdims=True)
+
+
+def pixels(texels, shape):
+    return np.moveaxis(resampling.resampled(np.moveaxis(texels, 2, 0), shape), 0, 2)
+
+
+# --- texels ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(32, 32), (20, 31), (1, 1), (64, 128)])
+def test_texels_come_back_from_their_own_bilinear_reading(rng, shape):
+    texels = rng.standard_normal((*shape, 2))
+    got = wrinkle_texels.low_passed(pixels(texels, (128, 128)), shape)
+    assert got.valid.all()
+    np.testing.assert_allclose(got.values, texels, atol=1e-6)
+
+
+def test_a_map_at_full_resolution_is_kept(rng):
+    d = rng.standard_normal((24, 17, 2))
+    np.testing.assert_allclose(wrinkle_texels.low_passed(d, (24, 17)).values, d, atol=1e-7)
+
+
+def test_detail_finer_than_a_texel_is_averaged_away_and_does_not_alias():
+    x = np.arange(256)
+    ripple = np.zeros((256, 256, 2))
+    ripple[..., 0] = np.cos(np.pi * x)  # one period in two pixels; sixteen pixels a texel
+    got = wrinkle_texels.low_passed(ripple, (16, 16)).values
+    assert np.abs(got[:, 2:-2]).max() < 0.02
+    assert np.abs(got).max() < 0.05  # half a texel's weights are missing at the border
+    picked = ripple[::16, ::16]  # what taking every sixteenth pixel would keep
+    assert np.abs(picked).max() == 1.0
+
+
+def test_the_fitted_low_pass_reads_closer_than_averages(rng):
+    d = gaussian_filter(rng.standard_normal((128, 128, 2)), (6, 6, 0))
+    fitted = wrinkle_texels.low_passed(d, (16, 16)).values
+    averaged = np.moveaxis(resampling.resampled(np.moveaxis(d, 2, 0), (16, 16)), 0, 2)
+    misfit = [np.mean((pixels(t, (128, 128)) - d) ** 2) for t in (fitted, averaged)]
+    assert misfit[0] < 0.8 * misfit[1]
+
+
+def test_holes_do_not_leak_into_texels(rng):
+    texels = rng.standard_normal((16, 16, 2))
+    d = pixels(texels, (128, 128))
+    valid = rng.random((128, 128)) > 0.4
+    valid[30:60, 40:90] = False
+    d[~valid] = 1e6
+    got = wrinkle_texels.low_passed(d, (16, 16), valid=valid)
+    np.testing.assert_allclose(got.values[got.valid], texels[got.valid], atol=1e-5)
+    assert not got.valid[5, 7]
+    assert not got.values[~got.valid].any()
+    assert np.isinf(got.stderr[~got.valid]).all()
+    assert np.isfinite(got.stderr[got.valid]).all()
+    nothing = wrinkle_texels.low_passed(d, (16, 16), valid=np.zeros((128, 128), bool))
+    assert not nothing.valid.any()
+
+
+@pytest.mark.parametrize("side", [8, 16, 64, 128])
+def test_a_texel_scatters_as_its_standard_error_says(rng, side):
+    sigma = 0.1
+    noise = sigma * rng.standard_normal((128, 128, 2))
+    got = wrinkle_texels.low_passed(noise, (side, side), variance=np.full(noise.shape, sigma**2))
+    edge = max(side // 8, 1)  # the error holds away from borders
+    z = (got.values / got.stderr)[edge:-edge, edge:-edge]
+    # neighbours scatter against each other: at least a quarter of the samples is independent
+    freedom = z.size / 4
+    low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], freedom) / freedom
+    assert low < np.mean(z**2) < high
+
+
+def test_more_texels_than_pixels_are_refused():
+    with pytest.raises(WrinkleError, match="size"):
+        wrinkle_texels.low_passed(np.zeros((8, 8, 2)), (9, 8))
+
+
+def test_errors_of_normals_become_errors_of_derivatives(rng):
+    n = np.array([0.3, -0.5, 0.7])
+    n /= np.linalg.norm(n)
+    many = np.broadcast_to(n, (300, 300, 3))
+    sigma = 0.01
+    d = wrinkles.encode(disturbed(many, sigma, rng), limit=None)
+    stated = wrinkle_texels.derivatives_of(many, stderr_rad=np.full((300, 300), sigma))
+    ratio = d.var(axis=(0, 1)) / stated.variance[0, 0]
+    np.testing.assert_allclose(ratio, 1.0, atol=4 * np.sqrt(2 / 90_000) + 5e-3)  # 4 sigma, bend
+
+
+def test_grazing_normals_and_unknown_errors_are_masked_and_counted():
+    n = np.zeros((1, 5, 3))
+    n[..., 2] = 1.0
+    n[0, 1] = [0.99, 0, np.sqrt(1 - 0.99**2)]
+    n[0, 2] = np.nan
+    stderr = np.array([[0.01, 0.01, 0.01, np.nan, 0.01]])
+    got = wrinkle_texels.derivatives_of(n, stderr_rad=stderr)
+    np.testing.assert_array_equal(got.valid, [[True, False, False, False, True]])
+    assert got.too_steep_fraction == 0.25
+    assert np.isfinite(got.values).all()
+    assert np.isfinite(got.variance).all()
+    same = wrinkle_texels.derivatives_of(
+        NormalMaps(n, n[..., 0], n[..., 0], np.ones((1, 5), bool), stderr)
+    )
+    np.testing.assert_array_equal(same.valid, got.valid)
+
+
+# --- one expression -------------------------------------------------------------------------
+
+
+def test_the_wrinkle_map_is_the_difference_of_derivatives(face):
+    base, layer = face
+    every = np.ones((1, 1, 1))
+    n = wrinkles.combine(base, layer.wrinkle, every, np.ones(1))
+    got = wrinkle_fit.wrinkle_map(wrinkles.decode(base), n, size=(32, 32))
+    np.testing.assert_allclose(got.values, layer.wrinkle, atol=1e-6)
+
+
+@pytest.mark.parametrize("clamp", ["unit", "signed"])
+def test_weights_of_a_new_expression_come_back(face, clamp):
+    base, layer = face
+    true = np.array([0.3, 1.0, 0.0, 0.7, 0.05, 0.5, 0.9, 0.2])
+    if clamp == "signed":
+        true[[1, 4]] = [-1.0, -0.4]
+    got = wrinkle_fit.fit_weights(layer, wrinkles.decode(base), shown(face, true), clamp=clamp)
+    np.testing.assert_allclose(got.weights, true, atol=1e-6)
+    assert got.valid.all()
+    assert got.explained > 1 - 1e-9
+
+
+def test_a_weight_beyond_the_bounds_is_held_at_them_and_said(face):
+    base, layer = face
+    asked = np.array([0.5, -0.6, 0.5, 0.5, 1.7, 0.5, 0.5, 0.5])
+    twice = Layer(2 * layer.wrinkle, layer.masks)
+    n = wrinkles.combine_layers(base, [twice], asked / 2, clamp="signed")
+    got = wrinkle_fit.fit_weights(layer, wrinkles.decode(base), n)
+    np.testing.assert_array_equal(got.weights[[1, 4]], [0.0, 1.0])
+    assert got.at_bound[[1, 4]].all()
+    assert got.explained < 0.999
+    free = wrinkle_fit.fit_weights(layer, wrinkles.decode(base), n, clamp="signed")
+    np.testing.assert_allclose(free.weights[1], -0.6, atol=0.1)
+
+
+def test_weights_scatter_as_their_standard_errors_and_the_cramer_rao_bound_say(face):
+    base, layer = face
+    true = np.array([0.3, 0.8, 0.4, 0.7, 0.25, 0.5, 0.6, 0.2])
+    sigma, draws = 0.1, 24
+    neutral, clean = wrinkles.decode(base), shown(face, true)
+    stderr_rad = np.full((SIDE, SIDE), sigma)
+    z = []
+    for seed in range(draws):
+        noisy = disturbed(clean, sigma, np.random.default_rng(seed))
+        measured = wrinkle_texels.derivatives_of(noisy, stderr_rad=stderr_rad)
+        got = wrinkle_fit.fit_weights(layer, neutral, measured, clamp="signed")
+        z.append((got.weights - true) / np.sqrt(np.diag(got.covariance)))
+        assert np.all(got.stderr >= np.sqrt(np.diag(got.covariance)) * (1 - 1e-12))
+    z = np.array(z)
+    low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], z.size) / z.size
+    # the bent relation of angle and derivative at sigma = 0.1 adds about sigma^2 to the variance
+    assert low < np.mean(z**2) < high * 1.05
+    # the bound: inverse of the information of independent derivatives with known map and masks
+    flat = shown(face, true)
+    exact = wrinkle_texels.derivatives_of(flat, stderr_rad=stderr_rad)
+    read = pixels(np.asarray(layer.wrinkle), (SIDE, SIDE))
+    full = np.stack([resampling.resampled(m, (SIDE, SIDE)) for m in layer.masks])
+    design = (full[..., None] * read / np.sqrt(exact.variance)).reshape(8, -1)
+    bound = np.sqrt(np.diag(np.linalg.inv(design @ design.T)))
+    ratio = np.sqrt(np.diag(got.covariance)) / bound
+    assert np.all(ratio > 0.97)
+    assert np.all(ratio < 1.1)
+
+
+def test_a_zone_without_a_wrinkle_has_no_weight_and_an_infinite_error(face):
+    base, layer = face
+    wrinkle = np.array(layer.wrinkle)
+    masks = np.zeros_like(layer.masks)
+    masks[:, :8, :] = layer.masks[:, :8, :]
+    masks[7] = 0.0
+    masks[7, 10:, 10:] = 1.0
+    wrinkle[18:, 18:] = 0.0
+    flat_there = Layer(wrinkle, masks)
+    n = wrinkles.combine_layers(base, [flat_there], np.full(8, 0.5))
+    got = wrinkle_fit.fit_weights(flat_there, wrinkles.decode(base), n)
+    assert not got.valid[7]
+    assert got.weights[7] == 0.0
+    assert np.isinf(got.stderr[7])
+    np.testing.assert_allclose(got.weights[:4], 0.5, atol=1e-6)
+
+
+def test_a_zone_that_is_wholly_masked_out_is_told_and_others_are_not_hurt(face):
+    base, layer = face
+    valid = np.ones((SIDE, SIDE), bool)
+    # soft masks reach everywhere: cut this one to its own square, then take the square away
+    masks = np.array(layer.masks)
+    masks[0] = 0.0
+    masks[0, :4, :4] = 1.0
+    near = resampling.resampled(masks[0], (SIDE, SIDE)) > 0
+    valid[near] = False
+    cut = Layer(layer.wrinkle, masks)
+    n = wrinkles.combine_layers(base, [cut], np.full(8, 0.5))
+    n[~valid] = np.nan
+    measured = wrinkle_texels.derivatives_of(n, valid=valid)
+    got = wrinkle_fit.fit_weights(cut, wrinkles.decode(base), measured)
+    np.testing.assert_array_equal(got.valid, [False] + [True] * 7)
+    np.testing.assert_allclose(got.weights, [0.0] + [0.5] * 7, atol=1e-6)
+
+
+def test_two_masks_that_are_the_same_share_what_nothing_tells_apart(face):
+    base, layer = face
+    masks = np.array(layer.masks)
+    masks[1] = masks[0]
+    twins = Layer(layer.wrinkle, masks)
+    n = wrinkles.combine_layers(base, [twins], np.full(8, 0.4))
+    got = wrinkle_fit.fit_weights(twins, wrinkles.decode(base), n)
+    np.testing.assert_array_equal(got.valid, [False, False] + [True] * 6)
+    assert np.isinf(got.stderr[:2]).all()
+    np.testing.assert_allclose(got.weights[2:], 0.4, atol=1e-5)
+
+
+def test_a_face_that_did_not_move_has_weights_of_zero_and_nothing_to_explain(face):
+    base, layer = face
+    got = wrinkle_fit.fit_weights(layer, wrinkles.decode(base), wrinkles.decode(base))
+    np.testing.assert_allclose(got.weights, 0.0, atol=1e-12)
+    assert got.explained == 0.0
+
+
+def test_a_map_without_any_wrinkle_determines_nothing(face):
+    base, layer = face
+    still = Layer(np.zeros_like(layer.wrinkle), layer.masks)
+    got = wrinkle_fit.fit_weights(still, wrinkles.decode(base), shown(face, np.ones(8)))
+    assert not got.valid.any()
+    assert np.isinf(got.stderr).all()
+    assert not got.weights.any()
+
+
+# --- several expressions --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fitted(face):
+    base, layer = face
+    states = {name: shown(face, {name: 1.0}) for name in JIMENEZ2011.rows}
+    fit = wrinkle_fit.fit(wrinkles.decode(base), states, layer.masks, size=(32, 32))
+    return states, fit
+
+
+def test_with_known_weights_the_map_comes_back(face):
+    base, layer = face
+    states = {name: shown(face, {name: 1.0}) for name in JIMENEZ2011.rows}
+    got = wrinkle_fit.fit(
+        wrinkles.decode(base), states, layer.masks, size=(32, 32), table=JIMENEZ2011
+    )
+    seen = got.layer.valid
+    assert seen.mean() > 0.95
+    np.testing.assert_allclose(got.layer.wrinkle[seen], layer.wrinkle[seen], atol=2e-5)
+    assert got.explained > 1 - 1e-8
+    for name, one in got.expressions.items():
+        np.testing.assert_allclose(one.weights, JIMENEZ2011.row(name), atol=1e-4)
+
+
+def test_map_and_weights_together_show_every_expression(face, fitted):
+    states, fit = fitted
+    assert fit.settled
+    model = fit.model(clamp="signed")
+    for name, normals in states.items():
+        got = model.evaluate({name: 1.0}).normals
+        angle = np.degrees(np.arccos(np.clip((got * normals).sum(axis=2), -1, 1)))
+        assert angle.mean() < 0.1
+        assert fit.expressions[name].explained > 0.999
+
+
+def test_weights_come_back_up_to_a_scale_of_each_zone(fitted):
+    _, fit = fitted
+    got = np.array([fit.layer.table.rows[name] for name in JIMENEZ2011.rows])
+    true = np.array(list(JIMENEZ2011.rows.values()))
+    for z in range(8):
+        scale = (got[:, z] @ true[:, z]) / (true[:, z] @ true[:, z])
+        assert scale > 0.5
+        np.testing.assert_allclose(got[:, z], scale * true[:, z], atol=0.04)
+
+
+def test_one_expression_alone_gives_its_own_map_with_weights_of_one(face):
+    base, layer = face
+    joy = {"joy": shown(face, {"joy": 1.0})}
+    fit = wrinkle_fit.fit(wrinkles.decode(base), joy, layer.masks, size=(32, 32))
+    weights = fit.expressions["joy"]
+    np.testing.assert_allclose(weights.weights[weights.valid], 1.0, atol=0.02)
+    assert fit.explained > 0.999
+
+
+def test_names_sizes_and_tables_that_do_not_fit_are_refused(face):
+    base, layer = face
+    n = wrinkles.decode(base)
+    with pytest.raises(WrinkleError, match="expected at least one"):
+        wrinkle_fit.fit(n, {}, layer.masks, size=(8, 8))
+    with pytest.raises(WrinkleError, match="expected that of neutral"):
+        wrinkle_fit.fit(n, {"joy": n[:64]}, layer.masks, size=(8, 8))
+    with pytest.raises(WrinkleError, match="8 zones, expected 5"):
+        wrinkle_fit.fit(n, {"joy": n}, layer.masks[:5], size=(8, 8), table=JIMENEZ2011)
+    with pytest.raises(WrinkleError, match="got 1 names"):
+        wrinkle_fit.fit(n, {"joy": n}, layer.masks, size=(8, 8), zones=("a",))
+    with pytest.raises(WrinkleError, match="clamp"):
+        wrinkle_fit.fit_weights(layer, n, n, clamp="tight")
+
+
+def test_the_normal_equations_are_those_of_the_full_design(face, rng):
+    _, layer = face
+    d = rng.standard_normal((SIDE, SIDE, 2)).astype(np.float32)
+    weight = rng.random((SIDE, SIDE)).astype(np.float32)
+    difference = wrinkle_weights.Difference(d, np.zeros_like(d), weight)
+    read = pixels(np.asarray(layer.wrinkle), (SIDE, SIDE))
+    got = wrinkle_weights.zone_equations(layer.masks, read, difference)
+    full = np.stack([resampling.resampled(m, (SIDE, SIDE)) for m in layer.masks])
+    design = (full[..., None] * read).reshape(8, -1)
+    v = np.repeat(weight.ravel().astype(float), 2)
+    np.testing.assert_allclose(got.matrix, (design * v) @ design.T, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(got.vector, (design * v) @ d.ravel(), rtol=1e-6, atol=1e-9)
+    w = rng.random(8)
+    left = d.ravel() - w @ design
+    assert got.misfit(w) == pytest.approx((v * left * left).sum(), rel=1e-6)
