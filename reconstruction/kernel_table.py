@@ -21,6 +21,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import lsq_linear
 from scipy.special import fdtrc
 
 from model.microstructure import ALPHA_LIMITS, KernelTable, kernel_parameters
@@ -33,6 +34,8 @@ BREAK_GRID = 24
 """Places tried for a break, beside the points', before it is moved in finer steps."""
 NEUTRAL = 1e-6
 """Stretch ratios nearer to 1 are neutral: they tell nothing of either branch."""
+LEAST_SIGMA_UM = 1.0
+"""The smallest sigma that Nagano2015 searches, section 5."""
 
 
 class KernelTableFitError(ValueError):
@@ -312,13 +315,23 @@ def _break_stderr(
 def _fit_sigma(
     r: Floats, s: Floats, w: Floats
 ) -> tuple[tuple[float, float] | None, tuple[float, float], float, float]:
-    """Return line, standard errors, covariance and weighted RMS residual of one branch, um."""
+    """Return line, standard errors, covariance and weighted RMS residual of one branch, um.
+
+    The line is not below `LEAST_SIGMA_UM` between r = 1 and the outermost point. Where that binds,
+    the standard errors are those of the line without the bound.
+    """
     if r.size == 0:
         return None, (math.inf, math.inf), math.inf, math.nan
     X = np.stack([r, np.ones(r.size)], axis=1)
     N = (X * w[:, None]).T @ X
     C = np.linalg.inv(N)
     line = C @ (X.T @ (w * s))
+    far = float(r[np.argmax(np.abs(r - 1.0))])
+    ends = np.array([[1.0, 1.0], [far, 1.0]])
+    if (ends @ line < LEAST_SIGMA_UM).any():
+        root, to_line = np.sqrt(w), np.linalg.inv(ends)
+        held = lsq_linear(root[:, None] * X @ to_line, root * s, (LEAST_SIGMA_UM, np.inf))
+        line = to_line @ held.x
     rss = float(np.sum(w * (X @ line - s) ** 2))
     rms = math.sqrt(rss / w.sum())
     pair = (float(line[0]), float(line[1]))

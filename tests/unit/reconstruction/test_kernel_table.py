@@ -111,3 +111,19 @@ def test_a_direction_that_differs_is_told_from_ones_that_do_not(rng):
     assert chances[0] > 1e-3 > 1e-6 > chances[1]
     with pytest.raises(KernelTableFitError, match="directions"):
         direction_dependence(FOREHEAD, r, alpha, sigma, np.zeros(r.size))
+
+
+def test_a_line_of_sigma_that_would_vanish_near_neutral_is_held_at_the_smallest_sigma_searched():
+    """Points that rise steeply, as the flat valley of alpha and sigma gives them."""
+    fit = fit_table([1.1, 1.19, 1.28], [0.28, 0.5, 0.7], [23.5, 92.5, 91.0])
+    slope, intercept = fit.table.sigma_stretch_um
+    assert slope + intercept == pytest.approx(1.0, abs=1e-6)
+    # the best line without the bound runs below zero at r = 1
+    free = np.polyfit([1.1, 1.19, 1.28], [23.5, 92.5, 91.0], 1)
+    assert np.polyval(free, 1.0) < 0.0
+    # no line within the bound is nearer to the points
+    r, s = np.array([1.1, 1.19, 1.28]), np.array([23.5, 92.5, 91.0])
+    best = np.sum((slope * r + intercept - s) ** 2)
+    for end in np.linspace(40.0, 200.0, 400):
+        other = 1.0 + (end - 1.0) * (r - 1.0) / 0.28
+        assert np.sum((other - s) ** 2) >= best - 1e-6

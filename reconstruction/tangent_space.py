@@ -1,0 +1,178 @@
+"""Normals of a face's texture in the texture's own frame, over the face's smooth shape.
+
+Dome and photometric stereo give normals in the rig's frame, on a texture that a mesh unwraps to.
+What wrinkles add is seen against the shape without them: the position map, smoothed until
+wrinkles are gone, gives the frame at each texel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+SMOOTHING_MM = 6.0
+"""Standard deviation of the smoothing: wrinkles of a face are 2 to 10 mm apart."""
+
+
+class TangentSpaceError(ValueError):
+    """Maps that give no frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class TangentNormals:
+    """Normals over the smooth shape.
+
+    Attributes
+    ----------
+    normals : ndarray of float32, shape (H, W, 3)
+        Unit vectors: +X along u (to the right), +Y across it on the side of growing v (up), +Z
+        the smooth shape's normal; (0, 0, 1) where not `valid`.
+    stderr : ndarray of float32, shape (H, W, 3) or None
+        Standard error of the components, those of the input turned into the frame as if they
+        were independent.
+    valid : ndarray of bool, shape (H, W)
+    """
+
+    normals: NDArray[np.float32]
+    stderr: NDArray[np.float32] | None
+    valid: Bools
+
+
+def frames(
+    position_mm: ArrayLike, valid: ArrayLike, *, smoothing_mm: float = SMOOTHING_MM
+) -> tuple[Floats, Bools]:
+    """Return the axes of the texture on the smoothed shape.
+
+    Parameters
+    ----------
+    position_mm : array_like, shape (H, W, 3)
+        Points of the surface under the texels; row 0 is the top (v = 1).
+    valid : array_like of bool, shape (H, W)
+        Texels with a surface.
+    smoothing_mm : float
+        Standard deviation of the Gaussian, mm on the surface, >= 0, by the median texel's size.
+
+    Returns
+    -------
+    axes : ndarray, shape (H, W, 3, 3)
+        ``axes[..., k, :]`` is the unit vector of axis k (X, Y, Z) in the frame of the positions.
+    known : ndarray of bool, shape (H, W)
+        Where neighbors along both directions have a surface.
+
+    Raises
+    ------
+    TangentSpaceError
+        For shapes that do not fit, or a texture without surface.
+    """
+    points = np.asarray(position_mm, np.float64)
+    good = np.asarray(valid, bool)
+    if points.ndim != 3 or points.shape[2] != 3 or good.shape != points.shape[:2]:
+        raise TangentSpaceError(
+            f"position_mm: got shape {points.shape} with valid {good.shape}, expected (H, W, 3)"
+        )
+    if not good.any():
+        raise TangentSpaceError("valid: got no texel with a surface")
+    if not (np.isfinite(smoothing_mm) and smoothing_mm >= 0):
+        raise TangentSpaceError(f"smoothing_mm: got {smoothing_mm}, expected 0 or more")
+    along_u, known_u = _slope(points, good, 1)
+    along_v, known_v = _slope(points, good, 0)
+    known = known_u & known_v
+    if smoothing_mm > 0.0:
+        texel = np.median(np.linalg.norm(along_u[known], axis=1)) if known.any() else 0.0
+        if not texel > 0.0:
+            raise TangentSpaceError("position_mm: neighboring texels lie on the same point")
+        sigma_px = smoothing_mm / float(texel)
+        # slopes are smoothed, not points: a smoothed point is drawn inwards at the rim
+        along_u, along_v = (_smoothed(s, known, sigma_px) for s in (along_u, along_v))
+    up = np.cross(along_u, -along_v)  # rows grow downwards, v grows upwards
+    x, z = _unit(along_u), _unit(up)
+    y = np.cross(z, x)
+    known &= (np.linalg.norm(along_u, axis=2) > 0) & (np.linalg.norm(up, axis=2) > 0)
+    return np.stack([x, y, z], axis=2), known
+
+
+def tangent_normals(
+    normals: ArrayLike,
+    position_mm: ArrayLike,
+    valid: ArrayLike,
+    *,
+    stderr: ArrayLike | None = None,
+    smoothing_mm: float = SMOOTHING_MM,
+) -> TangentNormals:
+    """Turn normals into the frame of the texture on the smooth shape.
+
+    Parameters
+    ----------
+    normals : array_like, shape (H, W, 3)
+        Unit normals in the frame of the positions.
+    position_mm, valid, smoothing_mm
+        See :func:`frames`.
+    stderr : array_like, shape (H, W, 3), optional
+        Standard errors of the normals' components.
+
+    Returns
+    -------
+    TangentNormals
+
+    Raises
+    ------
+    TangentSpaceError
+        For shapes that do not fit.
+
+    Examples
+    --------
+    >>> rows, columns = np.mgrid[0:32, 0:32] * 1.0
+    >>> flat = np.stack([columns, -rows, 0 * rows], axis=2)  # 1 mm a texel, seen from +z
+    >>> found = tangent_normals(np.full((32, 32, 3), [0.6, 0, 0.8]), flat, np.ones((32, 32), bool))
+    >>> found.normals[16, 16].round(3).tolist()
+    [0.6000000238418579, 0.0, 0.800000011920929]
+    """
+    given = np.asarray(normals, np.float64)
+    axes, known = frames(position_mm, valid, smoothing_mm=smoothing_mm)
+    if given.shape != (*known.shape, 3):
+        raise TangentSpaceError(f"normals: got shape {given.shape}, expected {(*known.shape, 3)}")
+    good = np.asarray(valid, bool) & known & np.isfinite(given).all(axis=2)
+    turned = _unit(np.einsum("hwij,hwj->hwi", axes, np.where(good[..., None], given, 0.0)))
+    turned[~good] = (0.0, 0.0, 1.0)
+    error = None
+    if stderr is not None:
+        own = np.asarray(stderr, np.float64)
+        if own.shape != given.shape:
+            raise TangentSpaceError(f"stderr: got shape {own.shape}, expected {given.shape}")
+        variance = np.einsum("hwij,hwj->hwi", axes**2, np.where(good[..., None], own**2, 0.0))
+        error = np.sqrt(variance).astype(np.float32)
+    return TangentNormals(turned.astype(np.float32), error, good)
+
+
+def _slope(points: Floats, good: Bools, axis: int) -> tuple[Floats, Bools]:
+    """Return the difference to the next texel along an axis, by both sides where both are there."""
+    step = np.diff(np.where(good[..., None], points, 0.0), axis=axis)
+    pair = np.logical_and(*(np.moveaxis(good, axis, 0)[s] for s in (slice(1, None), slice(-1))))
+    pair = np.moveaxis(pair, 0, axis)
+    step = np.where(pair[..., None], step, 0.0)
+    total, count = np.zeros(points.shape), np.zeros(good.shape)
+    for part in (slice(-1), slice(1, None)):
+        where = (part,) if axis == 0 else (slice(None), part)
+        total[where] += step
+        count[where] += pair
+    return total / np.maximum(count, 1.0)[..., None], count > 0
+
+
+def _smoothed(values: Floats, known: Bools, sigma_px: float) -> Floats:
+    weight = ndimage.gaussian_filter(known.astype(np.float64), sigma_px, truncate=3.0)
+    out = np.empty_like(values)
+    for k in range(values.shape[2]):
+        out[..., k] = ndimage.gaussian_filter(
+            np.where(known, values[..., k], 0.0), sigma_px, truncate=3.0
+        )
+    return out / np.maximum(weight, 1e-12)[..., None]
+
+
+def _unit(vectors: Floats) -> Floats:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
