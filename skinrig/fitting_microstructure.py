@@ -1,0 +1,202 @@
+"""From caliper sessions to microstructure that moves: neutral relief and its table of kernels."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model import store
+from model.microstructure import FOREHEAD, KernelTable, KernelTableError
+from model.skin import SkinAppearance, SkinMap
+from reconstruction.gradient_stages import KERNEL_FILE
+from reconstruction.kernel_table import KernelTableFitError, fit_table
+from skinrig import dynamic_appearance
+from skinrig.dynamic_appearance import MICROSTRUCTURE, Part
+
+SITE = re.compile(r"[a-z][a-z0-9_]{0,31}")
+
+
+class MicrostructureFitError(ValueError):
+    """Maps of caliper sessions that give no neutral relief or no table of kernels."""
+
+
+@dataclass(frozen=True, slots=True)
+class SiteFit:
+    """One site's share.
+
+    Attributes
+    ----------
+    site
+        Name; files and maps carry it.
+    height
+        Neutral relief, um.
+    pixel_um
+        Of the relief, on the skin.
+    table
+        Kernels over the stretch ratio.
+    kernels
+        How many fitted kernels stand behind the table; 0: it is the paper's forehead.
+    alpha_rms, sigma_rms_um
+        Residuals of the table's lines; None for the paper's.
+    """
+
+    site: str
+    height: SkinMap
+    pixel_um: float
+    table: KernelTable
+    kernels: int
+    alpha_rms: float | None
+    sigma_rms_um: tuple[float, float] | None
+
+    def document(self) -> dict[str, Any]:
+        """Return the figures as JSON values."""
+        return {
+            "pixel_um": self.pixel_um,
+            "map": f"microrelief_{self.site}",
+            "table": f"kernel_table_{self.site}.json",
+            "kernels": self.kernels,
+            "stretch_range": list(self.table.stretch_range),
+            "alpha_rms": self.alpha_rms,
+            "sigma_rms_um": None if self.sigma_rms_um is None
+            else [v if np.isfinite(v) else None for v in self.sigma_rms_um],
+        }  # fmt: skip
+
+
+def fit_microstructure(
+    appearances: Sequence[Path],
+    *,
+    out: Path,
+    paper_table: bool = False,
+    on_message: Any = None,
+) -> dict[str, SiteFit]:
+    """Fit the microstructure part of a dynamic appearance.
+
+    Parameters
+    ----------
+    appearances
+        APPEARANCE/ folders of caliper sessions with heights and kernels; ``SITE=FOLDER`` names
+        the site, otherwise the folder's name does. Several of one site share one table.
+    out
+        Folder of the dynamic appearance; other parts in it stay.
+    paper_table
+        Take the paper's forehead table where fewer kernels were fitted than a table needs,
+        instead of refusing.
+    on_message
+        Called with lines of text.
+
+    Raises
+    ------
+    MicrostructureFitError
+        Naming the folder and what it lacks.
+    """
+    dynamic_appearance.check_target(out)
+    if not appearances:
+        raise MicrostructureFitError("appearances: got none, expected folders of caliper sessions")
+    by_site: dict[str, list[tuple[Path, SkinAppearance]]] = {}
+    for given in appearances:
+        site, path = _site_of(given)
+        by_site.setdefault(site, []).append((path, store.read(path)))
+    fits = {site: _fit_site(site, group, paper_table) for site, group in by_site.items()}
+    maps = {f"microrelief_{site}": fit.height for site, fit in fits.items()}
+    files = {
+        f"kernel_table_{site}.json": fit.table.to_json().encode() for site, fit in fits.items()
+    }
+    everything = [one for group in by_site.values() for one in group]
+    inputs = {
+        str(path.name): hashlib.sha256((path / store.DOCUMENT).read_bytes()).hexdigest()
+        for path, _ in everything
+    }
+    left_out = tuple(
+        (site, "its table of kernels is the paper's forehead: too few kernels were fitted")
+        for site, fit in fits.items()
+        if fit.kernels == 0
+    )
+    sources = {one.source for _, one in everything}
+    dynamic_appearance.add(
+        out,
+        MICROSTRUCTURE,
+        Part(
+            maps=maps,
+            files=files,
+            parameters={"sites": {site: fit.document() for site, fit in fits.items()}},
+            inputs=inputs,
+            source="simulated" if "simulated" in sources else "measured",
+            left_out=left_out,
+            seed=everything[0][1].seed,
+        ),
+    )
+    if on_message is not None:
+        for site, fit in fits.items():
+            low, high = fit.table.stretch_range
+            how = f"{fit.kernels} kernels" if fit.kernels else "the paper's forehead table"
+            on_message(f"{site}: {how}, stretch {low:.2f} to {high:.2f}")
+    return fits
+
+
+def _site_of(given: Path) -> tuple[str, Path]:
+    site, equals, path = str(given).partition("=")
+    if equals:
+        folder = Path(path)
+    else:
+        folder = given
+        site = re.sub(r"^appearance-?(gradient-?)?", "", given.name) or "skin"
+    site = site.replace("-", "_").lower()
+    if not SITE.fullmatch(site):
+        raise MicrostructureFitError(
+            f"{given}: got site {site!r}, expected a-z, 0-9 and _; name it as SITE={folder}"
+        )
+    return site, folder
+
+
+def _fit_site(
+    site: str, group: Sequence[tuple[Path, SkinAppearance]], paper_table: bool
+) -> SiteFit:
+    points: list[Mapping[str, Any]] = []
+    for path, appearance in group:
+        if KERNEL_FILE not in appearance.files:
+            raise MicrostructureFitError(
+                f"{path}: holds no {KERNEL_FILE}, expected a caliper session reconstructed with "
+                "`skinrig reconstruct SESSION --want height,kernels`"
+            )
+        document = json.loads(appearance.files[KERNEL_FILE])
+        points += [fit for fit in document["fits"] if fit["valid"]]
+    path, first = group[0]
+    height, pixel_um = _neutral(path, first)
+    try:
+        found = fit_table(
+            [fit["stretch_s"] for fit in points],
+            [fit["alpha"] for fit in points],
+            [fit["sigma_um"] for fit in points],
+            source=f"{site}: {', '.join(p.name for p, _ in group)}",
+        )
+    except (KernelTableFitError, KernelTableError) as error:
+        if not paper_table:
+            raise MicrostructureFitError(
+                f"{site}: {len(points)} fitted kernels give no table ({error}); capture more "
+                "states (`--steps`), or take the paper's forehead with --paper-table"
+            ) from error
+        return SiteFit(site, height, pixel_um, FOREHEAD, 0, None, None)
+    return SiteFit(
+        site, height, pixel_um, found.table, len(points), found.alpha_rms, found.sigma_rms_um
+    )
+
+
+def _neutral(path: Path, appearance: SkinAppearance) -> tuple[SkinMap, float]:
+    states = appearance.parameters.get("states")
+    names = [str(s) for s in states] if isinstance(states, list) else []
+    neutral = [name for name in names if name.endswith("_n0")]
+    name = f"height_{neutral[0]}" if neutral else ""
+    pixel_um = appearance.parameters.get("pixel_um")
+    if name not in appearance.maps or not isinstance(pixel_um, int | float):
+        raise MicrostructureFitError(
+            f"{path}: has no height of the neutral state, expected a caliper session reconstructed "
+            "with `--want height,kernels`"
+        )
+    return appearance.maps[name], float(pixel_um)
