@@ -44,6 +44,9 @@ FURROW: Final = 1.2
 FINEST_TEXELS: Final = 3.0
 """Texels that a wave needs; finer wrinkles are left out."""
 
+SEAM_STEPS: Final = 6.0
+"""Texels that lie farther from each other than so many usual ones have a seam between them."""
+
 _STEPS: Final = 2048
 
 
@@ -217,15 +220,17 @@ def wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int) -> 
     tension = float(rng.uniform(*TENSION_RANGE))
     size = points_mm.shape[0]
     front = covered & (points_mm[..., 2] > -60.0)
-    # neighbours on both sides, for the slopes; a seam of the texture has none
     front[[0, -1]] = front[:, [0, -1]] = False
-    front[1:-1, 1:-1] &= covered[2:, 1:-1] & covered[:-2, 1:-1]
-    front[1:-1, 1:-1] &= covered[1:-1, 2:] & covered[1:-1, :-2]
     texel = np.flatnonzero(front)
     flat = points_mm.reshape(-1, 3)
     # the texel, its neighbours at larger and smaller u, at larger and smaller v
     around = texel[None] + np.array([0, 1, -1, -size, size])[:, None]
     points = flat[around].astype(np.float64)
+    away = np.linalg.norm(points[1:] - points[0], axis=-1)
+    # beyond a seam of the texture there is nothing, or skin from elsewhere
+    known = covered.reshape(-1)[around[1:]] & (away < SEAM_STEPS * np.median(away))
+    steps = np.maximum(known[0::2].astype(np.float64) + known[1::2], 1.0)
+    points[1:] = np.where(known[..., None], points[1:], points[0])
     phases, slopes, shares = [], [], []
     for zone in ZONES:
         wave = zone.wavelength_mm * float(rng.uniform(0.88, 1.14))
@@ -251,8 +256,8 @@ def wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int) -> 
         full = np.zeros(len(texel))
         full[near] = phase[0]
         slope = np.zeros((len(texel), 2))
-        slope[near, 0] = 0.5 * size * (phase[1] - phase[2])
-        slope[near, 1] = 0.5 * size * (phase[3] - phase[4])
+        slope[near, 0] = size * (phase[1] - phase[2]) / steps[0, near]
+        slope[near, 1] = size * (phase[3] - phase[4]) / steps[1, near]
         share[near] *= lifts[right] if zone.mirrored else lifts[0]
         phases.append(full)
         slopes.append(slope)

@@ -49,7 +49,7 @@ POINTS_MM: Final[Mapping[str, tuple[float, float]]] = {
 in the image. On the skin they are where a look along -z meets it."""
 
 NEAR_MM: Final = 0.5
-"""What a camera meets within this distance of a point is the point."""
+"""Surface nearer than this to a point does not hide it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,12 +150,8 @@ def seen(points_mm: FloatArray, view: View, caster: Caster) -> NDArray[np.bool_]
     way = points_mm - origin
     distance = np.linalg.norm(way, axis=-1)
     way /= distance[:, None]
-    prim, weight = caster.first_hit(np.broadcast_to(origin, way.shape), way)
-    share = np.column_stack([1.0 - weight.sum(axis=1), weight])
-    corners = caster.mesh.vertices_mm[caster.mesh.faces[np.maximum(prim, 0)]]
-    met = np.einsum("nk,nkc->nc", share, corners)
-    near = np.abs(np.linalg.norm(met - origin, axis=-1) - distance) < NEAR_MM
-    return np.asarray(inside.all(axis=1) & (prim >= 0) & near)
+    before = caster.blocked(np.broadcast_to(origin, way.shape), way, distance - NEAR_MM)
+    return np.asarray(inside.all(axis=1) & ~before)
 
 
 def _barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:

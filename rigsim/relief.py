@@ -155,12 +155,9 @@ def relief_normals(atlas: Atlas, height: NDArray[np.floating]) -> Float32Array:
     """
     h = np.where(atlas.covered, height, 0.0).astype(np.float64) * 1e-3
     valid = atlas.covered
-    along_u, along_v = np.zeros_like(h), np.zeros_like(h)
-    both = valid[:, 2:] & valid[:, :-2]
-    along_u[:, 1:-1] = np.where(both, 0.5 * (h[:, 2:] - h[:, :-2]), 0.0) * atlas.size
-    both = valid[2:] & valid[:-2]
     # Row 0 is the top: v grows against the rows.
-    along_v[1:-1] = np.where(both, 0.5 * (h[:-2] - h[2:]), 0.0) * atlas.size
+    along_u = atlas.size * _slope(h, valid)
+    along_v = -atlas.size * _slope(h.T, valid.T).T
     du, dv = atlas.dp_du_mm.astype(np.float64), atlas.dp_dv_mm.astype(np.float64)
     e, f = np.sum(du * du, axis=-1), np.sum(du * dv, axis=-1)
     g = np.sum(dv * dv, axis=-1)
@@ -172,6 +169,18 @@ def relief_normals(atlas: Atlas, height: NDArray[np.floating]) -> Float32Array:
     tilted = atlas.normal - (a[..., None] * du + b[..., None] * dv)
     length = np.linalg.norm(tilted, axis=-1, keepdims=True)
     return np.where(length > 0.0, tilted / np.maximum(length, 1e-12), 0.0).astype(np.float32)
+
+
+def _slope(h: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the change per column: central, at borders of what is valid one-sided, else 0."""
+    step = np.where(valid[:, 1:] & valid[:, :-1], h[:, 1:] - h[:, :-1], 0.0)
+    total, count = np.zeros_like(h), np.zeros(h.shape)
+    has = (valid[:, 1:] & valid[:, :-1]).astype(np.float64)
+    total[:, :-1] += step
+    total[:, 1:] += step
+    count[:, :-1] += has
+    count[:, 1:] += has
+    return total / np.maximum(count, 1.0)
 
 
 def tangent_normals(atlas: Atlas, normal: Float32Array) -> Float32Array:

@@ -11,7 +11,7 @@ behind crossed films, whatever stands there later.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 from weakref import WeakValueDictionary
@@ -167,6 +167,7 @@ class FlashScene:
         self._caster = self._stage.caster
         self._glow: dict[str, SkinGlow] = {}
         self._pictures: dict[str, Picture] = {}
+        self._blurs: dict[str, Mapping[str, Float32Array]] = {}
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
@@ -327,7 +328,7 @@ class FlashScene:
         picture = self._picture(view)
         white = self.white_rgb(view.name)
         passes_deg = self.films.passes_deg(view, "crossed", None)
-        truth: dict[str, NDArray[np.generic]] = dict(picture.maps)
+        truth: dict[str, NDArray[np.generic]] = {**picture.maps, **self._blurred(view, picture)}
         truth["shading"] = self._analysed(picture.shading, view, passes_deg)
         truth["diffuse"] = picture.diffuse[:, :, 0] * white
         truth["specular"] = picture.specular[:, :, :1] * white
@@ -421,6 +422,18 @@ class FlashScene:
             )
         return known[key]
 
+    def _blurred(self, view: View, picture: Picture) -> Mapping[str, Float32Array]:
+        """Return the maps that are blurred as the light is; nothing but the truth needs them."""
+        subject = self.subject
+        names = ("reflectance", "melanin", "hemoglobin")
+        if not self.lateral or not isinstance(subject, Subject):
+            return {f"{name}_blurred": picture.maps[name] for name in names}
+        if view.name not in self._blurs:
+            look = Look(self.rig, view, self.films, self._weights, self.subpixels)
+            maps = look.blurred_maps(subject, self.state, self._skin_glow(view))
+            self._blurs[view.name] = look.at_maps(self._caster, subject, maps).maps
+        return self._blurs[view.name]
+
     def _at_rest(
         self, view: View, moved: dict[str, NDArray[np.generic]]
     ) -> dict[str, NDArray[np.generic]]:
@@ -452,7 +465,6 @@ class FlashScene:
                     self.subject,
                     self.state,
                     self._skin_glow(view),
-                    lateral_transport=self.lateral,
                 )
             else:
                 picture = look.at_target(self._caster, self.subject)

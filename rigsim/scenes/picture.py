@@ -71,8 +71,6 @@ class Look:
         subject: Subject,
         state: str,
         glow: SkinGlow,
-        *,
-        lateral_transport: bool,
     ) -> Picture:
         """Look at a face.
 
@@ -84,15 +82,13 @@ class Look:
             Whose face, in which state.
         glow
             Light on and out of the face.
-        lateral_transport
-            Whether light spreads inside the skin; blurred maps are the sharp ones otherwise.
 
         Returns
         -------
         Picture
-            With all truth maps.
+            With all truth maps but those of `blurred_maps`.
         """
-        textures = self._textures(subject, state, glow, lateral_transport=lateral_transport)
+        textures = _textures(subject, state, glow)
         return self._in_bands(caster, lambda buffers: self._see_skin(buffers, textures))
 
     def at_target(self, caster: Caster, target: Target) -> Picture:
@@ -130,38 +126,33 @@ class Look:
         diffuse, specular, white = (maps.pop(name) for name in _LIGHT_NAMES)
         return Picture(diffuse.reshape(*coverage.shape, 3, 3), specular, white, maps, coverage)
 
-    def _textures(
-        self, subject: Subject, state: str, glow: SkinGlow, *, lateral_transport: bool
-    ) -> dict[str, Float32Array]:
-        """Return what the camera samples from the face's texture, shape (N, N, C) each."""
+    def blurred_maps(self, subject: Subject, state: str, glow: SkinGlow) -> dict[str, Float32Array]:
+        """Return the fractions and the reflectance of even skin that would look as the skin looks.
+
+        Parameters
+        ----------
+        subject, state
+            Whose face, in which state.
+        glow
+            Light on and out of the face, with lateral transport.
+
+        Returns
+        -------
+        dict
+            Textures of shape (N, N[, 3]).
+        """
         melanin, blood = subject.melanin, subject.hemoglobin(state)
-        blurred, melanin_blurred, blood_blurred = glow.reflectance, melanin, blood
-        if lateral_transport:
-            camera, light = self.view.spectral_sensitivity, self.rig.lights[0].illuminant
-            even = subject.atlas.covered.astype(np.float32)
-            blurred = spread_through_pigment(
-                subject, state, glow.reflectance, even, glow.kernels, camera, light
-            )
-            table = skin_color(camera, light)
-            melanin_blurred, blood_blurred = table.nearest(blurred, melanin, blood)
-        layers = {
-            "glow": glow.spread,
-            "visible": glow.surface.visible,
-            "reflectance": glow.reflectance,
+        camera, light = self.view.spectral_sensitivity, self.rig.lights[0].illuminant
+        even = subject.atlas.covered.astype(np.float32)
+        blurred = spread_through_pigment(
+            subject, state, glow.reflectance, even, glow.kernels, camera, light
+        )
+        nearest = skin_color(camera, light).nearest(blurred, melanin, blood)
+        return {
             "reflectance_blurred": blurred,
-            "normals": subject.normal,
-            "irradiance": glow.surface.irradiance,
-            "entered": glow.surface.entered,
-            "roughness": subject.roughness,
-            "hair": subject.hair,
-            "melanin": melanin,
-            "hemoglobin": blood,
-            "melanin_blurred": melanin_blurred,
-            "hemoglobin_blurred": blood_blurred,
+            "melanin_blurred": nearest[0],
+            "hemoglobin_blurred": nearest[1],
         }
-        if subject.rest is not None:
-            layers["position_at_rest_mm"] = subject.rest.atlas.position_mm
-        return _fillings(layers, subject)
 
     def at_maps(
         self, caster: Caster, subject: Subject, maps: Mapping[str, Float32Array]
@@ -271,6 +262,25 @@ class Look:
                 diffuse[:, 0] += passed[:, None] * rgb
         parts = {"diffuse": diffuse, "specular": specular, "shading": np.zeros_like(specular)}
         return {name: _scatter(values, inside, buffers.mask) for name, values in parts.items()}
+
+
+def _textures(subject: Subject, state: str, glow: SkinGlow) -> dict[str, Float32Array]:
+    """Return what the camera samples from the face's texture, shape (N, N, C) each."""
+    layers = {
+        "glow": glow.spread,
+        "visible": glow.surface.visible,
+        "reflectance": glow.reflectance,
+        "normals": subject.normal,
+        "irradiance": glow.surface.irradiance,
+        "entered": glow.surface.entered,
+        "roughness": subject.roughness,
+        "hair": subject.hair,
+        "melanin": subject.melanin,
+        "hemoglobin": subject.hemoglobin(state),
+    }
+    if subject.rest is not None:
+        layers["position_at_rest_mm"] = subject.rest.atlas.position_mm
+    return _fillings(layers, subject)
 
 
 def _fillings(layers: Mapping[str, Float32Array], subject: Subject) -> dict[str, Float32Array]:
