@@ -64,3 +64,30 @@ def add_and_normalize(base: Any, wx: Any, wy: Any, w_rows: Any, w_part: Any, a: 
             normals[y, x, 0] = p * z if good else zero
             normals[y, x, 1] = q * z if good else zero
             normals[y, x, 2] = z if good else zero
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def add_difference(base: Any, dx: Any, dy: Any, dz: Any, d_rows: Any, d_part: Any, a: Any,
+                   a_rows: Any, a_part: Any, renormalize: Any, normals: Any) -> None:  # fmt: skip
+    """Write normals of a base (H, W, 3) plus a difference of normals times its strength.
+
+    Parameters as of :func:`add`, with three planes of the difference; `renormalize` is 0 or 1.
+    """
+    rows, columns = base.shape[0], base.shape[1]
+    one = np.ones(1, base.dtype)[0]
+    zero = one - one
+    for y in prange(rows):
+        d0, a0 = d_rows[y], a_rows[y]
+        d1, a1 = min(d0 + 1, dx.shape[0] - 1), min(a0 + 1, a.shape[0] - 1)
+        f, g = d_part[y], a_part[y]
+        for x in range(columns):
+            s = a[a0, x] + g * (a[a1, x] - a[a0, x])
+            p = base[y, x, 0] + s * (dx[d0, x] + f * (dx[d1, x] - dx[d0, x]))
+            q = base[y, x, 1] + s * (dy[d0, x] + f * (dy[d1, x] - dy[d0, x]))
+            r = base[y, x, 2] + s * (dz[d0, x] + f * (dz[d1, x] - dz[d0, x]))
+            length = p * p + q * q + r * r
+            good = length > zero
+            scale = one / sqrt(length) if renormalize and good else one
+            normals[y, x, 0] = p * scale if good else zero
+            normals[y, x, 1] = q * scale if good else zero
+            normals[y, x, 2] = r * scale if good else zero

@@ -51,7 +51,7 @@ LIMIT = 1.0
 __all__ = [
     "CLAMPS", "JIMENEZ2011", "LIMIT", "ZONES", "Encoding", "Layer", "WrinkleError", "combine",
     "combine_layers", "decode", "encode", "encoding_report", "from_unit", "mask_stack",
-    "mask_textures", "to_unit",
+    "mask_textures", "to_unit", "widened", "zone_strength",
 ]  # fmt: skip
 
 
@@ -330,8 +330,12 @@ def combine_layers(
     if not layers:
         return decode(total)
     for last, layer in zip([False] * (len(layers) - 1) + [True], layers, strict=True):
-        strength = zone_strength(layer, clamped(zone_sums(weights, layer.table), clamp))
-        parts = _widened(layer, strength, total)
+        strength = zone_strength(layer.masks, clamped(zone_sums(weights, layer.table), clamp))
+        shape = (total.shape[0], total.shape[1])
+        parts = (
+            *widened(np.moveaxis(layer.wrinkle, 2, 0), shape, total.dtype),
+            *widened(strength[None], shape, total.dtype),
+        )
         if last:
             normals = np.empty((*total.shape[:2], 3), total.dtype)
             kernels.add_and_normalize(total, *parts, normals)
@@ -342,30 +346,37 @@ def combine_layers(
     raise AssertionError("a last layer returns")
 
 
-def zone_strength(layer: Layer, sums: Floating) -> Floating:
-    """Return the masks summed with their zones' weights, (h, w), at the masks' resolution.
+def zone_strength(masks: Floating, sums: Floating) -> Floating:
+    """Return masks (Z, h, w) summed with their zones' weights (Z,): (h, w), float64.
 
     Bilinear reading is linear, so that one map is read instead of as many as there are zones.
     """
-    if sums.shape[0] != layer.masks.shape[0]:
+    if sums.shape[0] != masks.shape[0]:
         raise WrinkleError(
-            f"weights: got {sums.shape[0]} zones, expected the {layer.masks.shape[0]} of the masks"
+            f"weights: got {sums.shape[0]} zones, expected the {masks.shape[0]} of the masks"
         )
-    return np.tensordot(sums, layer.masks.astype(np.float64, copy=False), axes=1)
+    return np.tensordot(sums, masks.astype(np.float64, copy=False), axes=1)
 
 
-def _widened(layer: Layer, strength: Floating, base: Floating) -> tuple[Any, ...]:
-    """Return what the kernels read: textures with the base's columns, and rows' taps."""
-    height, width = base.shape[:2]
-    parts: list[Any] = []
-    for texture in (np.moveaxis(layer.wrinkle, 2, 0), strength):
-        h = min(texture.shape[-2], height)
-        wide = resampling.resampled(texture.astype(base.dtype, copy=False), (h, width))
-        first, part = resampling.taps(h, height)
-        planes = np.ascontiguousarray(wide, base.dtype)
-        parts += list(planes) if planes.ndim == 3 else [planes]
-        parts += [first, part.astype(base.dtype)]
-    return tuple(parts)
+def widened(planes: Floating, shape: tuple[int, int], dtype: Any) -> tuple[Any, ...]:
+    """Return what the kernels read of a texture: planes with the base's columns, rows' taps.
+
+    Parameters
+    ----------
+    planes : ndarray, shape (C, h, w)
+    shape : (int, int)
+        Of the base.
+    dtype
+        Of the base.
+
+    Returns
+    -------
+    C planes (h', W), first texel row (H,) int64 and part of the next (H,)
+    """
+    rows = min(planes.shape[1], shape[0])
+    wide = resampling.resampled(planes.astype(dtype, copy=False), (rows, shape[1]))
+    first, part = resampling.taps(rows, shape[0])
+    return (*np.ascontiguousarray(wide, dtype), first, part.astype(dtype))
 
 
 def _derivative_map(name: str, values: ArrayLike, *, finite: bool) -> Floating:
