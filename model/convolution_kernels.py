@@ -14,6 +14,8 @@ from numba import njit, prange
 
 TRUNCATE = 4.0
 """The discrete Gaussian ends at the whole number of pixels next to so many sigmas."""
+LEAST_WEIGHT = 1e-8
+"""Of a neighbouring pixel; below it the Gaussian is the delta in single precision."""
 FAR = 255
 """Distances to what is not valid are told up to so many pixels."""
 LINEAR, CUBIC = 1, 2
@@ -240,6 +242,8 @@ def along_lines(
             ay = axis[row * xh, column * xw, 1]
             # w(i) = e^(i^2), by w(i + 1) = w(i) e^(2 i + 1)
             e = math.exp(-0.5 / (float(s) * float(s)))
+            if e < LEAST_WEIGHT:
+                continue
             w, grow, grow_by = e, e * e * e, e * e
             norm = 1.0
             total = zero

@@ -30,7 +30,7 @@ from skinrig.blend_shape_errors import BlendShapeFileError
 Floats = NDArray[np.float64]
 
 GLB_MAGIC, GLB_JSON, GLB_BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
-COMPONENTS: Final = {
+COMPONENTS: Final[dict[int, np.dtype[Any]]] = {
     5120: np.dtype("<i1"), 5121: np.dtype("<u1"), 5122: np.dtype("<i2"),
     5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4"),
 }  # fmt: skip

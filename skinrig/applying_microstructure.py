@@ -1,0 +1,382 @@
+"""The relief of a face whose skin is stretched: strain of a mesh, kernels, convolution."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.displacement_convolution import (
+    LineKernels,
+    Sampling,
+    Window,
+    convolve_tiled,
+    tiles_of,
+)
+from model.mesh_strain import MeshStrain, strain
+from model.microstructure import ALPHA_LIMITS, FOREHEAD, KernelTable
+from model.strain_fields import line_kernels, rasterize
+from skinrig.blend_shapes import BlendShapeMesh
+
+Float32 = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+TILE_PX: Final = 2048
+JOURNAL_SCHEMA: Final = "skinrig.microstructure-tiles/1"
+COUNTED_PX: Final = 1024
+"""Shares of pixels are counted on a texture of so many a side."""
+LEAST_SIGMA_PX: Final = 0.3
+"""The discrete Gaussian of a narrower kernel leaves 99 % and more to the pixel itself."""
+HASHED_ROWS: Final = 256
+"""Rows of a map that are read at a time to tell one map from another."""
+
+
+class ApplyMicrostructureError(ValueError):
+    """A relief and a mesh that do not go together, or a file of another job."""
+
+
+@dataclass(frozen=True, slots=True)
+class MicrostructureReport:
+    """What a pose did to the relief; shares are of 1.
+
+    Attributes
+    ----------
+    size_px : (int, int)
+        Height and width of the map.
+    stretch_s, stretch_t : (float, float)
+        Least and largest ratio over vertices.
+    fitted_range : (float, float)
+        Ratios that the table was fitted to.
+    outside_share : float
+        Of the vertices: r_s or r_t beyond the fitted range.
+    below_share, above_share : float
+        Of the vertices: r_t below it, r_s above it.
+    extrapolate : str
+        What was done there.
+    clipped_share : float
+        Of the vertices: an alpha that the table's lines have beyond [-2, 1].
+    invalid_share, degenerate_share, uv_degenerate_share, uv_turned_share : float
+        Of the vertices: without strain. Of the triangles: as in `model.mesh_strain.MeshStrain`.
+    covered_share : float
+        Of the pixels: within a triangle of the texture. Others keep the neutral relief.
+    changed_share : float
+        Of the covered pixels: a kernel does something.
+    unresolved_share : float
+        Of the covered pixels: kernels are asked for that are all too narrow for the map's pixels
+        (`LEAST_SIGMA_PX`), so that next to nothing is done. Near 1 for maps of a whole face below
+        8K or so: microstructure needs pixels of 10 to 20 um.
+    pixel_um : float
+        Median over vertices of the length of skin that a pixel has along the axes.
+    strain_s, convolution_s : float
+        Seconds for the strain of the mesh, and for fields and convolution of all tiles done now.
+    tiles, tiles_before : int
+        Tiles in all, and those that an interrupted run had done.
+    """
+
+    size_px: tuple[int, int]
+    stretch_s: tuple[float, float]
+    stretch_t: tuple[float, float]
+    fitted_range: tuple[float, float]
+    outside_share: float
+    below_share: float
+    above_share: float
+    extrapolate: str
+    clipped_share: float
+    invalid_share: float
+    degenerate_share: float
+    uv_degenerate_share: float
+    uv_turned_share: float
+    covered_share: float
+    changed_share: float
+    unresolved_share: float
+    pixel_um: float
+    strain_s: float
+    convolution_s: float
+    tiles: int
+    tiles_before: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as values for JSON."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AppliedMicrostructure:
+    """A relief under strain.
+
+    Attributes
+    ----------
+    height : ndarray of float32, shape (H, W)
+        In the neutral relief's unit; a memory map where a file was asked for.
+    strain : MeshStrain
+    report : MicrostructureReport
+    """
+
+    height: Float32
+    strain: MeshStrain
+    report: MicrostructureReport
+
+
+def apply_microstructure(
+    mesh: BlendShapeMesh,
+    weights: Mapping[str, float],
+    neutral_height: Any,
+    table: KernelTable = FOREHEAD,
+    *,
+    valid: Any = None,
+    extrapolate: Literal["hold", "formula"] = "hold",
+    sampling: Sampling = "cubic",
+    tile: int = TILE_PX,
+    out: Path | str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> AppliedMicrostructure:
+    """Return the relief of a mesh under weights of its blend shapes.
+
+    Parameters
+    ----------
+    mesh : BlendShapeMesh
+        In mm: its texture's scale tells how wide kernels are in pixels.
+    weights : mapping of str to float
+        Of its shapes.
+    neutral_height : array or memory map, shape (H, W)
+        Displacement in the mesh's texture, any unit; row 0 is the top (v = 1).
+    table : KernelTable
+        Kernels of the skin by its stretch ratios.
+    valid : array or memory map of bool, shape (H, W), optional
+        Heights that may be sampled; heights that are not finite never are.
+    extrapolate : {"hold", "formula"}
+        Beyond the table's range: see `model.microstructure.kernel_parameters`.
+    sampling : {"cubic", "linear"}
+        As of `model.displacement_convolution.convolve`.
+    tile : int
+        Pixels a side that are computed at a time; the result does not depend on it.
+    out : path, optional
+        A .npy file for the result, written as a memory map. Beside it, ``<out>.tiles.json`` tells
+        which tiles are done until all are: the same call goes on where an interrupted one ended.
+    progress : callable, optional
+        Called with the numbers of tiles done and in all.
+
+    Returns
+    -------
+    AppliedMicrostructure
+
+    Raises
+    ------
+    ApplyMicrostructureError
+        For heights that are no map, or an `out` that belongs to another job.
+    skinrig.blend_shapes.BlendShapeError
+        For shapes that the mesh lacks.
+    """
+    shape = tuple(int(side) for side in np.shape(neutral_height))
+    if len(shape) != 2 or min(shape) < 1:
+        raise ApplyMicrostructureError(f"neutral_height: got shape {shape}, expected (H, W)")
+    if valid is not None and tuple(np.shape(valid)) != shape:
+        raise ApplyMicrostructureError(f"valid: got shape {np.shape(valid)}, expected {shape}")
+    size = (shape[0], shape[1])
+    begin = time.perf_counter()
+    moved = mesh.deformed(weights)
+    found = strain(mesh.vertices_mm, moved, mesh.faces, mesh.uv)
+    strain_s = time.perf_counter() - begin
+
+    def fields_at(window: Window) -> tuple[LineKernels, LineKernels]:
+        shown = rasterize(found, mesh.faces, mesh.uv, size, window=window)
+        return line_kernels(shown, table, extrapolate=extrapolate)
+
+    def valid_at(window: Window) -> Bools:
+        return np.asarray(valid[window.rows, window.columns], bool)
+
+    tiles = tiles_of(size, tile)
+    journal = None
+    if out is None:
+        target: Float32 = np.empty(size, np.float32)
+    else:
+        job = _job(moved, mesh, neutral_height, valid, table, (extrapolate, sampling, str(tile)))
+        journal = _Journal.open(Path(out), job, size)
+        target = journal.target
+    before = [] if journal is None else list(journal.finished)
+    done = len(before)
+
+    def finished(number: int, count: int) -> None:
+        nonlocal done
+        done += 1
+        if journal is not None:
+            journal.add(number)
+        if progress is not None:
+            progress(done, count)
+
+    begin = time.perf_counter()
+    convolve_tiled(
+        neutral_height, target, fields_at, tile=tile, sampling=sampling,
+        valid_at=None if valid is None else valid_at, finished=before, progress=finished,
+    )  # fmt: skip
+    if journal is not None:
+        journal.close()
+    convolution_s = time.perf_counter() - begin
+    return AppliedMicrostructure(
+        target,
+        found,
+        _report(
+            found, table, size, extrapolate, strain_s, convolution_s, (len(tiles), len(before)),
+            _shares(found, mesh, table, size, extrapolate),
+        ),
+    )  # fmt: skip
+
+
+def _shares(
+    found: MeshStrain,
+    mesh: BlendShapeMesh,
+    table: KernelTable,
+    size: tuple[int, int],
+    extrapolate: Literal["hold", "formula"],
+) -> tuple[float, float, float]:
+    """Return shares of pixels: covered; of these, changed, and asked for but unresolved."""
+    coarser = math.ceil(max(size) / COUNTED_PX)
+    few = (math.ceil(size[0] / coarser), math.ceil(size[1] / coarser))
+    shown = rasterize(found, mesh.faces, mesh.uv, few, pad_px=0)
+    changed, narrow = np.zeros((2, *few), bool)
+    for lines in line_kernels(shown, table, extrapolate=extrapolate):
+        sigma_px = coarser * lines.sigma_px[shown.covered]
+        asked = (lines.alpha[shown.covered] != 0.0) & (sigma_px > 0.0)
+        wide = sigma_px >= LEAST_SIGMA_PX
+        changed[shown.covered] |= asked & wide
+        narrow[shown.covered] |= asked & ~wide
+    covered = max(int(shown.covered.sum()), 1)
+    return (
+        float(shown.covered.mean()),
+        float(changed.sum() / covered),
+        float((narrow & ~changed).sum() / covered),
+    )
+
+
+def _report(
+    found: MeshStrain,
+    table: KernelTable,
+    size: tuple[int, int],
+    extrapolate: str,
+    strain_s: float,
+    convolution_s: float,
+    tiles: tuple[int, int],
+    shares: tuple[float, float, float],
+) -> MicrostructureReport:
+    good = found.valid
+    if not good.any():
+        raise ApplyMicrostructureError("mesh: no vertex has a triangle with an area and a texture")
+    low, high = table.stretch_range
+    r_s, r_t = found.r_s[good], found.r_t[good]
+    both = np.stack([r_s, r_t])
+    told = np.clip(both, low, high) if extrapolate == "hold" else both
+    alpha = table.unlimited_alpha(told)
+    clipped = (alpha < ALPHA_LIMITS[0]) | (alpha > ALPHA_LIMITS[1])
+    pixels = np.concatenate(
+        [
+            np.hypot(axis[good, 0] * size[1], axis[good, 1] * size[0]) * per_mm[good]
+            for axis, per_mm in (
+                (found.axis_s, found.uv_per_mm_s), (found.axis_t, found.uv_per_mm_t)
+            )
+        ]
+    )  # fmt: skip
+    return MicrostructureReport(
+        size_px=size,
+        stretch_s=(float(r_s.min()), float(r_s.max())),
+        stretch_t=(float(r_t.min()), float(r_t.max())),
+        fitted_range=table.stretch_range,
+        outside_share=float((~table.inside(both)).any(axis=0).mean()),
+        below_share=float((r_t < low).mean()),
+        above_share=float((r_s > high).mean()),
+        extrapolate=extrapolate,
+        clipped_share=float(clipped.any(axis=0).mean()),
+        invalid_share=float(1.0 - good.mean()),
+        degenerate_share=found.degenerate_share,
+        uv_degenerate_share=found.uv_degenerate_share,
+        uv_turned_share=found.uv_turned_share,
+        covered_share=float(shares[0]),
+        changed_share=float(shares[1]),
+        unresolved_share=float(shares[2]),
+        pixel_um=float(1e3 / np.median(pixels)),
+        strain_s=strain_s,
+        convolution_s=convolution_s,
+        tiles=tiles[0],
+        tiles_before=tiles[1],
+    )
+
+
+def _job(
+    moved: NDArray[np.float64],
+    mesh: BlendShapeMesh,
+    height: Any,
+    valid: Any,
+    table: KernelTable,
+    settings: tuple[str, ...],
+) -> str:
+    """Return a digest of everything that the result depends on."""
+    digest = hashlib.blake2b(digest_size=16)
+    for array in (moved, mesh.vertices_mm, mesh.uv, mesh.faces):
+        digest.update(np.ascontiguousarray(array).data)
+    for each in (height, valid):
+        if each is not None:
+            digest.update(f"{each.dtype} {tuple(each.shape)}".encode())
+            for top in range(0, each.shape[0], HASHED_ROWS):
+                digest.update(np.ascontiguousarray(each[top : top + HASHED_ROWS]).data)
+    digest.update(json.dumps([table.to_json(), *settings]).encode())
+    return digest.hexdigest()
+
+
+@dataclass(slots=True, eq=False)
+class _Journal:
+    """Which tiles of a file are done."""
+
+    path: Path
+    job: str
+    target: Any
+    finished: list[int]
+
+    @classmethod
+    def open(cls, out: Path, job: str, size: tuple[int, int]) -> _Journal:
+        path = out.with_name(out.name + ".tiles.json")
+        if out.suffix != ".npy":
+            raise ApplyMicrostructureError(f"out: got {out.name!r}, expected a name in .npy")
+        if path.exists() and out.exists():
+            try:
+                told = json.loads(path.read_text("utf-8"))
+                known = told["schema"] == JOURNAL_SCHEMA
+                same, done = told["job"] == job, [int(number) for number in told["finished"]]
+            except (ValueError, KeyError, TypeError) as error:
+                raise ApplyMicrostructureError(f"{path}: not a list of tiles: {error}") from error
+            if not (known and same):
+                raise ApplyMicrostructureError(
+                    f"{path}: belongs to another relief, mesh, pose or setting; "
+                    "remove it, or choose another file"
+                )
+            target = np.load(out, mmap_mode="r+")
+            if target.shape != size or target.dtype != np.float32:
+                raise ApplyMicrostructureError(f"{out}: got {target.dtype} {target.shape}")
+            return cls(path, job, target, done)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        target = np.lib.format.open_memmap(out, "w+", np.float32, size)
+        journal = cls(path, job, target, [])
+        journal._write()
+        return journal
+
+    def add(self, number: int) -> None:
+        self.target.flush()
+        self.finished.append(number)
+        self._write()
+
+    def _write(self) -> None:
+        fresh = self.path.with_name(self.path.name + ".new")
+        told = {"schema": JOURNAL_SCHEMA, "job": self.job, "finished": self.finished}
+        fresh.write_text(json.dumps(told), encoding="utf-8")
+        os.replace(fresh, self.path)
+
+    def close(self) -> None:
+        self.target.flush()
+        self.path.unlink(missing_ok=True)
