@@ -1,0 +1,112 @@
+"""Smooth maps kept small: averaged down over the pixels that count, and made large again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class CoarseMapError(ValueError):
+    """A size that no map can be kept at."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cells:
+    """How the pixels of a map share the cells of a small one.
+
+    Cell and pixel grids cover the same rectangle. A cell is the mean of the valid pixels in it,
+    by area; a pixel is interpolated bilinearly between the centres of the cells that hold valid
+    pixels. Both are linear, and a constant stays what it is.
+    """
+
+    shape: tuple[int, int]
+    """Of the map, (H, W) px."""
+    stored: tuple[int, int]
+    """Of the small map, (h, w) cells, at most that of the map."""
+
+    def __post_init__(self) -> None:
+        """Refuse cells smaller than pixels."""
+        for full, few in zip(self.shape, self.stored, strict=True):
+            if not 1 <= few <= full:
+                raise CoarseMapError(f"stored: got {self.stored}, expected 1 to {self.shape}")
+
+    def coarsen(self, values: Floats, valid: Mask) -> tuple[Floats, Mask]:
+        """Return the means of the cells (h, w), 0 where none is, and where there is one.
+
+        Parameters
+        ----------
+        values
+            (H, W); what is not valid may be anything.
+        valid
+            (H, W).
+        """
+        down, across = (_areas(*pair) for pair in zip(self.shape, self.stored, strict=True))
+        weight = down @ valid.astype(np.float64) @ across.T
+        # about one value, so that a constant comes back to the last digit
+        about = float(values[valid].mean()) if valid.any() else 0.0
+        total = down @ np.where(valid, values - about, 0.0) @ across.T
+        held = weight > 1e-9
+        return np.where(held, about + total / np.where(held, weight, 1.0), 0.0), held
+
+    def refine(self, *cells: Floats, valid: Mask) -> tuple[Floats, ...]:
+        """Return small maps at the size of the map; NaN where no valid cell is near.
+
+        Parameters
+        ----------
+        cells
+            Each (h, w).
+        valid
+            (h, w): cells that hold something.
+        """
+        down, across = (_hats(*pair) for pair in zip(self.shape, self.stored, strict=True))
+        if valid.all():
+            return tuple(np.asarray(down @ one @ across.T) for one in cells)
+        weight = down @ valid.astype(np.float64) @ across.T
+        weight = np.where(weight > 0.0, weight, np.nan)
+        return tuple(
+            np.asarray((down @ np.where(valid, one, 0.0) @ across.T) / weight) for one in cells
+        )
+
+
+def fitting(shape: tuple[int, int], size: int | None) -> Cells:
+    """Return the cells of a map kept at ``size`` a side, or at its own where that is less.
+
+    Examples
+    --------
+    >>> fitting((2048, 100), 256).stored
+    (256, 100)
+    """
+    if size is not None and size < 1:
+        raise CoarseMapError(f"size: got {size}, expected at least 1 cell")
+    few = shape if size is None else (min(shape[0], size), min(shape[1], size))
+    return Cells(shape, few)
+
+
+def _areas(pixels: int, cells: int) -> csr_array:
+    """Return how much of each pixel lies in each cell, (cells, pixels)."""
+    edges = np.arange(cells + 1) * (pixels / cells)
+    starts = np.floor(edges[:-1] + 1e-9).astype(np.intp)
+    ends = np.minimum(np.ceil(edges[1:] - 1e-9).astype(np.intp), pixels)
+    rows = np.repeat(np.arange(cells), ends - starts)
+    columns = np.concatenate([np.arange(a, b) for a, b in zip(starts, ends, strict=True)])
+    share = np.minimum(columns + 1, edges[rows + 1]) - np.maximum(columns, edges[rows])
+    return csr_array((share, (rows, columns)), shape=(cells, pixels))
+
+
+def _hats(pixels: int, cells: int) -> csr_array:
+    """Return the weights of linear interpolation between cell centres, (pixels, cells)."""
+    at = np.clip((np.arange(pixels) + 0.5) * (cells / pixels) - 0.5, 0.0, cells - 1.0)
+    low = np.minimum(at.astype(np.intp), max(cells - 2, 0))
+    high = np.minimum(low + 1, cells - 1)
+    share = at - low
+    rows = np.tile(np.arange(pixels), 2)
+    return csr_array(
+        (np.concatenate([1.0 - share, share]), (rows, np.concatenate([low, high]))),
+        shape=(pixels, cells),
+    )
