@@ -16,6 +16,7 @@ the eyes to 8 mm on the forehead; the furrows are narrower than the ridges betwe
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,7 +36,7 @@ BoolArray = NDArray[np.bool_]
 MODULUS_RATIO: Final = 100.0
 """Stiffness of the layer that buckles over that of what lies below it."""
 
-TENSION_RANGE: Final = (0.07, 0.14)
+TENSION_RANGE: Final = (0.05, 0.10)
 """Part of its length by which a person's skin at rest is stretched."""
 
 FURROW: Final = 1.2
@@ -117,7 +118,7 @@ ZONES: Final = (
         "forehead",
         0.36,
         lambda p: _y(p) - 0.0035 * _x(p) ** 2,
-        lambda p: _plateau(p, (0.0, 64.0, 0.0), (46.0, 19.0, 55.0)),
+        lambda p: _plateau(p, (0.0, 62.0, 0.0), (46.0, 20.0, 55.0)),
         mirrored=False,
     ),
     Zone(
@@ -172,17 +173,25 @@ ZONES: Final = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WrinkleLines:
-    """Where a person's skin can buckle, at texels of the face's texture."""
+class ZoneLines:
+    """Where a person's skin can buckle in one zone, at n texels of the face's texture."""
 
+    zone: Zone
     texel: NDArray[np.intp]
     """Flat indices of the texels, shape (n,)."""
-    phase_rad: tuple[FloatArray, ...]
-    """For each zone 2 pi times the number of waves across the lines, shape (n,); 0 in a furrow."""
-    slope: tuple[FloatArray, ...]
+    phase_rad: FloatArray
+    """2 pi times the number of waves across the lines, shape (n,); 0 in a furrow."""
+    slope: FloatArray
     """Its change along u and v, rad per unit of u and v, shape (n, 2)."""
-    share: tuple[FloatArray, ...]
-    """Part of the excess length that each zone takes, shape (n,)."""
+    share: FloatArray
+    """Part of the excess length that goes into the zone's wrinkles, shape (n,)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class WrinkleLines:
+    """Where a person's skin can buckle."""
+
+    zones: tuple[ZoneLines, ...]
     tension: float
     """Part of its length by which the skin at rest is stretched."""
 
@@ -219,55 +228,56 @@ def wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int) -> 
     rng = np.random.default_rng([seed, 22])
     tension = float(rng.uniform(*TENSION_RANGE))
     size = points_mm.shape[0]
-    front = covered & (points_mm[..., 2] > -60.0)
+    y, z = points_mm[..., 1], points_mm[..., 2]
+    front = covered & (z > -60.0) & (y > -75.0) & (y < 90.0)  # no zone reaches farther
     front[[0, -1]] = front[:, [0, -1]] = False
     texel = np.flatnonzero(front)
     flat = points_mm.reshape(-1, 3)
-    # the texel, its neighbours at larger and smaller u, at larger and smaller v
-    around = texel[None] + np.array([0, 1, -1, -size, size])[:, None]
-    points = flat[around].astype(np.float64)
-    away = np.linalg.norm(points[1:] - points[0], axis=-1)
-    # beyond a seam of the texture there is nothing, or skin from elsewhere
-    known = covered.reshape(-1)[around[1:]] & (away < SEAM_STEPS * np.median(away))
-    steps = np.maximum(known[0::2].astype(np.float64) + known[1::2], 1.0)
-    points[1:] = np.where(known[..., None], points[1:], points[0])
-    phases, slopes, shares = [], [], []
+    middle = flat[texel].astype(np.float64)
+    folded = np.column_stack([np.abs(middle[:, 0]), middle[:, 1:]])
+    step_mm = np.median(np.linalg.norm(flat[texel + 1] - flat[texel], axis=-1))
+    drawn = []
     for zone in ZONES:
         wave = zone.wavelength_mm * float(rng.uniform(0.88, 1.14))
         offset = rng.uniform(0.0, 2.0 * math.pi, 2)
         lifts = rng.uniform(0.8, 1.0, 2)
-        half = points.copy()
-        half[..., 0] = np.abs(half[..., 0])
-        share = zone.share(half[0])
-        near = share > 0.01
-        p = half[:, near] if zone.mirrored else points[:, near]
-        right = (points[0, near, 0] > 0.0).astype(np.intp)
-        wobble = smooth_noise(points[:, near].astype(np.float32), (24.0, 11.0), seed=seed + 95)
-        across = zone.across_mm(p) / wave + 0.07 * wobble
+        share = zone.share(folded)
+        near = np.flatnonzero(share > 0.01)
+        share = share[near]
+        # the texel, its neighbours at larger and smaller u, at larger and smaller v
+        around = texel[near] + np.array([0, 1, -1, -size, size])[:, None]
+        points = flat[around].astype(np.float64)
+        away = np.linalg.norm(points[1:] - points[0], axis=-1)
+        # beyond a seam of the texture there is nothing, or skin from elsewhere
+        known = covered.reshape(-1)[around[1:]] & (away < SEAM_STEPS * step_mm)
+        steps = np.maximum(known[0::2].astype(np.float64) + known[1::2], 1.0)
+        points[1:] = np.where(known[..., None], points[1:], points[0])
+        wobble = smooth_noise(points.astype(np.float32), (24.0, 11.0), seed=seed + 95)
+        right = (points[0, :, 0] > 0.0).astype(np.intp)
+        if zone.mirrored:
+            points[..., 0] = np.abs(points[..., 0])
+        across = zone.across_mm(points) / wave + 0.07 * wobble
         phase = 2.0 * math.pi * across
         if zone.single:
             # one wave with its furrow on the line; beside it the skin is smooth
             lone = np.abs(across[0]) < 0.5
-            share[near] *= np.where(lone, np.cos(math.pi * across[0]) ** 2, 0.0)
+            share = share * np.where(lone, np.cos(math.pi * across[0]) ** 2, 0.0)
         elif zone.name == "glabella":
             phase -= 2.0 * math.pi * 0.55  # furrows on both sides of the middle, a little off it
         else:
             phase += offset[right] if zone.mirrored else offset[0]
-        full = np.zeros(len(texel))
-        full[near] = phase[0]
-        slope = np.zeros((len(texel), 2))
-        slope[near, 0] = size * (phase[1] - phase[2]) / steps[0, near]
-        slope[near, 1] = size * (phase[3] - phase[4]) / steps[1, near]
-        share[near] *= lifts[right] if zone.mirrored else lifts[0]
-        phases.append(full)
-        slopes.append(slope)
-        shares.append(np.where(near, share, 0.0))
-    together = np.maximum(np.sum(shares, axis=0), 1.0)
+        slope = size * np.stack(
+            [(phase[1] - phase[2]) / steps[0], (phase[3] - phase[4]) / steps[1]], axis=-1
+        )
+        share = share * (lifts[right] if zone.mirrored else lifts[0])
+        drawn.append(ZoneLines(zone, texel[near], phase[0], slope, share))
+    # zones that overlap divide the shortening among them
+    together = np.zeros(size * size)
+    for lines in drawn:
+        together[lines.texel] += lines.share
+    crowd = np.maximum(together, 1.0)
     return WrinkleLines(
-        texel,
-        tuple(phases),
-        tuple(slopes),
-        tuple(share / together for share in shares),
+        tuple(dataclasses.replace(one, share=one.share / crowd[one.texel]) for one in drawn),
         tension,
     )
 
@@ -289,37 +299,33 @@ def raise_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
         tension.
     """
     size = rest.size
-    height = np.zeros(len(lines.texel))
-    total = np.zeros(len(lines.texel))
-    before, after = _metric(rest, lines.texel), _metric(posed, lines.texel)
-    texel_mm = _texel_mm(posed, lines.texel)
+    height = np.zeros(size * size)
+    total = np.zeros(size * size)
+    along_u, along_v = posed.texel_mm()
+    texel_mm = np.maximum(along_u, along_v).reshape(-1)
     left_out = []
-    for zone, phase, slope, share in zip(
-        ZONES, lines.phase_rad, lines.slope, lines.share, strict=True
-    ):
-        here = np.flatnonzero(share > 0.0)
-        if not len(here):
+    for one in lines.zones:
+        if not len(one.texel):
             continue
         # waves per mm across the lines, before and after
-        dense_before = _density(before[here], slope[here])
-        dense_after = _density(after[here], slope[here])
-        steady = (dense_before > 1e-6) & (dense_after > 1e-6)
-        stretch = np.where(steady, dense_before / np.maximum(dense_after, 1e-9), 1.0)
-        slack = (1.0 - zone.tension * lines.tension) / np.maximum(stretch, 1e-3) - 1.0
-        excess = share[here] * np.maximum(slack, 0.0)
-        wave_mm = 2.0 * math.pi / np.maximum(dense_after, 1e-9)
-        fine = soft_step((wave_mm / texel_mm[here] - FINEST_TEXELS) / 0.5)
+        before = _density(_metric(rest, one.texel), one.slope)
+        after = _density(_metric(posed, one.texel), one.slope)
+        steady = (before > 1e-6) & (after > 1e-6)
+        stretch = np.where(steady, before / np.maximum(after, 1e-9), 1.0)
+        slack = (1.0 - one.zone.tension * lines.tension) / np.maximum(stretch, 1e-3) - 1.0
+        excess = one.share * np.maximum(slack, 0.0)
+        wave_mm = 2.0 * math.pi / np.maximum(after, 1e-9)
+        fine = soft_step((wave_mm / texel_mm[one.texel] - FINEST_TEXELS) / 0.5)
         if (excess > 0.0).any() and float(np.median(fine)) < 0.5:
-            left_out.append(zone.name)
+            left_out.append(one.zone.name)
         excess *= fine
-        height[here] += 1e3 * wave_mm * depth_of(excess) * _profile(phase[here])
-        total[here] += excess
-    maps = []
-    for values in (height, total):
-        full = np.zeros(size * size, np.float32)
-        full[lines.texel] = values
-        maps.append(full.reshape(size, size))
-    return Wrinkles(maps[0], maps[1], tuple(left_out))
+        height[one.texel] += 1e3 * wave_mm * depth_of(excess) * _profile(one.phase_rad)
+        total[one.texel] += excess
+    return Wrinkles(
+        height.astype(np.float32).reshape(size, size),
+        total.astype(np.float32).reshape(size, size),
+        tuple(left_out),
+    )
 
 
 def depth_of(excess: ArrayLike) -> FloatArray:
@@ -377,9 +383,3 @@ def _density(inverse: FloatArray, slope: FloatArray) -> FloatArray:
     u, v = slope[:, 0], slope[:, 1]
     squared = inverse[:, 0] * u * u + 2.0 * inverse[:, 1] * u * v + inverse[:, 2] * v * v
     return np.sqrt(np.maximum(squared, 0.0))
-
-
-def _texel_mm(atlas: Atlas, texel: NDArray[np.intp]) -> FloatArray:
-    along_u, along_v = atlas.texel_mm()
-    longer = np.maximum(along_u, along_v).reshape(-1)[texel]
-    return np.asarray(longer, np.float64)

@@ -38,6 +38,8 @@ class Pose:
     """How far it goes, 0 to 1.5."""
     origin: tuple[Mesh, Float32Array]
     """Mesh and relief of the face at rest."""
+    lines: expression_wrinkles.WrinkleLines
+    """Where this person's skin can buckle."""
     mesh: Mesh
     """The face moved; the same triangles and texture coordinates."""
     atlas: Atlas
@@ -176,6 +178,10 @@ class Subject:
 _poses: WeakValueDictionary[tuple[int, int, int, str, float], Pose] = WeakValueDictionary()
 """Poses that somebody holds, by what they are made of; a pose holds its origin, so that an id
 stays that of the same object."""
+_lines: WeakValueDictionary[tuple[int, int, int], expression_wrinkles.WrinkleLines] = (
+    WeakValueDictionary()
+)
+"""Their lines, by the first three of the same."""
 
 
 def _pose(rest: Subject, state: str, amount: float) -> Pose:
@@ -186,14 +192,18 @@ def _pose(rest: Subject, state: str, amount: float) -> Pose:
         deltas = expressions.displacement_mm(rest.mesh, state, amount=amount, seed=rest.seed)
         mesh = expressions.moved(rest.mesh, deltas)
         atlas = unwrap(mesh, rest.size)
-        points = face_regions.on_mean_head(rest.atlas.position_mm, rest.mesh)
-        lines = expression_wrinkles.wrinkle_lines(points, rest.atlas.covered, seed=rest.seed)
+        lines = _lines.get(key[:3])
+        if lines is None:
+            points = face_regions.on_mean_head(rest.atlas.position_mm, rest.mesh)
+            lines = expression_wrinkles.wrinkle_lines(points, rest.atlas.covered, seed=rest.seed)
+            _lines[key[:3]] = lines
         wrinkles = expression_wrinkles.raise_wrinkles(lines, rest.atlas, atlas)
         height = rest.height_um + wrinkles.height_um
         pose = Pose(
             state=state,
             amount=amount,
             origin=(rest.mesh, rest.height_um),
+            lines=lines,
             mesh=mesh,
             atlas=atlas,
             wrinkles=wrinkles,
