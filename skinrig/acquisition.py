@@ -7,6 +7,7 @@ import json
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
@@ -27,6 +28,7 @@ from skinrig.addresses import addresses, patiently, require_addresses
 from skinrig.console import Console
 from skinrig.errors import UsageError
 from skinrig.light_safety import light_figures, light_lines
+from skinrig.sequences import SequenceOrder, sequence_lines, sequence_plan
 
 CALIBRATION_TARGETS = ("dark", "flat", "chart", "malus")
 
@@ -101,6 +103,42 @@ def range_of(text: str | None, option: str) -> tuple[int, int] | None:
         raise UsageError(f"{option}: got {text!r}, expected FIRST..LAST, such as -2..3") from exc
 
 
+def sequence_of(
+    state: str | None,
+    prompt_period: str | None,
+    shot_period: str | None,
+    captures: int | None,
+    duration: str | None,
+) -> SequenceOrder | None:
+    """Return the sequence that options ask for; None without one.
+
+    Examples
+    --------
+    >>> sequence_of("smile", None, "10.25", None, None).shot_period_s
+    '10.25'
+
+    Raises
+    ------
+    UsageError
+        For options without a sequence, or of another kind of it.
+    """
+    if state is None:
+        if any(option is not None for option in (prompt_period, shot_period, captures, duration)):
+            raise UsageError(
+                "--prompt-period, --shot-period, --captures, --duration: are for a sequence; add "
+                "--sequence STATE"
+            )
+        return None
+    order = SequenceOrder(
+        state=state, shot_period_s=shot_period, captures=captures, duration_s=duration
+    )
+    if order.prompted and duration is not None:
+        raise UsageError(f"--duration: is for an event; {state} goes by --captures")
+    if not order.prompted and (prompt_period is not None or captures is not None):
+        raise UsageError(f"--prompt-period, --captures: {state} is no expression; use --duration")
+    return order if prompt_period is None else replace(order, prompt_period_s=prompt_period)
+
+
 def choose_plan(
     rig: Rig,
     file: Path | None,
@@ -110,6 +148,7 @@ def choose_plan(
     steps: tuple[int, int] | None = None,
     sites: Sequence[str] | None = None,
     repeats: int = 1,
+    sequence: SequenceOrder | None = None,
 ) -> Plan:
     """Return the plan in ``file``, or the rig's own for a target, or for a subject.
 
@@ -124,6 +163,8 @@ def choose_plan(
         Of a caliper; None: all. Of a probe one number, of directions.
     sites, repeats
         Of a probe.
+    sequence
+        In time, of the flash rig.
 
     Raises
     ------
@@ -133,6 +174,10 @@ def choose_plan(
         For what the rig does not know, or that a plan in a file has already.
     """
     own = file is None and target is None
+    if sequence is not None:
+        if not own or "flash" not in rig.boxes:
+            raise UsageError("--sequence: is for the flash rig's own plan of a subject")
+        return sequence_plan(rig, sequence)
     if (angles or steps) and not (own and (rig.caliper or (rig.probe and not steps))):
         raise UsageError(
             "--angles, --steps: are for the gradient rig's own plan of skin, --angles for the "
@@ -263,6 +308,7 @@ def capture_session(
     sites: Sequence[str] | None = None,
     repeats: int = 1,
     all_brackets: bool = False,
+    sequence: SequenceOrder | None = None,
 ) -> Mapping[str, Any]:
     """Capture into ``out`` and return the command's document.
 
@@ -278,8 +324,9 @@ def capture_session(
     box_urls, camera_urls = addresses(ports, "--port"), addresses(cameras, "--camera")
     rig = load_rig(rig_name)
     chosen = choose_plan(
-        rig, plan, target, angles=angles, steps=steps, sites=sites, repeats=repeats
-    )
+        rig, plan, target, angles=angles, steps=steps, sites=sites, repeats=repeats,
+        sequence=sequence,
+    )  # fmt: skip
     seconds = chosen.estimated_s(rig)
     needed = needed_boxes(rig, chosen)
     if not dry_run:
@@ -292,6 +339,8 @@ def capture_session(
     if out is None and not dry_run:
         raise UsageError("a capture needs --out SESSION")
     console.say(f"{len(chosen.steps)} steps, about {seconds:.0f} s")
+    for line in sequence_lines(chosen):
+        console.say(line)
     light: Mapping[str, Any] = {}
     if rig.leds is not None:
         light = light_figures(chosen, rig)
@@ -380,7 +429,7 @@ def _run(
                 plan, rig, boxes=boxes, cameras=opened, session=session,
                 progress=console.progress, prompt=partial(ask, console.progress),
                 interrupted=stopped, eyes=eyes, force_limit_n=force_limit_n,
-                all_brackets=all_brackets,
+                all_brackets=all_brackets, signal=partial(sound, console.progress),
             )  # fmt: skip
         session.close()
         left_out = dict(session.left_out())
@@ -405,6 +454,11 @@ def ask(progress: Callable[[str], None], what: str) -> None:
         return
     progress(f"{what}; then press Enter")
     sys.stdin.readline()
+
+
+def sound(progress: Callable[[str], None], what: str) -> None:
+    """Ring the terminal's bell and say what the subject shall change to; wait for nothing."""
+    progress(f"\a{what}")
 
 
 @contextlib.contextmanager

@@ -48,6 +48,28 @@ Angles = Annotated[
         "directions of its head: 16."
     ),
 ]
+Sequence = Annotated[
+    str | None,
+    typer.Option(
+        help="Of the flash rig, a sequence in time: an expression made and dropped by a sound, "
+        "such as smile, or exercise or alcohol, followed after the event."
+    ),
+]
+PromptPeriod = Annotated[
+    str | None, typer.Option(help="Of a sequence: seconds from sound to sound; default 5.")
+]
+ShotPeriod = Annotated[
+    str | None,
+    typer.Option(help="Of a sequence: seconds from shot to shot; default 5.5, of alcohol 300."),
+]
+Captures = Annotated[
+    int | None,
+    typer.Option(help="Shots of a sequence by sounds; default: each phase, a tenth twice."),
+]
+Duration = Annotated[
+    str | None,
+    typer.Option(help="Seconds an event is followed; default 60 for exercise, 3600 for alcohol."),
+]
 Steps = Annotated[str | None, typer.Option(help="First and last position of the caliper: -2..3.")]
 Consent = Annotated[
     list[str] | None,
@@ -151,6 +173,14 @@ def simulate(
             help="Whether the face moves and wrinkles with its states, or its blood changes only.",
         ),
     ] = True,
+    sequence: Sequence = None,
+    prompt_period: PromptPeriod = None,
+    shot_period: ShotPeriod = None,
+    captures: Captures = None,
+    duration: Duration = None,
+    relaxation: Annotated[
+        float | None, typer.Option(help="Time constant of a sequence's blood, s; default 0.05.")
+    ] = None,
     consent: Consent = None,
     consent_expires: ConsentExpires = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
@@ -160,7 +190,7 @@ def simulate(
 
     Example: skinrig simulate flash --out session-flash --subject IV
     """
-    from skinrig.acquisition import names_of, numbers_of, range_of
+    from skinrig.acquisition import names_of, numbers_of, range_of, sequence_of
     from skinrig.consent import subject_of
     from skinrig.simulation import USES, pseudonym, simulate_session
 
@@ -172,11 +202,13 @@ def simulate(
         sites=names_of(sites), repeats=repeats, all_brackets=all_brackets,
         movement=movement, progress=console.progress,
         person=subject_of(pseudonym(subject, seed), consent or USES, consent_expires),
+        sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
+        relaxation_s=relaxation,
     )  # fmt: skip
     console.say(
         f"{done.session}: {done.frames} frames" + (f", truth in {done.truth}" if done.truth else "")
     )
-    console.say(f"next: {_next_step(rig, out, target)}")
+    console.say(f"next: {_next_step(rig, out, target if sequence is None else 'sequence')}")
     console.document("skinrig.simulate/1", done.document())
 
 
@@ -189,6 +221,8 @@ def _next_step(rig: str, session: Path, target: str | None) -> str:
         kinds = {"ball": "lights", "flat": "sensor", "dark": "sensor"}
     if rig == "probe":
         kinds = {"phantom": "fibre"}
+    if target == "sequence":
+        return f"skinrig reconstruct {session} --want perfusion_curves --out appearance"
     if target is None:
         if rig == "probe":
             want = "profiles,subsurface,translucency --calibration calibration"
@@ -233,6 +267,11 @@ def capture(
     angles: Angles = None,
     all_brackets: AllBrackets = False,
     steps: Steps = None,
+    sequence: Sequence = None,
+    prompt_period: PromptPeriod = None,
+    shot_period: ShotPeriod = None,
+    captures: Captures = None,
+    duration: Duration = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
     json: Json = False,
 ) -> None:
@@ -241,7 +280,14 @@ def capture(
     Example: skinrig capture flash --port flash=/dev/ttyUSB0 --camera cam=hotfolder:incoming
     --out session
     """
-    from skinrig.acquisition import capture_session, eyes_of, names_of, numbers_of, range_of
+    from skinrig.acquisition import (
+        capture_session,
+        eyes_of,
+        names_of,
+        numbers_of,
+        range_of,
+        sequence_of,
+    )
     from skinrig.consent import subject_of
 
     console = Console(json)
@@ -252,6 +298,7 @@ def capture(
         force_limit_n=force_limit, angles=numbers_of(angles, "--angles"),
         steps=range_of(steps, "--steps"), sites=names_of(sites), repeats=repeats,
         all_brackets=all_brackets,
+        sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
     )  # fmt: skip
     console.document("skinrig.capture/1", done)
 

@@ -20,6 +20,10 @@ TARGETS = ("white", "chart", "flat", "dark", "malus")
 
 def simulate_flash(order: Order) -> Simulated:
     """Simulate a capture with the flash rig; see `skinrig.simulation.simulate_session`."""
+    if order.sequence is not None:
+        from skinrig.simulating_sequence import simulate_sequence
+
+        return simulate_sequence(order, order.sequence)
     target, states, seed = order.target, order.states, order.seed
     if target is not None and target not in TARGETS:
         raise SimulationError(f"target: got {target!r}, expected one of {', '.join(TARGETS)}")
@@ -55,7 +59,7 @@ def simulate_flash(order: Order) -> Simulated:
         truth = truth_folder(order.out)
         for state, scene in scenes.items():
             folder = truth if state == states[0] else truth.with_name(f"{truth.name}-{state}")
-            appearance = _truth(scene, seed, session.content_hash, state)
+            appearance = truth_of(scene, seed, session.content_hash, state)
             store.write(folder, appearance)
     blur = () if target else tuple(float(width) for width in first.resolution_mm())
     left_out = tuple(first.left_out)
@@ -142,7 +146,8 @@ def landmarks_at_superpixels(pixels: Mapping[str, tuple[float, float]]) -> dict[
     return {name: [0.5 * (x - 0.5), 0.5 * (y - 0.5)] for name, (x, y) in pixels.items()}
 
 
-def _truth(scene: Any, seed: int, session: str, state: str) -> SkinAppearance:
+def truth_of(scene: Any, seed: int, session: str, state: str) -> SkinAppearance:
+    """Return the truth of a scene of a face, at superpixels."""
     maps: Mapping[str, NDArray[Any]] = scene.truth()
     mask = np.asarray(maps["mask"], bool)
     # a superpixel on the outline mixes skin and background: no truth is claimed for it

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from capture.devices.probe import ProbeBox
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject
+from skinrig.sequences import SequenceOrder
 
 RIGS = ("flash", "dome", "gradient", "probe")
 BOXES: Mapping[str, type[Box]] = {
@@ -116,6 +119,8 @@ class Order:
     created: datetime | None
     person: Subject | None
     progress: Callable[[str], None] | None
+    sequence: SequenceOrder | None = None
+    relaxation_s: float | None = None
 
     def __post_init__(self) -> None:
         if self.size not in SIZES:
@@ -157,6 +162,8 @@ def simulate_session(
     created: datetime | None = None,
     person: Subject | None = None,
     progress: Callable[[str], None] | None = None,
+    sequence: SequenceOrder | None = None,
+    relaxation_s: float | None = None,
 ) -> Simulated:
     """Simulate a capture into SESSION/, and write its truth beside it.
 
@@ -214,6 +221,10 @@ def simulate_session(
         Pseudonym and consent to record; None: one who agreed to :data:`USES`.
     progress
         Called with one line a frame.
+    sequence
+        A sequence in time before the flash rig instead of ``states``.
+    relaxation_s
+        Time constant of its blood, s; None: of the state, see `rigsim.perfusion_course`.
 
     Raises
     ------
@@ -227,8 +238,13 @@ def simulate_session(
         states=tuple(states), repeats=repeats, resume=resume, width_px=width_px, lights=lights,
         views=views, move=move, site=site, angles=None if angles is None else tuple(angles),
         steps=steps, sites=None if sites is None else tuple(sites), all_brackets=all_brackets,
-        movement=movement, created=created, person=person, progress=progress,
+        movement=movement, created=created, person=person, progress=progress, sequence=sequence,
+        relaxation_s=relaxation_s,
     )  # fmt: skip
+    if sequence is not None and rig_name != "flash":
+        raise SimulationError(f"sequence: the {rig_name} rig knows nothing of it; leave it out")
+    if sequence is None and relaxation_s is not None:
+        raise SimulationError("relaxation: is for a sequence")
     if rig_name == "dome":
         from skinrig.simulating_dome import simulate_dome
 
@@ -287,6 +303,8 @@ def drive(
     force_limit_n: float | None = None,
     run_id: str = "",
     all_brackets: bool = False,
+    signal: Callable[[Any, str], None] | None = None,
+    begun_s: float | None = None,
 ) -> float:
     """Run a session's plan through the drivers, on a world registered under its id, and close it.
 
@@ -310,6 +328,11 @@ def drive(
         Begins the tokens of this run.
     all_brackets
         Of a probe.
+    signal
+        Called with the world and what the subject of a sequence is asked for, at the time.
+    begun_s
+        The host's time at which the world begins, s since 1970; None: the host's clock is not the
+        world's, but this computer's.
 
     Returns
     -------
@@ -326,11 +349,14 @@ def drive(
         for kind in rig.boxes
     }
     cameras = {view.name: open_camera(f"sim://{name}/{view.name}") for view in rig.views}
+    hear = None if signal is None else partial(signal, world)
     try:
         run_plan(
             session.plan, rig, boxes=boxes, cameras=cameras, session=session,
             progress=progress, prompt=lambda text: prompt(world, text), eyes=eyes,
-            force_limit_n=force_limit_n, run_id=run_id, all_brackets=all_brackets,
+            force_limit_n=force_limit_n, run_id=run_id, all_brackets=all_brackets, signal=hear,
+            timer=world.clock,
+            clock=time.time if begun_s is None else lambda: begun_s + world.now,
         )  # fmt: skip
         session.close()
         return float(world.now)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from capture.devices.camera import Camera
-from capture.devices.port import DeviceError
+from capture.devices.port import SYSTEM_CLOCK, Clock, DeviceError
 from capture.plan import Step
 from capture.session import Session
 
@@ -65,6 +65,10 @@ class Operator:
     """The host's time, s since 1970."""
     run_id: str
     """Begins every token of this run."""
+    signal: Callable[[str], None] = lambda text: None
+    """Gives the subject a sound, and returns at once."""
+    timer: Clock = SYSTEM_CLOCK
+    """What the times of a sequence are kept by."""
 
     def stop_if_asked(self) -> None:
         """Raise `Interrupted` when the capture is to stop."""

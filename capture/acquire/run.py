@@ -14,6 +14,7 @@ from capture.acquire.outcome import Acquired, AcquisitionError, Operator
 from capture.acquire.probe import run_probe
 from capture.devices.camera import Camera, check_serials
 from capture.devices.dome import Eyes
+from capture.devices.port import SYSTEM_CLOCK, Clock
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session
@@ -32,7 +33,9 @@ def run_plan(
     progress: Callable[[str], None] | None = None,
     prompt: Callable[[str], None] | None = None,
     interrupted: Callable[[], bool] | None = None,
+    signal: Callable[[str], None] | None = None,
     clock: Callable[[], float] = time.time,
+    timer: Clock = SYSTEM_CLOCK,
     run_id: str = "",
     eyes: Eyes = "open",
     force_limit_n: float | None = None,
@@ -61,8 +64,13 @@ def run_plan(
         too with what to press when only a hand can release a camera.
     interrupted
         Asked before each step, or each sequence; True stops in good order.
+    signal
+        Called in a sequence with the state that the subject shall change to, at the time; gives a
+        sound and returns at once.
     clock
         The host's time, s since 1970, for the journal.
+    timer
+        What the times of a sequence are kept by; the world's own where it is simulated.
     run_id
         Begins the token of every flash or sequence of this run; drawn at random by default, so
         that no two bear one token, also after a resume.
@@ -100,6 +108,8 @@ def run_plan(
         interrupted=interrupted or _never,
         clock=clock,
         run_id=run_id or secrets.token_hex(4),
+        signal=signal or _ignore,
+        timer=timer,
     )
     if kind == "gradient_sphere":
         return run_gradient(

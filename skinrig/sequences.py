@@ -1,0 +1,96 @@
+"""Sequences in time of the flash rig: what is asked for, its plan, and what is said of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from capture.plan import Plan
+from capture.plan.multiplexed import course_plan, multiplexed_plan, phases
+from capture.rig import Rig
+
+EVENTS = ("exercise", "alcohol")
+"""States that follow an event instead of prompts."""
+DURATIONS_S = {"exercise": "60", "alcohol": "3600"}
+"""How long they are followed by default, s: Jimenez et al. 2010, section 3."""
+PERIODS_S = {"exercise": "5.5", "alcohol": "300"}
+"""Time from shot to shot, s."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SequenceOrder:
+    """A sequence that is asked for; times are the decimals that a user wrote."""
+
+    state: str
+    """An expression that is made and dropped by prompts, or one of :data:`EVENTS`."""
+    prompt_period_s: str = "5"
+    """Time from prompt to prompt, s."""
+    shot_period_s: str | None = None
+    """Time from shot to shot, s; None: 5.5, or of the event."""
+    captures: int | None = None
+    """Shots of a prompted sequence; None: every phase, a tenth of them twice."""
+    duration_s: str | None = None
+    """How long an event is followed, s; None: as :data:`DURATIONS_S`."""
+
+    @property
+    def prompted(self) -> bool:
+        """Whether prompts make the course, and not an event."""
+        return self.state not in EVENTS
+
+    def document(self) -> dict[str, Any]:
+        """Return this as JSON values."""
+        return {
+            "state": self.state,
+            "prompt_period_s": self.prompt_period_s if self.prompted else None,
+            "shot_period_s": self.shot_period_s,
+            "captures": self.captures,
+            "duration_s": self.duration_s,
+        }
+
+
+def sequence_plan(rig: Rig, order: SequenceOrder, *, darks: int = 4) -> Plan:
+    """Return the plan of a sequence.
+
+    Raises
+    ------
+    PlanError
+        Where it cannot be planned: `capture.plan.multiplexed.ReadOutError` for a camera too slow.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> plan = sequence_plan(load_rig("flash"), SequenceOrder(state="alcohol"), darks=0)
+    >>> plan.steps[-1].settings["start_s"]
+    3600.0
+    """
+    if order.prompted:
+        return multiplexed_plan(
+            rig,
+            state=order.state,
+            prompt_period_s=order.prompt_period_s,
+            shot_period_s=order.shot_period_s or "5.5",
+            captures=order.captures,
+            darks=darks,
+        )
+    return course_plan(
+        rig,
+        state=order.state,
+        duration_s=order.duration_s or DURATIONS_S[order.state],
+        shot_period_s=order.shot_period_s or PERIODS_S[order.state],
+        darks=darks,
+    )
+
+
+def sequence_lines(plan: Plan) -> list[str]:
+    """Return what is to be said of a sequence before it begins; nothing of other plans.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> lines = sequence_lines(sequence_plan(load_rig("flash"), SequenceOrder(state="smile")))
+    >>> lines[0].partition(":")[0]
+    '22 captures meet 20 distinct phases of the 10 s cycle, 2 of them again'
+    """
+    if plan.limits.get("prompt_period_s", 0.0) > 0:
+        return [str(phases(plan))]
+    return []
