@@ -1,0 +1,291 @@
+"""A dynamic appearance evaluated: blood, color, normals and displacement of an expression."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model import color_table, facial_color, store
+from model.facial_color import HemoglobinRig
+from model.skin import UNITS, SkinAppearance, SkinMap
+from model.tissue_optics import ANISOTROPY_SKIN
+from model.wrinkle_expressions import ROW_OF_STATE, Clamp
+from model.wrinkle_model import FILE as WRINKLE_FILE
+from model.wrinkle_model import WrinkleModel
+from skinrig import dynamic_appearance
+from skinrig.dynamic_appearance import FACIAL_COLOR, PARTS, WRINKLES
+
+OBSERVER, LIGHT = "linear sRGB", "D65"
+"""What colors are given for: screens and textures, not the camera that measured."""
+
+
+class ApplyError(ValueError):
+    """Weights that cannot be applied."""
+
+
+@dataclass(slots=True)
+class Applied:
+    """What came out of an evaluation.
+
+    Attributes
+    ----------
+    maps
+        By name.
+    figures
+        JSON values of each part: clipped fractions, clamped zones, seconds.
+    left_out
+        Parts that were not evaluated, and why.
+    """
+
+    maps: dict[str, SkinMap] = field(default_factory=dict)
+    figures: dict[str, Any] = field(default_factory=dict)
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Expression:
+    """What is asked for.
+
+    Attributes
+    ----------
+    weights
+        By state; of facial color they sum to one, "neutral" among them.
+    normalize
+        Divide the weights by their sum.
+    clamp
+        Range of a wrinkle zone's sum over blend shapes.
+    emotional
+        Let anger redden and fear pale the whole face by the paper's factors.
+    gain
+        One more factor of all blood.
+    """
+
+    weights: Mapping[str, float]
+    normalize: bool = False
+    clamp: Clamp = "unit"
+    emotional: bool = False
+    gain: float = 1.0
+
+
+def parse_weights(text: str) -> dict[str, float]:
+    """Return weights given as ``smile=0.7,anger=0.3``.
+
+    Raises
+    ------
+    ApplyError
+        Naming the part that is no ``NAME=NUMBER``, or a name given twice.
+
+    Examples
+    --------
+    >>> parse_weights("smile=0.7, anger=0.3")
+    {'smile': 0.7, 'anger': 0.3}
+    """
+    found: dict[str, float] = {}
+    for part in text.split(","):
+        name, equals, number = (piece.strip() for piece in part.partition("="))
+        try:
+            weight = float(number)
+        except ValueError:
+            weight = float("nan")
+        if not (name and equals and np.isfinite(weight)):
+            raise ApplyError(
+                f"weights: got {part.strip()!r}, expected NAME=NUMBER, for example smile=0.7"
+            )
+        if name in found:
+            raise ApplyError(f"weights: {name!r} is given twice")
+        found[name] = weight
+    return found
+
+
+def apply_expression(
+    path: Path,
+    expression: Expression,
+    *,
+    out: Path,
+    parts: Sequence[str] = PARTS,
+    relief: Callable[[SkinAppearance, dict[str, Any], Applied], None] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Applied:
+    """Evaluate the parts of a dynamic appearance and write their maps.
+
+    Parameters
+    ----------
+    path
+        Folder that `skinrig fit` made.
+    expression
+        What is asked for.
+    out
+        APPEARANCE/ folder of the result.
+    parts
+        Which parts to evaluate, of those that there are.
+    relief
+        Evaluates the microstructure, which needs a mesh; None leaves it out.
+    progress
+        Called with one line a part.
+
+    Returns
+    -------
+    Applied
+
+    Raises
+    ------
+    ApplyError, FacialColorError, WrinkleError, DynamicAppearanceError, StoreError
+        For weights that a part cannot take, or a folder that holds none of the parts.
+    """
+    unknown = [name for name in parts if name not in PARTS]
+    if unknown:
+        raise ApplyError(f"parts: got {unknown[0]!r}, expected out of {', '.join(PARTS)}")
+    appearance, found = dynamic_appearance.read(path, parts=parts)
+    done = Applied()
+    for name in PARTS:
+        if name not in found or name not in parts:
+            why = "not asked for" if name in found else "the folder does not hold it"
+            done.left_out.append((name, why))
+            continue
+        if progress is not None:
+            progress(name.replace("_", " "))
+        start = time.perf_counter()
+        if name == FACIAL_COLOR:
+            _facial_color(appearance, expression, done)
+        elif name == WRINKLES:
+            _wrinkles(appearance, expression, done)
+        elif relief is not None:
+            relief(appearance, found[name], done)
+        else:
+            done.left_out.append((name, "needs the moving mesh: give --mesh"))
+            continue
+        done.figures.setdefault(name, {})["seconds"] = round(time.perf_counter() - start, 3)
+    if not done.maps:
+        reasons = "; ".join(f"{what}: {why}" for what, why in done.left_out)
+        raise ApplyError(f"{path}: nothing was left to evaluate ({reasons})")
+    content = (path / store.DOCUMENT).read_bytes()
+    store.write(
+        out,
+        SkinAppearance(
+            maps=done.maps,
+            source=appearance.source,
+            parameters={
+                "kind": "expression", "weights": dict(expression.weights),
+                "normalize": expression.normalize, "clamp": expression.clamp,
+                "emotional": expression.emotional, "gain": expression.gain,
+                "figures": _without_times(done.figures),
+            },
+            inputs={"appearance": hashlib.sha256(content).hexdigest()},
+            versions={n: metadata.version(n) for n in ("skinrig", "numpy", "scipy", "numba")},
+            left_out=tuple(done.left_out),
+            seed=appearance.seed,
+        ),
+    )  # fmt: skip
+    return done
+
+
+def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
+    """Return the hemoglobin rig that an appearance holds."""
+    from model.facial_color_document import DOCUMENT, from_maps_and_document
+
+    return from_maps_and_document(appearance.maps, appearance.files[DOCUMENT])
+
+
+def _facial_color(appearance: SkinAppearance, expression: Expression, done: Applied) -> None:
+    rig = hemoglobin_rig(appearance)
+    blend = rig.evaluate(
+        expression.weights,
+        normalize=expression.normalize,
+        gains=facial_color.GLOBAL_GAINS if expression.emotional else None,
+        gain=expression.gain,
+    )
+    good = blend.valid
+    held = np.where(good, blend.hemoglobin, 0.0).astype(np.float32)
+    done.maps["hemoglobin"] = SkinMap(
+        held, UNITS["hemoglobin"], np.where(good, blend.stderr, 0.0).astype(np.float32), good,
+        "blend of measured states",
+    )  # fmt: skip
+    done.figures[FACIAL_COLOR] = {
+        "clipped_fraction": blend.clipped_fraction,
+        "valid_fraction": float(good.mean()),
+        "mean_hemoglobin": float(held[good].mean()) if good.any() else None,
+    }
+    if "melanin" not in appearance.maps:
+        done.left_out.append(("color", "the folder holds no melanin map"))
+        return
+    melanin = appearance.maps["melanin"]
+    seen = good if melanin.valid is None else good & melanin.valid
+    done.maps["melanin"] = melanin
+    done.maps["color"] = SkinMap(
+        _color(melanin.values, held, seen), "1", None, seen,
+        f"diffuse reflectance as {OBSERVER} under {LIGHT}, white = 1",
+    )  # fmt: skip
+
+
+def _color(melanin: Any, hemoglobin: Any, seen: Any) -> Any:
+    table = color_table.build(OBSERVER, LIGHT, anisotropy=ANISOTROPY_SKIN)
+    color = np.zeros((*seen.shape, 3), np.float32)
+    color[seen] = table.lookup(melanin[seen], hemoglobin[seen])
+    return color
+
+
+def _wrinkles(appearance: SkinAppearance, expression: Expression, done: Applied) -> None:
+    model = WrinkleModel.from_maps(appearance.maps, appearance.files[WRINKLE_FILE])
+    weights = wrinkle_weights(model, expression.weights)
+    if model.clamp != expression.clamp:
+        model = WrinkleModel(
+            model.base, model.layers, expression.clamp, model.valid, model.base_stderr,
+            model.weight_stderr,
+        )  # fmt: skip
+    shown = model.evaluate(weights)
+    done.maps["normals"] = SkinMap(
+        shown.normals.astype(np.float32), "1", None, shown.valid,
+        "tangent space of the texture, +X right, +Y up",
+    )  # fmt: skip
+    done.figures[WRINKLES] = {
+        "weights": weights,
+        "zone_weights": [zones.tolist() for zones in shown.zone_weights],
+        "clamped_fraction": shown.clamped_fraction,
+    }
+
+
+def wrinkle_weights(model: WrinkleModel, weights: Mapping[str, float]) -> dict[str, float]:
+    """Return the weights of a wrinkle model's own rows for weights of states.
+
+    A state stands for the row of its name, or for the paper's row that means it; a state of the
+    whole body moves nothing.
+
+    Raises
+    ------
+    ApplyError
+        For a state that has no row.
+    """
+    rows = {name for layer in model.layers for name in layer.table.rows}  # type: ignore[union-attr]
+    found: dict[str, float] = {}
+    for state, weight in weights.items():
+        if state in rows:
+            row: str | None = state
+        elif state in ROW_OF_STATE:
+            row = ROW_OF_STATE[state]
+            if row is not None and row not in rows:
+                raise ApplyError(
+                    f"weights: wrinkles were not fitted to {state!r}, expected out of "
+                    f"{', '.join(sorted(rows))}; leave them out with --parts facial_color"
+                )
+        else:
+            raise ApplyError(
+                f"weights: got state {state!r}, expected out of {', '.join(sorted(rows))}"
+            )
+        if row is not None:
+            found[row] = found.get(row, 0.0) + weight
+    return found
+
+
+def _without_times(figures: Mapping[str, Any]) -> dict[str, Any]:
+    """Drop seconds, which differ from run to run: the same input gives the same bytes."""
+    return {
+        name: {key: value for key, value in part.items() if "seconds" not in key}
+        for name, part in figures.items()
+    }

@@ -1,0 +1,185 @@
+"""From flash sessions to a hemoglobin rig that can be blended: `skinrig fit facial-color`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model import facial_color_document, store
+from model.skin import SkinMap
+from reconstruction import facial_color_fit, landmark_table, state_images
+from reconstruction.facial_color_fit import FacialColorFit
+from reconstruction.state_images import Landmarks, Subject
+from skinrig import dynamic_appearance
+from skinrig.dynamic_appearance import FACIAL_COLOR, Part
+from skinrig.simulation import truth_folder
+
+
+class FacialColorInputError(ValueError):
+    """Landmarks or sessions that cannot be used."""
+
+
+def fit_facial_color(
+    sessions: Sequence[Path],
+    *,
+    out: Path,
+    calibration: Path | None = None,
+    landmarks: Path | None = None,
+    radius_px: float | None = None,
+    stored_size: int | None = 256,
+    progress: Callable[[str], None] | None = None,
+) -> FacialColorFit:
+    """Fit the facial-color part of a dynamic appearance.
+
+    Parameters
+    ----------
+    sessions
+        SESSION/ folders of the flash rig, one subject, with a neutral state.
+    out
+        Folder of the dynamic appearance; other parts in it stay.
+    calibration
+        CALIBRATION/ folder.
+    landmarks
+        Folder with a table ``STATE.csv`` (name, x, y) for each state; None: a simulation's own,
+        otherwise features are matched.
+    radius_px
+        Radius of the disc of the local statistics, px of the maps.
+    stored_size
+        Cells a side of the stored scale and bias maps.
+    progress
+        Called with one line a step.
+
+    Raises
+    ------
+    FacialColorFitError, EvidenceError, LandmarkError, DynamicAppearanceError
+        Naming what is missing or does not fit.
+    """
+    dynamic_appearance.check_target(out)
+    subject = state_images.read(sessions, calibration=calibration, progress=progress)
+    marks, marked_by = _landmarks(subject, sessions, landmarks)
+    found = facial_color_fit.fit(
+        subject, radius_px=radius_px, landmarks=marks, stored_size=stored_size, progress=progress
+    )
+    maps, document = facial_color_document.to_maps(found.rig)
+    maps["melanin"] = found.melanin
+    for state, change in found.changes.items():
+        maps[f"change_{state}"] = change
+        maps[f"hemoglobin_{state}"] = found.hemoglobin[state]
+    truths = {
+        state: folder.name
+        for state in subject.states
+        for folder in [_truth_of(sessions[0], state)]
+        if folder is not None
+    }
+    dynamic_appearance.add(
+        out,
+        FACIAL_COLOR,
+        Part(
+            maps=maps,
+            files={facial_color_document.DOCUMENT: document},
+            parameters={
+                "sessions": [path.name for path in sessions],
+                "states": list(found.hemoglobin),
+                "radius_px": found.rig.radius_px,
+                "landmarks": marked_by,
+                "alignment": facial_color_fit.alignment_document(found),
+                "storage_error": {n: list(e) for n, e in found.rig.storage_error().items()},
+                "camera": subject.camera,
+                "illuminant": subject.illuminant,
+                "assumed": list(subject.assumed),
+                "truth": truths,
+            },
+            inputs=subject.inputs,
+            source=subject.source,
+            left_out=found.left_out,
+            seed=subject.seed,
+        ),
+    )
+    return found
+
+
+def summary(found: FacialColorFit) -> list[tuple[str, str, str, str, str]]:
+    """Return state, mean change in percent, its share of the neutral's, scale, and alignment."""
+    rows = []
+    neutral = found.hemoglobin["neutral"]
+    errors = {one.image.state: one.alignment for one in found.aligned if one.alignment is not None}
+    for state, change in found.changes.items():
+        both = _both(change, neutral)
+        level = float(neutral.values[both].mean()) if both.any() else float("nan")
+        mean = float(change.values[both].mean()) if both.any() else float("nan")
+        scale = found.rig.states[state]
+        alignment = errors.get(state)
+        error = "" if alignment is None else f"{np.median(alignment.error_px[alignment.valid]):.2f}"
+        rows.append(
+            (
+                state,
+                f"{100 * mean:+.3f}",
+                f"{100 * mean / level:+.1f}",
+                f"{np.median(scale.scale[scale.valid]):.3f}",
+                error,
+            )
+        )
+    return rows
+
+
+def _both(a: SkinMap, b: SkinMap) -> Any:
+    good = np.ones(a.values.shape[:2], bool)
+    for one in (a, b):
+        if one.valid is not None:
+            good &= one.valid
+    return good
+
+
+def _landmarks(
+    subject: Subject, sessions: Sequence[Path], folder: Path | None
+) -> tuple[Mapping[str, Landmarks] | None, str]:
+    """Return the landmarks of each state and where they come from."""
+    if folder is not None:
+        if not folder.is_dir():
+            raise FacialColorInputError(
+                f"landmarks: {folder} is no folder; expected one with STATE.csv for each state"
+            )
+        found = {
+            state: landmark_table.read(folder / f"{state}.csv")
+            for state in subject.states
+            if (folder / f"{state}.csv").is_file()
+        }
+        if "neutral" not in found:
+            raise FacialColorInputError(f"landmarks: {folder / 'neutral.csv'} is missing")
+        return found, "tables"
+    if subject.source != "simulated":
+        return None, "features matched"
+    truth: dict[str, Landmarks] = {}
+    for state in subject.states:
+        place = _truth_of(sessions[0], state)
+        if place is None:
+            return None, "features matched"
+        points = store.read_document(place).parameters.get("landmarks_px")
+        if not isinstance(points, dict):
+            return None, "features matched"
+        truth[state] = {name: _point(place, name, value) for name, value in points.items()}
+    return truth, "the simulation's own"
+
+
+def _point(place: Path, name: str, value: Any) -> tuple[float, float]:
+    try:
+        x, y = value
+        return float(x), float(y)
+    except (TypeError, ValueError) as error:
+        raise FacialColorInputError(
+            f"{place}: landmark {name!r} is {json.dumps(value)}, expected two numbers"
+        ) from error
+
+
+def _truth_of(session: Path, state: str) -> Path | None:
+    """Return the folder with a simulated session's truth of a state, where there is one."""
+    first = truth_folder(session)
+    named = first if state == "neutral" else first.with_name(f"{first.name}-{state}")
+    if not (named / store.DOCUMENT).is_file():
+        return None
+    told = store.read_document(named).parameters.get("state")
+    return named if told == state else None
