@@ -1,0 +1,164 @@
+"""The flash scene of a moving face: its truth moves with it and says what it is at rest."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from capture.rig import Rig, load_rig
+from rigsim import landmarks
+from rigsim.scenes.dome import DomeScene
+from rigsim.scenes.flash import FlashScene
+from rigsim.subject import Subject, make_subject
+from rigsim.variant import VariantChoice
+from skinrig.simulating_dome import small_dome
+from skinrig.simulating_flash import truth_of
+
+EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
+WIDTH = 252
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig("flash").resized(WIDTH)
+
+
+@pytest.fixture(scope="module")
+def face() -> Subject:
+    return make_subject("II", seed=4, size=256)
+
+
+def scene_of(rig: Rig, face: Subject, state: str, **kwargs) -> FlashScene:
+    return FlashScene(rig, face, state=state, **({"choice": EMBREE, "lateral": False} | kwargs))
+
+
+@pytest.fixture(scope="module")
+def rest(rig: Rig, face: Subject) -> FlashScene:
+    return scene_of(rig, face, "neutral")
+
+
+@pytest.fixture(scope="module")
+def smile(rig: Rig, face: Subject) -> FlashScene:
+    return scene_of(rig, face, "smile")
+
+
+def test_the_moved_face_is_shown_and_its_maps_with_it(rest, smile):
+    before, after = rest.truth(), smile.truth()
+    x, y = before["position_mm"][..., 0], before["position_mm"][..., 1]
+    corner = before["mask"] & after["mask"] & (np.hypot(x - 30.0, y + 40.0) < 12.0)
+    still = before["mask"] & after["mask"] & (y > 55.0)
+    light = np.abs(smile.radiance() - rest.radiance()).sum(axis=-1)
+    assert light[corner].mean() > 5.0 * light[still].mean()
+    assert np.abs(after["uv"] - before["uv"])[corner].mean() > 0.005
+    assert np.abs(after["uv"] - before["uv"])[still].max() < 0.002
+
+
+def test_blood_of_a_state_carried_back_along_the_skin_is_that_at_rest(smile, rig):
+    """Rationale: each pixel's skin is known at rest, so the moved map can be laid over the face at
+    rest, where it must be the blood of that state.
+
+    Tolerance: 2 % in the median; both maps average the texture over a pixel, and once more by
+    bilinear sampling. Laid over without regard of the movement, smiling cheeks err at least three
+    times as much.
+    """
+    truth = smile.truth()
+    inside = truth["mask"]
+    pixels = landmarks.project(
+        truth["position_at_rest_mm"][inside].astype(np.float64), rig.views[0]
+    )
+    at = pixels[:, ::-1].T
+    whole = map_coordinates(truth["mask_at_rest"].astype(float), at, order=1) == 1.0
+    moved = np.linalg.norm((truth["position_mm"] - truth["position_at_rest_mm"])[inside], axis=-1)
+    checked = whole & (moved > 4.0)
+    assert checked.sum() > 300
+    for name in ("hemoglobin", "melanin"):
+        expected = map_coordinates(truth[f"{name}_at_rest"].astype(float), at, order=1)
+        error = np.abs(truth[name][inside] / np.maximum(expected, 1e-6) - 1.0)[checked]
+        unmoved = np.abs(truth[name] / np.maximum(truth[f"{name}_at_rest"], 1e-6) - 1.0)[inside]
+        assert np.median(error) < 0.02
+        assert np.median(unmoved[checked]) > 3.0 * np.median(error)
+
+
+def test_blood_at_rest_is_what_the_unmoved_face_shows(smile, rig, face):
+    still = scene_of(rig, face, "smile", movement=False)
+    truth, unmoved = smile.truth(), still.truth()
+    for name in ("hemoglobin", "melanin", "mask"):
+        np.testing.assert_array_equal(truth[f"{name}_at_rest"], unmoved[name])
+        np.testing.assert_array_equal(unmoved[f"{name}_at_rest"], unmoved[name])
+    assert "position_at_rest_mm" not in unmoved
+
+
+def test_without_movement_states_change_the_blood_only_and_that_is_said(rest, smile, rig, face):
+    still = scene_of(rig, face, "smile", movement=False)
+    np.testing.assert_array_equal(still.truth()["normals"], rest.truth()["normals"])
+    assert (still.truth()["hemoglobin"] != rest.truth()["hemoglobin"]).any()
+    said = dict(still.left_out)
+    assert said["movement of the face with the states"] == "movement=False asks for it"
+    assert "movement of the face with the states" not in dict(smile.left_out)
+    assert "shadows of wrinkles" in dict(smile.left_out)
+
+
+def test_global_states_do_not_move_and_neutral_needs_no_maps_at_rest(rest, rig, face):
+    tired = scene_of(rig, face, "exercise").truth()
+    np.testing.assert_array_equal(tired["position_mm"], rest.truth()["position_mm"])
+    np.testing.assert_array_equal(tired["hemoglobin_at_rest"], tired["hemoglobin"])
+    assert not [name for name in rest.truth() if "at_rest" in name]
+
+
+def test_a_posed_subject_keeps_its_pose_whatever_its_blood_does(rig, face):
+    half = face.posed("smile", 0.5)
+    scene = scene_of(rig, half, "exercise")
+    assert scene.subject is half
+    np.testing.assert_array_equal(
+        scene.truth()["hemoglobin_at_rest"],
+        scene_of(rig, face, "exercise").truth()["hemoglobin_at_rest"],
+    )
+
+
+def test_scenes_that_share_their_light_give_what_they_give_alone(rig, face, rest):
+    beside = scene_of(rig, face, "exercise").radiance()
+    stranger = make_subject("II", seed=4, size=256)  # the same person, nothing shared
+    alone = scene_of(rig, stranger, "exercise").radiance()
+    np.testing.assert_array_equal(beside, alone)
+    assert (beside != rest.radiance()).any()
+
+
+def test_truth_on_disk_has_landmarks_and_blood_at_rest_with_masks_of_their_own(smile, rest):
+    truth = truth_of(smile, 4, "0" * 64, "smile")
+    assert truth.parameters["state"] == "smile"
+    assert truth.parameters["movement"] is True
+    assert len(truth.parameters["landmarks_px"]) >= 20
+    height, width = truth.maps["melanin"].values.shape
+    for x, y in truth.parameters["landmarks_px"].values():
+        assert -0.5 <= x <= width - 0.5
+        assert -0.5 <= y <= height - 0.5
+    own, at_rest = truth.maps["hemoglobin"].valid, truth.maps["hemoglobin_at_rest"].valid
+    assert (own != at_rest).any()
+    assert truth.maps["hemoglobin_at_rest"].unit == truth.maps["hemoglobin"].unit
+    assert truth.maps["position_at_rest_mm"].unit == "mm"
+    neutral = truth_of(rest, 4, "0" * 64, "neutral")
+    assert len(neutral.parameters["landmarks_px"]) >= 20
+    assert "hemoglobin_at_rest" not in neutral.maps
+
+
+def test_the_dome_shows_an_expression_with_its_normals_in_the_texture_frame(face):
+    rig = small_dome(load_rig("dome"), lights=4, views=1, width_px=64)
+    scenes = {
+        state: DomeScene(rig, face, state=state, choice=EMBREE) for state in ("neutral", "surprise")
+    }
+    truths = {state: scene.truth_appearance().maps for state, scene in scenes.items()}
+    posed = face.posed("surprise")
+    np.testing.assert_array_equal(truths["surprise"]["normals"].values, posed.normal)
+    np.testing.assert_array_equal(
+        truths["surprise"]["normals_tangent"].values, posed.tangent_normal()
+    )
+    np.testing.assert_array_equal(
+        truths["surprise"]["position_at_rest"].values, truths["neutral"]["position"].values
+    )
+    valid = truths["neutral"]["r_d"].valid
+    changed = truths["surprise"]["r_d"].values[valid] / truths["neutral"]["r_d"].values[valid]
+    assert np.ptp(changed) > 0.02  # the blood of the state
+    assert "position_at_rest" not in truths["neutral"]
+    seen = scenes["surprise"].truth()["position_mm"][..., 1]
+    assert np.abs(seen - scenes["neutral"].truth()["position_mm"][..., 1]).max() > 1.0
+    still = DomeScene(rig, face, state="surprise", movement=False, choice=EMBREE)
+    assert dict(still.left_out)["movement of the face with the state"]
