@@ -1,0 +1,335 @@
+"""One melanin for all states of a face, and each state's blood under it.
+
+Expressions change the blood of skin, not its melanin (Jimenez et al. 2010, section 3.1). A state's
+picture alone leaves melanin and blood with errors that hang together: where melanin is taken too
+high, blood is too low. Seen together, the states have one melanin, whose noise goes down with
+their number, and changes of blood no longer carry the difference of two melanins.
+
+How it is done. The shading of each state is free, so that a color has two numbers left. All colors
+of a pixel, each taken back to the states' mean blood, are averaged; that color goes through the
+same weighing of all solutions as a single picture (`reconstruction.chromophore_posterior`), with
+the prior of the light and the model's error counted once. Given melanin, each state's blood is
+fitted to its own color. Where the light changes smoothly from state to state the colors of many
+pixels tell how, and a pixel's brightness then tells its blood too. The model's error is nearly the
+same in all states of a pixel: averaging does not reduce it, and differences are nearly free of it.
+Standard errors carry both.
+
+References
+----------
+Jimenez et al. 2010, doi:10.1145/1866158.1866167, section 3.1
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter
+
+from model.color_table import ColorTable
+from reconstruction import chromophore_posterior
+from reconstruction import shared_melanin_kernels as kernels
+from reconstruction.chromophore_posterior import FINEST
+from reconstruction.chromophore_start import LOWEST
+from reconstruction.chromophores import (
+    RELATIVE_NOISE,
+    ChromophoreError,
+    invert,
+    model_covariance,
+    without_brightness,
+)
+from reconstruction.shading_prior import ShadingPrior
+
+Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+OWN_SHARE = 0.01
+"""Part of the model error's variance that is each state's own: 0.0001 to 0.007 between simulated
+pictures of the same unmoved face in neutral, smile, fear and exercise, seeds 0 to 3."""
+LEAST_CHANGE = 0.002
+"""Least relative change of light from state to state that is allowed for in each pixel: what a
+flash's energy differs by from pop to pop."""
+FREE_CHANGE = 1.0
+"""Most that matters: with more, the brightness tells nothing."""
+MISFIT = 4.0
+"""Standard errors from which on a state's color does not belong to the pixel's melanin."""
+_TASK_PIXELS = 2048
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SharedMelanin:
+    """One melanin and S bloods; maps have the pixels' shape (...), those of states (S, ...)."""
+
+    melanin: Map
+    """Volume fraction of melanin in the epidermis; NaN where no state is usable."""
+    stderr_melanin: Map
+    """Its standard error, with noise, model error and second solutions."""
+    noise_stderr_melanin: Map
+    """The part of noise alone: what another set of pictures would differ by."""
+    hemoglobin: Map
+    """(S, ...): volume fraction of blood in the dermis; NaN where the state is not usable."""
+    stderr_hemoglobin: Map
+    """(S, ...): its standard error."""
+    noise_stderr_hemoglobin: Map
+    """(S, ...): the part of noise alone."""
+    change: Map
+    """(S, ...): blood less that of the reference state."""
+    stderr_change: Map
+    """(S, ...): its standard error; what the two have in common is left out of it."""
+    shading: Map
+    """(S, ...): light on the pixel over that on a white tile."""
+    residual: Map
+    """(S, ...): root of the weighted square sum of what the color leaves, in standard errors of the
+    state's own noise: of one number with free light, of two with light that changes smoothly."""
+    valid: Mask
+    """At least one state is usable, and the mean color belongs to the table."""
+    valid_states: Mask
+    """(S, ...): usable, and `valid`."""
+    reference: int
+    """State that changes are taken from."""
+
+    @property
+    def misfits(self) -> Mask:
+        """(S, ...): the color does not belong to the pixel's melanin: misplaced, or a highlight."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.valid_states & (self.residual > MISFIT))
+
+
+def weigh(
+    rgb: ArrayLike,
+    table: ColorTable,
+    *,
+    prior: ShadingPrior,
+    variance: ArrayLike | None = None,
+    model_error: ArrayLike | None = None,
+    valid: ArrayLike | None = None,
+    reference: int = 0,
+    shading_window_px: float | None = None,
+    own_share: float = OWN_SHARE,
+) -> SharedMelanin:
+    """Estimate one melanin and the blood of every state, pixel by pixel.
+
+    Parameters
+    ----------
+    rgb : array_like, shape (S, ..., 3)
+        Diffuse light of S states over that of a white tile, linear camera RGB, aligned.
+    table : ColorTable
+        Of the camera and the light that took the pictures.
+    prior : ShadingPrior
+        How the pixels' shading is distributed; of a pixel's mean over the states.
+    variance : array_like, optional
+        Noise variance of `rgb`, broadcast to its shape; where the place is uncertain with that
+        of the place (`expression_alignment.Alignment.warp_stderr`). None: 1 percent.
+    model_error : array_like, optional
+        Relative error of the table's colors, as of `reconstruction.chromophores.invert`.
+    valid : array_like of bool, shape (S, ...), optional
+        Where each state may be used; a state that is not leaves out.
+    reference : int
+        State that changes are taken from, such as neutral.
+    shading_window_px : float, optional
+        How smoothly the light on a pixel changes between states: it is taken from colors, averaged
+        by a Gaussian of so many px; pixels may be off it by as much as their colors show. Pixels
+        must be (H, W) then. None: the light is free in each pixel and state.
+    own_share : float
+        Part of the model error's variance that is each state's own, 0...1.
+
+    Returns
+    -------
+    SharedMelanin
+
+    Raises
+    ------
+    reconstruction.chromophores.ChromophoreError
+        When shapes do not fit.
+
+    Examples
+    --------
+    >>> from model import color_table
+    >>> from reconstruction.shading_prior import lognormal
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
+    >>> color = 0.8 * table.lookup([[0.02], [0.02]], [[0.03], [0.05]])
+    >>> found = weigh(color, table, prior=lognormal(0.7, 0.6), variance=(2e-3 * color) ** 2)
+    >>> f"{found.melanin[0]:.3f}", f"{found.change[1, 0]:.3f}"
+    ('0.020', '0.020')
+    """
+    colors = np.asarray(rgb, np.float32)
+    if colors.ndim < 2 or colors.shape[-1] != 3 or not colors.shape[0]:
+        raise ChromophoreError(f"rgb: expected shape (S, ..., 3), got {colors.shape}")
+    states, shape = colors.shape[0], colors.shape[1:-1]
+    if not -states <= reference < states:
+        raise ChromophoreError(f"reference: expected a state 0 to {states - 1}, got {reference}")
+    if shading_window_px is not None and (len(shape) != 2 or not shading_window_px > 0.0):
+        raise ChromophoreError(
+            f"shading_window_px: expected above 0 and rgb (S, H, W, 3), got {shading_window_px} "
+            f"and {colors.shape}"
+        )
+    if not 0.0 <= own_share <= 1.0:
+        raise ChromophoreError(f"own_share: expected 0 to 1, got {own_share}")
+    colors = colors.reshape(states, -1, 3)
+    usable = _usable(colors, valid, (states, *shape))
+    relative = _relative_variance(colors, variance, (states, *shape, 3), usable)
+    usable &= np.isfinite(relative).all(axis=-1)
+    log_rgb = np.log(np.where(usable[..., None], colors, 1.0), dtype=np.float32)
+    relative = np.where(usable[..., None], relative, 1.0).astype(np.float32)
+
+    whole = model_covariance(model_error, default_noise=False)
+    common = whole * (1.0 - own_share)
+    own = np.diag(own_share * np.diag(whole)) + FINEST**2 * np.eye(3)
+    cells = np.ascontiguousarray(table.cells, np.float64)
+    mean, mean_variance = _mean_color(log_rgb, relative, usable, table, cells, own)
+    mean_rgb = np.exp(mean)
+    found = chromophore_posterior.weigh(
+        mean_rgb,
+        table,
+        prior=prior,
+        variance=mean_variance * mean_rgb**2,
+        model_error=common + np.diag(np.diag(own)) / np.maximum(usable.sum(axis=0).max(), 1),
+    )
+    ends = np.array([table.c_m_max, table.c_hd_max])
+    begin = _fractions(np.stack([found.melanin, found.hemoglobin], axis=-1), ends)
+    # dm = 3 end a^2 da
+    stderr = found.stderr_melanin / (3.0 * ends[0] * np.maximum(begin[:, 0], LOWEST) ** 2)
+    good: Mask = np.asarray(usable & np.isfinite(found.melanin))
+    fixed = (np.ascontiguousarray(begin, np.float32),
+             np.where(np.isfinite(stderr), stderr, 0.0).astype(np.float32))  # fmt: skip
+
+    def fit(log_change: Map, stiffness: Map) -> tuple[Map, Map]:
+        pixels = mean.shape[0]
+        of_pixels = np.empty((len(kernels.PIXEL_MAPS), pixels), np.float32)
+        of_states = np.empty((len(kernels.STATE_MAPS), states, pixels), np.float32)
+        kernels.blood_of_states(
+            log_rgb, relative, good, mean, log_change, stiffness, *fixed,
+            without_brightness(common), own, cells, float(ends[0]), float(ends[1]),
+            reference % states, of_pixels, of_states, _TASK_PIXELS,
+        )  # fmt: skip
+        return of_pixels, of_states
+
+    free = np.zeros(good.shape, np.float32)
+    pixel_maps, state_maps = fit(free, free)
+    if shading_window_px is not None and states > 1:
+        log_change, stiffness = _smooth_change(
+            state_maps, good & (state_maps[5] < MISFIT), shape, shading_window_px
+        )
+        pixel_maps, state_maps = fit(log_change, np.where(good, stiffness, 0.0).astype(np.float32))
+    named = {
+        name: state_maps[k].reshape(states, *shape) for k, name in enumerate(kernels.STATE_MAPS)
+    }
+    shading = np.exp(named.pop("log_shading"))
+    del named["log_shading_variance"]
+    each: Mask = np.asarray(usable & found.valid)
+    return SharedMelanin(
+        melanin=found.melanin.reshape(shape),
+        stderr_melanin=found.stderr_melanin.reshape(shape),
+        noise_stderr_melanin=pixel_maps[0].reshape(shape),
+        **named,
+        shading=shading,
+        valid=found.valid.reshape(shape),
+        valid_states=each.reshape(states, *shape),
+        reference=reference % states,
+    )
+
+
+def _mean_color(
+    log_rgb: Map,
+    relative: Map,
+    usable: Mask,
+    table: ColorTable,
+    cells: NDArray[np.float64],
+    own: NDArray[np.float64],
+) -> tuple[Map, Map]:
+    """Return the states' mean log color, as of skin with their mean blood, and its variance."""
+    count = np.maximum(usable.sum(axis=0), 1)[:, None]
+    keep = usable[..., None]
+    plain = np.where(keep, log_rgb, 0.0).sum(axis=0) / count
+    noise = np.where(keep, relative, 0.0).sum(axis=0) / count**2
+    seen: Mask = np.asarray(usable.any(axis=0))
+    rgb = np.where(seen[:, None], np.exp(plain), np.nan).astype(np.float32)
+    first = invert(rgb, table, variance=noise * rgb**2)
+    ends = np.array([table.c_m_max, table.c_hd_max])
+    begin = _fractions(np.stack([first.melanin, first.hemoglobin], axis=-1), ends)
+    mean, variance = np.empty_like(plain, np.float32), np.empty_like(plain, np.float32)
+    kernels.mean_color(
+        log_rgb, relative, np.ascontiguousarray(usable), begin.astype(np.float32), own, cells,
+        mean, variance, _TASK_PIXELS,
+    )  # fmt: skip
+    return mean, variance
+
+
+def _smooth_change(
+    state_maps: Map, good: Mask, shape: tuple[int, ...], window_px: float
+) -> tuple[Map, Map]:
+    """Return how the light of each state differs, smoothed, and one over the variance of the rest.
+
+    Log shading and its variance by the states' colors alone are the maps 6 and 7.
+    """
+    known = good & np.isfinite(state_maps[7]) & (state_maps[7] > 0.0)
+    light = np.where(known, state_maps[6], 0.0).astype(np.float64)
+    variance = np.where(known, state_maps[7], 1.0).astype(np.float64)
+    share = np.where(known, 1.0 / variance, 0.0)
+    share /= np.maximum(share.sum(axis=0), 1e-300)
+    change = light - (share * light).sum(axis=0)
+    scatter = (1.0 - 2.0 * share) * variance + (share**2 * variance).sum(axis=0)
+    # a pixel seen in one state alone tells nothing of changes
+    weight = np.where(known & (share < 1.0 - 1e-9), 1.0 / np.maximum(scatter, 1e-12), 0.0)
+
+    def around(values: NDArray[np.float64], reach_px: float) -> NDArray[np.float64]:
+        stack = values.reshape(-1, *shape)
+        return np.stack([gaussian_filter(v, reach_px, mode="constant") for v in stack]).reshape(
+            values.shape
+        )
+
+    total = np.maximum(around(weight, window_px), 1e-300)
+    smooth = around(weight * change, window_px) / total
+    smooth_variance = around(weight, window_px / math.sqrt(2.0)) / (
+        4.0 * math.pi * window_px**2 * total**2
+    )
+    rest = weight * (np.square(change - smooth) - scatter)
+    wide = 2.0 * window_px
+    squares = np.maximum(around(weight**2, wide), 1e-300)
+    excess = around(weight * rest, wide) / squares
+    # by chance alone it is 0 within this
+    chance = np.sqrt(2.0 * around(weight**2, wide / math.sqrt(2.0)) / (4.0 * math.pi)) / (
+        wide * squares
+    )
+    loose = np.maximum(excess, 0.0) + chance + smooth_variance + LEAST_CHANGE**2
+    return smooth.astype(np.float32), (1.0 / np.minimum(loose, FREE_CHANGE**2)).astype(np.float32)
+
+
+def _fractions(values: Map, ends: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return volume fractions as fractions of the table's axes; NaN as a tenth of the ends."""
+    known = np.where(np.isfinite(values), values, 0.001 * ends)
+    return np.asarray(np.clip(np.cbrt(known / ends), LOWEST, 1.0), np.float64)
+
+
+def _usable(colors: Map, valid: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
+    good = np.isfinite(colors).all(axis=-1)
+    with np.errstate(invalid="ignore"):
+        good &= (colors > 0.0).all(axis=-1)
+    if valid is None:
+        return np.asarray(good)
+    given = np.asarray(valid)
+    if given.dtype != np.bool_ or given.shape != shape:
+        raise ChromophoreError(
+            f"valid: expected bool of shape {shape}, got {given.dtype} of {given.shape}"
+        )
+    return np.asarray(good & given.reshape(good.shape))
+
+
+def _relative_variance(
+    colors: Map, variance: ArrayLike | None, shape: tuple[int, ...], usable: Mask
+) -> Map:
+    if variance is None:
+        return np.full(colors.shape, RELATIVE_NOISE**2, np.float32)
+    values = np.asarray(variance, np.float32)
+    try:
+        values = np.broadcast_to(values, shape).reshape(colors.shape)
+    except ValueError as error:
+        raise ChromophoreError(
+            f"variance: expected a shape that broadcasts to {shape}, got {values.shape}"
+        ) from error
+    with np.errstate(invalid="ignore"):
+        if (values[usable] < 0.0).any():
+            raise ChromophoreError("variance: got a negative one")
+    return (values / np.square(np.where(usable[..., None], colors, 1.0))).astype(np.float32)
