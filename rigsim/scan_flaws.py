@@ -49,8 +49,14 @@ def add_flaws(
     return vertices[order], shuffled.astype(np.int32)
 
 
-def binary_ply(vertices_mm: NDArray[np.floating], faces: Faces) -> bytes:
-    """Return a mesh as the bytes of a little-endian binary PLY with float32 positions."""
+def binary_ply(
+    vertices_mm: NDArray[np.floating], faces: Faces, uv: NDArray[np.floating] | None = None
+) -> bytes:
+    """Return a mesh as the bytes of a little-endian binary PLY with float32 positions.
+
+    With ``uv``, shape (V, 2), its vertices have texture coordinates s and t.
+    """
+    rows = vertices_mm if uv is None else np.column_stack([vertices_mm, uv])
     corners = np.empty(len(faces), [("count", "u1"), ("index", "<i4", (3,))])
     corners["count"] = 3
     corners["index"] = faces
@@ -58,12 +64,13 @@ def binary_ply(vertices_mm: NDArray[np.floating], faces: Faces) -> bytes:
         "ply", "format binary_little_endian 1.0", "comment unit: mm",
         f"element vertex {len(vertices_mm)}",
         "property float x", "property float y", "property float z",
+        *(() if uv is None else ("property float s", "property float t")),
         f"element face {len(faces)}", "property list uchar int vertex_indices",
         "end_header", "",
     )  # fmt: skip
     return (
         "\n".join(lines).encode("ascii")
-        + np.ascontiguousarray(vertices_mm, "<f4").tobytes()
+        + np.ascontiguousarray(rows, "<f4").tobytes()
         + corners.tobytes()
     )
 

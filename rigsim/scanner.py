@@ -20,6 +20,7 @@ from rigsim.mesh import Float32Array, Mesh, MeshError, build_mesh
 from rigsim.render import Caster
 from rigsim.scan_flaws import add_flaws, binary_ply
 from rigsim.scan_fusion import RangeImage, fuse
+from rigsim.surface_noise import smooth_noise
 
 FloatArray = NDArray[np.float64]
 
@@ -34,6 +35,10 @@ MIN_COSINE: Final = 0.25
 """Stripes that arrive or are seen at a flatter angle are not decoded: 76 degrees."""
 JUMP_MM: Final = 4.0
 """Neighbouring pixels whose ranges differ by more are at an edge and are dropped."""
+WRAP_NOISE_SHARE: Final = 0.4
+"""Part of a range's noise that a wrapped template keeps."""
+WRAP_SLIDE_MM: Final = 0.25
+"""Deviation along the surface of a wrapped template from the same skin, mm in each direction."""
 COARSE_MM: Final = (8.0, 5.0)
 """Voxels of two rough passes, which tell how many triangles a fine one gives."""
 
@@ -139,6 +144,49 @@ def scan_face(
         vertices_mm=there,
         faces=faces,
         edge_mm=edge_mm,
+    )
+
+
+def wrap_template(mesh: Mesh, *, rng: np.random.Generator, scanner: Scanner | None = None) -> Scan:
+    """Scan a face and wrap a template onto the scan, as people do to compare expressions.
+
+    The template has the triangles and the texture coordinates of the mesh, whatever the face does;
+    so scans of several states share one texture. Wrapping closes holes and drops clothes; what it
+    leaves is an error across the surface, from the scanner, and one along it, as skin without
+    features can be matched only roughly.
+
+    Parameters
+    ----------
+    mesh
+        The true surface in the rig frame, at rest or moved.
+    rng
+        Source of the errors and of the offset between the frames.
+    scanner
+        The scanner; of its flaws only noise, warp and offset are left.
+
+    Returns
+    -------
+    Scan
+        With texture coordinates in its PLY.
+    """
+    scanner = scanner or Scanner()
+    seed = int(rng.integers(2**31))
+    points = mesh.vertices_mm
+    # a template of the resolution's stiffness averages the noise of many ranges
+    fit = WRAP_NOISE_SHARE * scanner.noise_mm * smooth_noise(points, (4.0,), seed=seed)
+    fit += scanner.warp_mm * smooth_noise(points, (60.0,), seed=seed + 1)
+    slide = np.stack([smooth_noise(points, (25.0,), seed=seed + 2 + k) for k in range(3)], axis=-1)
+    slide -= np.sum(slide * mesh.normals, axis=-1, keepdims=True) * mesh.normals
+    wrapped = points + fit[:, None] * mesh.normals + WRAP_SLIDE_MM * slide
+    to_scanner = _offset(scanner, rng)
+    there = (wrapped @ to_scanner[:3, :3].T + to_scanner[:3, 3]).astype(np.float32)
+    edges = mesh.vertices_mm[mesh.faces[:, 0]] - mesh.vertices_mm[mesh.faces[:, 1]]
+    return Scan(
+        ply=binary_ply(there, mesh.faces, mesh.uv),
+        to_dome=np.asarray(np.linalg.inv(to_scanner), np.float64),
+        vertices_mm=there,
+        faces=mesh.faces,
+        edge_mm=float(np.median(np.linalg.norm(edges, axis=-1))),
     )
 
 

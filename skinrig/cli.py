@@ -173,6 +173,13 @@ def simulate(
             help="Whether the face moves and wrinkles with its states, or its blood changes only.",
         ),
     ] = True,
+    wrapped: Annotated[
+        bool,
+        typer.Option(
+            "--wrapped",
+            help="The dome's scan is a template wrapped onto the face: one texture for all states.",
+        ),
+    ] = False,
     sequence: Sequence = None,
     prompt_period: PromptPeriod = None,
     shot_period: ShotPeriod = None,
@@ -200,7 +207,7 @@ def simulate(
         states=tuple(state or ("neutral",)), resume=resume, lights=lights, views=views, move=move,
         site=site, angles=numbers_of(angles, "--angles"), steps=range_of(steps, "--steps"),
         sites=names_of(sites), repeats=repeats, all_brackets=all_brackets,
-        movement=movement, progress=console.progress,
+        movement=movement, wrapped=wrapped, progress=console.progress,
         person=subject_of(pseudonym(subject, seed), consent or USES, consent_expires),
         sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
         relaxation_s=relaxation,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 from typing import Any, cast, get_args
 
 import numpy as np
@@ -25,6 +26,8 @@ BEHIND = -0.3
 """Cosine from +z beyond which a light stands too far behind the face to be chosen among few."""
 SCAN = "scan.ply"
 TRUE_MESH = "mesh.ply"
+BLEND_SHAPES = "expressions.npz"
+"""The face at rest with the movement of each expression, see `rigsim.mesh.load_mesh`."""
 SCAN_TRIANGLES = {"small": 12_000, "full": 40_000}
 TRACKING_EVERY = 24
 
@@ -53,6 +56,7 @@ def simulate_dome(order: Order) -> Simulated:
         "rig": "dome", "width_px": rig.views[0].width_px, "subject": order.subject,
         "target": order.target or "", "mesh": str(order.mesh or ""), "lights": len(rig.lights),
         "views": len(rig.views), "move": order.move, "state": state, "movement": order.movement,
+        "wrapped": order.wrapped,
     }  # fmt: skip
     scene = _scene(rig, order)
     session = open_session(order, plan, rig, asked)
@@ -114,12 +118,13 @@ def _state(order: Order) -> str:
 
 
 def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, bytes]:
-    """Return the true mesh, and how the face reflects in directions that no light has."""
+    """Return the true mesh, its expressions, and how it reflects where no light is."""
     from rigsim.scan_flaws import binary_ply
 
     mesh, landmarks = scene.subject.mesh, scene.subject.landmarks_mm()
     return {
         TRUE_MESH: binary_ply(mesh.vertices_mm, mesh.faces),
+        BLEND_SHAPES: _blend_shapes(scene.subject),
         TEST_FILE: make_test(
             scene,
             truth,
@@ -127,6 +132,22 @@ def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, byte
             sites={name: landmarks[name] for name in SITES},
         ),
     }
+
+
+def _blend_shapes(subject: Any) -> bytes:
+    """Return the face at rest and how each expression moves it, as the bytes of an .npz."""
+    rest = subject.mesh if subject.rest is None else subject.rest.mesh
+    shapes = subject.blend_shapes()
+    out = io.BytesIO()
+    np.savez_compressed(
+        out,
+        vertices_mm=rest.vertices_mm,
+        faces=rest.faces,
+        uv=rest.uv,
+        shape_names=np.array(list(shapes)),
+        shape_deltas_mm=np.array(list(shapes.values()), np.float16),
+    )
+    return out.getvalue()
 
 
 def small_dome(
@@ -228,13 +249,17 @@ def _scene(rig: Rig, order: Order) -> Any:
 
 def _attach_scan(session: Any, scene: Any, order: Order) -> dict[str, Any]:
     """Scan the face into the session; return what the truth keeps of it."""
-    from rigsim.scanner import Scanner, scan_face
+    from rigsim.perfusion import STATES
+    from rigsim.scanner import Scanner, scan_face, wrap_template
 
-    scan = scan_face(
-        scene.subject.mesh,
-        rng=np.random.default_rng([order.seed, 7]),
-        scanner=Scanner(triangles=SCAN_TRIANGLES[order.size]),
-    )
+    scanner = Scanner(triangles=SCAN_TRIANGLES[order.size])
+    mesh = scene.subject.mesh
+    if order.wrapped:
+        rng = np.random.default_rng([order.seed, 7, STATES.index(order.states[0])])
+        scan = wrap_template(mesh, rng=rng, scanner=scanner)
+    else:
+        scan = scan_face(mesh, rng=np.random.default_rng([order.seed, 7]), scanner=scanner)
     if SCAN not in session.attachments():
-        session.attach(SCAN, scan.ply, about={"kind": "scanned mesh", "unit": "mm"})
+        kind = "template wrapped onto a scan" if order.wrapped else "scanned mesh"
+        session.attach(SCAN, scan.ply, about={"kind": kind, "unit": "mm"})
     return {"scan_to_dome": scan.to_dome.tolist()}

@@ -29,7 +29,7 @@ def simulate_flash(order: Order) -> Simulated:
         raise SimulationError(f"target: got {target!r}, expected one of {', '.join(TARGETS)}")
     order.refuse(
         "flash", lights=None, views=None, move=False, site=None, angles=None, steps=None,
-        sites=None, all_brackets=False,
+        sites=None, all_brackets=False, wrapped=False,
     )  # fmt: skip
     if target is None:
         from rigsim.perfusion import STATES

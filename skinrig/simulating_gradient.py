@@ -41,7 +41,7 @@ def simulate_gradient(order: Order) -> Simulated:
         raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
     order.refuse(
         "gradient", states=("neutral",), movement=True, repeats=1, mesh=None, lights=None,
-        views=None, move=False, sites=None, all_brackets=False,
+        views=None, move=False, sites=None, all_brackets=False, wrapped=False,
     )  # fmt: skip
     if order.target is not None:
         order.refuse("target of the gradient", site=None, angles=None, steps=None)

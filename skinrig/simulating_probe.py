@@ -41,7 +41,7 @@ def simulate_probe(order: Order) -> Simulated:
         raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
     order.refuse(
         "probe", states=("neutral",), movement=True, mesh=None, lights=None, views=None, move=False,
-        width_px=None, site=None, steps=None,
+        width_px=None, site=None, steps=None, wrapped=False,
     )  # fmt: skip
     if order.target is not None:
         order.refuse("target of the probe", sites=None, angles=None)

@@ -116,6 +116,7 @@ class Order:
     sites: tuple[str, ...] | None
     all_brackets: bool
     movement: bool
+    wrapped: bool
     created: datetime | None
     person: Subject | None
     progress: Callable[[str], None] | None
@@ -159,6 +160,7 @@ def simulate_session(
     sites: Sequence[str] | None = None,
     all_brackets: bool = False,
     movement: bool = True,
+    wrapped: bool = False,
     created: datetime | None = None,
     person: Subject | None = None,
     progress: Callable[[str], None] | None = None,
@@ -215,6 +217,9 @@ def simulate_session(
         Whether the probe takes exposures that can show no more.
     movement
         Whether the face moves and wrinkles with its states; else they change the blood only.
+    wrapped
+        Whether the scan of the face in the dome is a template wrapped onto it, of the same
+        triangles and texture coordinates in every state, so that maps of states share one texture.
     created
         Date of the session; None: now.
     person
@@ -238,8 +243,8 @@ def simulate_session(
         states=tuple(states), repeats=repeats, resume=resume, width_px=width_px, lights=lights,
         views=views, move=move, site=site, angles=None if angles is None else tuple(angles),
         steps=steps, sites=None if sites is None else tuple(sites), all_brackets=all_brackets,
-        movement=movement, created=created, person=person, progress=progress, sequence=sequence,
-        relaxation_s=relaxation_s,
+        movement=movement, wrapped=wrapped, created=created, person=person, progress=progress,
+        sequence=sequence, relaxation_s=relaxation_s,
     )  # fmt: skip
     if sequence is not None and rig_name != "flash":
         raise SimulationError(f"sequence: the {rig_name} rig knows nothing of it; leave it out")
