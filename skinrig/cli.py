@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig import errors
+from skinrig import cli_dynamic, errors
 from skinrig.console import Console
 
 app = typer.Typer(
@@ -382,6 +382,8 @@ def calibrate(
 
 import_app = typer.Typer(help="Bring in what other devices made.", no_args_is_help=True)
 app.add_typer(import_app, name="import")
+app.add_typer(cli_dynamic.fit_app, name="fit")
+app.add_typer(cli_dynamic.apply_app, name="apply")
 
 
 @import_app.command("photos")

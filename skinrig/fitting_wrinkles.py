@@ -1,0 +1,226 @@
+"""From normals of a neutral face and its expressions to wrinkle maps: `skinrig fit wrinkles`."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import store
+from model.skin import SkinAppearance
+from model.wrinkle_model import FILE as WRINKLE_FILE
+from reconstruction.normal_maps import NormalMaps
+from reconstruction.tangent_space import SMOOTHING_MM, tangent_normals
+from reconstruction.wrinkle_fit import WrinkleFit, fit
+from reconstruction.wrinkle_zones import ZoneFit, amplitudes, fit_zones
+from skinrig import dynamic_appearance
+from skinrig.dynamic_appearance import WRINKLES, Part
+
+NORMALS = ("normals_refined", "normals")
+"""Maps that are taken, the better first."""
+ZONES = 8
+"""As many as Jimenez2011 stores in two RGBA masks."""
+
+
+class WrinkleInputError(ValueError):
+    """Folders whose normals cannot be compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class FittedWrinkles:
+    """What a fit of wrinkles found."""
+
+    fit: WrinkleFit
+    zones: ZoneFit | None
+    """None: the masks were given."""
+
+
+def fit_wrinkles(
+    appearances: Sequence[Path],
+    *,
+    out: Path,
+    masks: Sequence[Path] | None = None,
+    size: int = 256,
+    mask_size: int = 64,
+    smoothing_mm: float = SMOOTHING_MM,
+    seed: int = 0,
+) -> FittedWrinkles:
+    """Fit the wrinkle part of a dynamic appearance.
+
+    Parameters
+    ----------
+    appearances
+        APPEARANCE/ folders of dome sessions of one subject, with normals and positions on one
+        texture: the neutral and at least one expression. ``STATE=FOLDER`` names the state,
+        otherwise the folder says it.
+    out
+        Folder of the dynamic appearance; other parts in it stay.
+    masks
+        Two RGBA pictures of the zones; None: zones are found in the data.
+    size, mask_size
+        Texels a side of wrinkle map and masks.
+    smoothing_mm
+        Of the shape that wrinkles are seen against.
+    seed
+        Of the search for zones.
+
+    Raises
+    ------
+    WrinkleInputError, WrinkleError, DynamicAppearanceError
+        Naming the folder and what it lacks.
+    """
+    dynamic_appearance.check_target(out)
+    read: dict[str, tuple[Path, SkinAppearance]] = {}
+    for given in appearances:
+        state, folder = _state_of(given)
+        if state in read:
+            raise WrinkleInputError(f"{folder}: {state!r} is there twice: {read[state][0]}")
+        read[state] = (folder, store.read(folder))
+    if "neutral" not in read or len(read) < 2:
+        raise WrinkleInputError(
+            f"appearances: got {', '.join(read) or 'none'}, expected neutral and an expression"
+        )
+    measured = {state: _normals(folder, one, smoothing_mm) for state, (folder, one) in read.items()}
+    shapes = {state: one.normals.shape for state, one in measured.items()}
+    if len(set(shapes.values())) > 1:
+        told = ", ".join(f"{state} {shape[:2]}" for state, shape in shapes.items())
+        raise WrinkleInputError(f"appearances: textures of sizes {told}, expected one size")
+    neutral = measured.pop("neutral")
+    side = min(neutral.normals.shape[:2])
+    found_zones = None
+    stack: Any
+    if masks is None:
+        small = min(mask_size, side)
+        found_zones = fit_zones(
+            amplitudes(neutral, measured, size=(small, small)), zones=ZONES,
+            rng=np.random.default_rng(seed),
+        )  # fmt: skip
+        stack = found_zones.masks
+    else:
+        stack = _read_masks(masks)
+    found = fit(neutral, measured, stack, size=(min(size, side), min(size, side)))
+    maps, document = found.model().to_maps()
+    folders = [folder for folder, _ in read.values()]
+    sources = {one.source for _, one in read.values()}
+    dynamic_appearance.add(
+        out,
+        WRINKLES,
+        Part(
+            maps=maps,
+            files={WRINKLE_FILE: document},
+            parameters={
+                "expressions": list(measured),
+                "appearances": [folder.name for folder in folders],
+                "explained": found.explained,
+                "rounds": found.rounds,
+                "zones": "given" if found_zones is None else "found in the data",
+                "rank_one_share": None if found_zones is None else found_zones.rank_one_share,
+                "distinct_zones": None if found_zones is None else found_zones.distinct,
+                "smoothing_mm": smoothing_mm,
+                "truth": {state: one.parameters.get("truth", "") for state, (_, one) in
+                          read.items()},
+            },
+            inputs={
+                folder.name: hashlib.sha256((folder / store.DOCUMENT).read_bytes()).hexdigest()
+                for folder in folders
+            },
+            source="simulated" if "simulated" in sources else "measured",
+            seed=read["neutral"][1].seed,
+        ),
+    )  # fmt: skip
+    return FittedWrinkles(found, found_zones)
+
+
+def _state_of(given: Path) -> tuple[str, Path]:
+    state, equals, path = str(given).partition("=")
+    if equals:
+        return state, Path(path)
+    told = store.read_document(given).parameters.get("state")
+    if not isinstance(told, str) or not told:
+        raise WrinkleInputError(f"{given}: says no state; name it as STATE={given}")
+    return told, given
+
+
+def _normals(folder: Path, appearance: SkinAppearance, smoothing_mm: float) -> NormalMaps:
+    """Return normals in the texture's frame."""
+    maps = appearance.maps
+    if "normals_tangent" in maps:
+        tangent = maps["normals_tangent"]
+        shape = tangent.values.shape[:2]
+        valid = np.ones(shape, bool) if tangent.valid is None else tangent.valid
+        return _as_maps(tangent.values, tangent.stderr, valid)
+    name = next((name for name in NORMALS if name in maps), None)
+    if name is None or "position" not in maps:
+        raise WrinkleInputError(
+            f"{folder}: holds no normals with positions, expected a dome session reconstructed "
+            "with `skinrig reconstruct SESSION --want normals_refined`"
+        )
+    normals, position = maps[name], maps["position"]
+    valid = np.ones(normals.values.shape[:2], bool)
+    for each in (normals, position):
+        if each.valid is not None:
+            valid &= each.valid
+    found = tangent_normals(
+        normals.values, position.values, valid, stderr=normals.stderr, smoothing_mm=smoothing_mm
+    )
+    return _as_maps(found.normals, found.stderr, found.valid)
+
+
+def _as_maps(
+    normals: NDArray[np.float32], stderr: NDArray[np.float32] | None, valid: NDArray[np.bool_]
+) -> NormalMaps:
+    """Return normals with the angle that their components' errors make."""
+    shape = valid.shape
+    error = np.zeros(shape) if stderr is None else np.sqrt((stderr.astype(float) ** 2).sum(axis=2))
+    return NormalMaps(
+        normals=normals.astype(np.float64),
+        albedo=np.ones(shape),
+        residual=np.zeros(shape),
+        valid=valid,
+        stderr_rad=error,
+    )
+
+
+def _read_masks(paths: Sequence[Path]) -> NDArray[np.float32]:
+    """Return zones from RGBA pictures, (Z, h, w)."""
+    import cv2
+
+    planes: list[NDArray[np.float32]] = []
+    for path in paths:
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if picture is None:
+            raise WrinkleInputError(f"{path}: cannot be read as a picture")
+        if picture.ndim != 3 or picture.shape[2] != 4:
+            raise WrinkleInputError(
+                f"{path}: got shape {picture.shape}, expected four channels: a zone in each of RGBA"
+            )
+        scale = float(np.iinfo(picture.dtype).max) if picture.dtype.kind == "u" else 1.0
+        rgba = picture[..., [2, 1, 0, 3]].astype(np.float32) / scale
+        planes += [rgba[..., k] for k in range(4)]
+    if len({plane.shape for plane in planes}) > 1:
+        raise WrinkleInputError("masks: pictures of different sizes, expected one size")
+    return np.stack(planes)
+
+
+def summary(found: FittedWrinkles) -> list[tuple[str, ...]]:
+    """Return expression and its zones' weights with standard errors, for people."""
+    return [
+        (
+            name,
+            *(
+                f"{w:.2f}" + (f" ({e:.2f})" if np.isfinite(e) else " (?)")
+                for w, e in zip(zones.weights, zones.stderr, strict=True)
+            ),
+        )
+        for name, zones in found.fit.expressions.items()
+    ]
+
+
+def zone_names(found: FittedWrinkles) -> Mapping[int, str]:
+    """Return the names of the zones by their number."""
+    return dict(enumerate(found.fit.layer.table.zones))  # type: ignore[union-attr]
