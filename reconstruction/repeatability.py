@@ -1,0 +1,443 @@
+"""How well states repeat: within states against between them, and melanin over the hour.
+
+A subject makes each expression several times, with others in between. Per region of the face the
+mean of a map is taken from each picture. What pictures of one state differ by is set against noise
+(a chi-square test) and against what states differ by (the intraclass correlation). Melanin should
+stay: its drift over the order of capture is fitted with the states' own levels left free, so that
+blood mistaken for melanin is no drift.
+
+References
+----------
+Jimenez et al. 2010, doi:10.1145/1866158.1866167, section 3.1
+Donner 1986, A review of inference procedures for the intraclass correlation coefficient in the
+one-way random effects model, doi:10.2307/1403259
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+FALSE_ALARM = 0.01
+"""Chance that any of the regions is said to scatter, or to drift, when none does."""
+FEWEST_PIXELS = 16
+WHOLE = "whole face"
+"""Name of the region of all valid pixels."""
+
+
+class RepeatabilityError(ValueError):
+    """Captures whose repeats cannot be compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class RegionRepeatability:
+    """One region over all captures.
+
+    Attributes
+    ----------
+    name : str
+    pixels : int
+        Valid in all captures.
+    means : ndarray of float64, shape (N,)
+        Mean of the map in each capture.
+    stderr : ndarray of float64, shape (N,)
+        By noise.
+    within, within_stderr : float
+        Standard deviation of repeats about their state, and its standard error.
+    between : float
+        Standard deviation of the states' levels, noise and repeats taken away; 0 when they do not
+        differ by more.
+    correlation, correlation_stderr : float
+        Intraclass correlation: part of the variance that is the states', at most 1, and its
+        standard error for levels drawn from a normal distribution.
+    chi_square : float
+        Of repeats about their state, in standard errors of noise.
+    degrees : int
+        Captures less states.
+    p_value : float
+        Chance of so much scatter by noise alone.
+    scatters : bool
+        The p-value is below the false-alarm rate, shared among the regions.
+    change_to_scatter : float
+        Largest change of a state from the reference over `within`.
+    """
+
+    name: str
+    pixels: int
+    means: Floats
+    stderr: Floats
+    within: float
+    within_stderr: float
+    between: float
+    correlation: float
+    correlation_stderr: float
+    chi_square: float
+    degrees: int
+    p_value: float
+    scatters: bool
+    change_to_scatter: float
+
+
+@dataclass(frozen=True, slots=True)
+class Repeatability:
+    """All regions.
+
+    Attributes
+    ----------
+    states : tuple of str
+        State of each capture.
+    regions : tuple of RegionRepeatability
+        The whole face is the last one.
+    false_alarm : float
+        Chance that any region is said to scatter when there is noise alone.
+    left_out : tuple of (str, str)
+        Regions with too few valid pixels, and how many they have.
+    """
+
+    states: tuple[str, ...]
+    regions: tuple[RegionRepeatability, ...]
+    false_alarm: float
+    left_out: tuple[tuple[str, str], ...]
+
+    def region(self, name: str) -> RegionRepeatability:
+        """Return a region by name."""
+        for found in self.regions:
+            if found.name == name:
+                return found
+        names = ", ".join(found.name for found in self.regions)
+        raise RepeatabilityError(f"region: got {name!r}, expected one of {names}")
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How a map changes over the order of capture.
+
+    Attributes
+    ----------
+    name : str
+        Of the region.
+    slope_per_minute, slope_stderr : float
+        In units of the map a minute, and its standard error.
+    relative_per_minute : float
+        Slope over the mean of all captures.
+    p_value : float
+        Chance of such a slope without drift.
+    drifts : bool
+        The p-value is below the false-alarm rate, shared among the regions.
+    degrees : int
+        Captures less states less one.
+    scatter : float
+        Standard deviation of the captures about the line.
+    """
+
+    name: str
+    slope_per_minute: float
+    slope_stderr: float
+    relative_per_minute: float
+    p_value: float
+    drifts: bool
+    degrees: int
+    scatter: float
+
+
+def compare(
+    maps: ArrayLike,
+    states: Sequence[str],
+    *,
+    stderr: ArrayLike,
+    valid: ArrayLike | None = None,
+    regions: Mapping[str, ArrayLike] | None = None,
+    reference: str = "neutral",
+    correlated_px: float = 1.0,
+    false_alarm: float = FALSE_ALARM,
+) -> Repeatability:
+    """Compare repeats of states with each other, and states with repeats.
+
+    Parameters
+    ----------
+    maps : array_like, shape (N, H, W)
+        The map of each capture, aligned.
+    states : sequence of str
+        State of each capture, N; at least one of them twice.
+    stderr : array_like, shape (N, H, W)
+        Standard error by noise alone, such as `hemoglobin_noise_stderr`: what all captures have in
+        common must not be in it.
+    valid : array_like of bool, shape (N, H, W), optional
+    regions : mapping of str to array_like of bool (H, W), optional
+        By default a grid of 3 x 3 over the valid pixels.
+    reference : str
+        State that changes are taken from; when it was not captured, the mean of the states.
+    correlated_px : float
+        Pixels whose noise goes together, at least 1: a region has so many times fewer independent
+        ones. Interpolation and demosaicing make it some 2 to 4.
+    false_alarm : float
+        Chance that any region is said to scatter when there is noise alone.
+
+    Returns
+    -------
+    Repeatability
+
+    Raises
+    ------
+    RepeatabilityError
+        For shapes that do not fit, no state with repeats, or no region with pixels.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> level = np.array([0.02, 0.03, 0.02, 0.03])[:, None, None]
+    >>> maps = level + 1e-3 * rng.standard_normal((4, 24, 24))
+    >>> found = compare(
+    ...     maps, ["neutral", "smile"] * 2, stderr=np.full(maps.shape, 1e-3)
+    ... ).region("whole face")
+    >>> found.correlation > 0.99, found.scatters
+    (True, False)
+    """
+    values, error, common, names = _checked(maps, states, stderr, valid)
+    groups = _groups(names)
+    if len(names) == len(groups):
+        raise RepeatabilityError("states: got each once, expected at least one that is repeated")
+    _check_rates(false_alarm, correlated_px)
+    chosen, left_out = _regions(regions, common)
+    # Sidak: all of them together alarm at the stated rate
+    limit = 1.0 - (1.0 - false_alarm) ** (1.0 / len(chosen))
+    found = []
+    for name, mask in chosen.items():
+        means, noise = _means(values, error, mask, correlated_px)
+        found.append(_compared(name, int(mask.sum()), means, noise, groups, reference, limit))
+    return Repeatability(names, tuple(found), false_alarm, left_out)
+
+
+def drift(
+    maps: ArrayLike,
+    states: Sequence[str],
+    times_s: ArrayLike,
+    *,
+    stderr: ArrayLike,
+    valid: ArrayLike | None = None,
+    regions: Mapping[str, ArrayLike] | None = None,
+    correlated_px: float = 1.0,
+    false_alarm: float = FALSE_ALARM,
+) -> tuple[Drift, ...]:
+    """Fit how a map, such as melanin, drifts over the time of capture.
+
+    Parameters
+    ----------
+    maps, states, stderr, valid, regions, correlated_px, false_alarm
+        As of `compare`; states that were captured once tell nothing of drift.
+    times_s : array_like, shape (N,)
+        When each was captured, s.
+
+    Returns
+    -------
+    tuple of Drift
+        By region, the whole face last. Each state has a level of its own, so that what states
+        differ by is no drift when they are interleaved; the error is by the scatter about the
+        line, or by noise where that is larger.
+
+    Raises
+    ------
+    RepeatabilityError
+        When captures less states leave no degree of freedom, or times do not differ within
+        states.
+
+    Examples
+    --------
+    >>> times = 60.0 * np.arange(6)
+    >>> maps = 0.02 + 1e-4 * np.arange(6)[:, None, None] + np.zeros((6, 8, 8))
+    >>> found = drift(maps, ["neutral", "smile"] * 3, times, stderr=np.full(maps.shape, 1e-4))
+    >>> f"{found[-1].slope_per_minute:.5f}", found[-1].drifts
+    ('0.00010', True)
+    """
+    values, error, common, names = _checked(maps, states, stderr, valid)
+    times = np.asarray(times_s, np.float64)
+    if times.shape != (len(names),) or not np.isfinite(times).all():
+        raise RepeatabilityError(f"times_s: got shape {times.shape}, expected ({len(names)},)")
+    _check_rates(false_alarm, correlated_px)
+    groups = _groups(names)
+    degrees = len(names) - len(groups) - 1
+    minutes = times / 60.0
+    apart = minutes.copy()
+    for members in groups.values():
+        apart[members] -= minutes[members].mean()
+    if degrees < 1 or not (apart**2).sum() > 0:
+        raise RepeatabilityError(
+            f"states: {len(names)} captures of {len(groups)} states leave no repeats over time; "
+            "expected at least two more captures than states"
+        )
+    chosen, _ = _regions(regions, common)
+    limit = 1.0 - (1.0 - false_alarm) ** (1.0 / len(chosen))
+    found = []
+    for name, mask in chosen.items():
+        means, noise = _means(values, error, mask, correlated_px)
+        rest = means.copy()
+        for members in groups.values():
+            rest[members] -= means[members].mean()
+        slope = float((apart * rest).sum() / (apart**2).sum())
+        scatter = math.sqrt(float(((rest - slope * apart) ** 2).sum()) / degrees)
+        by_noise = math.sqrt(float((apart**2 * noise**2).sum())) / float((apart**2).sum())
+        by_scatter = scatter / math.sqrt(float((apart**2).sum()))
+        if by_scatter >= by_noise:
+            stderr_slope = by_scatter
+            p_value = float(2 * stats.t.sf(abs(slope) / max(stderr_slope, 1e-300), degrees))
+        else:
+            stderr_slope = by_noise
+            p_value = float(2 * stats.norm.sf(abs(slope) / stderr_slope))
+        level = float(means.mean())
+        found.append(
+            Drift(
+                name, slope, stderr_slope, slope / level if level else math.nan, p_value,
+                p_value < limit, degrees, scatter,
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+def _compared(
+    name: str,
+    pixels: int,
+    means: Floats,
+    noise: Floats,
+    groups: Mapping[str, NDArray[np.intp]],
+    reference: str,
+    limit: float,
+) -> RegionRepeatability:
+    count, kinds = len(means), len(groups)
+    levels = {state: float(means[members].mean()) for state, members in groups.items()}
+    sizes = np.array([len(members) for members in groups.values()], np.float64)
+    degrees = count - kinds
+    square_within = sum(
+        float(((means[members] - levels[state]) ** 2).sum()) for state, members in groups.items()
+    )
+    within = math.sqrt(square_within / degrees)
+    chi_square = sum(_scatter(means[members], noise[members]) for members in groups.values())
+    p_value = float(stats.chi2.sf(chi_square, degrees))
+    between, correlation, error = 0.0, 0.0, math.nan
+    if kinds > 1:
+        grand = float(means.mean())
+        square_between = sum(
+            size * (levels[state] - grand) ** 2 for size, state in zip(sizes, groups, strict=True)
+        )
+        # captures a state, unequal ones averaged as the variance needs it
+        typical = (count - float((sizes**2).sum()) / count) / (kinds - 1)
+        ms_between, ms_within = square_between / (kinds - 1), square_within / degrees
+        variance = (ms_between - ms_within) / typical
+        between = math.sqrt(max(variance, 0.0))
+        whole = variance + ms_within
+        correlation = float(variance / whole) if whole > 0 else 0.0
+        error = _correlation_stderr(correlation, typical, kinds, count)
+    start = levels.get(reference, float(np.mean(list(levels.values()))))
+    largest = max(abs(level - start) for level in levels.values())
+    return RegionRepeatability(
+        name=name, pixels=pixels, means=means, stderr=noise, within=within,
+        within_stderr=within / math.sqrt(2.0 * degrees), between=between,
+        correlation=correlation, correlation_stderr=error, chi_square=chi_square,
+        degrees=degrees, p_value=p_value, scatters=p_value < limit,
+        change_to_scatter=largest / within if within > 0 else math.inf,
+    )  # fmt: skip
+
+
+def _scatter(means: Floats, noise: Floats) -> float:
+    """Return the chi-square of some captures about their weighted mean."""
+    weight = noise**-2.0
+    center = float((weight * means).sum() / weight.sum())
+    return float((weight * (means - center) ** 2).sum())
+
+
+def _correlation_stderr(correlation: float, size: float, kinds: int, count: int) -> float:
+    """Return the large-sample standard error of an intraclass correlation (Donner 1986, 3.1)."""
+    spread = (1.0 - correlation) * (1.0 + (size - 1.0) * correlation)
+    return math.sqrt(2.0 * (count - 1) / ((kinds - 1) * (count - kinds))) * abs(spread) / size
+
+
+def _means(
+    values: Floats, error: Floats, mask: Bools, correlated_px: float
+) -> tuple[Floats, Floats]:
+    count = int(mask.sum())
+    means = values[:, mask].mean(axis=1)
+    noise = np.sqrt((error[:, mask] ** 2).sum(axis=1) * min(correlated_px, count)) / count
+    # rounding of float32 maps is noise too
+    return means, np.maximum(noise, 1e-9 * np.abs(means) + 1e-30)
+
+
+def _groups(states: tuple[str, ...]) -> dict[str, NDArray[np.intp]]:
+    return {
+        state: np.flatnonzero([other == state for other in states])
+        for state in dict.fromkeys(states)
+    }
+
+
+def _check_rates(false_alarm: float, correlated_px: float) -> None:
+    if not 0.0 < false_alarm < 1.0:
+        raise RepeatabilityError(f"false_alarm: got {false_alarm}, expected between 0 and 1")
+    if not correlated_px >= 1.0:
+        raise RepeatabilityError(f"correlated_px: got {correlated_px}, expected at least 1")
+
+
+def _checked(
+    maps: ArrayLike, states: Sequence[str], stderr: ArrayLike, valid: ArrayLike | None
+) -> tuple[Floats, Floats, Bools, tuple[str, ...]]:
+    values, error = np.asarray(maps, np.float64), np.asarray(stderr, np.float64)
+    if values.ndim != 3:
+        raise RepeatabilityError(f"maps: got shape {values.shape}, expected (N, H, W)")
+    if error.shape != values.shape:
+        raise RepeatabilityError(f"stderr: got shape {error.shape}, expected {values.shape}")
+    names = tuple(states)
+    if len(names) != len(values):
+        raise RepeatabilityError(f"states: got {len(names)}, expected {len(values)}")
+    good = np.ones(values.shape, bool) if valid is None else np.asarray(valid, bool)
+    if good.shape != values.shape:
+        raise RepeatabilityError(f"valid: got shape {good.shape}, expected {values.shape}")
+    known = (good & np.isfinite(values) & np.isfinite(error)).all(axis=0)
+    if (error[:, known] < 0).any():
+        raise RepeatabilityError("stderr: got a negative one, expected 0 or above")
+    return values, error, np.asarray(known), names
+
+
+def _regions(
+    regions: Mapping[str, ArrayLike] | None, known: Bools
+) -> tuple[dict[str, Bools], tuple[tuple[str, str], ...]]:
+    wanted = (
+        _grid(known) if regions is None else {k: np.asarray(v, bool) for k, v in regions.items()}
+    )
+    chosen, left_out = {}, []
+    for name, mask in {**wanted, WHOLE: np.ones_like(known)}.items():
+        if mask.shape != known.shape:
+            raise RepeatabilityError(
+                f"regions: {name!r} has shape {mask.shape}, expected {known.shape}"
+            )
+        seen = mask & known
+        pixels = int(seen.sum())
+        if pixels < FEWEST_PIXELS:
+            left_out.append((name, f"{pixels} pixels are valid in all captures"))
+        else:
+            chosen[name] = seen
+    if not chosen:
+        raise RepeatabilityError("valid: no region has pixels that are valid in all captures")
+    return chosen, tuple(left_out)
+
+
+def _grid(known: Bools) -> dict[str, Bools]:
+    """Return 3 x 3 cells over the valid pixels, named as seen in the picture."""
+    places = np.argwhere(known)
+    out: dict[str, Bools] = {}
+    if not len(places):
+        return out
+    low, high = places.min(axis=0), places.max(axis=0) + 1
+    rows, columns = (
+        np.linspace(a, b, 4).round().astype(int) for a, b in zip(low, high, strict=True)
+    )
+    for i, vertical in enumerate(("upper", "middle", "lower")):
+        for j, across in enumerate(("left", "center", "right")):
+            mask = np.zeros_like(known)
+            mask[rows[i] : rows[i + 1], columns[j] : columns[j + 1]] = True
+            out[f"{vertical} {across}"] = mask
+    return out
