@@ -9,30 +9,22 @@ from numba import njit, prange
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _add_runs(t: Any, a: Any, b: Any, left: Any, right: Any) -> None:
-    """Add what lies between entries `left` and `right` of two rows of prefix sums."""
-    al, ar, bl, br = a[left:], a[right:], b[left:], b[right:]
+def _add_run(t: Any, a: Any, left: Any, right: Any) -> None:
+    """Add what lies between entries `left` and `right` of one row of prefix sums."""
+    al, ar = a[left:], a[right:]
     for i in range(t.size):
-        t[i] += (ar[i] - al[i]) + (br[i] - bl[i])
+        t[i] += ar[i] - al[i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _add_two_runs(
+def _add_runs(
     t: Any, a: Any, b: Any, c: Any, d: Any, left: Any, right: Any, left2: Any, right2: Any
 ) -> None:
-    """Do the work of `_add_runs` for rows `a` and `b`, and for `c` and `d`."""
+    """Do the work of `_add_run` for rows `a` and `b`, and between others for `c` and `d`."""
     al, ar, bl, br = a[left:], a[right:], b[left:], b[right:]
     cl, cr, dl, dr = c[left2:], c[right2:], d[left2:], d[right2:]
     for i in range(t.size):
         t[i] += ((ar[i] - al[i]) + (br[i] - bl[i])) + ((cr[i] - cl[i]) + (dr[i] - dl[i]))
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _add_run(t: Any, a: Any, left: Any, right: Any, sign: Any) -> None:
-    """Add what lies between entries `left` and `right` of one row of prefix sums."""
-    al, ar = a[left:], a[right:]
-    for i in range(t.size):
-        t[i] += sign * (ar[i] - al[i])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
@@ -43,65 +35,164 @@ def _add_columns(t: Any, upper: Any, lower: Any, one: Any, other: Any) -> None:
         t[i] += (ll[i] - ul[i]) + (lr[i] - ur[i])
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="never")
+def _add_column_pairs(
+    t: Any, upper: Any, lower: Any, upper2: Any, lower2: Any, one: Any, other: Any
+) -> None:
+    """Do the work of `_add_columns`, and of the next columns outward between other rows."""
+    ul, ur, ll, lr = upper[one:], upper[other:], lower[one:], lower[other:]
+    vl, vr = upper2[one - 1 :], upper2[other + 1 :]
+    ml, mr = lower2[one - 1 :], lower2[other + 1 :]
+    for i in range(t.size):
+        t[i] += ((ll[i] - ul[i]) + (lr[i] - ur[i])) + ((ml[i] - vl[i]) + (mr[i] - vr[i]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="never")
+def _move_square(square: Any, new: Any, old: Any, left: Any, right: Any) -> None:
+    """Add a run of the row that a square reaches, take off that of the row that it leaves."""
+    nl, nr, ol, orr = new[left:], new[right:], old[left:], old[right:]
+    for i in range(square.size):
+        square[i] += np.float64(nr[i] - nl[i]) - np.float64(orr[i] - ol[i])
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _disc_row(t: Any, box: Any, p: Any, q: Any, half: Any, high: Any, inner: Any, y: Any) -> None:
+def _disc_row(
+    t: Any, square: Any, p: Any, q: Any, half: Any, high: Any, inner: Any, rows: Any, y: Any
+) -> None:
     """Write the sums over the discs about one row of a tile.
 
     Parameters
     ----------
     t : (n,), written
-    box : (n,) float64
+    square : (n,) float64
         Sum over the square of half-side `inner`.
     p, q : (K, L), (K + 1, L)
-        Sums along rows and down columns, before each entry, of the K rows that the tile sees.
+        Sums along rows and down columns, before each entry, of the rows that the tile sees.
     half, high : (R + 1,), (C + 1,) int64
-    inner : int
+    inner, rows : int
+        Rows before 0 and from `rows` on hold nothing.
     y : int
-        The row, counted within the K; rows before 0 and from K on hold nothing.
+        The row.
     """
-    rows, reach, width = p.shape[0], half.size - 1, half[0]
+    reach, width = half.size - 1, half[0]
     for i in range(t.size):
-        t[i] = box[i]
-    for a in range(inner + 1, width + 1):
+        t[i] = square[i]
+    a = inner + 1
+    while a <= width:
         w = high[a]
-        _add_columns(t, q[max(y - w, 0)], q[min(y + w + 1, rows)], width - a, width + a)
+        upper, lower = q[max(y - w, 0)], q[min(y + w + 1, rows)]
+        if a < width:
+            v = high[a + 1]
+            _add_column_pairs(
+                t, upper, lower, q[max(y - v, 0)], q[min(y + v + 1, rows)], width - a, width + a
+            )
+            a += 2
+        else:
+            _add_columns(t, upper, lower, width - a, width + a)
+            a += 1
     a = inner + 1
     while a <= reach:
         w = half[a]
         if a < reach and y - a - 1 >= 0 and y + a + 1 < rows:
             v = half[a + 1]
-            _add_two_runs(
+            _add_runs(
                 t, p[y - a], p[y + a], p[y - a - 1], p[y + a + 1],
                 width - w, width + w + 1, width - v, width + v + 1,
             )  # fmt: skip
             a += 2
             continue
         if y - a >= 0:
-            _add_run(t, p[y - a], width - w, width + w + 1, 1)
+            _add_run(t, p[y - a], width - w, width + w + 1)
         if y + a < rows:
-            _add_run(t, p[y + a], width - w, width + w + 1, 1)
+            _add_run(t, p[y + a], width - w, width + w + 1)
         a += 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _move_box(box: Any, p: Any, inner: Any, width: Any, y: Any, first: Any) -> None:
-    """Move the square's sums to row `y`, or begin them there."""
-    rows = p.shape[0]
+def _square_row(
+    square: Any, p: Any, nothing: Any, inner: Any, width: Any, rows: Any, y: Any, first: Any
+) -> None:
+    """Move the square's sums down to row `y`, or begin them there."""
+    left, right = width - inner, width + inner + 1
     if first:
-        box[:] = 0.0
+        square[:] = 0.0
         for k in range(max(y - inner, 0), min(y + inner + 1, rows)):
-            _add_run(box, p[k], width - inner, width + inner + 1, 1)
+            _move_square(square, p[k], nothing, left, right)
         return
-    if y + inner < rows:
-        _add_run(box, p[y + inner], width - inner, width + inner + 1, 1)
-    if y - inner - 1 >= 0:
-        _add_run(box, p[y - inner - 1], width - inner, width + inner + 1, -1)
+    new = p[y + inner] if y + inner < rows else nothing
+    old = p[y - inner - 1] if y - inner - 1 >= 0 else nothing
+    _move_square(square, new, old, left, right)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _counts(h: Any, valid: Any, masked: Any, y: Any, x: Any) -> Any:
     """Return whether a pixel counts."""
     return np.isfinite(h[y, x]) and (not masked or valid[y, x] != 0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})
+def _sum_about(row: Any, about: Any) -> Any:
+    """Return the sum of the differences from a value."""
+    total = 0.0
+    for i in range(row.size):
+        total += np.float64(row[i]) - about
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="never")
+def _powers(out: Any, row: Any, about: Any, moment: Any) -> None:
+    """Write differences from a value, or their squares."""
+    if moment == 0:
+        for i in range(row.size):
+            out[i] = np.float64(row[i]) - about
+    else:
+        for i in range(row.size):
+            d = np.float64(row[i]) - about
+            out[i] = d * d
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="never")
+def _add_down(running: Any, new: Any, out: Any) -> None:
+    """Go one row down with sums down columns."""
+    for i in range(new.size):
+        running[i] += new[i]
+        out[i] = running[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="never")
+def _along(v: Any, r0: Any, r1: Any, r2: Any, r3: Any) -> Any:
+    """Write the sums along four rows, before each entry and after the last; return the largest."""
+    n = v.shape[1]
+    v0, v1, v2, v3 = v[0], v[1], v[2], v[3]
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        r0[i], r1[i], r2[i], r3[i] = s0, s1, s2, s3
+        s0 += v0[i]
+        s1 += v1[i]
+        s2 += v2[i]
+        s3 += v3[i]
+    for i in range(n, r0.size):
+        r0[i], r1[i], r2[i], r3[i] = s0, s1, s2, s3
+    return max(max(s0, s1), max(s2, s3))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="never")
+def _finish(
+    s1: Any, s2: Any, whole: Any, about: Any, trusted: Any, blur1: Any, blur2: Any, unit: Any,
+    mean: Any, deviation: Any,
+) -> Any:  # fmt: skip
+    """Write mean and deviation of a row of whole discs; return how many need another look."""
+    doubtful = 0
+    per = 1.0 / whole
+    for i in range(mean.size):
+        m = np.float64(s1[i]) * per
+        squares = np.float64(s2[i]) * per
+        v = squares - m * m
+        doubt = blur2 + 2.0 * abs(m) * blur1 + 4.0 * unit * whole * squares
+        doubtful += whole * v * trusted < doubt
+        mean[i] = about + m
+        deviation[i] = np.sqrt(v if v > 0.0 else 0.0)
+    return doubtful
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -173,83 +264,98 @@ def disc_moments(
         y1, x1 = min(rows, y0 + tall), min(columns, x0 + wide)
         k0, k1 = max(0, y0 - reach), min(rows, y1 + reach)
         c0, c1 = max(0, x0 - width), min(columns, x1 + width)
-        seen = 0
-        first, total = 0.0, 0.0
-        for k in range(k0, k1):
-            for c in range(c0, c1):
-                if _counts(h, valid, masked, k, c):
-                    if seen == 0:
-                        first = np.float64(h[k, c])
-                    seen += 1
-                    total += h[k, c] - first
+        n, seeable = x1 - x0, (k1 - k0) * (c1 - c0)
+        first = np.float64(h[k0, c0])
+        seen, total = 0, 0.0
+        if not masked:
+            for k in range(k0, k1):
+                total += _sum_about(h[k, c0:c1], first)
+            seen = seeable
+        every = not masked and np.isfinite(total)
+        if not every:
+            seen, total = 0, 0.0
+            for k in range(k0, k1):
+                for c in range(c0, c1):
+                    if _counts(h, valid, masked, k, c):
+                        if seen == 0:
+                            first = np.float64(h[k, c])
+                        seen += 1
+                        total += np.float64(h[k, c]) - first
+            every = seen == seeable
         if seen == 0:
-            for y in range(y0, y1):
-                for x in range(x0, x1):
-                    mean[y, x] = np.nan
-                    deviation[y, x] = np.nan
-                    count[y, x] = 0
+            mean[y0:y1, x0:x1] = np.nan
+            deviation[y0:y1, x0:x1] = np.nan
+            count[y0:y1, x0:x1] = 0
             continue
         about = first + total / seen
-        every = seen == (k1 - k0) * (c1 - c0)
-        partial = seen < (y1 - y0 + 2 * reach) * (x1 - x0 + 2 * width)
-        n = x1 - x0
+        partial = seen < (y1 - y0 + 2 * reach) * (n + 2 * width)
         length = n + 2 * width + 1  # entry j: column x0 - width + j
         skip = c0 - (x0 - width)
         moments = 3 if partial else 2
-        sums = np.empty((moments, y1 - y0, n))
-        p = np.zeros((k1 - k0, length), h.dtype)
-        q = np.zeros((k1 - k0 + 1, length), h.dtype)
-        running = np.empty(length)
-        box = np.empty(n)
-        t = np.empty(n, h.dtype)
+        high_rows = k1 - k0
+        sums = np.empty((moments, y1 - y0, n), h.dtype)
+        p = np.zeros(((high_rows + 3) // 4 * 4, length), h.dtype)
+        q = np.zeros((high_rows + 1, length), h.dtype)
+        nothing = np.zeros(length, h.dtype)
+        v = np.empty((4, c1 - c0))
+        running = np.empty(c1 - c0)
+        square = np.empty(n)
         largest = 0.0
         for moment in range(moments):
             running[:] = 0.0
-            for k in range(k0, k1):
-                total = 0.0
-                r = p[k - k0]
-                for c in range(c0, c1):
-                    j = c - c0 + skip
-                    r[j] = total
-                    value = 0.0
-                    if every or _counts(h, valid, masked, k, c):
-                        d = h[k, c] - about
-                        value = d if moment == 0 else (d * d if moment == 1 else 1.0)
-                    total += value
-                    running[j] += value
-                for j in range(c1 - c0 + skip, length):
-                    r[j] = total
-                s = q[k - k0 + 1]
-                for j in range(length):
-                    s[j] = running[j]
+            for k in range(0, high_rows, 4):
+                for b in range(4):
+                    if k + b >= high_rows:
+                        v[b] = 0.0
+                        continue
+                    if every and moment < 2:
+                        _powers(v[b], h[k0 + k + b, c0:c1], about, moment)
+                    elif every:
+                        v[b] = 1.0
+                    else:
+                        for c in range(c0, c1):
+                            value = 0.0
+                            if _counts(h, valid, masked, k0 + k + b, c):
+                                d = np.float64(h[k0 + k + b, c]) - about
+                                value = d if moment == 0 else (d * d if moment == 1 else 1.0)
+                            v[b, c - c0] = value
+                    _add_down(running, v[b], q[k + b + 1, skip:])
+                most = _along(v, p[k, skip:], p[k + 1, skip:], p[k + 2, skip:], p[k + 3, skip:])
                 if moment == 1:
-                    largest = max(largest, total)
+                    largest = max(largest, most)
             if moment == 1:
-                for j in range(length):
-                    largest = max(largest, running[j])
-            for y in range(y0, y1):
-                _move_box(box, p, inner, width, y - k0, y == y0)
-                _disc_row(t, box, p, q, half, high, inner, y - k0)
-                sums[moment, y - y0] = t
+                for value in running:
+                    largest = max(largest, value)
+            for y in range(y0 - k0, y1 - k0):
+                _square_row(square, p, nothing, inner, width, high_rows, y, y == y0 - k0)
+                _disc_row(sums[moment, y + k0 - y0], square, p, q, half, high, inner, high_rows, y)
         # what rounding of the stored sums may have done to a disc's sum of squares and sum
         unit = np.finfo(h.dtype).eps
         chain = 0.5 * unit * np.sqrt(4.0 * (reach + width))
         blur2 = chain * largest
-        blur1 = chain * np.sqrt(max(length, k1 - k0) * largest)
+        blur1 = chain * np.sqrt(max(length, high_rows) * largest)
         for y in range(y0, y1):
+            s1, s2 = sums[0, y - y0], sums[1, y - y0]
+            if not partial:
+                count[y, x0:x1] = whole
+                doubtful = _finish(
+                    s1, s2, np.float64(whole), about, trusted, blur1, blur2, unit,
+                    mean[y, x0:x1], deviation[y, x0:x1],
+                )  # fmt: skip
+                if doubtful == 0:
+                    continue
             for i in range(n):
-                held = np.int64(sums[2, y - y0, i]) if partial else whole
+                held = np.int64(sums[moments - 1, y - y0, i]) if partial else whole
                 count[y, x0 + i] = held
                 if held == 0:
                     mean[y, x0 + i] = np.nan
                     deviation[y, x0 + i] = np.nan
                     continue
-                m = sums[0, y - y0, i] / held
-                squares = sums[1, y - y0, i] / held
-                v = squares - m * m
+                m = np.float64(s1[i]) / held
+                squares = np.float64(s2[i]) / held
+                variance = squares - m * m
                 doubt = blur2 + 2.0 * abs(m) * blur1 + 4.0 * unit * held * squares
-                if held * v * trusted < doubt:
-                    mean[y, x0 + i], v = _directly(h, valid, masked, half, y, x0 + i)
-                else:
-                    mean[y, x0 + i] = about + m
-                deviation[y, x0 + i] = np.sqrt(max(v, 0.0))
+                mean[y, x0 + i] = about + m
+                if held * variance * trusted < doubt:
+                    mean[y, x0 + i], variance = _directly(h, valid, masked, half, y, x0 + i)
+                deviation[y, x0 + i] = np.sqrt(max(variance, 0.0))

@@ -22,8 +22,10 @@ TRUSTED: Final = {np.dtype(np.float32): 2.0e-4, np.dtype(np.float64): 2.0e-7}
 """Relative error of a variance by running sums, by the type of the map, above which a disc is
 summed by itself; half of it is that of the deviation."""
 
-_TILE: Final = (128, 512)
-"""Rows and columns that share a value to sum about; their sums fit a core's cache."""
+_WIDE: Final = 512
+"""Columns that share a value to sum about; the sums of a tile fit a core's cache."""
+_SMALL_PX: Final = 6.0
+"""A disc of smaller radius has too few digits left in float32 sums of its whole tile."""
 
 
 class DiscStatisticsError(ValueError):
@@ -87,8 +89,8 @@ def measure(
     ----------
     h
         Shape (H, W), any unit. float32 is summed in float32 about a value of its neighbourhood,
-        which leaves the deviation a relative error below 1e-4 (and 1e-7 of it to the mean);
-        anything else in float64, with 1e-7. What is not finite counts as missing.
+        which leaves the deviation a relative error below 1e-4; anything else, or in a disc of
+        less than 6 px, in float64, with 1e-7. What is not finite counts as missing.
     radius_px
         Radius of the disc, px; 0 is the pixel alone, and a disc may be larger than the map.
     valid
@@ -113,7 +115,7 @@ def measure(
     h = np.asarray(h)
     if h.ndim != 2 or not h.size:
         raise DiscStatisticsError(f"h: got shape {h.shape}, expected (H, W) with pixels")
-    if h.dtype != np.float32:
+    if h.dtype != np.float32 or radius_px < _SMALL_PX:
         h = np.asarray(h, np.float64)
     if valid is not None:
         valid = np.asarray(valid)
@@ -130,6 +132,6 @@ def measure(
     mask = np.zeros((1, 1), np.uint8) if valid is None else np.ascontiguousarray(valid)
     disc_kernels.disc_moments(
         np.ascontiguousarray(h), mask.view(np.uint8), valid is not None, half, high, inner,
-        *_TILE, TRUSTED[h.dtype], mean, deviation, count,
+        64 if radius_px <= 32.0 else 128, _WIDE, TRUSTED[h.dtype], mean, deviation, count,
     )  # fmt: skip
     return DiscStatistics(mean, deviation, count)
