@@ -1,0 +1,431 @@
+"""A block of skin pushed by a probe: finite elements whose surface strain drives microstructure.
+
+The patch of Nagano et al. 2015, fig. 14 (doi:10.1145/2766894): a coarse volume mesh gives the shape
+and the strain of the surface, the displacement map's convolution the relief at ten micrometres.
+
+The tissue is a compressible neo-Hookean solid with the energy
+``mu / 2 (|F|^2 - 3 - 2 ln J) + lambda / 2 (ln J)^2`` per neutral volume, for large deformations;
+for small ones it is linear elasticity. Pressure ``p = lambda ln J`` is a field of its own on MINI
+elements (Arnold, Brezzi and Fortin 1984, doi:10.1007/BF02576171), which do not lock as Poisson's
+number goes to 1/2. Forces are not asked for, so only Poisson's number matters. Newton's method, in
+steps of the push; scikit-fem assembles (the optional part ``fem``).
+
+Axes: x to the right and y up on the skin, z out of it; mm; the block's surface is z = 0.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse.linalg import splu
+
+from model import microstructure, strain_fields
+from model.microstructure import FOREHEAD, KernelTable, MeshStrain
+from skinrig.errors import MissingExtra
+
+Floats = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+Integers = NDArray[np.int64]
+
+DIVISIONS = (23, 23, 8)
+"""Boxes of six tetrahedra each: 25,392 in all, as many as the paper's mesh has, about."""
+MOST_ITERATIONS = 30
+SHORTEST_STEP = 1.0 / 64.0
+"""Of the push, below which a step that does not converge ends the search."""
+TOLERANCE = 1e-7
+"""Of the displacement's last correction, of the block's width."""
+
+
+class PushError(ValueError):
+    """A block or a push that makes no sense."""
+
+
+class PushDiverged(PushError, ArithmeticError):
+    """Newton's method found no equilibrium: the push is too strong for the mesh."""
+
+
+@dataclass(frozen=True, slots=True)
+class SkinBlock:
+    """A block of tissue, held below and at its sides."""
+
+    width_mm: float = 10.0
+    """Side of its square surface, mm, > 0."""
+    depth_mm: float = 4.0
+    """Thickness, mm, > 0."""
+    poisson: float = 0.49
+    """Poisson's number, 0.01 to 0.5; 0.5 keeps every volume."""
+    divisions: tuple[int, int, int] = DIVISIONS
+    """Boxes along x, y and z, each of six tetrahedra."""
+
+    def __post_init__(self) -> None:
+        for name in ("width_mm", "depth_mm"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise PushError(f"{name}: got {getattr(self, name)}, expected above 0")
+        if not 0.01 <= self.poisson <= 0.5:
+            raise PushError(f"poisson: got {self.poisson}, expected 0.01 to 0.5")
+        if len(self.divisions) != 3 or not all(1 <= n <= 64 for n in self.divisions):
+            raise PushError(f"divisions: got {self.divisions}, expected three of 1...64")
+
+    @property
+    def inverse_lambda(self) -> float:
+        """Lame's first parameter inverted, for a shear modulus of 1."""
+        return (1.0 - 2.0 * self.poisson) / (2.0 * self.poisson)
+
+
+@dataclass(frozen=True, slots=True)
+class Push:
+    """A probe with a round tip that is stuck to the skin and moves it."""
+
+    contact_mm: float = 1.2
+    """Radius of the skin that is stuck to the tip, mm, > 0."""
+    tip_mm: float = 4.0
+    """Radius of the tip's sphere, mm, >= ``contact_mm``."""
+    depth_mm: float = 0.8
+    """How far the tip's lowest point goes in, mm; below 0 it pulls."""
+    shift_mm: tuple[float, float] = (0.8, 0.0)
+    """How far it goes along x and y, mm."""
+    centre_mm: tuple[float, float] = (0.0, 0.0)
+    """Where it touches, mm from the middle of the block."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.contact_mm <= self.tip_mm < math.inf:
+            raise PushError(
+                f"contact_mm, tip_mm: got {self.contact_mm}, {self.tip_mm}, "
+                "expected 0 < contact <= tip"
+            )
+        if not np.isfinite([self.depth_mm, *self.shift_mm, *self.centre_mm]).all():
+            raise PushError("depth_mm, shift_mm, centre_mm: got NaN or infinity")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PushedPatch:
+    """The block's equilibrium."""
+
+    rest_mm: Floats
+    """(V, 3) nodes before."""
+    deformed_mm: Floats
+    """(V, 3) nodes after."""
+    tetrahedra: Integers
+    """(T, 4) nodes."""
+    surface: Integers
+    """(F, 3) nodes of the triangles at z = 0, counterclockwise from outside."""
+    width_mm: float
+    """Side of the surface, mm."""
+    iterations: int
+    """Newton's corrections in all."""
+
+    @property
+    def uv(self) -> Floats:
+        """(V, 2) texture coordinates of the nodes: u to the right, v up, 0 to 1."""
+        return self.rest_mm[:, :2] / self.width_mm + 0.5
+
+    @property
+    def volume_ratio(self) -> float:
+        """Volume of all tetrahedra after the push, over that before."""
+        after, before = (self._volumes(nodes) for nodes in (self.deformed_mm, self.rest_mm))
+        return float(after.sum() / before.sum())
+
+    def _volumes(self, nodes: Floats) -> Floats:
+        corner = nodes[self.tetrahedra]
+        return np.abs(np.linalg.det(corner[:, 1:] - corner[:, :1])) / 6.0
+
+    def strain(self) -> MeshStrain:
+        """Return the strain of the surface, on the nodes of the whole mesh."""
+        return microstructure.strain(self.rest_mm, self.deformed_mm, self.surface, self.uv)
+
+    def convolve(
+        self, height_um: ArrayLike, *, table: KernelTable = FOREHEAD
+    ) -> tuple[Float32Array, strain_fields.TextureStrain]:
+        """Convolve a displacement map of the surface by the strain of the push.
+
+        Parameters
+        ----------
+        height_um : array_like, shape (N, N)
+            Neutral map of the whole surface, um; row 0 is its +y side.
+        table : KernelTable
+            Kernels by stretch; the paper's forehead by default.
+
+        Returns
+        -------
+        height_um : ndarray of float32, shape (N, N)
+        strain : model.strain_fields.TextureStrain
+            Ratios and axes at its pixels.
+        """
+        height = np.asarray(height_um, np.float32)
+        if height.ndim != 2 or height.shape[0] != height.shape[1]:
+            raise PushError(f"height_um: got shape {height.shape}, expected (N, N)")
+        field = strain_fields.rasterize(self.strain(), self.surface, self.uv, height.shape)
+        s, t = strain_fields.line_kernels(field, table)
+        moved = microstructure.convolve(
+            height, s.axis, t.axis, s.alpha, s.sigma_px, t.alpha, t.sigma_px
+        )
+        return moved, field
+
+
+def push(block: SkinBlock, probe: Push, *, steps: int = 4) -> PushedPatch:
+    """Push a block of skin and return its equilibrium.
+
+    Parameters
+    ----------
+    block : SkinBlock
+    probe : Push
+    steps : int
+        Parts of the push that are solved one after the other; halved where one does not converge.
+
+    Returns
+    -------
+    PushedPatch
+
+    Raises
+    ------
+    PushError
+        For a probe that does not touch the block's surface within its edges.
+    PushDiverged
+        When no equilibrium is found.
+    skinrig.errors.MissingExtra
+        Without scikit-fem: the optional part ``fem``.
+    """
+    mesh = _mesh(block)
+    nodes = mesh.p.T
+    away = nodes[:, :2] - np.asarray(probe.centre_mm)
+    distance = np.hypot(away[:, 0], away[:, 1])
+    half = 0.5 * block.width_mm
+    touched = (nodes[:, 2] > -1e-9) & (distance <= probe.contact_mm + 1e-9)
+    edge = (np.abs(nodes[:, :2]) > half - 1e-9).any(axis=1)
+    held = (nodes[:, 2] < 1e-9 - block.depth_mm) | edge
+    if not touched.any() or (touched & held).any():
+        raise PushError(
+            "centre_mm, contact_mm: expected a contact within the block's edges that has at least "
+            "one node of its surface"
+        )
+    given = np.full(nodes.shape, np.nan)
+    given[held] = 0.0
+    given[touched, :2] = probe.shift_mm
+    given[touched, 2] = (
+        probe.tip_mm - np.sqrt(probe.tip_mm**2 - distance[touched] ** 2) - probe.depth_mm
+    )
+    return solve(block, given, steps=steps)
+
+
+def solve(block: SkinBlock, given_mm: ArrayLike, *, steps: int = 4) -> PushedPatch:
+    """Return the equilibrium of a block some of whose nodes' displacements are given.
+
+    Parameters
+    ----------
+    block : SkinBlock
+    given_mm : array_like, shape (V, 3)
+        Displacements of the nodes (those of ``solve(...).rest_mm``), mm; NaN: free.
+    steps : int
+        Parts in which they are brought about, >= 1.
+
+    Raises
+    ------
+    PushError, PushDiverged, skinrig.errors.MissingExtra
+        As of :func:`push`.
+    """
+    tissue = _Tissue(block)
+    given = np.asarray(given_mm, np.float64)
+    if given.shape != tissue.nodes.shape:
+        raise PushError(f"given_mm: got shape {given.shape}, expected {tissue.nodes.shape}")
+    if np.isinf(given).any() or np.isnan(given).all():
+        raise PushError("given_mm: expected finite displacements of some nodes")
+    if not 1 <= steps <= 1000:
+        raise PushError(f"steps: got {steps}, expected 1...1000")
+    state = tissue.neutral()
+    reached, step, iterations = 0.0, 1.0 / steps, 0
+    while reached < 1.0 - 1e-12:
+        target = min(1.0, reached + step)
+        found, count = tissue.equilibrium(state, given * target)
+        iterations += count
+        if found is None:
+            step *= 0.5
+            if step < SHORTEST_STEP / steps:
+                raise PushDiverged(
+                    f"push: found no equilibrium beyond {100 * reached:.0f} % of it, expected a "
+                    "weaker push, a finer mesh or a wider contact"
+                )
+        else:
+            state, reached = found, target
+    return PushedPatch(
+        rest_mm=tissue.nodes,
+        deformed_mm=tissue.nodes + state.nodes_mm,
+        tetrahedra=tissue.corners,
+        surface=_surface(tissue.mesh),
+        width_mm=block.width_mm,
+        iterations=iterations,
+    )
+
+
+def _fem() -> Any:
+    try:
+        import skfem
+    except ImportError as error:
+        raise MissingExtra("a pushed patch of skin", "fem") from error
+    return skfem
+
+
+def _mesh(block: SkinBlock) -> Any:
+    half = 0.5 * block.width_mm
+    nx, ny, nz = block.divisions
+    return _fem().MeshTet.init_tensor(
+        np.linspace(-half, half, nx + 1),
+        np.linspace(-half, half, ny + 1),
+        np.linspace(-block.depth_mm, 0.0, nz + 1),
+    )
+
+
+def _surface(mesh: Any) -> Integers:
+    """Return the triangles at z = 0, counterclockwise from outside."""
+    facets = mesh.facets.T
+    faces = np.asarray(facets[(mesh.p[2][facets] > -1e-9).all(axis=1)], np.int64)
+    a, b, c = (mesh.p[:2, faces[:, k]].T for k in range(3))
+    turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    faces[turn < 0] = faces[turn < 0][:, ::-1]
+    return faces
+
+
+class _Tissue:
+    """Forces and stiffness of one block; the bubbles of MINI elements are solved for in each.
+
+    Within an element the unknowns are the displacements of its 4 corners and its bubble, (5, 3),
+    and the pressure at its corners, (4,), for a shear modulus of 1.
+    """
+
+    def __init__(self, block: SkinBlock) -> None:
+        fem = _fem()
+        self.mesh = _mesh(block)
+        self.nodes = np.ascontiguousarray(self.mesh.p.T)
+        self.corners = np.ascontiguousarray(self.mesh.t.T, np.int64)
+        self.inverse_lambda = block.inverse_lambda
+        self.tolerance_mm = TOLERANCE * block.width_mm
+        bubble = fem.Basis(self.mesh, fem.ElementTetMini(), intorder=5)
+        linear = bubble.with_element(fem.ElementTetP1())
+        # (T, Q, 5, 3) gradients, (Q, 4) values, (T, Q) weights
+        self.gradients = np.stack([b[0].grad for b in bubble.basis]).transpose(2, 3, 0, 1).copy()
+        self.values = np.stack([np.asarray(b[0])[0] for b in linear.basis], axis=1)
+        self.weights = np.asarray(bubble.dx)
+        count = len(self.nodes)
+        self.places = np.concatenate(
+            [
+                (3 * self.corners[:, :, None] + np.arange(3)).reshape(-1, 12),
+                3 * count + self.corners,
+            ],
+            axis=1,
+        )
+
+    def neutral(self) -> _State:
+        """Return the state without displacement and pressure."""
+        return _State(
+            np.zeros_like(self.nodes), np.zeros((len(self.corners), 3)), np.zeros(len(self.nodes))
+        )
+
+    def equilibrium(self, begin: _State, given: Floats) -> tuple[_State | None, int]:
+        """Return the equilibrium with given displacements, or None, and corrections made."""
+        known = np.isfinite(given)
+        free = np.concatenate([~known.reshape(-1), np.ones(len(self.nodes), bool)])
+        first = np.zeros(free.size)
+        first[: -len(self.nodes)][known.reshape(-1)] = (given - begin.nodes_mm)[known]
+        state = begin
+        for count in range(1, MOST_ITERATIONS + 1):
+            system = self._system(state)
+            if system is None:
+                return None, count
+            matrix, force, bubbles = system
+            step = first if count == 1 else np.zeros(free.size)
+            right = -force - matrix @ step
+            inner = matrix[free][:, free].tocsc()
+            step = step.copy()
+            factors = splu(
+                inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01,
+                options={"SymmetricMode": True},
+            )  # fmt: skip
+            step[free] = factors.solve(right[free])
+            moves = step[: 3 * len(self.nodes)].reshape(-1, 3)
+            local = step[self.places]
+            by_bubble, own = bubbles
+            state = _State(
+                state.nodes_mm + moves,
+                state.bubbles_mm - own - (by_bubble @ local[..., None])[..., 0],
+                state.pressure + step[3 * len(self.nodes) :],
+            )
+            if not np.isfinite(step).all():
+                return None, count
+            if np.abs(moves).max() < self.tolerance_mm:
+                return state, count
+        return None, MOST_ITERATIONS
+
+    def _system(self, state: _State) -> tuple[Any, Floats, tuple[Floats, Floats]] | None:
+        """Return stiffness, forces, and how bubbles follow; None where an element is turned over.
+
+        Of each element, with H the gradients on the deformed block: force
+        ``F G - (1 - p) H``, stiffness ``G.G + (1 - p) H H`` with both indices exchanged.
+        """
+        moves = np.concatenate([state.nodes_mm[self.corners], state.bubbles_mm[:, None]], axis=1)
+        deformation = moves.transpose(0, 2, 1)[:, None] @ self.gradients + np.eye(3)
+        ratio, inverse = _inverted(deformation)
+        if not (ratio > 0).all():
+            return None
+        spatial = self.gradients @ inverse
+        pressure = state.pressure[self.corners] @ self.values.T
+        elements, points = self.weights.shape
+        less = self.weights * (1.0 - pressure)
+        flat = spatial.reshape(elements, points, 15)
+        plain = self.gradients.transpose(0, 2, 1, 3).reshape(elements, 5, -1)
+        weighed = (self.gradients * self.weights[..., None, None]).transpose(0, 2, 1, 3)
+        weighed = weighed.reshape(elements, 5, -1)
+        turned = deformation.transpose(0, 1, 3, 2).reshape(elements, -1, 3)
+        force_u = (weighed @ turned).reshape(elements, 15)
+        force_u -= (less[:, None] @ flat)[:, 0]
+        crossed = (flat.transpose(0, 2, 1) * less[:, None]) @ flat
+        stiff = np.ascontiguousarray(crossed.reshape(elements, 5, 3, 5, 3).transpose(0, 1, 4, 3, 2))
+        along = weighed @ plain.transpose(0, 2, 1)
+        for axis in range(3):
+            stiff[:, :, axis, :, axis] += along
+        tested = self.weights[..., None] * self.values
+        coupling = tested.transpose(0, 2, 1) @ flat
+        mass = tested.transpose(0, 2, 1) @ self.values
+        excess = np.log(ratio) - self.inverse_lambda * pressure
+        force_p = (excess[:, None] @ tested)[:, 0]
+        # whole element: 12 of corners, 3 of the bubble, 4 of the pressure
+        matrix = np.zeros((elements, 19, 19))
+        matrix[:, :15, :15] = stiff.reshape(elements, 15, 15)
+        matrix[:, 15:, :15] = coupling
+        matrix[:, :15, 15:] = coupling.transpose(0, 2, 1)
+        matrix[:, 15:, 15:] = -self.inverse_lambda * mass
+        force = np.concatenate([force_u, force_p], axis=1)
+        kept = np.r_[0:12, 15:19]
+        inside = np.linalg.inv(matrix[:, 12:15, 12:15])
+        follows = inside @ matrix[:, 12:15][:, :, kept]
+        own = (inside @ force[:, 12:15, None])[..., 0]
+        outer = matrix[:, kept][:, :, 12:15]
+        small = matrix[:, kept][:, :, kept] - outer @ follows
+        push = force[:, kept] - (outer @ own[..., None])[..., 0]
+        size = 4 * len(self.nodes)
+        rows = np.repeat(self.places, 16, axis=1).reshape(-1)
+        columns = np.tile(self.places, (1, 16)).reshape(-1)
+        whole = sparse.coo_matrix((small.reshape(-1), (rows, columns)), shape=(size, size))
+        total = np.bincount(self.places.reshape(-1), push.reshape(-1), minlength=size)
+        return whole.tocsr(), np.asarray(total, np.float64), (follows, own)
+
+
+def _inverted(matrices: Floats) -> tuple[Floats, Floats]:
+    """Return determinants and inverses of (..., 3, 3) matrices, by the cross products of rows."""
+    a, b, c = (matrices[..., row, :] for row in range(3))
+    columns = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
+    ratio = np.einsum("...i,...i->...", a, columns[..., 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return ratio, columns / ratio[..., None, None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """Displacements of nodes (V, 3) and bubbles (T, 3), mm; pressure (V,) per shear modulus."""
+
+    nodes_mm: Floats
+    bubbles_mm: Floats
+    pressure: Floats
