@@ -1,0 +1,86 @@
+"""Reliefs under strain by kernels, against skin whose stiff layer came to rest; two passes as one.
+
+Rationale: the truth minimises the energy of a layer on soft tissue and knows of no kernel. Kernels
+are fitted to other patches of the same site, as from caliper sessions.
+Expected: the distribution of normals comes nearer to the truth's than a relief that does not
+change, under every stretch; kernels of the opposite strain take it farther away.
+"""
+
+import numpy as np
+import pytest
+
+from reconstruction import normal_histogram
+from rigsim.microrelief import make_micro_skin
+from rigsim.skin_stretch import deform
+from skinrig.bench_microstructure import (
+    TEXEL_UM,
+    fitted_table,
+    slopes_under,
+    strained_relief,
+    two_passes_error,
+)
+
+
+def skin(seed, size_mm=2.0):
+    return make_micro_skin("forehead", seed=seed, size_mm=size_mm, texel_um=TEXEL_UM)
+
+
+def off(truth, relief, state):
+    return normal_histogram.distance(
+        normal_histogram.from_slopes(*slopes_under(truth, state)),
+        normal_histogram.from_slopes(*slopes_under(relief, state)),
+    )
+
+
+@pytest.fixture(scope="module")
+def table():
+    return fitted_table([skin(1)], (0.8, 0.9, 1.1, 1.22), every=2)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("angle_deg", [0.0, 35.0])
+@pytest.mark.parametrize("stretch", [0.84, 1.18])
+def test_fitted_kernels_bring_normals_nearer_to_those_of_settled_skin(table, stretch, angle_deg):
+    unseen = skin(5)
+    state = deform(unseen, stretch=stretch, angle_deg=angle_deg, compensation="none")
+    static = off(state.height_um, unseen.height_um, state)
+    # two patches of one kind of skin differ by about 0.05 already
+    assert (
+        off(state.height_um, strained_relief(unseen, state, table, "cubic"), state) < 0.6 * static
+    )
+    opposite = deform(unseen, stretch=2.0 - stretch, angle_deg=angle_deg, compensation="none")
+    wrong = strained_relief(unseen, opposite, table, "cubic")
+    assert off(state.height_um, wrong, state) > 1.2 * static
+
+
+@pytest.mark.long
+def test_stretched_skin_is_smoother_and_compressed_rougher_along_the_jaws_only(table):
+    unseen = skin(6)
+    before = slopes_under(unseen.height_um, deform(unseen, stretch=1.0, angle_deg=0.0))
+    for stretch in (0.84, 1.18):
+        state = deform(unseen, stretch=stretch, angle_deg=0.0, compensation="none")
+        after = slopes_under(strained_relief(unseen, state, table, "cubic"), state)
+        truth = slopes_under(state.height_um, state)
+        along, across = (np.log(after[i].var() / before[i].var()) for i in (0, 1))
+        assert np.sign(along) == np.sign(1.0 - stretch)
+        assert abs(across) < 0.5 * abs(along)
+        assert abs(np.log(after[0].var() / truth[0].var())) < 0.5 * abs(along)
+
+
+def test_where_nothing_varies_two_passes_are_the_two_dimensional_convolution(rng):
+    for sigma_px, limit in ((1.5, 0.008), (3.0, 0.002)):
+        error, _ = two_passes_error(turn=0.0, growth=0.0, sigma_px=sigma_px, rng=rng)
+        assert error < limit
+
+
+def test_the_error_of_two_passes_grows_as_fast_as_kernels_vary():
+    def error(turn, growth):
+        rng = np.random.default_rng(3)  # the same waves for all
+        return two_passes_error(turn=turn, growth=growth, side=120, rng=rng)[0]
+
+    turning = [error(turn, 0.0) for turn in (0.05, 0.1, 0.2)]
+    # to first order proportional to the turn; a sampling error would not grow at all
+    assert turning[1] / turning[0] == pytest.approx(2.0, rel=0.25)
+    assert turning[2] / turning[1] == pytest.approx(2.0, rel=0.25)
+    assert error(0.0, 0.04) < 0.02
+    assert error(0.0, 0.2) > 3.0 * error(0.0, 0.04)
