@@ -219,12 +219,13 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
     seen = good if melanin.valid is None else good & melanin.valid
     done.maps["melanin"] = melanin
     done.maps["color"] = SkinMap(
-        _color(melanin.values, held, seen), "1", None, seen,
+        colors(melanin.values, held, seen), "1", None, seen,
         f"diffuse reflectance as {OBSERVER} under {LIGHT}, white = 1",
     )  # fmt: skip
 
 
-def _color(melanin: Any, hemoglobin: Any, seen: Any) -> Any:
+def colors(melanin: Any, hemoglobin: Any, seen: Any) -> Any:
+    """Return diffuse reflectance of skin, (H, W, 3), as `OBSERVER` under `LIGHT`; 0 outside."""
     table = color_table.build(OBSERVER, LIGHT, anisotropy=ANISOTROPY_SKIN)
     color = np.zeros((*seen.shape, 3), np.float32)
     color[seen] = table.lookup(melanin[seen], hemoglobin[seen])

@@ -93,7 +93,7 @@ def add(out: Path, name: str, part: Part) -> SkinAppearance:
     left_out: list[tuple[str, str]] = []
     sources, seed = {part.source}, part.seed
     if previous is not None:
-        for other, entry in _parts_of(previous).items():
+        for other, entry in parts_of(previous).items():
             if other == name:
                 continue
             parts[other] = entry
@@ -140,7 +140,7 @@ def read(path: Path, *, parts: Sequence[str] = PARTS) -> tuple[SkinAppearance, d
         It holds none of them.
     """
     appearance = store.read(path)
-    found = _parts_of(appearance) if appearance.parameters.get("kind") == KIND else {}
+    found = parts_of(appearance) if appearance.parameters.get("kind") == KIND else {}
     if not set(parts) & set(found):
         commands = " or ".join(f"`{FIT_COMMANDS[name]}`" for name in parts)
         raise DynamicAppearanceError(
@@ -162,6 +162,7 @@ def _previous(out: Path) -> SkinAppearance | None:
     return store.read(out)
 
 
-def _parts_of(appearance: SkinAppearance) -> dict[str, Any]:
+def parts_of(appearance: SkinAppearance) -> dict[str, Any]:
+    """Return what an appearance says of its parts, by name; empty where it has none."""
     parts = appearance.parameters.get("parts")
     return dict(parts) if isinstance(parts, dict) else {}

@@ -15,6 +15,7 @@ from model import store
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.flash_stages import NOISE_STDERR
 from skinrig import (
+    dynamic_section,
     evaluation,
     figures,
     microrelief_section,
@@ -23,6 +24,7 @@ from skinrig import (
     subsurface_section,
     surface_section,
 )
+from skinrig.dynamic_appearance import parts_of
 
 
 class ReportError(ValueError):
@@ -96,6 +98,9 @@ def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
     sections: list[str] = []
     appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
     for name, appearance in appearances.items():
+        if dynamic_section.is_dynamic(appearance):
+            sections.append(_dynamic_section(name, appearance, found, checks))
+            continue
         truth_path = _truth_of(appearance, found)
         truth = store.read(truth_path) if truth_path else None
         sections.append(_appearance_section(name, appearance, truth, checks))
@@ -179,12 +184,31 @@ def _appearance_section(
         body += "<h3>Assumed</h3>" + page.table(("assumption",), [[text] for text in assumed])  # type: ignore[attr-defined]
     if appearance.left_out:
         body += "<h3>Left out</h3>" + page.table(("what", "why"), appearance.left_out)
-    body += "<h3>Provenance</h3>" + page.facts(
+    return body + "<h3>Provenance</h3>" + _provenance(appearance)
+
+
+def _dynamic_section(
+    name: str, appearance: SkinAppearance, found: Findings, checks: list[page.Check]
+) -> str:
+    part = parts_of(appearance).get("facial_color", {})
+    truths = {
+        state: store.read(found.truths[folder])
+        for state, folder in part.get("truth", {}).items()
+        if folder in found.truths
+    }
+    body = f"<h2>Moving face: {page.escape(name)}</h2>"
+    body += dynamic_section.section(name, appearance, truths, checks)
+    if appearance.left_out:
+        body += "<h3>Left out</h3>" + page.table(("what", "why"), appearance.left_out)
+    return body + "<h3>Provenance</h3>" + _provenance(appearance)
+
+
+def _provenance(appearance: SkinAppearance) -> str:
+    return page.facts(
         {"source": appearance.source, "seed": appearance.seed}
         | {f"input {k}": v[:16] for k, v in sorted(appearance.inputs.items())}
         | dict(sorted(appearance.versions.items()))
     )
-    return body
 
 
 NOISE_OF_IDENTIFIABILITY = 0.005
