@@ -195,6 +195,34 @@ def _finish(
     return doubtful
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="never", fastmath={"reassoc"})
+def _moments_of(row: Any, about: Any) -> Any:
+    """Return number, sum and sum of squares about a value of the finite entries."""
+    n, s1, s2 = 0, 0.0, 0.0
+    for i in range(row.size):
+        d = np.float64(row[i]) - about
+        finite = np.isfinite(d)
+        d = d if finite else 0.0
+        n += 1 if finite else 0
+        s1 += d
+        s2 += d * d
+    return n, s1, s2
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="never", fastmath={"reassoc"})
+def _valid_moments_of(row: Any, valid: Any, about: Any) -> Any:
+    """Do the work of `_moments_of` where an entry is valid."""
+    n, s1, s2 = 0, 0.0, 0.0
+    for i in range(row.size):
+        d = np.float64(row[i]) - about
+        held = np.isfinite(d) & (valid[i] != 0)
+        d = d if held else 0.0
+        n += 1 if held else 0
+        s1 += d
+        s2 += d * d
+    return n, s1, s2
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _directly(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any) -> Any:
     """Return mean and variance of one disc by summing its pixels about one of them."""
@@ -203,16 +231,34 @@ def _directly(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any) -> Any
     n, s1, s2, about = 0, 0.0, 0.0, 0.0
     for k in range(max(0, y - reach), min(rows, y + reach + 1)):
         w = half[abs(k - y)]
-        for c in range(max(0, x - w), min(columns, x + w + 1)):
-            if _counts(h, valid, masked, k, c):
-                if n == 0:
-                    about = np.float64(h[k, c])
-                d = h[k, c] - about
-                n += 1
-                s1 += d
-                s2 += d * d
+        low, end = max(0, x - w), min(columns, x + w + 1)
+        if n == 0:
+            while low < end and not _counts(h, valid, masked, k, low):
+                low += 1
+            if low == end:
+                continue
+            about = np.float64(h[k, low])
+        if masked:
+            row_n, row_1, row_2 = _valid_moments_of(h[k, low:end], valid[k, low:end], about)
+        else:
+            row_n, row_1, row_2 = _moments_of(h[k, low:end], about)
+        n += row_n
+        s1 += row_1
+        s2 += row_2
     m = s1 / n
     return about + m, max(s2 / n - m * m, 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _stays(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any, level: Any) -> Any:
+    """Return whether what a disc gains by a step to column `x` is all of one value."""
+    rows, columns = h.shape
+    reach = half.size - 1
+    for k in range(max(0, y - reach), min(rows, y + reach + 1)):
+        c = x + half[abs(k - y)]
+        if c < columns and h[k, c] != level and _counts(h, valid, masked, k, c):
+            return False
+    return True
 
 
 _SIGNATURES = [
@@ -344,18 +390,26 @@ def disc_moments(
                 )  # fmt: skip
                 if doubtful == 0:
                     continue
+            constant, level = False, 0.0  # whether the disc to the left is, and its value
             for i in range(n):
                 held = np.int64(sums[moments - 1, y - y0, i]) if partial else whole
                 count[y, x0 + i] = held
                 if held == 0:
                     mean[y, x0 + i] = np.nan
                     deviation[y, x0 + i] = np.nan
+                    constant = False
                     continue
                 m = np.float64(s1[i]) / held
                 squares = np.float64(s2[i]) / held
                 variance = squares - m * m
                 doubt = blur2 + 2.0 * abs(m) * blur1 + 4.0 * unit * held * squares
                 mean[y, x0 + i] = about + m
-                if held * variance * trusted < doubt:
-                    mean[y, x0 + i], variance = _directly(h, valid, masked, half, y, x0 + i)
+                if held * variance * trusted >= doubt:
+                    constant = False
+                elif constant and _stays(h, valid, masked, half, y, x0 + i, level):
+                    mean[y, x0 + i], variance = level, 0.0
+                else:
+                    level, variance = _directly(h, valid, masked, half, y, x0 + i)
+                    mean[y, x0 + i] = level
+                    constant = variance == 0.0
                 deviation[y, x0 + i] = np.sqrt(max(variance, 0.0))
