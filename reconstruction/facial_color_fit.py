@@ -21,15 +21,24 @@ from model import color_table
 from model.facial_color import HemoglobinRig
 from model.skin import UNITS, SkinMap
 from model.tissue_optics import ANISOTROPY_SKIN
-from reconstruction import expression_alignment, model_error, shading_prior, shared_melanin
+from reconstruction import (
+    expression_alignment,
+    model_error,
+    repeatability,
+    shading_prior,
+    shared_melanin,
+)
 from reconstruction.detectability import detectable
 from reconstruction.expression_alignment import Alignment
 from reconstruction.flash_stages import EXPOSURE_SPREAD
+from reconstruction.repeatability import Drift, Repeatability, RepeatabilityError
 from reconstruction.shared_melanin import SharedMelanin
 from reconstruction.state_images import NEUTRAL, Landmarks, StateImage, Subject
 
 Mask = NDArray[np.bool_]
 
+CORRELATED_PX: Final = 3.0
+"""Pixels whose noise goes together after demosaicing and interpolation."""
 RADIUS_SHARE: Final = 1 / 32
 """Radius of the disc over the larger side of the map, where none is given."""
 
@@ -61,6 +70,22 @@ class AlignedImage:
     alignment: Alignment | None
 
 
+@dataclass(frozen=True, slots=True)
+class Repeats:
+    """How far repeats of states agree, each image inverted by itself.
+
+    Attributes
+    ----------
+    hemoglobin
+        Repeats against states.
+    melanin_drift
+        Of melanin over the time of capture, by region; empty where it cannot be told.
+    """
+
+    hemoglobin: Repeatability
+    melanin_drift: tuple[Drift, ...]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FacialColorFit:
     """What sessions of one subject give.
@@ -79,6 +104,8 @@ class FacialColorFit:
         Every image.
     shared
         The joint inversion.
+    repeats
+        How far states repeat; None where none was captured twice.
     left_out
         What was not used, and why.
     """
@@ -89,6 +116,7 @@ class FacialColorFit:
     changes: Mapping[str, SkinMap]
     aligned: tuple[AlignedImage, ...]
     shared: SharedMelanin
+    repeats: Repeats | None
     left_out: tuple[tuple[str, str], ...]
 
 
@@ -184,6 +212,7 @@ def fit(
         changes={state: _change(shared, k) for k, state in enumerate(kept) if state != NEUTRAL},
         aligned=tuple(aligned),
         shared=shared,
+        repeats=_repeats(aligned),
         left_out=tuple(left_out),
     )
 
@@ -218,6 +247,43 @@ def _align(
             continue
         found.append(_aligned(image, alignment.warp_map(diffuse), alignment))
     return found, left_out
+
+
+def _repeats(aligned: list[AlignedImage]) -> Repeats | None:
+    """Compare repeats; None where no state has any, or too little of the face is known in all."""
+    states = [one.image.state for one in aligned]
+    if len(set(states)) == len(states) or "hemoglobin" not in aligned[0].image.maps:
+        return None
+
+    def over(name: str) -> tuple[NDArray[np.float32], NDArray[np.float32], Mask]:
+        values, errors, good = [], [], []
+        for one in aligned:
+            found, noise = one.image.maps[name], one.image.maps[f"{name}_noise_stderr"]
+            both, error = (found.values, _valid(found)), noise.values
+            if one.alignment is not None:
+                error = one.alignment.warp_stderr(found.values, noise.values, _valid(found))
+                both = one.alignment.warp(*both)
+            values.append(both[0])
+            errors.append(error)
+            good.append(both[1])
+        return np.stack(values), np.stack(errors), np.stack(good)
+
+    blood, blood_error, blood_good = over("hemoglobin")
+    melanin, melanin_error, melanin_good = over("melanin")
+    try:
+        compared = repeatability.compare(
+            blood, states, stderr=blood_error, valid=blood_good, correlated_px=CORRELATED_PX
+        )
+    except RepeatabilityError:
+        return None
+    try:
+        drifts = repeatability.drift(
+            melanin, states, [one.image.captured_s for one in aligned], stderr=melanin_error,
+            valid=melanin_good, correlated_px=CORRELATED_PX,
+        )  # fmt: skip
+    except RepeatabilityError:
+        drifts = ()
+    return Repeats(compared, drifts)
 
 
 def _light(diffuse: SkinMap) -> NDArray[np.float32]:
@@ -308,3 +374,38 @@ def alignment_document(fit: FacialColorFit) -> list[dict[str, Any]]:
 
 def _number(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
+
+
+def repeats_document(fit: FacialColorFit) -> dict[str, Any] | None:
+    """Return how far states repeat, as JSON values; None where nothing was repeated."""
+    if fit.repeats is None:
+        return None
+    regions = [
+        {
+            "region": one.name,
+            "pixels": one.pixels,
+            "within": one.within,
+            "between": one.between,
+            "correlation": _number(one.correlation),
+            "correlation_stderr": _number(one.correlation_stderr),
+            "p_value": one.p_value,
+            "scatters": bool(one.scatters),
+            "change_to_scatter": _number(one.change_to_scatter),
+        }
+        for one in fit.repeats.hemoglobin.regions
+    ]
+    drifts = [
+        {
+            "region": one.name,
+            "slope_per_minute": one.slope_per_minute,
+            "slope_stderr": one.slope_stderr,
+            "p_value": one.p_value,
+            "drifts": bool(one.drifts),
+        }
+        for one in fit.repeats.melanin_drift
+    ]
+    return {
+        "false_alarm": fit.repeats.hemoglobin.false_alarm,
+        "hemoglobin": regions,
+        "melanin_drift": drifts,
+    }

@@ -16,7 +16,9 @@ from reconstruction import flash_stages, stages
 from reconstruction.evidence import Evidence, EvidenceError
 
 NEUTRAL = "neutral"
-MAPS = ("diffuse", "melanin", "hemoglobin")
+ONCE = ("diffuse",)
+REPEATED = (*ONCE, "melanin", "hemoglobin", "melanin_noise_stderr", "hemoglobin_noise_stderr")
+"""Where states are repeated each image's own chromophores tell how far they repeat."""
 
 Landmarks = Mapping[str, tuple[float, float]]
 
@@ -36,7 +38,8 @@ class StateImage:
     captured_s
         When the crossed image was taken, seconds since the first session began.
     maps
-        Diffuse reflectance and the chromophores as they follow from this image alone.
+        Diffuse reflectance; where any state is repeated also the chromophores as they follow from
+        this image alone, and their errors by noise.
     """
 
     state: str
@@ -125,15 +128,17 @@ def read(
     assumed: dict[str, None] = {}
     table: set[tuple[str, str]] = set()
     has_white = True
+    pairs = [_pairs(session, path) for path, session in zip(sessions, opened, strict=True)]
+    named = [state for group in pairs for state, _, _ in group]
+    maps = REPEATED if len(set(named)) < len(named) else ONCE
     for number, (path, session) in enumerate(zip(sessions, opened, strict=True)):
         began_s = (session.manifest.created_at - start).total_seconds()
-        pairs = _pairs(session, path)
-        for state, repeat, since_s in pairs:
+        for state, repeat, since_s in pairs[number]:
             if progress is not None:
                 progress(f"{path.name}: {state}, repeat {repeat}")
             evidence = Evidence.of(session, calibration, state=state, on_date=on_date)
             evidence.repeat = repeat
-            found = stages.run(flash_stages.graph(evidence), list(MAPS)).products
+            found = stages.run(flash_stages.graph(evidence), list(maps)).products
             images.append(
                 StateImage(state, repeat, number, began_s + since_s, MappingProxyType(dict(found)))
             )

@@ -97,6 +97,7 @@ def _facial_color(
         rows,
         caption="States; points are percent of the dermis' volume",
     )  # fmt: skip
+    body += _repeats(part.get("repeatability"))
     if truths:
         states, changes = evaluation.compare(appearance, rig, truths, rng=np.random.default_rng(0))
         body += _errors(name, states, changes, checks)
@@ -114,6 +115,33 @@ def _facial_color(
             truth=None if true is None else true.values, valid=seen,
         )  # fmt: skip
     return body
+
+
+def _repeats(told: Mapping[str, Any] | None) -> str:
+    """Return how far states repeat, and whether melanin drifts."""
+    if not told:
+        return ""
+    drifts = {row["region"]: row for row in told["melanin_drift"]}
+    rows = []
+    for row in told["hemoglobin"]:
+        drift = drifts.get(row["region"])
+        slope = "" if drift is None else (
+            f"{100 * drift['slope_per_minute']:+.4f} ({100 * drift['slope_stderr']:.4f})"
+        )  # fmt: skip
+        rows.append(
+            (
+                row["region"], 100 * row["within"], 100 * row["between"],
+                float("nan") if row["correlation"] is None else row["correlation"],
+                "yes" if row["scatters"] else "no", slope,
+                "" if drift is None else f"{drift['p_value']:.2g}",
+            )
+        )  # fmt: skip
+    return page.table(
+        ("region", "between repeats, points", "between states, points", "intraclass correlation",
+         "more than noise", "melanin's drift a minute, points", "p"),
+        rows,
+        caption="Repeats: standard deviations of blood",
+    )  # fmt: skip
 
 
 def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> str:

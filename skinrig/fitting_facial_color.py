@@ -87,6 +87,7 @@ def fit_facial_color(
                 "radius_px": found.rig.radius_px,
                 "landmarks": marked_by,
                 "alignment": facial_color_fit.alignment_document(found),
+                "repeatability": facial_color_fit.repeats_document(found),
                 "storage_error": {n: list(e) for n, e in found.rig.storage_error().items()},
                 "camera": subject.camera,
                 "illuminant": subject.illuminant,
