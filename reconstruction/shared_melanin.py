@@ -48,9 +48,14 @@ Mask = NDArray[np.bool_]
 OWN_SHARE = 0.01
 """Part of the model error's variance that is each state's own: 0.0001 to 0.007 between simulated
 pictures of the same unmoved face in neutral, smile, fear and exercise, seeds 0 to 3."""
+SHADING_WINDOW_PX = 3.0
+"""Window for the light's changes on moving faces: wider ones blur the shadows that move with them,
+narrower ones average less."""
 LEAST_CHANGE = 0.002
 """Least relative change of light from state to state that is allowed for in each pixel: what a
 flash's energy differs by from pop to pop."""
+CLEARLY = 3.0
+"""Standard errors from which on a pixel's light is said not to follow its neighbors'."""
 FREE_CHANGE = 1.0
 """Most that matters: with more, the brightness tells nothing."""
 MISFIT = 4.0
@@ -120,8 +125,8 @@ def weigh(
     prior : ShadingPrior
         How the pixels' shading is distributed; of a pixel's mean over the states.
     variance : array_like, optional
-        Noise variance of `rgb`, broadcast to its shape; where the place is uncertain with that
-        of the place (`expression_alignment.Alignment.warp_stderr`). None: 1 percent.
+        Noise variance of `rgb`, broadcast to its shape. None: 1 percent. A misplaced pixel is
+        brighter or darker rather than of another color: that is the light's, not the noise's.
     model_error : array_like, optional
         Relative error of the table's colors, as of `reconstruction.chromophores.invert`.
     valid : array_like of bool, shape (S, ...), optional
@@ -130,8 +135,9 @@ def weigh(
         State that changes are taken from, such as neutral.
     shading_window_px : float, optional
         How smoothly the light on a pixel changes between states: it is taken from colors, averaged
-        by a Gaussian of so many px; pixels may be off it by as much as their colors show. Pixels
-        must be (H, W) then. None: the light is free in each pixel and state.
+        by a Gaussian of so many px, best `SHADING_WINDOW_PX`; pixels may be off it by as much as
+        their colors and their neighbors' show. Pixels must be (H, W) then. None: the light is free
+        in each pixel and state.
     own_share : float
         Part of the model error's variance that is each state's own, 0...1.
 
@@ -280,20 +286,23 @@ def _smooth_change(
             values.shape
         )
 
-    total = np.maximum(around(weight, window_px), 1e-300)
+    total = np.maximum(around(weight, window_px), 1e-9)
     smooth = around(weight * change, window_px) / total
     smooth_variance = around(weight, window_px / math.sqrt(2.0)) / (
         4.0 * math.pi * window_px**2 * total**2
     )
     rest = weight * (np.square(change - smooth) - scatter)
-    wide = 2.0 * window_px
-    squares = np.maximum(around(weight**2, wide), 1e-300)
+    wide = 3.0 * window_px
+    squares = np.maximum(around(weight**2, wide), 1e-9)
     excess = around(weight * rest, wide) / squares
     # by chance alone it is 0 within this
     chance = np.sqrt(2.0 * around(weight**2, wide / math.sqrt(2.0)) / (4.0 * math.pi)) / (
         wide * squares
     )
-    loose = np.maximum(excess, 0.0) + chance + smooth_variance + LEAST_CHANGE**2
+    # a wrinkle's shadow is narrower than that: a pixel that is clearly off is off by so much
+    apart = np.square(change - smooth)
+    alone = np.where(apart > CLEARLY**2 * scatter, apart, 0.0)
+    loose = np.maximum(np.maximum(excess, alone), 0.0) + chance + smooth_variance + LEAST_CHANGE**2
     return smooth.astype(np.float32), (1.0 / np.minimum(loose, FREE_CHANGE**2)).astype(np.float32)
 
 
