@@ -1,0 +1,124 @@
+"""A dynamic appearance evaluated: what weights give, and what is refused."""
+
+import numpy as np
+import pytest
+
+from model import facial_color_document, store
+from model.facial_color import FacialColorError, HemoglobinRig
+from model.skin import UNITS, SkinMap
+from model.wrinkle_model import FILE as WRINKLE_FILE
+from model.wrinkle_model import WrinkleModel
+from model.wrinkles import Layer
+from skinrig import applying
+from skinrig import dynamic_appearance as dynamic
+from skinrig.applying import ApplyError, Expression, apply_expression, parse_weights
+
+SIDE = 48
+
+
+@pytest.fixture
+def face(tmp_path):
+    """A folder with a hemoglobin rig, melanin and wrinkles."""
+    rng = np.random.default_rng(3)
+    neutral = 0.02 + 0.004 * rng.standard_normal((SIDE, SIDE)).astype(np.float32)
+    neutral = np.clip(neutral, 0.005, 0.05)
+    rig = HemoglobinRig.from_maps(
+        neutral, {"smile": 1.5 * neutral, "anger": neutral + 0.01}, radius_px=6.0
+    )
+    maps, document = facial_color_document.to_maps(rig)
+    maps["melanin"] = SkinMap(np.full((SIDE, SIDE), 0.03, np.float32), UNITS["melanin"])
+    out = tmp_path / "moving"
+    dynamic.add(
+        out, dynamic.FACIAL_COLOR,
+        dynamic.Part(maps, {facial_color_document.DOCUMENT: document}, {}, {}, "simulated"),
+    )  # fmt: skip
+    layer = Layer(np.full((8, 8, 2), 0.3), np.ones((8, 4, 4)) / 8.0)
+    maps, document = WrinkleModel(np.zeros((16, 16, 2)), (layer,)).to_maps()
+    dynamic.add(
+        out, dynamic.WRINKLES, dynamic.Part(maps, {WRINKLE_FILE: document}, {}, {}, "simulated")
+    )
+    return out, neutral
+
+
+def test_weights_are_read_by_name():
+    assert parse_weights("smile=0.7,anger=-0.3") == {"smile": 0.7, "anger": -0.3}
+
+
+@pytest.mark.parametrize("text", ["smile", "smile=", "=1", "smile=x", "smile=nan", "a=1,a=2", ""])
+def test_a_weight_that_is_none_is_named(text):
+    with pytest.raises(ApplyError, match="weights"):
+        parse_weights(text)
+
+
+def test_a_state_at_full_weight_has_that_states_blood(face, tmp_path):
+    folder, neutral = face
+    apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / "out")
+    found = store.read(tmp_path / "out").maps["hemoglobin"]
+    np.testing.assert_allclose(found.values, 1.5 * neutral, rtol=0.02)
+    # the neutral face has other blood
+    apply_expression(folder, Expression({"neutral": 1.0}), out=tmp_path / "rest")
+    rest = store.read(tmp_path / "rest").maps["hemoglobin"].values
+    np.testing.assert_allclose(rest, neutral, rtol=1e-5)
+
+
+def test_more_blood_makes_skin_redder(face, tmp_path):
+    folder, _ = face
+    reds = []
+    for state in ("neutral", "smile"):
+        apply_expression(folder, Expression({state: 1.0}), out=tmp_path / state)
+        color = store.read(tmp_path / state).maps["color"].values.reshape(-1, 3).mean(axis=0)
+        reds.append(float(color[0] / color[1]))
+    assert reds[1] > reds[0]
+
+
+def test_anger_and_surprise_wrinkle_by_the_papers_table(face, tmp_path):
+    folder, _ = face
+    done = apply_expression(
+        folder, Expression({"anger": 1.0}), out=tmp_path / "a", parts=("wrinkles",)
+    )
+    assert done.figures["wrinkles"]["zone_weights"][0] == [0.0] * 4 + [0.8, 0.8, 1.0, 0.0]
+    signed = apply_expression(
+        folder, Expression({"anger": 1.0}, clamp="signed"), out=tmp_path / "s", parts=("wrinkles",)
+    )
+    assert signed.figures["wrinkles"]["zone_weights"][0][:2] == [-0.6, -0.6]
+    assert not np.array_equal(done.maps["normals"].values, signed.maps["normals"].values)
+
+
+def test_weights_that_do_not_sum_to_one_write_nothing(face, tmp_path):
+    folder, _ = face
+    out = tmp_path / "out"
+    with pytest.raises(FacialColorError, match="normalize"):
+        apply_expression(folder, Expression({"smile": 0.7, "anger": 0.7}), out=out)
+    assert not out.exists()
+    apply_expression(folder, Expression({"smile": 0.7, "anger": 0.7}, normalize=True), out=out)
+    assert (out / store.DOCUMENT).is_file()
+
+
+def test_a_state_that_wrinkles_do_not_know_is_refused(face, tmp_path):
+    folder, _ = face
+    with pytest.raises(ApplyError, match="smiling"):
+        apply_expression(
+            folder, Expression({"smiling": 1.0}), out=tmp_path / "out", parts=("wrinkles",)
+        )
+
+
+def test_what_a_face_lacks_is_left_out_with_the_reason(face, tmp_path):
+    folder, _ = face
+    done = apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / "out")
+    assert ("microstructure", "the folder does not hold it") in done.left_out
+    written = store.read(tmp_path / "out")
+    assert ("microstructure", "the folder does not hold it") in written.left_out
+    with pytest.raises(ApplyError, match="parts"):
+        apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / "o", parts=("hair",))
+
+
+def test_the_same_evaluation_gives_the_same_bytes(face, tmp_path):
+    folder, _ = face
+    for name in ("one", "two"):
+        apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / name)
+    first, second = (
+        {path.name: path.read_bytes() for path in sorted((tmp_path / name).iterdir())}
+        for name in ("one", "two")
+    )
+    assert first == second
+    assert applying.OBSERVER == "linear sRGB"
