@@ -107,13 +107,14 @@ def combine(
     sums = clamped(zone_sums(weights, table), clamp)
     shape = (normals.shape[0], normals.shape[1])
     out = np.empty_like(normals)
-    kernels.add_difference(
-        normals,
-        *wrinkles.widened(np.moveaxis(d, 2, 0), shape, normals.dtype),
-        *wrinkles.widened(wrinkles.zone_strength(stack, sums)[None], shape, normals.dtype),
-        int(renormalize),
-        out,
-    )
+    with kernels.threads_for(shape[0] * shape[1]):
+        kernels.add_difference(
+            normals,
+            *wrinkles.widened(np.moveaxis(d, 2, 0), shape, normals.dtype),
+            *wrinkles.widened(wrinkles.zone_strength(stack, sums)[None], shape, normals.dtype),
+            int(renormalize),
+            out,
+        )
     return out
 
 

@@ -6,11 +6,29 @@ rows of each and runs without look-ups. Kernels are parallel over rows and calle
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from math import sqrt
 from typing import Any
 
+import numba
 import numpy as np
 from numba import njit, prange
+
+SMALL = 500_000
+"""Pixels below which one thread is sooner done than several are brought in."""
+
+
+@contextmanager
+def threads_for(pixels: int) -> Iterator[None]:
+    """Keep to one thread while few pixels are computed."""
+    before = numba.get_num_threads()
+    if pixels < SMALL:
+        numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

@@ -337,12 +337,14 @@ def combine_layers(
             *widened(strength[None], shape, total.dtype),
         )
         if last:
-            normals = np.empty((*total.shape[:2], 3), total.dtype)
-            kernels.add_and_normalize(total, *parts, normals)
+            normals = np.empty((*shape, 3), total.dtype)
+            with kernels.threads_for(shape[0] * shape[1]):
+                kernels.add_and_normalize(total, *parts, normals)
             return normals
         if total is base or np.shares_memory(total, np.asarray(base)):
             total = total.copy()
-        kernels.add(total, *parts)
+        with kernels.threads_for(shape[0] * shape[1]):
+            kernels.add(total, *parts)
     raise AssertionError("a last layer returns")
 
 

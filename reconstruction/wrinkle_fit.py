@@ -41,6 +41,8 @@ Bools: TypeAlias = NDArray[np.bool_]
 Measured: TypeAlias = ArrayLike | NormalMaps | Derivatives
 
 ROUNDS = 20
+ROUGH = 256
+"""Texels a side of the map with which weights are sought."""
 FREE = (-math.inf, math.inf)
 SETTLED = 1e-5
 """Fall of the misfit in a round, relative to the differences, at which the fit ends."""
@@ -181,17 +183,7 @@ def fit(
             if len(row) != len(stack):
                 raise WrinkleError(f"table[{name!r}]: got {len(row)} zones, expected {len(stack)}")
     else:
-        rows = _begun(stack, data, base)
-        settled = len(data) == 1  # then every weight is 1
-        left = math.inf
-        while rounds < ROUNDS and not settled:
-            equations = _equations(stack, _shown_by(stack, rows, data, size), data)
-            free = {name: one.least(FREE) for name, one in equations.items()}
-            rows = _limited(free)
-            misfit = sum(equations[name].misfit(row) for name, row in free.items())
-            total = sum(one.total for one in equations.values())
-            rounds, settled = rounds + 1, left - misfit <= SETTLED * total
-            left = misfit
+        rows, rounds, settled = _in_turn(stack, data, base, size)
     texels = _shown_by(stack, rows, data, size)
     wrinkle = _read(texels.values, base.valid.shape)
     found = {
@@ -210,6 +202,59 @@ def fit(
     )  # fmt: skip
     return WrinkleFit(
         layer, found, base, 1.0 - misfit / total if total > 0 else 0.0, rounds, settled
+    )
+
+
+def _in_turn(
+    masks: Floats, data: Mapping[str, Difference], base: Derivatives, size: tuple[int, int]
+) -> tuple[dict[str, Floats], int, bool]:
+    """Return weights that map and weights in turn lead to, the rounds, and whether they settled.
+
+    Weights hardly depend on detail: they are sought at a resolution that two pixels a texel of
+    map or masks suffice for.
+    """
+    rows = _begun(masks, data, base)
+    if len(data) == 1:
+        return rows, 0, True  # every weight is 1
+    shape = base.valid.shape
+    rough = min(size[0], ROUGH), min(size[1], ROUGH)
+    texels = max(rough[0], masks.shape[1]), max(rough[1], masks.shape[2])
+    small = min(2 * texels[0], shape[0]), min(2 * texels[1], shape[1])
+    data = {name: _reduced(one, small) for name, one in data.items()}
+    left = math.inf
+    for rounds in range(1, ROUNDS + 1):
+        equations = _equations(masks, _shown_by(masks, rows, data, rough), data)
+        free = {name: one.least(FREE) for name, one in equations.items()}
+        rows = _limited(free)
+        misfit = sum(equations[name].misfit(row) for name, row in free.items())
+        total = sum(one.total for one in equations.values())
+        if left - misfit <= SETTLED * total:
+            return rows, rounds, True
+        left = misfit
+    return rows, ROUNDS, False
+
+
+def _reduced(difference: Difference, shape: tuple[int, int]) -> Difference:
+    """Return a difference averaged to fewer pixels, by its weights."""
+    height, width = difference.weight.shape
+    if shape == (height, width):
+        return difference
+    ay = resampling.averaging_matrix(height, shape[0])
+    ax = resampling.averaging_matrix(width, shape[1])
+
+    def mean(image: NDArray[np.floating]) -> Floats:
+        return np.asarray((ay @ image.astype(np.float64)) @ ax.T)
+
+    v = difference.weight.astype(np.float64)
+    weight = mean(v)
+    inverse = np.divide(1.0, weight, out=np.zeros_like(weight), where=weight > 0)
+    pixels = height * width / (shape[0] * shape[1])
+    values = [mean(v * difference.values[..., c]) * inverse for c in (0, 1)]
+    variance = [mean(v * v * difference.variance[..., c]) * inverse**2 / pixels for c in (0, 1)]
+    return Difference(
+        np.stack(values, axis=-1).astype(np.float32),
+        np.stack(variance, axis=-1).astype(np.float32),
+        weight.astype(np.float32),
     )
 
 

@@ -32,7 +32,9 @@ LEAST_COVERAGE = 0.1
 LEAST_STRENGTH = 1e-3
 """Sum of squared strengths, relative to the largest, below which a texel is not determined."""
 TOLERANCE = 1e-12
-DAMPING = 1e-9
+DAMPING = 1e-10
+SILENT = 1e-9
+"""Diagonal of the normal matrix, relative to the largest, below which a texel is left at 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,14 +169,19 @@ def fit_texels(
     if not valid.any():
         return Texels(values, stderr, valid)
     diagonal = A.diagonal()
-    matrix = A + sparse.diags_array(np.full(diagonal.size, DAMPING * diagonal.max()))
-    scaling = sparse.diags_array(1.0 / matrix.diagonal())
+    some = np.flatnonzero(diagonal > SILENT * diagonal.max())
+    root = 1.0 / np.sqrt(diagonal[some])
+    scaling = sparse.diags_array(root)
+    matrix = scaling @ A[some][:, some] @ scaling
+    matrix = (matrix + DAMPING * sparse.eye_array(some.size)).tocsr()
     spread = _inverse_diagonal(by) * _inverse_diagonal(bx)
     for c in (0, 1):
-        b = gathered(by, bx, product[..., c]).ravel()
-        first = np.divide(b, summed.ravel(), out=np.zeros_like(b), where=summed.ravel() > 0)
-        solved, _ = cg(matrix, b, x0=first, rtol=TOLERANCE, maxiter=500, M=scaling)
-        values[..., c] = np.where(valid, solved.reshape(shape), 0.0)
+        b = gathered(by, bx, product[..., c]).ravel()[some]
+        first = b / summed.ravel()[some] / root
+        solved, _ = cg(matrix, root * b, x0=first, rtol=TOLERANCE, maxiter=500)
+        plane = np.zeros(summed.size)
+        plane[some] = root * solved
+        values[..., c] = np.where(valid, plane.reshape(shape), 0.0)
         scatter = gathered(by, bx, noise[..., c])
         variance = np.divide(scatter, summed**2, out=np.zeros_like(scatter), where=valid)
         stderr[..., c] = np.where(valid, np.sqrt(spread * variance), np.inf)
