@@ -32,6 +32,7 @@ from skinrig import (
     bench_tissue,
     bench_translucency,
     bench_transport,
+    bench_wrinkles,
 )
 from skinrig.benchmark import StageBenchmark, to_document
 from skinrig.console import Console, plain
@@ -68,6 +69,10 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "anisotropy": bench_translucency.directions,
     "translucency": bench_translucency.sites,
     "photon-transport": bench_transport.photon_transport,
+    "wrinkles": bench_wrinkles.fitting,
+    "wrinkle-sum": bench_wrinkles.summing,
+    "wrinkle-storage": bench_wrinkles.storing,
+    "wrinkle-weights": bench_wrinkles.weighing,
 }
 
 
