@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,7 +74,7 @@ class Inputs:
 
 def graph(evidence: Evidence) -> list[stages.Stage]:
     """Return the stages that a flash session can go through; see `stages.run`."""
-    inputs = _inputs(evidence)
+    inputs = inputs_of(evidence)
     base = {"revision": REVISION, "inputs": dict(sorted(inputs.hashes.items()))}
     table = base | {"camera": inputs.camera, "illuminant": inputs.illuminant}
     return [
@@ -103,7 +103,8 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     ]  # fmt: skip
 
 
-def _inputs(evidence: Evidence) -> Inputs:
+def inputs_of(evidence: Evidence) -> Inputs:
+    """Return what the stages of a flash session read, and note what is assumed."""
     session = evidence.session
     shots = session.frames("subject", state=evidence.state)
     view = session.rig.view(shots[0].camera) if shots else session.rig.views[0]
@@ -147,24 +148,7 @@ def _inputs(evidence: Evidence) -> Inputs:
 def _frames(inputs: Inputs) -> Mapping[str, Any]:
     """Average the repeats of each polarizer state and subtract the darks."""
     session = inputs.session
-    # the cells of an imported picture are its pixels; a sensor's sites stand beside each other
-    imported = "photographs" in session.manifest.extra
-    demosaic: raw.Demosaic = "superpixel" if imported else "centered"
-    gain, read_noise = _noise(inputs.sensor)
-
-    def linear_light(record: FrameRecord) -> raw.LinearImage:
-        frame = session.read(record)
-        return raw.linear_rgb(frame, demosaic=demosaic, gain=gain, read_noise=read_noise)
-
-    darks = [linear_light(record) for record in session.frames("dark")]
-    dark: NDArray[np.float64] | float = (
-        np.mean([d.rgb for d in darks], axis=0, dtype=np.float64) if darks else 0.0
-    )
-    dark_variance = (
-        np.mean([d.variance for d in darks], axis=0, dtype=np.float64) / len(darks)
-        if darks
-        else 0.0
-    )
+    linear_light, dark, dark_variance = _light_without_darks(inputs)
     images: dict[str, Image | None] = {}
     for polarizer in ("parallel", "crossed"):
         which: dict[str, str | int | float] = {"state": inputs.state, "polarizer": polarizer}
@@ -199,6 +183,46 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
             f"it has the states {', '.join(states) or 'none'}"
         )
     return images
+
+
+def _light_without_darks(
+    inputs: Inputs,
+) -> tuple[
+    Callable[[FrameRecord], raw.LinearImage],
+    NDArray[np.float64] | float,
+    NDArray[np.float64] | float,
+]:
+    """Return how to read a frame's light, and the mean dark frame with its variance."""
+    session = inputs.session
+    # the cells of an imported picture are its pixels; a sensor's sites stand beside each other
+    imported = "photographs" in session.manifest.extra
+    demosaic: raw.Demosaic = "superpixel" if imported else "centered"
+    gain, read_noise = _noise(inputs.sensor)
+
+    def linear_light(record: FrameRecord) -> raw.LinearImage:
+        frame = session.read(record)
+        return raw.linear_rgb(frame, demosaic=demosaic, gain=gain, read_noise=read_noise)
+
+    darks = [linear_light(record) for record in session.frames("dark")]
+    if not darks:
+        return linear_light, 0.0, 0.0
+    dark = np.mean([d.rgb for d in darks], axis=0, dtype=np.float64)
+    dark_variance = np.mean([d.variance for d in darks], axis=0, dtype=np.float64) / len(darks)
+    return linear_light, dark, dark_variance
+
+
+def diffuse_of_each(inputs: Inputs, records: Sequence[FrameRecord]) -> Iterator[SkinMap]:
+    """Yield the diffuse reflectance that each of some crossed frames shows alone."""
+    linear_light, dark, dark_variance = _light_without_darks(inputs)
+    for record in records:
+        image = linear_light(record)
+        power = float(record.settings.get("power", 1.0))
+        crossed = Image(
+            ((image.rgb - dark) / power).astype(np.float32),
+            ((image.variance + dark_variance) / power**2).astype(np.float32),
+            image.valid,
+        )
+        yield _separate(inputs, None, crossed)["diffuse"]
 
 
 def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None, None]:

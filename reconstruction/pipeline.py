@@ -37,9 +37,9 @@ class Recipe:
 
 
 def _flash() -> Recipe:
-    from reconstruction import flash_stages as stages_of
+    from reconstruction import sequence_stages as stages_of
 
-    return Recipe(stages_of.MAPS, stages_of.graph)
+    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, products=stages_of.products)
 
 
 def _dome() -> Recipe:

@@ -20,14 +20,14 @@ from rigsim.mesh import Float32Array
 from rigsim.perfusion import STATES, Perfusion, StateError
 from rigsim.subject import Subject
 
-RELAXATION_S: Final = 0.05
+RELAXATION_S: Final = 0.02
 """Time constant of the blood of an expression, s. Jimenez et al. 2010, section 3.1, saw no phase
 between two states at samples 0.25 s apart: mostly, the moving face squeezes its skin."""
 
-REACTION_S: Final = 0.25
-"""Time from a sound to the movement, s; simple reactions to sounds take 0.15 to 0.3 s."""
+REACTION_S: Final = 0.16
+"""Time from a sound to the movement, s; simple reactions to sounds take about 0.16 s."""
 
-REACTION_SPREAD_S: Final = 0.03
+REACTION_SPREAD_S: Final = 0.02
 """Standard deviation of the reaction time, s."""
 
 FADING_S: Final = 40.0

@@ -183,8 +183,8 @@ def parabola_weights(level: float) -> tuple[float, float, float]:
 
     Examples
     --------
-    >>> parabola_weights(0.5), parabola_weights(0.25)
-    ((0.0, 1.0, 0.0), (0.375, 0.75, -0.125))
+    >>> parabola_weights(0.25)
+    (0.375, 0.75, -0.125)
     """
     a, b, c = LEVELS
     return (

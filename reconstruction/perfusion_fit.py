@@ -1,0 +1,421 @@
+"""Levels, delay and time constant of blood that relaxes, with what the samples can tell of them.
+
+Levels enter a curve linearly: for each delay and time constant they are solved for, and what
+remains is a landscape of two numbers, looked at as a whole. So a time constant far below the
+sampling interval is no failure of a search: the landscape is flat there, and what is told is the
+bound. The noise is that of what the best curve leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import optimize, stats
+
+from reconstruction.perfusion_curves import CurveError
+
+Floats = NDArray[np.float64]
+Known = Literal["estimated", "only below", "only above", "unknown"]
+
+BOUND_LEVEL = 0.95
+"""Confidence of bounds."""
+LEVEL_TEST = 0.001
+"""Two levels differ when chance would make them differ as much at most so often."""
+_GRID = 97
+_DELAYS = 81
+_SLOPE = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5])
+"""Time constants since the beginning of a change at which samples are tried."""
+Shape = Callable[[Floats, Floats], Floats]
+"""Delays and constants of shape (..., 1) to the part of the way, (..., N)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelaxationFit:
+    """What relaxing curves share, and the levels of each."""
+
+    start: Floats
+    """(P,): level that is left: rest, or that of the event's end."""
+    end: Floats
+    """(P,): level that is gone to."""
+    stderr_start: Floats
+    """(P,)"""
+    stderr_end: Floats
+    """(P,)"""
+    time_constant_s: float
+    """Best time constant, s."""
+    stderr_time_constant_s: float
+    """Half of its 68 % interval, s; NaN where it is only bounded."""
+    interval_s: tuple[float, float]
+    """95 % interval of the time constant, s; 0 or inf where there is no such end."""
+    known: Known
+    """Whether the time constant is estimated, or "only below" the interval's upper end, or "only
+    above" its lower one, or the levels do not differ."""
+    delay_s: float
+    """Time from prompt to change, s; 0 where none is fitted."""
+    stderr_delay_s: float
+    """Half of its 68 % interval, s."""
+    delay_interval_s: tuple[float, float]
+    """95 % interval of the delay, s: where the change is quick, the gap between two samples."""
+    noise: Floats
+    """(P,): standard deviation of one sample about the curve."""
+    chi2: float
+    """Weighted square sum over the degrees of freedom by the given standard errors; NaN without."""
+
+    def __str__(self) -> str:
+        low, high = self.interval_s
+        if self.known == "estimated":
+            return f"{self.time_constant_s:.3g} +- {self.stderr_time_constant_s:.2g} s"
+        if self.known == "only below":
+            return f"below {high:.3g} s"
+        if self.known == "only above":
+            return f"above {low:.3g} s"
+        return "unknown: the levels do not differ"
+
+
+def fit_cycle(
+    phase_s: ArrayLike,
+    values: ArrayLike,
+    *,
+    cycle_s: float,
+    change_s: float | None = None,
+    stderr: ArrayLike | None = None,
+) -> RelaxationFit:
+    """Fit blood that relaxes to one level after a prompt and back after the next, again and again.
+
+    Parameters
+    ----------
+    phase_s : array_like, shape (N,)
+        Phase of each sample, s.
+    values : array_like, shape (N,) or (P, N)
+        One curve, or several that share delay and time constant; NaN is left out.
+    cycle_s : float
+        Length of the cycle, s; the expression is asked for at 0.
+    change_s : float, optional
+        When rest is asked for, s; None: after half of the cycle.
+    stderr : array_like, optional
+        Standard errors of the values, their shape: relative weights, and what ``chi2`` is by.
+
+    Returns
+    -------
+    RelaxationFit
+        ``start`` is the level of rest, ``end`` that of the expression.
+
+    Raises
+    ------
+    CurveError
+        For fewer than 6 samples, or a shape that does not fit.
+
+    Examples
+    --------
+    >>> phase = np.arange(20) * 0.5
+    >>> true = np.where(phase < 5, 1 - np.exp(-phase / 2), np.exp(-(phase - 5) / 2))
+    >>> found = fit_cycle(phase, 0.03 + 0.01 * true, cycle_s=10)
+    >>> found.known
+    'estimated'
+    """
+    middle = 0.5 * cycle_s if change_s is None else change_s
+    phase = np.asarray(phase_s, np.float64)
+    data = _Data.of(phase, values, stderr)
+
+    def shape(delay: Floats, constant: Floats) -> Floats:
+        """Part of the way to the expression's level, of the steady cycle."""
+        on, off = middle, cycle_s - middle
+        into = (phase - delay) % cycle_s
+        up, down = np.exp(-on / constant), np.exp(-off / constant)
+        # level at the beginning of the expression, after infinitely many cycles
+        begin = (1.0 - up) * down / (1.0 - up * down)
+        top = 1.0 - (1.0 - begin) * up
+        rising = 1.0 - (1.0 - begin) * np.exp(-np.minimum(into, on) / constant)
+        falling = top * np.exp(-np.maximum(into - on, 0.0) / constant)
+        return np.where(into < on, rising, falling)
+
+    spacing = cycle_s / phase.size
+    constants = np.geomspace(spacing / 50, 4 * cycle_s, _GRID)
+    delays = np.linspace(0.0, 0.5 * min(middle, cycle_s - middle), _DELAYS)
+    changes = np.concatenate([phase % cycle_s, (phase - middle) % cycle_s])
+    return _fit(data, shape, delays, constants, changes)
+
+
+def fit_course(
+    time_s: ArrayLike, values: ArrayLike, *, stderr: ArrayLike | None = None
+) -> RelaxationFit:
+    """Fit blood that relaxes to a new level after an event at time 0.
+
+    Parameters
+    ----------
+    time_s : array_like, shape (N,)
+        s after the event; samples before it are not used.
+    values : array_like, shape (N,) or (P, N)
+        One curve, or several that share the time constant; NaN is left out.
+    stderr : array_like, optional
+        Standard errors of the values, their shape.
+
+    Returns
+    -------
+    RelaxationFit
+        ``start`` is the level right after the event, ``end`` the one that is approached.
+
+    Raises
+    ------
+    CurveError
+        For fewer than 5 samples after the event, or a shape that does not fit.
+    """
+    time = np.asarray(time_s, np.float64)
+    after = time >= 0
+    time = time[after]
+    shown = np.atleast_2d(np.asarray(values, np.float64))[:, after]
+    errors = None if stderr is None else np.atleast_2d(np.asarray(stderr, np.float64))[:, after]
+    data = _Data.of(time, shown, errors)
+
+    def shape(delay: Floats, constant: Floats) -> Floats:
+        """Part of the way to the new level."""
+        return -np.expm1(-time / constant)
+
+    span = float(np.ptp(time))
+    spacing = span / max(1, time.size - 1)
+    constants = np.geomspace(spacing / 50, 50 * span, _GRID)
+    return _fit(data, shape, np.zeros(1), constants, np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Data:
+    """Curves (P, N) with weights that sum to the number of samples of each; 0 where missing."""
+
+    values: Floats
+    weights: Floats
+    variance: Floats
+    """(P,): mean variance by the given errors; NaN without."""
+
+    @staticmethod
+    def of(at: Floats, values: ArrayLike, stderr: ArrayLike | None) -> _Data:
+        shown = np.atleast_2d(np.asarray(values, np.float64))
+        if shown.ndim != 2 or at.shape != shown.shape[1:]:
+            raise CurveError(f"values: got shape {shown.shape}, expected (P, {at.size})")
+        good = np.isfinite(shown) & np.isfinite(at)
+        variance = np.full(shown.shape, np.nan)
+        if stderr is not None:
+            variance = np.square(np.atleast_2d(np.asarray(stderr, np.float64)))
+            if variance.shape != shown.shape:
+                raise CurveError(f"stderr: got shape {variance.shape}, expected {shown.shape}")
+            good &= np.isfinite(variance) & (variance > 0)
+        if at.size < 5 or (good.sum(axis=1) < 5).any():
+            raise CurveError(f"values: got {int(good.sum(axis=1).min())} usable, expected >= 5")
+        inverse = np.where(good, 1.0 if stderr is None else 1.0 / variance, 0.0)
+        count = good.sum(axis=1, keepdims=True)
+        scale = count / inverse.sum(axis=1, keepdims=True)
+        known = scale[:, 0] if stderr is not None else np.full(len(shown), np.nan)
+        return _Data(np.where(good, shown, 0.0), inverse * scale, known)
+
+    def residual(self, shape: Floats) -> Floats:
+        """Return the weighted square sum of the best levels, (..., P), of shapes (..., N)."""
+        level, gap = self.levels(shape)
+        left = self.values - level[..., None] - gap[..., None] * shape[..., None, :]
+        return (self.weights * left**2).sum(axis=-1)
+
+    def levels(self, shape: Floats) -> tuple[Floats, Floats]:
+        """Return the best start and gap of each curve, (..., P)."""
+        w, b = self.weights, shape[..., None, :]
+        total = w.sum(axis=-1)
+        b_mean = (w * b).sum(axis=-1) / total
+        v_mean = (w * self.values).sum(axis=-1) / total
+        b_off, v_off = b - b_mean[..., None], self.values - v_mean[:, None]
+        square = (w * b_off**2).sum(axis=-1)
+        product = (w * b_off * v_off).sum(axis=-1)
+        gap = np.where(square > 1e-12 * total, product / np.maximum(square, 1e-300), 0.0)
+        return v_mean - gap * b_mean, gap
+
+
+def _fit(data: _Data, curve: Shape, delays: Floats, constants: Floats, at: Floats) -> RelaxationFit:
+
+    def residuals(delay: Floats, constant: Floats) -> Floats:
+        """(..., P) square sums for delays and constants that broadcast to (...)."""
+        return data.residual(curve(delay[..., None], constant[..., None]))
+
+    # by constant: first the common delays, then those that put a sample on its slope
+    tried = [np.concatenate([delays, _near(at, constant, delays)]) for constant in constants]
+    by_curve = np.array(
+        [residuals(d, np.full(d.size, c)) for d, c in zip(tried, constants, strict=True)]
+    )
+    curves = len(data.values)
+    samples = (data.weights > 0).sum(axis=1)
+    # each curve by its own noise, which the best common curve leaves
+    freedom = np.maximum(samples - 2.0 - (1.0 + (delays.size > 1)) / curves, 1.0)
+    noise2 = np.full(curves, 1.0)
+    tiny = np.finfo(float).eps * np.maximum((data.weights * data.values**2).sum(axis=1), 1e-300)
+    for _ in range(2):
+        total = (by_curve / noise2).sum(axis=-1)
+        best = np.unravel_index(int(np.argmin(total)), total.shape)
+        noise2 = np.maximum(by_curve[best] / freedom, tiny)
+    total = (by_curve / noise2).sum(axis=-1)
+
+    def landscape(delay: float, log_constant: float) -> float:
+        sums = residuals(np.array([delay]), np.exp(np.array([log_constant])))
+        return float((sums[0] / noise2).sum())
+
+    start = np.array([tried[best[0]][best[1]], np.log(constants[best[0]])])
+    found = _refined(landscape, start, delays, np.log(constants), float(total[best]))
+    delay, constant, least = float(found[0]), float(np.exp(found[1])), found[2]
+    nu = float(freedom.sum())
+    excess_68 = float(stats.f.ppf(0.6827, 1, nu))
+    excess_95 = float(stats.f.ppf(BOUND_LEVEL, 1, nu))
+    least = min(least, float(total.min()))
+
+    profile = total.min(axis=1) - least
+    low, high = _crossings(np.log(constants), profile, float(np.log(constant)), excess_95)
+    interval = (float(np.exp(low)) if low is not None else 0.0,
+                float(np.exp(high)) if high is not None else np.inf)  # fmt: skip
+    inner = _crossings(np.log(constants), profile, float(np.log(constant)), excess_68)
+    stderr_constant = np.nan
+    if inner[0] is not None and inner[1] is not None:
+        stderr_constant = 0.5 * float(np.exp(inner[1]) - np.exp(inner[0]))
+
+    delay_interval, stderr_delay = (0.0, 0.0), 0.0
+    if delays.size > 1:
+        along = total[:, : delays.size].min(axis=0) - least
+        ends = _crossings(delays, along, delay, excess_95)
+        delay_interval = (ends[0] if ends[0] is not None else float(delays[0]),
+                          ends[1] if ends[1] is not None else float(delays[-1]))  # fmt: skip
+        ends = _crossings(delays, along, delay, excess_68)
+        stderr_delay = 0.5 * ((ends[1] if ends[1] is not None else float(delays[-1]))
+                              - (ends[0] if ends[0] is not None else float(delays[0])))  # fmt: skip
+
+    level, gap = (
+        part[0] for part in data.levels(curve(np.array([[delay]]), np.array([[constant]])))
+    )
+    flat = ((data.weights * (data.values - _means(data)[:, None]) ** 2).sum(axis=1) / noise2).sum()
+    differ = (flat - least) / curves / max(least / nu, 1e-300)
+    changes = stats.f.sf(differ, curves, nu) < LEVEL_TEST
+    known: Known = "estimated"
+    if not changes:
+        known, interval = "unknown", (0.0, float("inf"))
+    elif interval[0] == 0.0:
+        known = "only below"
+    elif np.isinf(interval[1]):
+        known = "only above"
+    errors = _level_errors(data, curve, delay, constant, gap, noise2, known == "estimated",
+                           delays.size > 1)  # fmt: skip
+    given = data.variance
+    chi2 = float((by_curve[best] / given).sum() / nu) if np.isfinite(given).all() else float("nan")
+    return RelaxationFit(
+        start=level,
+        end=level + gap,
+        stderr_start=errors[0],
+        stderr_end=errors[1],
+        time_constant_s=constant,
+        stderr_time_constant_s=stderr_constant if known == "estimated" else float("nan"),
+        interval_s=interval,
+        known=known,
+        delay_s=delay,
+        stderr_delay_s=stderr_delay,
+        delay_interval_s=delay_interval,
+        noise=np.sqrt(noise2),
+        chi2=chi2,
+    )
+
+
+def _near(since: Floats, constant: float, delays: Floats) -> Floats:
+    """Return delays that leave a sample, so long after a prompt, on the slope of the change, s.
+
+    Their number is the same for each constant; those beyond the range are put into it.
+    """
+    if delays.size == 1:
+        return np.zeros(0)
+    late = since[np.isfinite(since) & (since <= 2 * delays[-1])]
+    return np.clip((late[:, None] - constant * _SLOPE).ravel(), delays[0], delays[-1])
+
+
+def _means(data: _Data) -> Floats:
+    return (data.weights * data.values).sum(axis=1) / data.weights.sum(axis=1)
+
+
+def _refined(
+    landscape: Callable[[float, float], float],
+    start: Floats,
+    delays: Floats,
+    logs: Floats,
+    at_start: float,
+) -> tuple[float, float, float]:
+    """Return delay, logarithm of the constant, and height of the lowest point near the start."""
+    step = float(logs[1] - logs[0])
+    if delays.size == 1:
+        found = optimize.minimize_scalar(
+            lambda log: landscape(float(delays[0]), log),
+            bounds=(max(logs[0], start[1] - step), min(logs[-1], start[1] + step)),
+            method="bounded",
+        )
+        point, height = (float(delays[0]), float(found.x)), float(found.fun)
+    else:
+        width = float(delays[1] - delays[0])
+        bounds = [
+            (max(delays[0], start[0] - width), min(delays[-1], start[0] + width)),
+            (max(logs[0], start[1] - step), min(logs[-1], start[1] + step)),
+        ]
+        simplex = optimize.minimize(
+            lambda v: landscape(v[0], v[1]), start, method="Nelder-Mead", bounds=bounds,
+            options={"xatol": 1e-5, "fatol": 1e-9},
+        )  # fmt: skip
+        point, height = (float(simplex.x[0]), float(simplex.x[1])), float(simplex.fun)
+    if height < at_start:
+        return (*point, height)
+    return float(start[0]), float(start[1]), at_start
+
+
+def _crossings(
+    grid: Floats, profile: Floats, best: float, excess: float
+) -> tuple[float | None, float | None]:
+    """Return where a profile first rises by ``excess`` on both sides of its best; None: nowhere."""
+    ends: list[float | None] = []
+    for sign in (-1, 1):
+        side = grid[sign * (grid - best) > 0][::sign]
+        height = profile[sign * (grid - best) > 0][::sign]
+        above = np.flatnonzero(height > excess)
+        if above.size == 0:
+            ends.append(None)
+            continue
+        k = int(above[0])
+        inner, level = (best, 0.0) if k == 0 else (float(side[k - 1]), float(height[k - 1]))
+        # square roots of a parabola's heights are straight
+        a, b, c = (np.sqrt(max(v, 0.0)) for v in (level, float(height[k]), excess))
+        ends.append(inner + (float(side[k]) - inner) * float((c - a) / max(b - a, 1e-12)))
+    return ends[0], ends[1]
+
+
+def _level_errors(
+    data: _Data,
+    curve: Shape,
+    delay: float,
+    constant: float,
+    gap: Floats,
+    noise2: Floats,
+    with_constant: bool,
+    with_delay: bool,
+) -> tuple[Floats, Floats]:
+    """Return standard errors of start and end, with what delay and constant add where known."""
+
+    def at(d: float, c: float) -> Floats:
+        return np.asarray(curve(np.array([[d]]), np.array([[c]]))[0], np.float64)
+
+    base = at(delay, constant)
+    slopes = []
+    if with_constant:
+        h = 1e-3 * constant
+        slopes.append((at(delay, constant + h) - at(delay, constant - h)) / (2 * h))
+        if with_delay and delay > 1e-3 * constant:
+            slopes.append((at(delay + h, constant) - at(delay - h, constant)) / (2 * h))
+    curves = len(gap)
+    size = 2 * curves + len(slopes)
+    normal = np.zeros((size, size))
+    for p in range(curves):
+        rows = np.zeros((size, base.size))
+        rows[2 * p], rows[2 * p + 1] = 1.0 - base, base  # start and end
+        for k, slope in enumerate(slopes):
+            rows[2 * curves + k] = gap[p] * slope
+        normal += (rows * data.weights[p] / noise2[p]) @ rows.T
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    covariance = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return errors[0 : 2 * curves : 2], errors[1 : 2 * curves : 2]
