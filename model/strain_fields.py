@@ -111,6 +111,100 @@ def rasterize(
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class KernelRegions:
+    """Which kind of skin is where on a texture.
+
+    Attributes
+    ----------
+    tables : tuple of KernelTable
+        One for each kind.
+    weights : ndarray, shape (N, h, w)
+        How much of each kind there is, >= 0, on the whole texture at any resolution, row 0 on top;
+        between pixels they are bilinear. They are divided by their sum; where it is 0, the first
+        kind is.
+    """
+
+    tables: tuple[KernelTable, ...]
+    weights: NDArray[np.floating]
+
+    def __post_init__(self) -> None:
+        """Refuse weights that do not fit the tables."""
+        object.__setattr__(self, "tables", tuple(self.tables))
+        shape, count = self.weights.shape, len(self.tables)
+        if count < 1 or len(shape) != 3 or shape[0] != count or min(shape) < 1:
+            raise StrainError(f"weights: got shape {shape} for {count} tables, expected (N, h, w)")
+        if not (np.isfinite(self.weights).all() and (self.weights >= 0).all()):
+            raise StrainError("weights: got NaN, infinity or a number below 0")
+
+    def shares_at(self, u: NDArray[np.floating], v: NDArray[np.floating]) -> Float32:
+        """Return shares at rows of v and columns of u, shape (N, len(v), len(u))."""
+        _, height, width = self.weights.shape
+        y0, y1, fy = _between((1.0 - np.asarray(v)) * height - 0.5, height)
+        x0, x1, fx = _between(np.asarray(u) * width - 0.5, width)
+        weights = np.asarray(self.weights, np.float32)
+        rows = weights[:, y0] * (1.0 - fy)[:, None] + weights[:, y1] * fy[:, None]
+        found = rows[:, :, x0] * (1.0 - fx) + rows[:, :, x1] * fx
+        total = found.sum(axis=0)
+        found[0, total == 0.0] = 1.0
+        return np.asarray(found / np.where(total > 0.0, total, 1.0), np.float32)
+
+    def table_at(self, uv: NDArray[np.floating]) -> NDArray[np.intp]:
+        """Return the number of the table with the largest share at points, shape (V, 2)."""
+        _, height, width = self.weights.shape
+        y = np.clip(np.rint((1.0 - uv[:, 1]) * height - 0.5), 0, height - 1).astype(np.intp)
+        x = np.clip(np.rint(uv[:, 0] * width - 0.5), 0, width - 1).astype(np.intp)
+        return np.asarray(np.argmax(self.weights[:, y, x], axis=0))
+
+
+def _between(
+    at: NDArray[np.floating], count: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Float32]:
+    """Return the pixels before and after places, and how far between them they are."""
+    held = np.clip(at, 0.0, count - 1.0)
+    first = np.minimum(np.floor(held).astype(np.intp), max(count - 2, 0))
+    return first, np.minimum(first + 1, count - 1), np.asarray(held - first, np.float32)
+
+
+def regional_kernels(
+    strain: TextureStrain,
+    regions: KernelRegions,
+    size: tuple[int, int],
+    *,
+    window: Window | None = None,
+    extrapolate: Literal["hold", "formula"] = "hold",
+) -> tuple[LineKernels, LineKernels]:
+    """Return the kernels of both passes, alpha and sigma blended by how much of each kind is there.
+
+    Parameters
+    ----------
+    strain : TextureStrain
+        Of the window.
+    regions : KernelRegions
+    size : (int, int)
+        Height and width of the whole texture, px.
+    window, extrapolate
+        As of `rasterize` and `line_kernels`.
+    """
+    here = Window(0, size[0], 0, size[1]) if window is None else window
+    made = [line_kernels(strain, table, extrapolate=extrapolate) for table in regions.tables]
+    if len(made) == 1:
+        return made[0]
+    shares = regions.shares_at(
+        (np.arange(here.left, here.right) + 0.5) / size[1],
+        1.0 - (np.arange(here.top, here.bottom) + 0.5) / size[0],
+    )
+    first, second = (
+        LineKernels(
+            made[0][axis].axis,
+            np.einsum("nyx,nyx->yx", shares, np.stack([lines[axis].alpha for lines in made])),
+            np.einsum("nyx,nyx->yx", shares, np.stack([lines[axis].sigma_px for lines in made])),
+        )
+        for axis in range(2)
+    )
+    return first, second
+
+
 def line_kernels(
     strain: TextureStrain,
     table: KernelTable = FOREHEAD,

@@ -24,7 +24,7 @@ from model.displacement_convolution import (
 )
 from model.mesh_strain import MeshStrain, strain
 from model.microstructure import ALPHA_LIMITS, FOREHEAD, KernelTable
-from model.strain_fields import line_kernels, rasterize
+from model.strain_fields import KernelRegions, rasterize, regional_kernels
 from skinrig.blend_shapes import BlendShapeMesh
 
 Float32 = NDArray[np.float32]
@@ -55,11 +55,11 @@ class MicrostructureReport:
     stretch_s, stretch_t : (float, float)
         Least and largest ratio over vertices.
     fitted_range : (float, float)
-        Ratios that the table was fitted to.
+        Ratios that the table, the first one of several, was fitted to.
     outside_share : float
-        Of the vertices: r_s or r_t beyond the fitted range.
+        Of the vertices: r_s or r_t beyond the range of the table that counts most there.
     below_share, above_share : float
-        Of the vertices: r_t below it, r_s above it.
+        Of the vertices: a ratio below it, a ratio above it.
     extrapolate : str
         What was done there.
     clipped_share : float
@@ -130,7 +130,7 @@ def apply_microstructure(
     mesh: BlendShapeMesh,
     weights: Mapping[str, float],
     neutral_height: Any,
-    table: KernelTable = FOREHEAD,
+    table: KernelTable | KernelRegions = FOREHEAD,
     *,
     valid: Any = None,
     extrapolate: Literal["hold", "formula"] = "hold",
@@ -149,8 +149,8 @@ def apply_microstructure(
         Of its shapes.
     neutral_height : array or memory map, shape (H, W)
         Displacement in the mesh's texture, any unit; row 0 is the top (v = 1).
-    table : KernelTable
-        Kernels of the skin by its stretch ratios.
+    table : KernelTable or KernelRegions
+        Kernels of the skin by its stretch ratios; several kinds of skin and where they are.
     valid : array or memory map of bool, shape (H, W), optional
         Heights that may be sampled; heights that are not finite never are.
     extrapolate : {"hold", "formula"}
@@ -182,6 +182,9 @@ def apply_microstructure(
     if valid is not None and tuple(np.shape(valid)) != shape:
         raise ApplyMicrostructureError(f"valid: got shape {np.shape(valid)}, expected {shape}")
     size = (shape[0], shape[1])
+    regions = (
+        table if isinstance(table, KernelRegions) else KernelRegions((table,), np.ones((1, 1, 1)))
+    )
     begin = time.perf_counter()
     moved = mesh.deformed(weights)
     found = strain(mesh.vertices_mm, moved, mesh.faces, mesh.uv)
@@ -189,7 +192,7 @@ def apply_microstructure(
 
     def fields_at(window: Window) -> tuple[LineKernels, LineKernels]:
         shown = rasterize(found, mesh.faces, mesh.uv, size, window=window)
-        return line_kernels(shown, table, extrapolate=extrapolate)
+        return regional_kernels(shown, regions, size, window=window, extrapolate=extrapolate)
 
     def valid_at(window: Window) -> Bools:
         return np.asarray(valid[window.rows, window.columns], bool)
@@ -199,7 +202,7 @@ def apply_microstructure(
     if out is None:
         target: Float32 = np.empty(size, np.float32)
     else:
-        job = _job(moved, mesh, neutral_height, valid, table, (extrapolate, sampling, str(tile)))
+        job = _job(moved, mesh, neutral_height, valid, regions, (extrapolate, sampling, str(tile)))
         journal = _Journal.open(Path(out), job, size)
         target = journal.target
     before = [] if journal is None else list(journal.finished)
@@ -221,20 +224,17 @@ def apply_microstructure(
     if journal is not None:
         journal.close()
     convolution_s = time.perf_counter() - begin
-    return AppliedMicrostructure(
-        target,
-        found,
-        _report(
-            found, table, size, extrapolate, strain_s, convolution_s, (len(tiles), len(before)),
-            _shares(found, mesh, table, size, extrapolate),
-        ),
+    report = _report(
+        found, regions, mesh, size, extrapolate, (strain_s, convolution_s),
+        (len(tiles), len(before)), _shares(found, mesh, regions, size, extrapolate),
     )  # fmt: skip
+    return AppliedMicrostructure(target, found, report)
 
 
 def _shares(
     found: MeshStrain,
     mesh: BlendShapeMesh,
-    table: KernelTable,
+    regions: KernelRegions,
     size: tuple[int, int],
     extrapolate: Literal["hold", "formula"],
 ) -> tuple[float, float, float]:
@@ -243,7 +243,7 @@ def _shares(
     few = (math.ceil(size[0] / coarser), math.ceil(size[1] / coarser))
     shown = rasterize(found, mesh.faces, mesh.uv, few, pad_px=0)
     changed, narrow = np.zeros((2, *few), bool)
-    for lines in line_kernels(shown, table, extrapolate=extrapolate):
+    for lines in regional_kernels(shown, regions, few, extrapolate=extrapolate):
         sigma_px = coarser * lines.sigma_px[shown.covered]
         asked = (lines.alpha[shown.covered] != 0.0) & (sigma_px > 0.0)
         wide = sigma_px >= LEAST_SIGMA_PX
@@ -259,23 +259,26 @@ def _shares(
 
 def _report(
     found: MeshStrain,
-    table: KernelTable,
+    regions: KernelRegions,
+    mesh: BlendShapeMesh,
     size: tuple[int, int],
     extrapolate: str,
-    strain_s: float,
-    convolution_s: float,
+    seconds: tuple[float, float],
     tiles: tuple[int, int],
     shares: tuple[float, float, float],
 ) -> MicrostructureReport:
     good = found.valid
     if not good.any():
         raise ApplyMicrostructureError("mesh: no vertex has a triangle with an area and a texture")
-    low, high = table.stretch_range
-    r_s, r_t = found.r_s[good], found.r_t[good]
-    both = np.stack([r_s, r_t])
-    told = np.clip(both, low, high) if extrapolate == "hold" else both
-    alpha = table.unlimited_alpha(told)
-    clipped = (alpha < ALPHA_LIMITS[0]) | (alpha > ALPHA_LIMITS[1])
+    both = np.stack([found.r_s[good], found.r_t[good]])
+    own = regions.table_at(mesh.uv[good])
+    below, above, clipped = np.zeros((3, *both.shape), bool)
+    for number, table in enumerate(regions.tables):
+        (low, high), there = table.stretch_range, own == number
+        below[:, there], above[:, there] = both[:, there] < low, both[:, there] > high
+        held = np.clip(both[:, there], low, high) if extrapolate == "hold" else both[:, there]
+        alpha = table.unlimited_alpha(held)
+        clipped[:, there] = (alpha < ALPHA_LIMITS[0]) | (alpha > ALPHA_LIMITS[1])
     pixels = np.concatenate(
         [
             np.hypot(axis[good, 0] * size[1], axis[good, 1] * size[0]) * per_mm[good]
@@ -286,12 +289,12 @@ def _report(
     )  # fmt: skip
     return MicrostructureReport(
         size_px=size,
-        stretch_s=(float(r_s.min()), float(r_s.max())),
-        stretch_t=(float(r_t.min()), float(r_t.max())),
-        fitted_range=table.stretch_range,
-        outside_share=float((~table.inside(both)).any(axis=0).mean()),
-        below_share=float((r_t < low).mean()),
-        above_share=float((r_s > high).mean()),
+        stretch_s=(float(both[0].min()), float(both[0].max())),
+        stretch_t=(float(both[1].min()), float(both[1].max())),
+        fitted_range=regions.tables[0].stretch_range,
+        outside_share=float((below | above).any(axis=0).mean()),
+        below_share=float(below.any(axis=0).mean()),
+        above_share=float(above.any(axis=0).mean()),
         extrapolate=extrapolate,
         clipped_share=float(clipped.any(axis=0).mean()),
         invalid_share=float(1.0 - good.mean()),
@@ -302,8 +305,8 @@ def _report(
         changed_share=float(shares[1]),
         unresolved_share=float(shares[2]),
         pixel_um=float(1e3 / np.median(pixels)),
-        strain_s=strain_s,
-        convolution_s=convolution_s,
+        strain_s=seconds[0],
+        convolution_s=seconds[1],
         tiles=tiles[0],
         tiles_before=tiles[1],
     )
@@ -314,19 +317,19 @@ def _job(
     mesh: BlendShapeMesh,
     height: Any,
     valid: Any,
-    table: KernelTable,
+    regions: KernelRegions,
     settings: tuple[str, ...],
 ) -> str:
     """Return a digest of everything that the result depends on."""
     digest = hashlib.blake2b(digest_size=16)
     for array in (moved, mesh.vertices_mm, mesh.uv, mesh.faces):
         digest.update(np.ascontiguousarray(array).data)
-    for each in (height, valid):
+    for each in (height, valid, *regions.weights):
         if each is not None:
             digest.update(f"{each.dtype} {tuple(each.shape)}".encode())
             for top in range(0, each.shape[0], HASHED_ROWS):
                 digest.update(np.ascontiguousarray(each[top : top + HASHED_ROWS]).data)
-    digest.update(json.dumps([table.to_json(), *settings]).encode())
+    digest.update(json.dumps([*(table.to_json() for table in regions.tables), *settings]).encode())
     return digest.hexdigest()
 
 

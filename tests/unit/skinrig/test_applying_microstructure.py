@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from model.displacement_convolution import convolve
-from model.microstructure import FOREHEAD, kernel_parameters
+from model.mesh_strain import StrainError
+from model.microstructure import FOREHEAD, KernelTable, kernel_parameters
+from model.strain_fields import KernelRegions
 from skinrig.applying_microstructure import ApplyMicrostructureError, apply_microstructure
 from skinrig.blend_shapes import BlendShapeMesh
 
@@ -73,6 +75,32 @@ def test_a_map_too_coarse_for_the_kernels_is_reported_as_such(rng):
     np.testing.assert_array_equal(done.height, height)
     assert done.report.unresolved_share == 1.0
     assert done.report.pixel_um == pytest.approx(1e3 * 30.0 / 32.0, rel=1e-5)
+
+
+def test_two_kinds_of_skin_each_have_their_own_kernels_and_are_blended_between(rng):
+    height = rng.standard_normal((128, 128)).astype(np.float32)
+    softer = KernelTable(
+        (), ((1.5, -1.5),), None, (10.0, 5.0), (1.0, 1.1), "half as strong, fitted to 1.1"
+    )
+    mesh, weights = square_mm(), {"wide": 1.0}
+    one, other = (apply_microstructure(mesh, weights, height, t).height for t in (FOREHEAD, softer))
+    left = np.zeros((2, 4, 8))
+    left[0, :, :3], left[1, :, 4:] = 1.0, 2.0
+    left[:, :, 3] = 0.5
+    done = apply_microstructure(mesh, weights, height, KernelRegions((FOREHEAD, softer), left))
+    far = 12  # samples of the passes reach so many pixels
+    np.testing.assert_allclose(done.height[:, : 40 - far], one[:, : 40 - far], atol=1e-5)
+    np.testing.assert_allclose(done.height[:, 72 + far :], other[:, 72 + far :], atol=1e-5)
+    assert np.abs(done.height - one)[:, 60:].max() > 0.1
+    assert done.report.outside_share == pytest.approx(0.6)  # columns of vertices there
+    tiled = apply_microstructure(
+        mesh, weights, height, KernelRegions((FOREHEAD, softer), left), tile=50
+    )
+    np.testing.assert_array_equal(tiled.height, done.height)
+    with pytest.raises(StrainError, match="weights"):
+        KernelRegions((FOREHEAD, softer), left[:1])
+    with pytest.raises(StrainError, match="NaN"):
+        KernelRegions((FOREHEAD, softer), left - 1.0)
 
 
 def test_an_interrupted_run_goes_on_and_gives_the_same_file(rng, tmp_path):
