@@ -129,7 +129,7 @@ class DeformedSphere:
         Mesh and relief follow the skin: a pixel is as long as on the neutral sphere times the
         stretch ratio.
         """
-        down, right = np.gradient(self.height_um.astype(np.float64))
+        down, right = (np.asarray(part) for part in np.gradient(self.height_um))
         along = self.strain.axes[..., 0] * right[..., None]
         along = along + self.strain.axes[..., 1] * down[..., None]
         return np.asarray(1e-3 * along * self.strain.px_per_mm / self.strain.stretch)
@@ -151,8 +151,8 @@ class DeformedSphere:
         near = self.sphere.points_mm() @ np.asarray(PLACES[place]) > (
             self.sphere.radius_mm * math.cos(within_rad)
         )
-        variance_s, variance_t = self.slopes()[near].var(axis=0)
-        return float(variance_s), float(variance_t)
+        variance_s, variance_t = np.var(self.slopes()[near], axis=0).tolist()
+        return variance_s, variance_t
 
     def picture(
         self, *, size_px: int = 256, alpha: float = 0.2, light: tuple[float, float, float] = (
@@ -188,7 +188,7 @@ class DeformedSphere:
         n = self.sphere.texels
         columns = (px / (1.0 + pz) / REACH + 1.0) * 0.5 * n - 0.5
         rows = (1.0 - py / (1.0 + pz) / REACH) * 0.5 * n - 0.5
-        down, right = np.gradient(self.height_um.astype(np.float64))
+        down, right = (np.asarray(part) for part in np.gradient(self.height_um))
         scale = 1.0 / self.sphere.pixel_um()
         slope_x, slope_y = (
             map_coordinates(part * scale, [rows, columns], order=1, mode="nearest")
