@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from model import store
 from model.skin import SkinAppearance
 from model.wrinkle_model import FILE as WRINKLE_FILE
+from reconstruction.dome_stages import MESH_FILE
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.tangent_space import SMOOTHING_MM, tangent_normals
 from reconstruction.wrinkle_fit import WrinkleFit, fit
@@ -85,6 +86,7 @@ def fit_wrinkles(
         raise WrinkleInputError(
             f"appearances: got {', '.join(read) or 'none'}, expected neutral and an expression"
         )
+    _check_textures({state: one for state, (_, one) in read.items()})
     measured = {state: _normals(folder, one, smoothing_mm) for state, (folder, one) in read.items()}
     shapes = {state: one.normals.shape for state, one in measured.items()}
     if len(set(shapes.values())) > 1:
@@ -144,6 +146,23 @@ def _state_of(given: Path) -> tuple[str, Path]:
     if not isinstance(told, str) or not told:
         raise WrinkleInputError(f"{given}: says no state; name it as STATE={given}")
     return told, given
+
+
+def _check_textures(appearances: Mapping[str, SkinAppearance]) -> None:
+    """Refuse faces that are unwrapped differently: a texel would be other skin in each."""
+    digests: dict[str, str] = {}
+    for state, appearance in appearances.items():
+        mesh = appearance.files.get(MESH_FILE)
+        if mesh is None:
+            continue
+        lines = [line for line in mesh.split(b"\n") if line.startswith((b"vt ", b"f "))]
+        digests[state] = hashlib.sha256(b"\n".join(lines)).hexdigest()
+    if len(set(digests.values())) > 1:
+        raise WrinkleInputError(
+            f"appearances: {', '.join(digests)} have textures of their own, expected one for all; "
+            "give each session the same template wrapped onto its scan (`skinrig simulate dome "
+            "--wrapped`, or `skinrig reconstruct --scan`)"
+        )
 
 
 def _normals(folder: Path, appearance: SkinAppearance, smoothing_mm: float) -> NormalMaps:
