@@ -156,12 +156,12 @@ def _carried(basis, normal):  # type: ignore[no-untyped-def]
     c = _dot(n, normal)
     sign = 1.0 if c >= 0.0 else -1.0
     scale = 1.0 / (1.0 + abs(c))
-    out = np.empty((2, 3))
-    for axis in range(2):
-        lean = _dot(basis[axis], normal) * scale
-        for m in range(3):
-            out[axis, m] = basis[axis, m] - lean * (sign * n[m] + normal[m])
-    return out
+    x, y, z = sign * n[0] + normal[0], sign * n[1] + normal[1], sign * n[2] + normal[2]
+    a, b = _dot(basis[0], normal) * scale, _dot(basis[1], normal) * scale
+    return (
+        (basis[0, 0] - a * x, basis[0, 1] - a * y, basis[0, 2] - a * z),
+        (basis[1, 0] - b * x, basis[1, 1] - b * y, basis[1, 2] - b * z),
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -211,7 +211,9 @@ def vertex_strain(
         else:
             for m in range(3):
                 normal[w, m] /= length
-        axes[w] = _carried(basis[widest[w]], normal[w])
+        first, second = _carried(basis[widest[w]], normal[w])
+        for m in range(3):
+            axes[w, 0, m], axes[w, 1, m] = first[m], second[m]
     tensor_at = np.zeros((places, 3))
     weight = np.zeros(places)
     # textures seen from both sides apart: what is folded there would cancel
@@ -249,6 +251,8 @@ def vertex_strain(
         if kind[f] == FINE:
             for corner in range(3):
                 vertex = faces[f, corner]
+                if share[vertex, 0] == 0.0 or share[vertex, 1] == 0.0:
+                    continue
                 w = place[vertex]
                 here = _carried(basis[f], normal[w])
                 det = to_uv[f, 0, 0] * to_uv[f, 1, 1] - to_uv[f, 0, 1] * to_uv[f, 1, 0]

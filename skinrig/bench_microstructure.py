@@ -109,11 +109,10 @@ def strained_relief(
 
 def truth(*, toy: bool) -> StageBenchmark:
     """Judge convolved reliefs by skin whose stiff layer came to rest; then time the convolution."""
-    size_mm = 0.8 if toy else 3.0
+    size_mm = 0.8 if toy else 2.4
     states = (0.82, 0.94, 1.06, 1.18) if toy else FITTED_STATES
     table = fitted_table(
-        [make_micro_skin("forehead", seed=seed, size_mm=size_mm, texel_um=TEXEL_UM)
-         for seed in ((1,) if toy else (1, 2))],
+        [make_micro_skin("forehead", seed=1, size_mm=size_mm, texel_um=TEXEL_UM)],
         states,
         every=4 if toy else 1,
     )  # fmt: skip
@@ -222,7 +221,8 @@ def varying_fields(
     return tuple(
         np.ascontiguousarray(values, np.float32)
         for values in (
-            np.stack([c, s], -1), np.stack([-s, c], -1), alpha, sigma, -alpha, 0.9 * sigma
+            np.stack([c, s], -1), np.stack([-s, c], -1), alpha, sigma,
+            np.minimum(-alpha, 1.0), 0.9 * sigma
         )
     )  # fmt: skip
 
