@@ -23,6 +23,8 @@ from rigsim.mesh import Mesh, build_mesh
 from rigsim.subject import Subject, make_subject
 
 SIZE = 320
+PLATE = 256
+"""Texels along the sides of the flat piece, 28 mm up and 60 mm across."""
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +49,8 @@ def brow_plate(stretch_x: float = 1.0, stretch_y: float = 1.0) -> Mesh:
 def plate_wrinkles(
     stretch_x: float, stretch_y: float, *, seed: int = 1
 ) -> tuple[Wrinkles, WrinkleLines, Atlas]:
-    rest, posed = unwrap(brow_plate(), 400), unwrap(brow_plate(stretch_x, stretch_y), 400)
+    rest = unwrap(brow_plate(), PLATE)
+    posed = unwrap(brow_plate(stretch_x, stretch_y), PLATE)
     lines = wrinkle_lines(rest.position_mm, rest.covered, seed=seed)
     return raise_wrinkles(lines, rest, posed), lines, posed
 
@@ -93,15 +96,15 @@ def test_along_a_wrinkled_line_the_skin_keeps_its_slack_length(stretch):
 
     Expected: from furrow to furrow the length is that of the surface and of the excess, which in
     the middle of a zone makes it the skin's slack length, (1 - tension) of that at rest (next
-    test). Tolerance: 1.5 % of the length; texels of 0.05 mm take 0.1 %, the rest is that the depth
+    test). Tolerance: 1.5 % of the length; texels of 0.1 mm take 0.2 %, the rest is that the depth
     changes along the way.
     """
     wrinkles, _lines, posed = plate_wrinkles(1.0, stretch, seed=3)
     ratios, gains = [], []
-    for column in range(150, 250, 5):
+    for column in range(96, 160, 4):
         height_mm = wrinkles.height_um[:, column].astype(np.float64) * 1e-3
         low = (height_mm[1:-1] < height_mm[:-2]) & (height_mm[1:-1] <= height_mm[2:])
-        furrows = 1 + np.flatnonzero(low & (np.abs(np.arange(1, 399) - 200) < 150))
+        furrows = 1 + np.flatnonzero(low & (np.abs(np.arange(1, PLATE - 1) - PLATE // 2) < 96))
         part = slice(furrows[0], furrows[-1] + 1)
         assert len(furrows) >= 2
         step_mm = np.abs(np.diff(posed.position_mm[part, column, 1].astype(np.float64)))
@@ -115,7 +118,7 @@ def test_along_a_wrinkled_line_the_skin_keeps_its_slack_length(stretch):
 
 def test_in_the_middle_of_a_zone_the_whole_excess_is_taken():
     wrinkles, lines, _ = plate_wrinkles(1.0, 0.75, seed=3)
-    excess = wrinkles.excess[190:260, 150:250]
+    excess = wrinkles.excess[122:166, 96:160]
     whole = (1.0 - lines.tension) / 0.75 - 1.0
     # persons take up to a fifth less; the lines' wobble turns some of them a little
     assert (excess < 1.08 * whole).all()
@@ -169,7 +172,8 @@ def test_expressions_that_shorten_the_same_skin_raise_the_same_lines(face, posed
     both = (np.abs(one) > 0) & (np.abs(other) > 0) & (points[..., 1] > 46.0)
     assert both.sum() > 1000
     assert np.corrcoef(one[both], other[both])[0, 1] > 0.9
-    stranger = make_subject("II", seed=5, size=SIZE).posed("surprise").pose.wrinkles.height_um
+    lines = wrinkle_lines(points, face.atlas.covered, seed=5)
+    stranger = raise_wrinkles(lines, face.atlas, posed("surprise").atlas).height_um
     shared = (np.abs(one) > 0) & (np.abs(stranger) > 0) & (points[..., 1] > 46.0)
     assert abs(np.corrcoef(one[shared], stranger[shared])[0, 1]) < 0.6
 

@@ -14,7 +14,7 @@ from skinrig.simulating_dome import small_dome
 from skinrig.simulating_flash import truth_of
 
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
-WIDTH = 252
+WIDTH = 192
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def rig() -> Rig:
 
 @pytest.fixture(scope="module")
 def face() -> Subject:
-    return make_subject("II", seed=4, size=256)
+    return make_subject("II", seed=4, size=160)
 
 
 def scene_of(rig: Rig, face: Subject, state: str, **kwargs) -> FlashScene:
@@ -39,6 +39,16 @@ def rest(rig: Rig, face: Subject) -> FlashScene:
 @pytest.fixture(scope="module")
 def smile(rig: Rig, face: Subject) -> FlashScene:
     return scene_of(rig, face, "smile")
+
+
+@pytest.fixture(scope="module")
+def tired(rig: Rig, face: Subject) -> FlashScene:
+    return scene_of(rig, face, "exercise")
+
+
+@pytest.fixture(scope="module")
+def still(rig: Rig, face: Subject) -> FlashScene:
+    return scene_of(rig, face, "smile", movement=False)
 
 
 def test_the_moved_face_is_shown_and_its_maps_with_it(rest, smile):
@@ -78,8 +88,7 @@ def test_blood_of_a_state_carried_back_along_the_skin_is_that_at_rest(smile, rig
         assert np.median(unmoved[checked]) > 3.0 * np.median(error)
 
 
-def test_blood_at_rest_is_what_the_unmoved_face_shows(smile, rig, face):
-    still = scene_of(rig, face, "smile", movement=False)
+def test_blood_at_rest_is_what_the_unmoved_face_shows(smile, still):
     truth, unmoved = smile.truth(), still.truth()
     for name in ("hemoglobin", "melanin", "mask"):
         np.testing.assert_array_equal(truth[f"{name}_at_rest"], unmoved[name])
@@ -87,8 +96,7 @@ def test_blood_at_rest_is_what_the_unmoved_face_shows(smile, rig, face):
     assert "position_at_rest_mm" not in unmoved
 
 
-def test_without_movement_states_change_the_blood_only_and_that_is_said(rest, smile, rig, face):
-    still = scene_of(rig, face, "smile", movement=False)
+def test_without_movement_states_change_the_blood_only_and_that_is_said(rest, smile, still):
     np.testing.assert_array_equal(still.truth()["normals"], rest.truth()["normals"])
     assert (still.truth()["hemoglobin"] != rest.truth()["hemoglobin"]).any()
     said = dict(still.left_out)
@@ -97,26 +105,26 @@ def test_without_movement_states_change_the_blood_only_and_that_is_said(rest, sm
     assert "shadows of wrinkles" in dict(smile.left_out)
 
 
-def test_global_states_do_not_move_and_neutral_needs_no_maps_at_rest(rest, rig, face):
-    tired = scene_of(rig, face, "exercise").truth()
-    np.testing.assert_array_equal(tired["position_mm"], rest.truth()["position_mm"])
-    np.testing.assert_array_equal(tired["hemoglobin_at_rest"], tired["hemoglobin"])
+def test_global_states_do_not_move_and_neutral_needs_no_maps_at_rest(rest, tired):
+    truth = tired.truth()
+    np.testing.assert_array_equal(truth["position_mm"], rest.truth()["position_mm"])
+    np.testing.assert_array_equal(truth["hemoglobin_at_rest"], truth["hemoglobin"])
     assert not [name for name in rest.truth() if "at_rest" in name]
 
 
-def test_a_posed_subject_keeps_its_pose_whatever_its_blood_does(rig, face):
+def test_a_posed_subject_keeps_its_pose_whatever_its_blood_does(rig, face, tired):
     half = face.posed("smile", 0.5)
     scene = scene_of(rig, half, "exercise")
     assert scene.subject is half
     np.testing.assert_array_equal(
         scene.truth()["hemoglobin_at_rest"],
-        scene_of(rig, face, "exercise").truth()["hemoglobin_at_rest"],
+        tired.truth()["hemoglobin_at_rest"],
     )
 
 
-def test_scenes_that_share_their_light_give_what_they_give_alone(rig, face, rest):
-    beside = scene_of(rig, face, "exercise").radiance()
-    stranger = make_subject("II", seed=4, size=256)  # the same person, nothing shared
+def test_scenes_that_share_their_light_give_what_they_give_alone(rig, rest, tired):
+    beside = tired.radiance()
+    stranger = make_subject("II", seed=4, size=160)  # the same person, nothing shared
     alone = scene_of(rig, stranger, "exercise").radiance()
     np.testing.assert_array_equal(beside, alone)
     assert (beside != rest.radiance()).any()
@@ -140,8 +148,9 @@ def test_truth_on_disk_has_landmarks_and_blood_at_rest_with_masks_of_their_own(s
     assert "hemoglobin_at_rest" not in neutral.maps
 
 
+@pytest.mark.long
 def test_the_dome_shows_an_expression_with_its_normals_in_the_texture_frame(face):
-    rig = small_dome(load_rig("dome"), lights=4, views=1, width_px=64)
+    rig = small_dome(load_rig("dome"), lights=4, views=1, width_px=32)
     scenes = {
         state: DomeScene(rig, face, state=state, choice=EMBREE) for state in ("neutral", "surprise")
     }
