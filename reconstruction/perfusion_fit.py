@@ -29,6 +29,8 @@ _GRID = 97
 _DELAYS = 81
 _SLOPE = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5])
 """Time constants since the beginning of a change at which samples are tried."""
+_COARSE = 3.0
+"""Constants below so many steps of the delay need delays between them."""
 Shape = Callable[[Floats, Floats], Floats]
 """Delays and constants of shape (..., 1) to the part of the way, (..., N)."""
 
@@ -235,11 +237,19 @@ def _fit(data: _Data, curve: Shape, delays: Floats, constants: Floats, at: Float
         """(..., P) square sums for delays and constants that broadcast to (...)."""
         return data.residual(curve(delay[..., None], constant[..., None]))
 
-    # by constant: first the common delays, then those that put a sample on its slope
-    tried = [np.concatenate([delays, _near(at, constant, delays)]) for constant in constants]
-    by_curve = np.array(
-        [residuals(d, np.full(d.size, c)) for d, c in zip(tried, constants, strict=True)]
+    # by constant: the common delays, and where those are too coarse some that put a sample on a
+    # slope
+    quick = constants < _COARSE * (delays[1] - delays[0]) if delays.size > 1 else constants < 0.0
+    near = np.array([_near(at, constant, delays) for constant in constants[quick]])
+    by_curve = np.full(
+        (constants.size, delays.size + (near.shape[1] if quick.any() else 0), len(data.values)),
+        np.inf,
     )
+    by_curve[:, : delays.size] = residuals(*np.broadcast_arrays(delays, constants[:, None]))
+    if quick.any():
+        by_curve[quick, delays.size :] = residuals(
+            *np.broadcast_arrays(near, constants[quick][:, None])
+        )
     curves = len(data.values)
     samples = (data.weights > 0).sum(axis=1)
     # each curve by its own noise, which the best common curve leaves
@@ -256,7 +266,9 @@ def _fit(data: _Data, curve: Shape, delays: Floats, constants: Floats, at: Float
         sums = residuals(np.array([delay]), np.exp(np.array([log_constant])))
         return float((sums[0] / noise2).sum())
 
-    start = np.array([tried[best[0]][best[1]], np.log(constants[best[0]])])
+    common = best[1] < delays.size
+    begin = delays[best[1]] if common else near[int(quick[: best[0]].sum()), best[1] - delays.size]
+    start = np.array([begin, np.log(constants[best[0]])])
     found = _refined(landscape, start, delays, np.log(constants), float(total[best]))
     delay, constant, least = float(found[0]), float(np.exp(found[1])), found[2]
     nu = float(freedom.sum())
@@ -322,8 +334,6 @@ def _near(since: Floats, constant: float, delays: Floats) -> Floats:
 
     Their number is the same for each constant; those beyond the range are put into it.
     """
-    if delays.size == 1:
-        return np.zeros(0)
     late = since[np.isfinite(since) & (since <= 2 * delays[-1])]
     return np.clip((late[:, None] - constant * _SLOPE).ravel(), delays[0], delays[-1])
 

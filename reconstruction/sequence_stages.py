@@ -8,7 +8,6 @@ moved are laid over the face at rest. The curves take the times at which the fla
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -39,8 +38,6 @@ RADIUS_SHARE = 0.02
 """Radius of a place's disc, of the map's width: 5 mm of a face that fills the picture."""
 ALIASES = {"cheek": "cheek left", "nose": "nose tip", "temple": "temple left"}
 """Landmarks that stand for a place where a table does not have the place itself."""
-POSE_SIGMAS = 3.3
-"""Standard errors of the difference of poses that blood must differ by: one in a thousand."""
 STILL_PX = 0.1
 """A face whose median pixel moves less has not moved."""
 
@@ -330,9 +327,7 @@ def _of_event(
 def _of_fit(
     fit: perfusion_fit.RelaxationFit, curve: int | None, of_pose: float = 0.0
 ) -> dict[str, Any]:
-    """Return a fit's document; levels that differ by no more than poses do, do not differ."""
-    if curve is not None and abs(fit.end[curve] - fit.start[curve]) < POSE_SIGMAS * of_pose:
-        fit = replace(fit, known="unknown", interval_s=(0.0, np.inf), stderr_time_constant_s=np.nan)
+    """Return a fit's document, and how many standard errors its levels lie apart."""
     document = {
         "time_constant_s": fit.time_constant_s,
         "stderr_time_constant_s": fit.stderr_time_constant_s,
@@ -351,6 +346,9 @@ def _of_fit(
             "stderr_end": fit.stderr_end[curve],
             "noise": fit.noise[curve],
         }
+        apart = float(fit.end[curve] - fit.start[curve])
+        error = np.sqrt(fit.stderr_start[curve] ** 2 + fit.stderr_end[curve] ** 2 + of_pose**2)
+        document["levels_apart_sigmas"] = abs(apart) / max(float(error), 1e-300)
     return document
 
 
