@@ -21,6 +21,8 @@ from skinrig.simulation import Simulated, simulate_session
 
 FLASH_SUBJECTS = ("II", "IV")
 """Skin types of the flash rig's faces: one light, one dark, so that errors by melanin show."""
+FLASH_STATES = ("neutral", "anger")
+"""States of the first face: what a hemoglobin rig is fitted to."""
 FLASH_WANT = (
     "melanin", "hemoglobin", "shading", "residual", "diffuse", "picture", "specular_picture",
     "tsumura_melanin", "tsumura_hemoglobin",
@@ -54,7 +56,9 @@ Share = Callable[[str], AbstractContextManager[None]]
 
 
 def _flash(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
-    """Capture targets and two faces with the flash rig, down to melanin and hemoglobin."""
+    """Capture targets and two faces with the flash rig, down to melanin, blood and its changes."""
+    from skinrig.fitting_facial_color import fit_facial_color
+
     calibration = out / "calibration-flash"
     with share("flash: capture the calibration targets"):
         for target in ("flat", "white", "chart", "malus"):
@@ -69,7 +73,7 @@ def _flash(out: Path, seed: int, share: Share, width_px: int | None, found: Find
             calibrate(kind, [out / f"session-flash-{target}"], calibration)
     captures: list[Simulated] = []
     with share("flash: capture two faces"):
-        for subject in FLASH_SUBJECTS:
+        for number, subject in enumerate(FLASH_SUBJECTS):
             captures.append(
                 simulate_session(
                     "flash",
@@ -77,6 +81,7 @@ def _flash(out: Path, seed: int, share: Share, width_px: int | None, found: Find
                     subject=subject,
                     seed=seed,
                     width_px=width_px,
+                    states=FLASH_STATES if number == 0 else ("neutral",),
                 )
             )
     with share("flash: reconstruct melanin and hemoglobin"):
@@ -88,6 +93,10 @@ def _flash(out: Path, seed: int, share: Share, width_px: int | None, found: Find
                 calibration=calibration, truth=truth.name if truth else "",
             )  # fmt: skip
             found.errors += _chromophore_rows(out / f"appearance-{name}", truth)
+    with share("flash: fit the blood of a moving face"):
+        moving = out / f"appearance-moving-{FLASH_SUBJECTS[0]}"
+        fit_facial_color([captures[0].session], out=moving, calibration=calibration)
+        found.errors += _moving_rows(moving, out)
     found.tables.append(
         {
             "title": "Resolution lost as light spreads in the skin, 10 to 90 % of an edge, mm",
@@ -141,6 +150,8 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
 
 def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
     """Capture a glass ball and stretched skin in the gradient sphere, down to kernels."""
+    from skinrig.fitting_microstructure import fit_microstructure
+
     calibration = out / "calibration-gradient"
     ball = out / "session-gradient-ball"
     with share("gradient: capture a ball of black glass"):
@@ -159,6 +170,9 @@ def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: F
             capture.session, want=GRADIENT_WANT, out=appearance, calibration=calibration,
             truth=capture.truth.name if capture.truth else "",
         )  # fmt: skip
+        fit_microstructure(
+            [appearance], out=out / f"appearance-moving-{GRADIENT_SITE}", paper_table=True
+        )
         found.errors += _microrelief_rows(appearance, capture.truth)
     found.tables.append(
         {
@@ -233,6 +247,25 @@ def _chromophore_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
         [appearance.name.removeprefix("appearance-"), row.name, 100 * row.median_relative, "%",
          100 * row.coverage.share, 100 * row.masked]
         for row in rows if row.band is None and row.against == "blurred"
+    ]  # fmt: skip
+
+
+def _moving_rows(appearance: Path, out: Path) -> list[list[Any]]:
+    from skinrig import facial_color_evaluation
+    from skinrig.applying import hemoglobin_rig
+    from skinrig.dynamic_appearance import FACIAL_COLOR, parts_of
+
+    found = store.read(appearance)
+    named = parts_of(found)[FACIAL_COLOR]["truth"]
+    truths = {state: store.read(out / folder) for state, folder in named.items()}
+    states, _ = facial_color_evaluation.compare(
+        found, hemoglobin_rig(found), truths, rng=np.random.default_rng(0)
+    )
+    return [
+        [appearance.name.removeprefix("appearance-"), f"blood of {row.state}, {row.way}",
+         100 * row.median_relative, "%", 100 * row.coverage, 0.0]
+        for row in states if row.way in (facial_color_evaluation.WAYS[1],
+                                         facial_color_evaluation.WAYS[3])
     ]  # fmt: skip
 
 
