@@ -149,20 +149,38 @@ def _state_of(given: Path) -> tuple[str, Path]:
 
 
 def _check_textures(appearances: Mapping[str, SkinAppearance]) -> None:
-    """Refuse faces that are unwrapped differently: a texel would be other skin in each."""
-    digests: dict[str, str] = {}
-    for state, appearance in appearances.items():
-        mesh = appearance.files.get(MESH_FILE)
-        if mesh is None:
-            continue
-        lines = [line for line in mesh.split(b"\n") if line.startswith((b"vt ", b"f "))]
-        digests[state] = hashlib.sha256(b"\n".join(lines)).hexdigest()
-    if len(set(digests.values())) > 1:
+    """Refuse faces that are unwrapped differently: a texel would be other skin in each.
+
+    Faces on one texture need not have all triangles in common: each scan is cropped for itself.
+    """
+    places = {
+        state: _texture_triangles(appearance.files[MESH_FILE])
+        for state, appearance in appearances.items()
+        if MESH_FILE in appearance.files
+    }
+    if not places:
+        return
+    first = next(iter(places.values()))
+    if any(len(first & one) < 0.5 * min(len(first), len(one)) for one in places.values()):
         raise WrinkleInputError(
-            f"appearances: {', '.join(digests)} have textures of their own, expected one for all; "
+            f"appearances: {', '.join(places)} have textures of their own, expected one for all; "
             "give each session the same template wrapped onto its scan (`skinrig simulate dome "
             "--wrapped`, or `skinrig reconstruct --scan`)"
         )
+
+
+def _texture_triangles(mesh: bytes) -> set[tuple[float, float]]:
+    """Return where the triangles of a Wavefront mesh lie in its texture, by their middles."""
+    corners: list[tuple[float, float]] = []
+    found = set()
+    for line in mesh.split(b"\n"):
+        if line.startswith(b"vt "):
+            u, v = line.split()[1:3]
+            corners.append((float(u), float(v)))
+        elif line.startswith(b"f "):
+            used = [corners[int(corner.split(b"/")[1]) - 1] for corner in line.split()[1:4]]
+            found.add((round(sum(u for u, _ in used), 4), round(sum(v for _, v in used), 4)))
+    return found
 
 
 def _normals(folder: Path, appearance: SkinAppearance, smoothing_mm: float) -> NormalMaps:
