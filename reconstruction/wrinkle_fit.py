@@ -27,12 +27,18 @@ from model.wrinkle_expressions import CLAMPS, JIMENEZ2011, Clamp, ExpressionTabl
 from model.wrinkle_model import WrinkleModel
 from model.wrinkles import Layer, Masks, WrinkleError, mask_stack
 from reconstruction.normal_maps import NormalMaps
-from reconstruction.wrinkle_texels import Derivatives, Texels, derivatives_of, fit_texels
+from reconstruction.wrinkle_texels import (
+    TOLERANCE,
+    Derivatives,
+    Texels,
+    derivatives_of,
+    fit_texels,
+)
 from reconstruction.wrinkle_weights import (
     Difference,
     ZoneEquations,
     ZoneWeights,
-    zone_equations,
+    equations_of,
     zone_weights,
 )
 
@@ -43,7 +49,6 @@ Measured: TypeAlias = ArrayLike | NormalMaps | Derivatives
 ROUNDS = 20
 ROUGH = 256
 """Texels a side of the map with which weights are sought."""
-FREE = (-math.inf, math.inf)
 SETTLED = 1e-5
 """Fall of the misfit in a round, relative to the differences, at which the fit ends."""
 
@@ -67,6 +72,8 @@ class WrinkleFit:
         Of map and weights in turn; 0 where the weights were given.
     settled : bool
         The last round explained no more than `SETTLED` of the differences in addition.
+    clamp : {"unit", "signed"}
+        Range of the weights.
     """
 
     layer: Layer
@@ -75,16 +82,15 @@ class WrinkleFit:
     explained: float
     rounds: int
     settled: bool
+    clamp: Clamp
 
-    def model(self, *, clamp: Clamp = "unit") -> WrinkleModel:
-        """Return the face with its wrinkles, ready to be evaluated and stored.
-
-        "unit" shows no negative sum: an expression that only flattens then leaves neutral.
-        """
+    def model(self) -> WrinkleModel:
+        """Return the face with its wrinkles, ready to be evaluated and stored."""
+        stderr = np.sqrt(self.base.variance)
+        errors = {name: tuple(one.stderr) for name, one in self.expressions.items()}
         return WrinkleModel(
-            self.base.values, (self.layer,), clamp, self.base.valid, np.sqrt(self.base.variance),
-            {name: tuple(one.stderr) for name, one in self.expressions.items()},
-        )  # fmt: skip
+            self.base.values, (self.layer,), self.clamp, self.base.valid, stderr, errors
+        )
 
 
 def wrinkle_map(neutral: Measured, expression: Measured, *, size: tuple[int, int]) -> Texels:
@@ -141,6 +147,7 @@ def fit(
     size: tuple[int, int],
     zones: tuple[str, ...] | None = None,
     table: ExpressionTable | None = None,
+    clamp: Clamp = "unit",
 ) -> WrinkleFit:
     """Fit one wrinkle map, and the weights of expressions where no table gives them.
 
@@ -158,6 +165,9 @@ def fit(
         Names of the zones; the paper's for eight, numbers otherwise.
     table : ExpressionTable, optional
         Known weights with a row an expression: then only the map is fitted with them.
+    clamp : {"unit", "signed"}
+        Range of the weights, as the face will be evaluated: [0, 1], or [-1, 1] in which an
+        expression may flatten what others wrinkle, as anger does the forehead in table 1.1.
 
     Returns
     -------
@@ -168,6 +178,8 @@ def fit(
     WrinkleError
         For sizes that do not fit, or no expression.
     """
+    if clamp not in CLAMPS:
+        raise WrinkleError(f"clamp: got {clamp!r}, expected one of {', '.join(CLAMPS)}")
     if not expressions:
         raise WrinkleError("expressions: got none, expected at least one")
     stack = mask_stack(masks).astype(np.float64)
@@ -183,12 +195,10 @@ def fit(
             if len(row) != len(stack):
                 raise WrinkleError(f"table[{name!r}]: got {len(row)} zones, expected {len(stack)}")
     else:
-        rows, rounds, settled = _in_turn(stack, data, base, size)
+        rows, rounds, settled = _in_turn(stack, data, base, size, clamp)
     texels = _shown_by(stack, rows, data, size)
     wrinkle = _read(texels.values, base.valid.shape)
-    found = {
-        name: zone_weights(stack, wrinkle, one, CLAMPS["signed"]) for name, one in data.items()
-    }
+    found = {name: zone_weights(stack, wrinkle, one, CLAMPS[clamp]) for name, one in data.items()}
     source = "fitted to normals" if table is None else table.source
     if table is None:
         rows = {name: one.weights for name, one in found.items()}
@@ -201,13 +211,14 @@ def fit(
         np.where(texels.valid[..., None], texels.stderr, 0.0).astype(np.float32), texels.valid,
     )  # fmt: skip
     return WrinkleFit(
-        layer, found, base, 1.0 - misfit / total if total > 0 else 0.0, rounds, settled
+        layer, found, base, 1.0 - misfit / total if total > 0 else 0.0, rounds, settled, clamp
     )
 
 
 def _in_turn(
-    masks: Floats, data: Mapping[str, Difference], base: Derivatives, size: tuple[int, int]
-) -> tuple[dict[str, Floats], int, bool]:
+    masks: Floats, data: Mapping[str, Difference], base: Derivatives, size: tuple[int, int],
+    clamp: Clamp,
+) -> tuple[dict[str, Floats], int, bool]:  # fmt: skip
     """Return weights that map and weights in turn lead to, the rounds, and whether they settled.
 
     Weights hardly depend on detail: they are sought at a resolution that two pixels a texel of
@@ -221,10 +232,11 @@ def _in_turn(
     texels = max(rough[0], masks.shape[1]), max(rough[1], masks.shape[2])
     small = min(2 * texels[0], shape[0]), min(2 * texels[1], shape[1])
     data = {name: _reduced(one, small) for name, one in data.items()}
+    bounds = (0.0 if clamp == "unit" else -math.inf, math.inf)
     left = math.inf
     for rounds in range(1, ROUNDS + 1):
-        equations = _equations(masks, _shown_by(masks, rows, data, rough), data)
-        free = {name: one.least(FREE) for name, one in equations.items()}
+        equations = _equations(masks, _shown_by(masks, rows, data, rough, tolerance=1e-7), data)
+        free = {name: one.least(bounds) for name, one in equations.items()}
         rows = _limited(free)
         misfit = sum(equations[name].misfit(row) for name, row in free.items())
         total = sum(one.total for one in equations.values())
@@ -298,7 +310,7 @@ def _read(texels: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.fl
 
 def _shown_by(
     masks: Floats, rows: Mapping[str, Floats], data: Mapping[str, Difference],
-    size: tuple[int, int],
+    size: tuple[int, int], *, tolerance: float = TOLERANCE,
 ) -> Texels:  # fmt: skip
     """Return the map that expressions with known weights show best."""
     parts = []
@@ -306,10 +318,13 @@ def _shown_by(
         shape = one.weight.shape
         small = np.tensordot(rows[name], masks, axes=1)
         parts.append((resampling.resampled(small, (shape[0], shape[1])), one))
-    return _map_of(parts, size)
+    return _map_of(parts, size, tolerance=tolerance)
 
 
-def _map_of(parts: list[tuple[NDArray[np.floating], Difference]], size: tuple[int, int]) -> Texels:
+def _map_of(
+    parts: list[tuple[NDArray[np.floating], Difference]], size: tuple[int, int],
+    *, tolerance: float = TOLERANCE,
+) -> Texels:  # fmt: skip
     """Return the map that differences show, each with a strength (H, W)."""
     shape = parts[0][0].shape
     weight, covered = np.zeros(shape), np.zeros(shape)
@@ -320,15 +335,14 @@ def _map_of(parts: list[tuple[NDArray[np.floating], Difference]], size: tuple[in
         product += v[..., None] * one.values
         noise += (v * v)[..., None] * one.variance
         covered = np.maximum(covered, one.weight > 0)
-    return fit_texels(weight, product, noise, covered, size)
+    return fit_texels(weight, product, noise, covered, size, tolerance=tolerance)
 
 
 def _equations(
     masks: Floats, texels: Texels, data: Mapping[str, Difference]
 ) -> dict[str, ZoneEquations]:
     shape = next(iter(data.values())).weight.shape
-    wrinkle = _read(texels.values, shape)
-    return {name: zone_equations(masks, wrinkle, one) for name, one in data.items()}
+    return equations_of(masks, _read(texels.values, shape), data, with_noise=False)
 
 
 def _begun(masks: Floats, data: Mapping[str, Difference], base: Derivatives) -> dict[str, Floats]:

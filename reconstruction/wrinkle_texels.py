@@ -138,6 +138,8 @@ def fit_texels(
     noise: NDArray[np.floating],
     covered: NDArray[np.floating],
     shape: tuple[int, int],
+    *,
+    tolerance: float = TOLERANCE,
 ) -> Texels:
     """Return texels t whose bilinear reading B t makes sum_x weight (B t)^2 - 2 product B t least.
 
@@ -153,6 +155,8 @@ def fit_texels(
         Part of the pixel that was measured, 0 or 1.
     shape : (int, int)
         Rows and columns of texels, at most those of the pixels.
+    tolerance : float
+        Relative error at which conjugate gradients end.
     """
     height, width = weight.shape
     if shape[0] > height or shape[1] > width or min(shape) < 1:
@@ -178,7 +182,7 @@ def fit_texels(
     for c in (0, 1):
         b = gathered(by, bx, product[..., c]).ravel()[some]
         first = b / summed.ravel()[some] / root
-        solved, _ = cg(matrix, root * b, x0=first, rtol=TOLERANCE, maxiter=500)
+        solved, _ = cg(matrix, root * b, x0=first, rtol=tolerance, maxiter=500)
         plane = np.zeros(summed.size)
         plane[some] = root * solved
         values[..., c] = np.where(valid, plane.reshape(shape), 0.0)

@@ -8,6 +8,7 @@ scalar image, |W|^2, gathered at the masks' resolution.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -160,25 +161,56 @@ def zone_equations(
         At the resolution of the difference.
     difference : Difference
     """
-    shape = difference.weight.shape
+    return equations_of(masks, wrinkle, {"": difference})[""]
+
+
+def equations_of(
+    masks: NDArray[np.floating], wrinkle: NDArray[np.floating], data: Mapping[str, Difference],
+    *, with_noise: bool = True,
+) -> dict[str, ZoneEquations]:  # fmt: skip
+    """Return the normal equations of several expressions' weights for the same wrinkle map.
+
+    Parameters
+    ----------
+    masks, wrinkle
+        As of :func:`zone_equations`.
+    data : mapping of str to Difference
+    with_noise : bool
+        False leaves `noise` at 0, which weights do not need.
+    """
+    shape = next(iter(data.values())).weight.shape
     masks = resampling.resampled(
         masks, (min(masks.shape[1], shape[0]), min(masks.shape[2], shape[1]))
     )
     h, w = masks.shape[1:]
     by, bx = (resampling.reading_matrix(t, p) for t, p in zip((h, w), shape, strict=True))
-    v = difference.weight.astype(np.float64)
     flat = masks.reshape(len(masks), -1)
-    energy = np.einsum("hwc,hwc->hw", wrinkle, wrinkle) * v
-    agreement = np.einsum("hwc,hwc->hw", wrinkle, difference.values) * v
-    scatter = np.einsum("hwc,hwc,hwc->hw", wrinkle, wrinkle, difference.variance) * v * v
-    squares = np.einsum("hwc,hwc->hw", difference.values, difference.values, dtype=np.float64)
-    return ZoneEquations(
-        flat @ (normal_matrix(by, bx, energy, (h, w)) @ flat.T),
-        flat @ gathered(by, bx, agreement).ravel(),
-        flat @ (normal_matrix(by, bx, scatter, (h, w)) @ flat.T),
-        float((v * squares).sum()),
-        float((v * difference.variance.sum(axis=2)).sum()),
-    )
+
+    def squares(image: Floats) -> Floats:
+        return np.asarray(flat @ (normal_matrix(by, bx, image, (h, w)) @ flat.T))
+
+    energy = np.einsum("hwc,hwc->hw", wrinkle, wrinkle)
+    weight: NDArray[np.float32] | None = None
+    matrix = np.zeros((len(masks), len(masks)))
+    found = {}
+    for name, one in data.items():
+        v = one.weight.astype(np.float64)
+        if weight is None or not np.array_equal(weight, one.weight):
+            weight, matrix = one.weight, squares(energy * v)
+        agreement = np.einsum("hwc,hwc->hw", wrinkle, one.values) * v
+        total = np.einsum("hwc,hwc->hw", one.values, one.values, dtype=np.float64)
+        noise = np.zeros_like(matrix)
+        if with_noise and one.variance.any():
+            scatter = np.einsum("hwc,hwc,hwc->hw", wrinkle, wrinkle, one.variance)
+            noise = squares(scatter * v * v)
+        found[name] = ZoneEquations(
+            matrix,
+            flat @ gathered(by, bx, agreement).ravel(),
+            noise,
+            float((v * total).sum()),
+            float((v * one.variance.sum(axis=2)).sum()),
+        )
+    return found
 
 
 def zone_weights(

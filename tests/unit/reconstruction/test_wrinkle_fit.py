@@ -280,7 +280,7 @@ def test_a_map_without_any_wrinkle_determines_nothing(face):
 def fitted(face):
     base, layer = face
     states = {name: shown(face, {name: 1.0}) for name in JIMENEZ2011.rows}
-    fit = wrinkle_fit.fit(wrinkles.decode(base), states, layer.masks, size=(32, 32))
+    fit = wrinkle_fit.fit(wrinkles.decode(base), states, layer.masks, size=(32, 32), clamp="signed")
     return states, fit
 
 
@@ -288,7 +288,7 @@ def test_with_known_weights_the_map_comes_back(face):
     base, layer = face
     states = {name: shown(face, {name: 1.0}) for name in JIMENEZ2011.rows}
     got = wrinkle_fit.fit(
-        wrinkles.decode(base), states, layer.masks, size=(32, 32), table=JIMENEZ2011
+        wrinkles.decode(base), states, layer.masks, size=(32, 32), table=JIMENEZ2011, clamp="signed"
     )
     seen = got.layer.valid
     assert seen.mean() > 0.95
@@ -301,7 +301,7 @@ def test_with_known_weights_the_map_comes_back(face):
 def test_map_and_weights_together_show_every_expression(face, fitted):
     states, fit = fitted
     assert fit.settled
-    model = fit.model(clamp="signed")
+    model = fit.model()
     for name, normals in states.items():
         got = model.evaluate({name: 1.0}).normals
         angle = np.degrees(np.arccos(np.clip((got * normals).sum(axis=2), -1, 1)))
@@ -322,7 +322,7 @@ def test_weights_come_back_up_to_a_scale_of_each_zone(fitted):
 def test_one_expression_alone_gives_its_own_map_with_weights_of_one(face):
     base, layer = face
     joy = {"joy": shown(face, {"joy": 1.0})}
-    fit = wrinkle_fit.fit(wrinkles.decode(base), joy, layer.masks, size=(32, 32))
+    fit = wrinkle_fit.fit(wrinkles.decode(base), joy, layer.masks, size=(32, 32), clamp="signed")
     weights = fit.expressions["joy"]
     np.testing.assert_allclose(weights.weights[weights.valid], 1.0, atol=0.02)
     assert fit.explained > 0.999

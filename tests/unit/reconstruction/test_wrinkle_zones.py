@@ -52,7 +52,7 @@ def test_rough_regions_become_soft_masks_that_explain_more(face):
     np.testing.assert_allclose(got.masks.sum(axis=0), 1.0, atol=1e-5)
     assert got.masks.min() >= 0.0
     explained = [
-        wrinkle_fit.fit(neutral, states, masks, size=(32, 32)).explained
+        wrinkle_fit.fit(neutral, states, masks, size=(32, 32), clamp="signed").explained
         for masks in (shifted, got.masks)
     ]
     assert 1 - explained[1] < 0.3 * (1 - explained[0])
@@ -69,7 +69,7 @@ def test_without_a_layout_amplitudes_and_places_find_the_zones(face):
     by_chance = np.random.default_rng(1).permutation(label.ravel()).reshape(label.shape)
     chance = sum(np.bincount(true[by_chance == z]).max() for z in range(8)) / true.size
     assert chance < 0.4
-    fit = wrinkle_fit.fit(neutral, states, got.masks, size=(32, 32))
+    fit = wrinkle_fit.fit(neutral, states, got.masks, size=(32, 32), clamp="signed")
     assert fit.explained > 0.99
 
 
