@@ -40,6 +40,8 @@ Wrap: TypeAlias = Literal["none", "u", "both"]
 Patches: TypeAlias = Sequence[ArrayLike] | Mapping[str, Sequence[ArrayLike]]
 
 MAX_SIDE_PX = 65_536
+MOST_FILLED = 0.1
+"""Share of a window's pixels that may be without a measured height."""
 SCALE_STEP = 1.04
 """Scales of one map are whole powers of this, so that features are at most 2 % off their size."""
 
@@ -316,8 +318,8 @@ def _choose(
             list(pool.map(choose, rows, *([v] * len(rows) for v in (first, beside, above))))
         if (cells[..., 0] == -1).any():
             raise SynthesisError(
-                "patches: got no window without large holes at some scale, expected patches with "
-                "larger whole parts, or smaller cell_px, overlap_px"
+                f"patches: got no window with at most {allowed} filled pixels in "
+                f"{candidates * kernels.TRIES} draws, expected fewer holes or more candidates"
             )
         list(pool.map(cut_columns, range(ny)))
         list(pool.map(cut_rows, range(0 if wrap_y else 1, ny)))
@@ -325,7 +327,13 @@ def _choose(
 
 
 def _allowance(sources: Sources, window: int) -> int:
-    """Return how many filled pixels windows may have: what a twentieth of all windows keep to."""
+    """Return how many filled pixels windows may have: what a twentieth of all windows keep to.
+
+    Raises
+    ------
+    SynthesisError
+        When that is more than `MOST_FILLED` of a window.
+    """
     most = 0
     for level in range(sources.level_first.size - 1):
         counts = []
@@ -337,4 +345,10 @@ def _allowance(sources: Sources, window: int) -> int:
             inside = s[window:, window:] - s[:-window, window:] - s[window:, :-window]
             counts.append((inside + s[:-window, :-window]).reshape(-1))
         most = max(most, int(np.quantile(np.concatenate(counts), 0.05)))
+    if most > MOST_FILLED * window**2:
+        raise SynthesisError(
+            f"patches: got holes of {100 * most / window**2:.0f} % of a window of {window} px even "
+            f"in its best places, expected at most {100 * MOST_FILLED:.0f} %: give patches with "
+            "larger whole parts, or smaller cell_px, overlap_px"
+        )
     return most

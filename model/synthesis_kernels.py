@@ -210,7 +210,7 @@ def choose_windows(
         First pixel in ``heights``, height, width, first entry in ``filled``, first pixel in
         ``turned`` (where height and width are exchanged).
     heights, turned : (N,) float32
-    filled : (M,) int64
+    filled : (M,) int32
         Summed-area tables of the pixels that were filled.
     most_filled : int
         Filled pixels of a window.

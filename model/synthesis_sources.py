@@ -21,7 +21,7 @@ Bools = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 
 MAX_SOURCE_PX = 150_000_000
-"""Pixels of all patches at all scales, 16 bytes each with their transposes and tables."""
+"""Pixels of all patches at all scales, 12 bytes each with their transposes and tables."""
 
 
 class SynthesisError(ValueError):
@@ -127,7 +127,7 @@ class Sources:
     """(N,) heights, um."""
     turned: Float32Array
     """(N,) the same with each source transposed."""
-    filled: Integers
+    filled: NDArray[np.int32]
     """(M,) summed-area tables, (height + 1, width + 1) each, of pixels without a height of their
     own."""
 
@@ -163,44 +163,49 @@ def gather(
             "or smaller patches, or a narrower range of pixel_um"
         )
     rows, firsts = [], [0]
-    flat, turned, tables = [], [], []
+    used: list[tuple[int, float]] = []
     pixel = entry = 0
     for zoom in zooms:
-        for height, known in whole:
-            scaled, missing = _scaled(height, known, zoom)
-            high, wide = scaled.shape
-            if min(high, wide) < window:
-                continue
-            rows.append((pixel, high, wide, entry, pixel))
-            flat.append(scaled.reshape(-1))
-            turned.append(np.ascontiguousarray(scaled.T).reshape(-1))
-            sums = np.zeros((high + 1, wide + 1), np.int64)
-            sums[1:, 1:] = missing.cumsum(0, dtype=np.int64).cumsum(1)
-            tables.append(sums.reshape(-1))
-            pixel += scaled.size
-            entry += sums.size
+        for number, (height, _) in enumerate(whole):
+            high, wide = _scaled_shape(height.shape, zoom)
+            if min(high, wide) >= window:
+                rows.append((pixel, high, wide, entry, pixel))
+                used.append((number, zoom))
+                pixel += high * wide
+                entry += (high + 1) * (wide + 1)
         if len(rows) == firsts[-1]:
-            largest = max(min(h.shape) for h, _ in whole)
+            largest = max(min(_scaled_shape(h.shape, zoom)) for h, _ in whole)
             raise SynthesisError(
-                f"{name}: got at most {int(largest * zoom)} px a side at the result's scale, "
+                f"{name}: got at most {largest} px a side at the result's scale, "
                 f"expected at least {window}: give larger patches or smaller cell_px, overlap_px"
             )
         firsts.append(len(rows))
+    heights, turned = np.empty(pixel, np.float32), np.empty(pixel, np.float32)
+    sums = np.zeros(entry, np.int32)
+    for (begin, high, wide, entry, _), (number, zoom) in zip(rows, used, strict=True):
+        scaled, missing = _scaled(*whole[number], zoom)
+        heights[begin : begin + scaled.size] = scaled.reshape(-1)
+        turned[begin : begin + scaled.size] = scaled.T.reshape(-1)
+        table = sums[entry : entry + (high + 1) * (wide + 1)].reshape(high + 1, wide + 1)
+        table[1:, 1:] = missing.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
     return Sources(
         table=np.array(rows, np.int64),
         level_first=np.array(firsts, np.int64),
-        heights=np.concatenate(flat),
-        turned=np.concatenate(turned),
-        filled=np.concatenate(tables),
+        heights=heights,
+        turned=turned,
+        filled=sums,
     )
+
+
+def _scaled_shape(shape: tuple[int, ...], zoom: float) -> tuple[int, int]:
+    return max(1, int(shape[0] * zoom + 1e-9)), max(1, int(shape[1] * zoom + 1e-9))
 
 
 def _scaled(height: Float32Array, known: Bools, zoom: float) -> tuple[Float32Array, Bools]:
     """Return heights with ``zoom`` times the pixels a side, and which of them were filled."""
     if abs(zoom - 1.0) < 1e-9:
         return height, ~known
-    size = [max(1, int(n * zoom)) for n in height.shape]
-    places = [(np.arange(n) + 0.5) / zoom - 0.5 for n in size]
+    places = [(np.arange(n) + 0.5) / zoom - 0.5 for n in _scaled_shape(height.shape, zoom)]
     grid = np.meshgrid(*places, indexing="ij")
     smooth = height
     if zoom < 1.0:

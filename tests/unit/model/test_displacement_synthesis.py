@@ -280,6 +280,7 @@ PATCH = np.random.default_rng(0).standard_normal((64, 64))
         ([PATCH], (4, 4, 4), {}, "size_px"),
         ([PATCH[0]], 64, {}, "expected \\(H, W\\)"),
         ([PATCH * np.nan], 64, {}, "no valid height"),
+        ([np.where(PATCH > 1.0, PATCH, np.nan)], 64, {}, "got holes of 8. %"),
         ([PATCH], 64, {"cell_px": 8, "overlap_px": 9}, "overlap_px: got 9"),
         ([PATCH], 400, {"cell_px": 80}, "at most 64 px"),
         ([PATCH], 64, {"pixel_um": -1.0}, "pixel_um"),
@@ -302,6 +303,23 @@ PATCH = np.random.default_rng(0).standard_normal((64, 64))
 def test_what_nothing_grows_from_is_refused_by_name(patches, size, changes, message):
     with pytest.raises(synthesis.SynthesisError, match=message):
         synthesis.grow(patches, size, rng=np.random.default_rng(0), **changes)
+
+
+def test_flat_skin_stays_flat_and_any_unit_will_do():
+    flat = synthesis.grow([np.full((100, 100), 5.0)], 200, rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(flat, 5.0)
+    maps = [
+        synthesis.grow([scale * PATCH], 200, rng=np.random.default_rng(0)) / scale
+        for scale in (1.0, 2.0**20, 2.0**-20)
+    ]
+    np.testing.assert_allclose(maps[1], maps[0], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(maps[2], maps[0], rtol=1e-5, atol=1e-5)
+
+
+def test_a_map_may_be_a_line_or_smaller_than_a_cell():
+    for size in (1, (1, 300), (300, 7)):
+        found = synthesis.grow([PATCH], size, rng=np.random.default_rng(0))
+        assert np.isfinite(found).all()
 
 
 def test_a_part_outside_the_map_is_refused(foreheads):
