@@ -90,7 +90,7 @@ def refine(
     valid, valid_second : ndarray of bool
         Which pixels of each picture show the subject.
     rounds : int
-        How often the rest is followed, at least 1.
+        How often the rest is followed; 0 leaves the guess as it is.
 
     Returns
     -------
@@ -102,7 +102,7 @@ def refine(
     gap = np.zeros(valid.shape, np.float32)
     known = np.zeros(valid.shape, bool)
     stderr = error
-    for _ in range(max(rounds, 1)):
+    for _ in range(rounds):
         both = valid & (bilinear(valid_second.astype(np.float32), at) > 0.999)
         one = np.where(both, first, 128).astype(np.uint8)
         two = np.where(both, bilinear(second, at), 128).astype(np.uint8)

@@ -157,14 +157,50 @@ class Alignment:
         shown = seen[..., None] if image.ndim == 3 else seen
         return np.where(shown, np.sqrt(total), 0.0).astype(np.float32)
 
-    def warp_map(self, skin_map: SkinMap) -> SkinMap:
-        """Lay a map with its standard error and mask over the neutral picture."""
+    def place_stderr(self, values: ArrayLike, valid: ArrayLike | None = None) -> Float32s:
+        """Return how far a map on the neutral picture may be off because its places are.
+
+        Parameters
+        ----------
+        values : array_like, shape (H, W) or (H, W, C)
+            What was warped, or computed of it: the change of a state's blood, for one.
+        valid : array_like of bool, shape (H, W), optional
+
+        Returns
+        -------
+        ndarray of float32
+            Shape of `values`: its slope (smoothed over 2 px) times the error of the place; 0 where
+            not valid. It adds to other errors in squares.
+        """
+        image = np.asarray(values, np.float32)
+        if image.ndim not in (2, 3) or image.shape[:2] != self.valid.shape:
+            raise AlignmentError(f"values: got shape {image.shape}, expected {self.valid.shape}")
+        good = self.valid if valid is None else self.valid & np.asarray(valid, bool)
+        finite = np.isfinite(image)
+        good = good & (finite.all(axis=-1) if image.ndim == 3 else finite)
+        place = self.error_px if image.ndim == 2 else self.error_px[..., None]
+        steep = np.sqrt(_slope_variance(np.where(finite, image, 0.0).astype(np.float32), good))
+        return np.asarray(steep * place / math.sqrt(2.0), np.float32)
+
+    def warp_map(self, skin_map: SkinMap, *, place: bool = True) -> SkinMap:
+        """Lay a map with its standard error and mask over the neutral picture.
+
+        Parameters
+        ----------
+        skin_map
+            Of the moving picture.
+        place
+            Whether the error of the place is added to the map's own. Colors for
+            `reconstruction.shared_melanin` go without: a misplaced pixel is mostly brighter or
+            darker, and brightness is left open there.
+        """
         values, seen = self.warp(skin_map.values, skin_map.valid)
-        stderr = (
-            None
-            if skin_map.stderr is None
-            else self.warp_stderr(skin_map.values, skin_map.stderr, skin_map.valid)
-        )
+        stderr = None
+        if skin_map.stderr is not None and place:
+            stderr = self.warp_stderr(skin_map.values, skin_map.stderr, skin_map.valid)
+        elif skin_map.stderr is not None:
+            variance, _ = self.warp(np.square(skin_map.stderr), skin_map.valid)
+            stderr = np.sqrt(np.maximum(variance, 0.0))
         return SkinMap(values, skin_map.unit, stderr, seen, skin_map.description)
 
     def _checked(self, values: ArrayLike, valid: ArrayLike | None) -> tuple[Float32s, Bools]:
@@ -190,6 +226,7 @@ def align(
     valid_neutral: ArrayLike | None = None,
     landmark_stderr_px: float = LANDMARK_STDERR_PX,
     largest_error_px: float = LARGEST_ERROR_PX,
+    rounds: int = dense_flow.ROUNDS,
 ) -> Alignment:
     """Find where each pixel of the neutral picture lies in that of an expression.
 
@@ -208,6 +245,8 @@ def align(
         the motion between landmarks is.
     largest_error_px : float
         Pixels with a larger estimated error are invalid.
+    rounds : int
+        How often the dense flow is followed; 0: landmarks or features alone.
 
     Returns
     -------
@@ -238,17 +277,24 @@ def align(
     if (landmarks_moving is None) != (landmarks_neutral is None):
         missing = "landmarks_moving" if landmarks_moving is None else "landmarks_neutral"
         raise AlignmentError(f"{missing}: got None, expected landmarks of both pictures or neither")
+    if rounds < 0:
+        raise AlignmentError(f"rounds: got {rounds}, expected 0 or more")
     second, mask_second = _structure("moving", moving, valid_moving)
     first, mask = _structure("neutral", neutral, valid_neutral)
     by: Literal["landmarks", "features"]
-    if landmarks_moving is not None and landmarks_neutral is not None:
-        names, points, moved = _common(landmarks_moving, landmarks_neutral)
-        by, stderr = "landmarks", math.sqrt(2.0) * landmark_stderr_px
-    else:
-        points, moved = feature_matches.match(first, second, valid=mask, valid_second=mask_second)
-        names = [f"feature {k + 1}" for k in range(len(points))]
-        by, stderr = "features", math.sqrt(2.0) * FEATURE_STDERR_PX
-    field = landmark_field.fit(points, moved, stderr_px=stderr)
+    try:
+        if landmarks_moving is not None and landmarks_neutral is not None:
+            names, points, moved = _common(landmarks_moving, landmarks_neutral)
+            by, stderr = "landmarks", math.sqrt(2.0) * landmark_stderr_px
+        else:
+            points, moved = feature_matches.match(
+                first, second, valid=mask, valid_second=mask_second
+            )
+            names = [f"feature {k + 1}" for k in range(len(points))]
+            by, stderr = "features", math.sqrt(2.0) * FEATURE_STDERR_PX
+        field = landmark_field.fit(points, moved, stderr_px=stderr)
+    except (feature_matches.FeatureError, landmark_field.LandmarkFieldError) as few:
+        raise AlignmentError(str(few)) from few
     displacement, uncertain = field.on_grid(first.shape)
     flow = dense_flow.refine(
         first,
@@ -257,6 +303,7 @@ def align(
         uncertain,
         valid=mask,
         valid_second=mask_second,
+        rounds=rounds,
     )
     seen = _within(flow.source_px, mask_second) & mask
     folded = _folded(flow.source_px)

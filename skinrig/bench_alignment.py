@@ -10,8 +10,11 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 
 from model import color_table
 from model.color_table import ColorTable
+from model.facial_color import HemoglobinRig
 from model.tissue_optics import ANISOTROPY_SKIN
+from reconstruction import expression_alignment
 from rigsim.subject import Subject, make_subject
+from skinrig.benchmark import Limit, Point, StageBenchmark, measure
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -183,3 +186,156 @@ def spread_points(mask: Bools, count: int) -> NDArray[np.intp]:
 def face_of(preset: str, side: int, *, seed: int = 0) -> Subject:
     """Return a simulated face with a texture of so many pixels a side."""
     return make_subject(preset, seed=seed, size=side)
+
+
+def aligned(*, toy: bool) -> StageBenchmark:
+    """Align moved faces by landmarks few and many, by features, with and without dense flow."""
+    side = 128 if toy else 512
+    rng = np.random.default_rng(1)
+    face = face_of("III", side, seed=2)
+    away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
+    seen = moved_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
+    still = moved_face(face, np.zeros_like(away), state="exercise", noise=0.005, rng=rng)
+    settings: list[tuple[int, int]] = [(24, 0), (24, 2)]
+    if not toy:
+        settings = [(8, 0), (8, 2), (24, 0), (24, 1), (24, 2), (24, 4), (48, 0), (48, 2),
+                    (0, 0), (0, 2)]  # fmt: skip
+    points = []
+    covered = None
+    for count, rounds in settings:
+
+        def run(
+            count: int = count, rounds: int = rounds, pictures: MovedFace = seen
+        ) -> expression_alignment.Alignment:
+            names = list(pictures.landmarks)[:count]
+            return expression_alignment.align(
+                pictures.moving, pictures.neutral, rounds=rounds,
+                landmarks_moving={n: pictures.landmarks_moving[n] for n in names} or None,
+                landmarks_neutral={n: pictures.landmarks[n] for n in names} or None,
+                valid_moving=pictures.valid_moving, valid_neutral=pictures.valid,
+            )  # fmt: skip
+
+        timing = measure(run, repeats=1, memory=(count, rounds) == (24, 2))
+        found = run()
+        error = np.linalg.norm(found.source_px - seen.source_px, axis=-1)[found.valid]
+        if (count, rounds) == (24, 2):
+            covered = float((error < 2.0 * found.error_px[found.valid]).mean())
+        points.append(
+            Point(
+                {"by": found.by, "landmarks": count, "rounds": rounds}, timing, _rms(error),
+                _rms_interval(error, side),
+            )
+        )  # fmt: skip
+    limits: tuple[Limit, ...] = ()
+    if not toy:
+        before = run(24, 2, still)
+        false_motion = np.linalg.norm(before.source_px - still.source_px, axis=-1)[before.valid]
+        by_setting = {(p.knobs["landmarks"], p.knobs["rounds"]): p.error for p in points}
+        limits = (
+            Limit("px (median) of motion seen where blood alone changed",
+                  float(np.median(false_motion)), 0.1, "<=", "px"),
+            Limit("share of pixels within twice the stated error, 24 landmarks",
+                  float(covered or 0.0), 0.95, ">="),
+            Limit("times smaller error by dense flow than by 24 landmarks alone",
+                  by_setting[24, 0] / by_setting[24, 2], 3.0, ">="),
+            Limit("seconds on 512 x 512, 24 landmarks",
+                  next(p.timing.seconds for p in points
+                       if (p.knobs["landmarks"], p.knobs["rounds"]) == (24, 2)),
+                  10.0, "<=", "s"),
+        )  # fmt: skip
+    return StageBenchmark(
+        "expression-alignment",
+        "root mean square error of a pixel's place, px",
+        f"the smooth displacement of {side / 50:.3g} px that moved the picture",
+        0.0,
+        tuple(points),
+        limits,
+        left_out=(("Cramér-Rao bound", "deformation within the flow's windows limits, not noise"),),
+    )
+
+
+MISALIGNED_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
+
+
+def misaligned(*, toy: bool) -> StageBenchmark:
+    """Blend from maps that were put in a wrong place on purpose, beside interpolating them.
+
+    The paper's claim (Jimenez et al. 2010, section 4.2) is that local statistics bear alignments
+    that are not perfect, and interpolated maps do not.
+    """
+    side = 128 if toy else 512
+    face = face_of("III", side, seed=2)
+    mask = oval(side)
+    neutral = face.hemoglobin().astype(np.float64)
+    points = []
+    errors: dict[tuple[str, float], float] = {}
+    for state in ("exercise",) if toy else ("exercise", "smile"):
+        truth = face.hemoglobin(state).astype(np.float64)
+        size = _rms((truth - neutral)[mask])
+        for off_px in MISALIGNED_PX[:3] if toy else MISALIGNED_PX:
+            map_of_state = displaced(truth, off_px, rng=np.random.default_rng(3))
+
+            def interpolated(map_of_state: Floats = map_of_state) -> Floats:
+                return neutral + 1.0 * (map_of_state - neutral)
+
+            ways = [("interpolated", 0.0, interpolated)]
+            for radius in (16.0,) if toy else (8.0, 16.0, 32.0):
+
+                def blended(
+                    map_of_state: Floats = map_of_state, radius: float = radius, name: str = state
+                ) -> Floats:
+                    rig = HemoglobinRig.from_maps(
+                        neutral, {name: map_of_state}, radius_px=radius, valid=mask
+                    )
+                    return np.asarray(rig.blend({name: 1.0, "neutral": 0.0}), np.float64)
+
+                ways.append(("blended", radius, blended))
+            for way, radius, call in ways:
+                timing = measure(call, repeats=1, memory=False)
+                error = (call() - truth)[mask] / size
+                error = error[np.isfinite(error)]
+                errors[f"{way} {radius:g} {state}", off_px] = _rms(error)
+                knobs: dict[str, str | float] = {"state": state, "way": way, "off_px": off_px}
+                if radius:
+                    knobs["radius_px"] = radius
+                points.append(Point(knobs, timing, _rms(error), _rms_interval(error, side)))
+    limits: tuple[Limit, ...] = ()
+    if not toy:
+        limits = tuple(
+            Limit(f"times larger error of interpolation than of blending, {state}, 2 px off",
+                  errors[f"interpolated 0 {state}", 2.0] / errors[f"blended 16 {state}", 2.0],
+                  2.0, ">=")
+            for state in ("exercise", "smile")
+        )  # fmt: skip
+    return StageBenchmark(
+        "misalignment",
+        "root mean square error over that of the state's change",
+        "blood of the state by dilated vessels, on the unmoved face",
+        0.0,
+        tuple(points),
+        limits,
+        left_out=(("a bound", "what eq. (6) leaves out of dilated vessels is its error at 0 px"),),
+    )
+
+
+def displaced(image: Floats, rms_px: float, *, rng: np.random.Generator) -> Floats:
+    """Return a map seen at places that are off by a smooth random displacement of so many px."""
+    if rms_px == 0.0:
+        return image
+    side = image.shape[0]
+    away = smooth_displacement(side, bend_px=side / 12.8, rms_px=rms_px, rng=rng)
+    rows, columns = np.mgrid[:side, :side].astype(np.float64)
+    at = [rows + away[..., 1], columns + away[..., 0]]
+    return np.asarray(map_coordinates(image, at, order=3, mode="nearest"))
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _rms_interval(values: Floats, side: int) -> tuple[float, float]:
+    """Return the 68 % interval of a root mean square over pixels that go together in patches."""
+    squares = np.square(values)
+    patches = max(values.size / (side / 10.0) ** 2, 2.0)
+    mean, spread = float(squares.mean()), float(squares.std()) / np.sqrt(patches)
+    return float(np.sqrt(max(mean - spread, 0.0))), float(np.sqrt(mean + spread))

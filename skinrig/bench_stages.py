@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from skinrig import (
+    bench_alignment,
     bench_brdf,
     bench_chromophores,
     bench_dome_calibration,
@@ -25,8 +26,10 @@ from skinrig import (
     bench_light_order,
     bench_microstructure,
     bench_motion,
+    bench_perfusion,
     bench_photometric,
     bench_probe,
+    bench_shared_melanin,
     bench_skin_stretch,
     bench_subsurface,
     bench_surface,
@@ -47,6 +50,9 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "skin-stretch": bench_skin_stretch.stretched,
     "layered-reflectance": bench_tissue.layered_reflectance,
     "color-table": bench_tissue.table,
+    "expression-alignment": bench_alignment.aligned,
+    "misalignment": bench_alignment.misaligned,
+    "shared-melanin": bench_shared_melanin.inversion,
     "facial-color": bench_facial_color.rig,
     "diffuse-albedo": bench_brdf.albedo,
     "brdf": bench_brdf.surface,
@@ -67,6 +73,7 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "displacement-synthesis": bench_synthesis.growth,
     "microstructure": bench_microstructure.truth,
     "microstructure-passes": bench_microstructure.passes,
+    "perfusion-curves": bench_perfusion.curves,
     "probe-session": bench_probe.session,
     "subsurface-fit": bench_subsurface.tiers,
     "subsurface-batch": bench_subsurface.batches,

@@ -7,7 +7,6 @@ import pytest
 from model.skin import SkinMap
 from reconstruction import expression_alignment as alignment
 from reconstruction import landmark_field, landmark_table
-from reconstruction.feature_matches import FeatureError
 
 SIDE = 96
 
@@ -90,7 +89,7 @@ def test_without_landmarks_features_are_matched_and_the_result_says_so(rng):
 
 
 def test_pictures_of_different_skin_have_no_features_in_common(rng):
-    with pytest.raises(FeatureError, match="give landmarks"):
+    with pytest.raises(alignment.AlignmentError, match="give landmarks"):
         alignment.align(skin(rng), skin(rng))
 
 
@@ -190,6 +189,22 @@ def test_the_error_of_a_warped_map_grows_with_its_slope_times_that_of_the_place(
     np.testing.assert_allclose(still[inner], 0.3, rtol=1e-5)
     # 2 px are the distance: sqrt(2) along the slope of 0.5 a px
     np.testing.assert_allclose(moved[inner], np.hypot(0.3, 0.5 * np.sqrt(2.0)), rtol=1e-3)
+
+
+def test_the_error_of_the_place_alone_is_that_of_the_slope_on_the_neutral_picture():
+    ramp = np.broadcast_to(0.5 * np.arange(40.0), (40, 40))
+    found = alignment_of(identity((40, 40)), error=2.0)
+    stderr = found.place_stderr(ramp)
+    np.testing.assert_allclose(stderr[10:-10, 10:-10], 0.5 * np.sqrt(2.0), rtol=1e-3)
+    masked = found.place_stderr(np.where(np.eye(40) > 0, np.nan, ramp))
+    assert np.isfinite(masked).all()
+    assert not masked[np.eye(40) > 0].any()
+    whole = found.warp_map(SkinMap(ramp, "1", np.full((40, 40), 0.3)))
+    own = found.warp_map(SkinMap(ramp, "1", np.full((40, 40), 0.3)), place=False)
+    np.testing.assert_allclose(own.stderr, 0.3, rtol=1e-5)
+    np.testing.assert_allclose(
+        whole.stderr[10:-10, 10:-10] ** 2, 0.09 + stderr[10:-10, 10:-10] ** 2, rtol=1e-3
+    )
 
 
 def test_a_skin_map_keeps_its_unit_and_gets_its_mask():
