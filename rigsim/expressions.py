@@ -7,8 +7,8 @@ mouth stay closed: a jaw that drops stretches the lips in place of parting them.
 References
 ----------
 Actions and what emotions are made of: Ekman, Friesen and Hager 2002, "Facial action coding system:
-the manual"; Ekman and Friesen 1983, "EMFACS-7". Sizes: a spontaneous smile moves the corners of the
-mouth by 6 to 10 mm, Schmidt, Liu and Cohn 2006, doi:10.1080/13576500600568508.
+the manual"; Ekman and Friesen 1983, "EMFACS-7". How far skin goes is chosen here: the corners of
+the mouth by 6 to 10 mm in a smile.
 """
 
 from __future__ import annotations

@@ -12,7 +12,6 @@ from rigsim import face_regions, relief
 from rigsim.atlas import Atlas, unwrap
 from rigsim.expression_wrinkles import (
     FURROW,
-    ZONES,
     WrinkleLines,
     Wrinkles,
     depth_of,
@@ -21,6 +20,7 @@ from rigsim.expression_wrinkles import (
 )
 from rigsim.mesh import Mesh, build_mesh
 from rigsim.subject import Subject, make_subject
+from rigsim.wrinkle_zones import ZONES
 
 SIZE = 320
 PLATE = 256
