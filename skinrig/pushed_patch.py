@@ -167,7 +167,7 @@ class PushedPatch:
         return moved, field
 
 
-def push(block: SkinBlock, probe: Push, *, steps: int = 4) -> PushedPatch:
+def push(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:
     """Push a block of skin and return its equilibrium.
 
     Parameters
@@ -212,7 +212,7 @@ def push(block: SkinBlock, probe: Push, *, steps: int = 4) -> PushedPatch:
     return solve(block, given, steps=steps)
 
 
-def solve(block: SkinBlock, given_mm: ArrayLike, *, steps: int = 4) -> PushedPatch:
+def solve(block: SkinBlock, given_mm: ArrayLike, *, steps: int = 2) -> PushedPatch:
     """Return the equilibrium of a block some of whose nodes' displacements are given.
 
     Parameters

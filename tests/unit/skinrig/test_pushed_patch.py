@@ -60,11 +60,13 @@ def test_an_affine_motion_of_the_border_moves_the_inside_alike(rng):
 
 def test_volume_is_kept_the_better_the_nearer_poisson_is_to_a_half():
     lost = [
-        abs(pushed_patch.push(block(6, poisson=p), Push(), steps=2).volume_ratio - 1.0)
+        abs(
+            pushed_patch.push(block(6, poisson=p), Push(contact_mm=2.0), steps=1).volume_ratio - 1.0
+        )
         for p in (0.3, 0.45, 0.49)
     ]
     assert (np.diff(lost) < 0).all()
-    assert lost[2] < 2e-3
+    assert lost[2] < 0.3 * lost[0]
 
 
 def shear(nodes, moved_mm, held):
@@ -174,10 +176,10 @@ def test_the_surface_looks_out_and_covers_the_square():
 
 
 def test_the_probe_takes_the_skin_it_touches_along():
-    probe = Push(depth_mm=0.5, shift_mm=(0.3, -0.2), contact_mm=1.5, centre_mm=(1.0, 0.5))
-    patch = pushed_patch.push(block(8), probe, steps=2)
+    probe = Push(depth_mm=0.5, shift_mm=(0.3, -0.2), contact_mm=2.0, centre_mm=(1.0, 0.5))
+    patch = pushed_patch.push(block(6), probe, steps=2)
     away = np.hypot(*(patch.rest_mm[:, :2] - (1.0, 0.5)).T)
-    touched = (patch.rest_mm[:, 2] > -1e-9) & (away <= 1.5)
+    touched = (patch.rest_mm[:, 2] > -1e-9) & (away <= 2.0)
     moved = (patch.deformed_mm - patch.rest_mm)[touched]
     np.testing.assert_allclose(moved[:, :2], np.tile((0.3, -0.2), (touched.sum(), 1)))
     tip = 4.0 - np.sqrt(16.0 - away[touched] ** 2) - 0.5
@@ -187,7 +189,7 @@ def test_the_probe_takes_the_skin_it_touches_along():
 def test_skin_is_rougher_before_a_moving_probe_and_smoother_behind_it(rng):
     """Where the push compresses along x, slopes along x grow; where it stretches, they shrink."""
     patch = pushed_patch.push(
-        block(10), Push(depth_mm=0.0, shift_mm=(1.0, 0.0), contact_mm=1.0), steps=2
+        block(8), Push(depth_mm=0.0, shift_mm=(1.0, 0.0), contact_mm=1.3), steps=2
     )
     neutral = 20.0 * gaussian_filter(rng.standard_normal((1000, 1000)), 1.5)
     moved, field = patch.convolve(neutral.astype(np.float32))
