@@ -245,11 +245,11 @@ def _fit(data: _Data, curve: Shape, delays: Floats, constants: Floats, at: Float
         (constants.size, delays.size + (near.shape[1] if quick.any() else 0), len(data.values)),
         np.inf,
     )
-    by_curve[:, : delays.size] = residuals(*np.broadcast_arrays(delays, constants[:, None]))
-    if quick.any():
-        by_curve[quick, delays.size :] = residuals(
-            *np.broadcast_arrays(near, constants[quick][:, None])
-        )
+    # one constant after the other: all at once would take hundreds of megabytes
+    for row, constant in enumerate(constants):
+        by_curve[row, : delays.size] = residuals(delays, np.full(delays.size, constant))
+    for place, some in zip(np.flatnonzero(quick), near, strict=True):
+        by_curve[place, delays.size :] = residuals(some, np.full(some.size, constants[place]))
     curves = len(data.values)
     samples = (data.weights > 0).sum(axis=1)
     # each curve by its own noise, which the best common curve leaves
