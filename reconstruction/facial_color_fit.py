@@ -180,6 +180,7 @@ def fit(
         variance=np.stack([average[1] for average in averages]),
         model_error=model_error.load(),
         valid=np.stack([average[2] for average in averages]),
+        shading_window_px=shared_melanin.SHADING_WINDOW_PX,
     )
     blood = {state: _blood(shared, k) for k, state in enumerate(kept)}
     tell("scale and bias maps")
@@ -245,7 +246,7 @@ def _align(
         except expression_alignment.AlignmentError as error:
             left_out.append((image.name, str(error)))
             continue
-        found.append(_aligned(image, alignment.warp_map(diffuse), alignment))
+        found.append(_aligned(image, alignment.warp_map(diffuse, place=False), alignment))
     return found, left_out
 
 
