@@ -160,9 +160,8 @@ def _add_down(running: Any, new: Any, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
-def _along(v: Any, r0: Any, r1: Any, r2: Any, r3: Any) -> Any:
+def _along(v: Any, n: Any, r0: Any, r1: Any, r2: Any, r3: Any) -> Any:
     """Write the sums along four rows, before each entry and after the last; return the largest."""
-    n = v.shape[1]
     v0, v1, v2, v3 = v[0], v[1], v[2], v[3]
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
     for i in range(n):
@@ -261,9 +260,135 @@ def _stays(h: Any, valid: Any, masked: Any, half: Any, y: Any, x: Any, level: An
     return True
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tile(
+    h: Any, valid: Any, masked: Any, half: Any, high: Any, inner: Any, whole: Any, trusted: Any,
+    y0: Any, y1: Any, x0: Any, x1: Any, p: Any, q: Any, nothing: Any, sums: Any, v: Any,
+    down: Any, squares_of: Any, mean: Any, deviation: Any, count: Any,
+) -> None:  # fmt: skip
+    """Do the work of `disc_moments` for rows y0 to y1 and columns x0 to x1.
+
+    Parameters
+    ----------
+    whole : int
+        Pixels of a disc.
+    p, q : (K, L), (K + 1, L) in the type of `h`
+        Room for sums along rows and down columns; entry j stands for column x0 - width + j.
+    nothing : (L,), 0
+    sums, v, down, squares_of
+        Room for the sums of a tile, four rows, sums down columns, and over squares.
+    """
+    rows, columns = h.shape
+    reach, width = half.size - 1, half[0]
+    k0, k1 = max(0, y0 - reach), min(rows, y1 + reach)
+    c0, c1 = max(0, x0 - width), min(columns, x1 + width)
+    n, seeable = x1 - x0, (k1 - k0) * (c1 - c0)
+    first = np.float64(h[k0, c0])
+    seen, total = 0, 0.0
+    if not masked:
+        for k in range(k0, k1):
+            total += _sum_about(h[k, c0:c1], first)
+        seen = seeable
+    every = not masked and np.isfinite(total)
+    if not every:
+        seen, total = 0, 0.0
+        for k in range(k0, k1):
+            for c in range(c0, c1):
+                if _counts(h, valid, masked, k, c):
+                    if seen == 0:
+                        first = np.float64(h[k, c])
+                    seen += 1
+                    total += np.float64(h[k, c]) - first
+        every = seen == seeable
+    if seen == 0:
+        mean[y0:y1, x0:x1] = np.nan
+        deviation[y0:y1, x0:x1] = np.nan
+        count[y0:y1, x0:x1] = 0
+        return
+    about = first + total / seen
+    partial = seen < (y1 - y0 + 2 * reach) * (n + 2 * width)
+    skip = c0 - (x0 - width)
+    moments = 3 if partial else 2
+    high_rows = k1 - k0
+    wide = c1 - c0
+    running, square = down[: c1 - c0], squares_of[:n]
+    q[0] = 0.0
+    p[:, :skip] = 0.0
+    q[:, :skip] = 0.0
+    q[:, skip + c1 - c0 :] = 0.0
+    largest = 0.0
+    for moment in range(moments):
+        running[:] = 0.0
+        for k in range(0, high_rows, 4):
+            for b in range(4):
+                if k + b >= high_rows:
+                    v[b, :wide] = 0.0
+                    continue
+                if every and moment < 2:
+                    _powers(v[b, :wide], h[k0 + k + b, c0:c1], about, moment)
+                elif every:
+                    v[b, :wide] = 1.0
+                else:
+                    for c in range(c0, c1):
+                        value = 0.0
+                        if _counts(h, valid, masked, k0 + k + b, c):
+                            d = np.float64(h[k0 + k + b, c]) - about
+                            value = d if moment == 0 else (d * d if moment == 1 else 1.0)
+                        v[b, c - c0] = value
+                _add_down(running, v[b, :wide], q[k + b + 1, skip:])
+            most = _along(v, wide, p[k, skip:], p[k + 1, skip:], p[k + 2, skip:], p[k + 3, skip:])
+            if moment == 1:
+                largest = max(largest, most)
+        if moment == 1:
+            for value in running:
+                largest = max(largest, value)
+        for y in range(y0 - k0, y1 - k0):
+            _square_row(square, p, nothing, inner, width, high_rows, y, y == y0 - k0)
+            _disc_row(sums[moment, y + k0 - y0, :n], square, p, q, half, high, inner, high_rows, y)
+    # what rounding of the stored sums may have done to a disc's sum of squares and sum
+    unit = np.finfo(h.dtype).eps
+    chain = 0.5 * unit * np.sqrt(4.0 * (reach + width))
+    blur2 = chain * largest
+    blur1 = chain * np.sqrt(max(p.shape[1], high_rows) * largest)
+    for y in range(y0, y1):
+        s1, s2 = sums[0, y - y0, :n], sums[1, y - y0, :n]
+        if not partial:
+            count[y, x0:x1] = whole
+            doubtful = _finish(
+                s1, s2, np.float64(whole), about, trusted, blur1, blur2, unit,
+                mean[y, x0:x1], deviation[y, x0:x1],
+            )  # fmt: skip
+            if doubtful == 0:
+                continue
+        constant, level = False, np.float64(0.0)  # whether the disc to the left is, and its value
+        for i in range(n):
+            held = np.int64(sums[moments - 1, y - y0, i]) if partial else whole
+            count[y, x0 + i] = held
+            if held == 0:
+                mean[y, x0 + i] = np.nan
+                deviation[y, x0 + i] = np.nan
+                constant = False
+                continue
+            m = np.float64(s1[i]) / held
+            squares = np.float64(s2[i]) / held
+            variance = squares - m * m
+            doubt = blur2 + 2.0 * abs(m) * blur1 + 4.0 * unit * held * squares
+            mean[y, x0 + i] = about + m
+            if held * variance * trusted >= doubt:
+                constant = False
+            elif constant and _stays(h, valid, masked, half, y, x0 + i, level):
+                mean[y, x0 + i] = level
+                variance = np.float64(0.0)
+            else:
+                level, variance = _directly(h, valid, masked, half, y, x0 + i)
+                mean[y, x0 + i] = level
+                constant = variance == 0.0
+            deviation[y, x0 + i] = np.sqrt(max(variance, 0.0))
+
+
 _SIGNATURES = [
     f"void({kind}[:, ::1], uint8[:, ::1], boolean, int64[::1], int64[::1], int64, int64, int64, "
-    "float64, float64[:, ::1], float64[:, ::1], int32[:, ::1])"
+    "int64, float64, float64[:, ::1], float64[:, ::1], int32[:, ::1])"
     for kind in ("float32", "float64")
 ]
 
@@ -271,7 +396,7 @@ _SIGNATURES = [
 @njit(_SIGNATURES, cache=True, parallel=True, error_model="numpy")
 def disc_moments(
     h: Any, valid: Any, masked: Any, half: Any, high: Any, inner: Any, tall: Any, wide: Any,
-    trusted: Any, mean: Any, deviation: Any, count: Any,
+    parts: Any, trusted: Any, mean: Any, deviation: Any, count: Any,
 ) -> None:  # fmt: skip
     """Write mean, deviation and number of valid pixels in a disc about each pixel.
 
@@ -291,6 +416,8 @@ def disc_moments(
         Half-side of a square in the disc; no column farther out is taller than it.
     tall, wide : int
         Pixels of a tile.
+    parts : int
+        Runs of tiles that one thread does at a time.
     trusted : float
         Relative error of a variance that rounding may cause.
     mean, deviation : (H, W) float64, written
@@ -304,112 +431,20 @@ def disc_moments(
     whole = np.int64(0)
     for a in range(reach + 1):
         whole += (2 * half[a] + 1) * (1 if a == 0 else 2)
-    for tile in prange(across * down):
-        y0 = (tile // across) * tall
-        x0 = (tile % across) * wide
-        y1, x1 = min(rows, y0 + tall), min(columns, x0 + wide)
-        k0, k1 = max(0, y0 - reach), min(rows, y1 + reach)
-        c0, c1 = max(0, x0 - width), min(columns, x1 + width)
-        n, seeable = x1 - x0, (k1 - k0) * (c1 - c0)
-        first = np.float64(h[k0, c0])
-        seen, total = 0, 0.0
-        if not masked:
-            for k in range(k0, k1):
-                total += _sum_about(h[k, c0:c1], first)
-            seen = seeable
-        every = not masked and np.isfinite(total)
-        if not every:
-            seen, total = 0, 0.0
-            for k in range(k0, k1):
-                for c in range(c0, c1):
-                    if _counts(h, valid, masked, k, c):
-                        if seen == 0:
-                            first = np.float64(h[k, c])
-                        seen += 1
-                        total += np.float64(h[k, c]) - first
-            every = seen == seeable
-        if seen == 0:
-            mean[y0:y1, x0:x1] = np.nan
-            deviation[y0:y1, x0:x1] = np.nan
-            count[y0:y1, x0:x1] = 0
-            continue
-        about = first + total / seen
-        partial = seen < (y1 - y0 + 2 * reach) * (n + 2 * width)
-        length = n + 2 * width + 1  # entry j: column x0 - width + j
-        skip = c0 - (x0 - width)
-        moments = 3 if partial else 2
-        high_rows = k1 - k0
-        sums = np.empty((moments, y1 - y0, n), h.dtype)
-        p = np.zeros(((high_rows + 3) // 4 * 4, length), h.dtype)
-        q = np.zeros((high_rows + 1, length), h.dtype)
+    # each part keeps its buffers: fresh ones for every tile would be mapped and cleared anew
+    most_rows = min(rows, tall + 2 * reach)
+    length = min(wide, columns) + 2 * width + 1
+    for part in prange(parts):
+        p = np.zeros(((most_rows + 3) // 4 * 4, length), h.dtype)
+        q = np.zeros((most_rows + 4, length), h.dtype)
         nothing = np.zeros(length, h.dtype)
-        v = np.empty((4, c1 - c0))
-        running = np.empty(c1 - c0)
-        square = np.empty(n)
-        largest = 0.0
-        for moment in range(moments):
-            running[:] = 0.0
-            for k in range(0, high_rows, 4):
-                for b in range(4):
-                    if k + b >= high_rows:
-                        v[b] = 0.0
-                        continue
-                    if every and moment < 2:
-                        _powers(v[b], h[k0 + k + b, c0:c1], about, moment)
-                    elif every:
-                        v[b] = 1.0
-                    else:
-                        for c in range(c0, c1):
-                            value = 0.0
-                            if _counts(h, valid, masked, k0 + k + b, c):
-                                d = np.float64(h[k0 + k + b, c]) - about
-                                value = d if moment == 0 else (d * d if moment == 1 else 1.0)
-                            v[b, c - c0] = value
-                    _add_down(running, v[b], q[k + b + 1, skip:])
-                most = _along(v, p[k, skip:], p[k + 1, skip:], p[k + 2, skip:], p[k + 3, skip:])
-                if moment == 1:
-                    largest = max(largest, most)
-            if moment == 1:
-                for value in running:
-                    largest = max(largest, value)
-            for y in range(y0 - k0, y1 - k0):
-                _square_row(square, p, nothing, inner, width, high_rows, y, y == y0 - k0)
-                _disc_row(sums[moment, y + k0 - y0], square, p, q, half, high, inner, high_rows, y)
-        # what rounding of the stored sums may have done to a disc's sum of squares and sum
-        unit = np.finfo(h.dtype).eps
-        chain = 0.5 * unit * np.sqrt(4.0 * (reach + width))
-        blur2 = chain * largest
-        blur1 = chain * np.sqrt(max(length, high_rows) * largest)
-        for y in range(y0, y1):
-            s1, s2 = sums[0, y - y0], sums[1, y - y0]
-            if not partial:
-                count[y, x0:x1] = whole
-                doubtful = _finish(
-                    s1, s2, np.float64(whole), about, trusted, blur1, blur2, unit,
-                    mean[y, x0:x1], deviation[y, x0:x1],
-                )  # fmt: skip
-                if doubtful == 0:
-                    continue
-            constant, level = False, 0.0  # whether the disc to the left is, and its value
-            for i in range(n):
-                held = np.int64(sums[moments - 1, y - y0, i]) if partial else whole
-                count[y, x0 + i] = held
-                if held == 0:
-                    mean[y, x0 + i] = np.nan
-                    deviation[y, x0 + i] = np.nan
-                    constant = False
-                    continue
-                m = np.float64(s1[i]) / held
-                squares = np.float64(s2[i]) / held
-                variance = squares - m * m
-                doubt = blur2 + 2.0 * abs(m) * blur1 + 4.0 * unit * held * squares
-                mean[y, x0 + i] = about + m
-                if held * variance * trusted >= doubt:
-                    constant = False
-                elif constant and _stays(h, valid, masked, half, y, x0 + i, level):
-                    mean[y, x0 + i], variance = level, 0.0
-                else:
-                    level, variance = _directly(h, valid, masked, half, y, x0 + i)
-                    mean[y, x0 + i] = level
-                    constant = variance == 0.0
-                deviation[y, x0 + i] = np.sqrt(max(variance, 0.0))
+        sums = np.empty((3, tall, wide), h.dtype)
+        v = np.empty((4, length))
+        down_columns, squares = np.empty(length), np.empty(wide)
+        for tile in range(part * across * down // parts, (part + 1) * across * down // parts):
+            y0, x0 = (tile // across) * tall, (tile % across) * wide
+            _tile(
+                h, valid, masked, half, high, inner, whole, trusted, y0, min(rows, y0 + tall), x0,
+                min(columns, x0 + wide), p, q, nothing, sums, v, down_columns, squares, mean,
+                deviation, count,
+            )  # fmt: skip

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numba import get_num_threads
 from numpy.typing import ArrayLike, NDArray
 
 from model import disc_kernels
@@ -132,6 +133,7 @@ def measure(
     mask = np.zeros((1, 1), np.uint8) if valid is None else np.ascontiguousarray(valid)
     disc_kernels.disc_moments(
         np.ascontiguousarray(h), mask.view(np.uint8), valid is not None, half, high, inner,
-        64 if radius_px <= 32.0 else 128, _WIDE, TRUSTED[h.dtype], mean, deviation, count,
+        64 if radius_px <= 32.0 else 128, _WIDE, 4 * get_num_threads(), TRUSTED[h.dtype],
+        mean, deviation, count,
     )  # fmt: skip
     return DiscStatistics(mean, deviation, count)
