@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model import disc_statistics
 from model.coarse_maps import Cells
+from model.deviation_ratio import ROUNDING
 from model.skin import SkinMap
 from model.tissue_optics import C_HD_MAX
 
@@ -385,7 +386,7 @@ class HemoglobinRig:
             scale += w * state.scale
             bias += w * state.bias
             scale_variance += (w * state.scale_stderr) ** 2
-            bias_variance += (w * state.bias_stderr) ** 2
+            bias_variance += w * w * (state.bias_stderr**2 + state.storage_rms**2)
             misfit += (w * state.misfit) ** 2
         up = self.cells.refine(
             scale, bias, self.neutral_mean, scale_variance, bias_variance, misfit, valid=few
@@ -394,6 +395,7 @@ class HemoglobinRig:
         blood = factor * (up[1] + base * up[0])  # eq. (6)
         # the misfit was seen with the noise of the maps in it
         pixel = np.maximum(up[5], (up[0] * self.neutral_stderr) ** 2)
+        pixel += (ROUNDING * self.neutral) ** 2
         error = factor * np.sqrt(pixel + up[4] + base * base * up[3])
         valid = self.valid & np.isfinite(blood)
         outside = valid & ((blood < limits[0]) | (blood > limits[1]))
