@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from capture.rig import load_rig
 from capture.session import Session
 from model import store
-from skinrig.sequences import SequenceOrder, sequence_plan
+from skinrig.sequences import SequenceOrder, sequence_lines, sequence_plan
 from skinrig.simulating_flash import (
     WIDTHS_PX,
     landmarks_at_superpixels,
@@ -77,7 +77,11 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
         course = PromptedCourse(sequence.state, rise_s=constant_s, fall_s=constant_s, seed=seed)
     texels = TEXELS[0] if width <= COARSE_PX else TEXELS[1]
     person = make_subject(order.subject, seed=seed, size=texels, mesh=order.mesh)
-    session = open_session(order, sequence_plan(rig, sequence), rig, asked)
+    plan = sequence_plan(rig, sequence)
+    if order.progress is not None:
+        for line in sequence_lines(plan):
+            order.progress(line)
+    session = open_session(order, plan, rig, asked)
     truth = truth_folder(order.out)
     log = _Log(truth.with_name(f"{truth.name}.flashes.jsonl"), fresh=not order.resume)
 

@@ -211,10 +211,11 @@ class Plan:
         time that the light stays on where that is longer, and the turning of the analyser where
         its state changes. Where a caliper's position changes its way, and the time in which the
         skin creeps; where a head is held by suction, pumping and rests, and all exposures of a
-        series, though some may turn out to be not needed. Not the time of the person who tapes the
+        series, though some may turn out to be not needed. Of a sequence its lead and its last
+        time. Not the time of the person who tapes the
         caliper or places the head.
         """
-        total = 0.0
+        total, last_s = self.limits.get("lead_s", 0.0), 0.0
         each_s: list[float] = []
         state: object = None
         held: tuple[object, int] = (None, 0)
@@ -224,6 +225,9 @@ class Plan:
             pause_s = max(rig.recycle_s * power, 60.0 / rig.max_pops_per_min) if power > 0 else 0.0
             pause_s = max(pause_s, float(step.settings.get("dwell_s", 0.0)))
             each_s.append(max(float(step.settings.get("exposure_s", 0.0)) + readout_s, pause_s))
+            if "start_s" in step.settings:  # a sequence lasts as long as its times say
+                last_s = max(last_s, float(step.settings["start_s"]) + each_s[-1])
+                continue
             total += each_s[-1]
             asked = step.settings.get("analyser_deg", step.settings.get("polarizer"))
             turn_s = rig.polarizer_move_s if asked not in (state, None) else 0.0
@@ -238,7 +242,9 @@ class Plan:
                     move_s += rig.caliper.settle_s
                 held = now
             total += max(turn_s, move_s)  # the analyser turns while the jaws move
-        return total + (0.0 if rig.probe is None else held_s(self.steps, each_s, rig.probe))
+        return (
+            total + last_s + (0.0 if rig.probe is None else held_s(self.steps, each_s, rig.probe))
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return the plan as JSON values."""

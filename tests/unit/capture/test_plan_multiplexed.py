@@ -203,3 +203,8 @@ def test_interleaved_repeats_of_a_state_have_all_others_in_between():
     assert taken == wanted
     turns = [s.settings["polarizer"] for s in plan.steps]
     assert sum(a != b for a, b in pairwise(turns)) == len(plan.steps) // 2
+
+
+def test_a_sequence_lasts_from_its_lead_to_its_last_shot():
+    plan = multiplexed_plan(FLASH, darks=0)
+    assert plan.estimated_s(FLASH) == pytest.approx(10.0 + 21 * 5.5 + 5.458)
