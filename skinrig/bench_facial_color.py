@@ -87,6 +87,14 @@ def rig(*, toy: bool) -> StageBenchmark:
                 lambda name, made=made: made.blend({name: 1.0}),  # type: ignore[misc]
             )
         )  # fmt: skip
+    points.append(
+        point(
+            {"method": "scale and bias, fitted anew", "radius_px": RADIUS_PX},
+            lambda name: HemoglobinRig.from_maps(
+                neutral, {name: truths[name]}, radius_px=RADIUS_PX, valid=covered
+            ).blend({name: 1.0}),
+        )
+    )
     windows = [8] if toy else [11, 8, 4]
     for spacing in windows:
         points.append(

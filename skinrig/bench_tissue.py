@@ -100,9 +100,9 @@ def table(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         tuple(
-            Limit(f"smallest table with every Delta E 2000 below 0.5, {between}", size, bound, "<=",
+            Limit(f"smallest table with every Delta E 2000 below 0.5, {between}", size, 128, "<=",
                   "nodes")
-            for (between, size), bound in zip(smallest.items(), (128, 1024), strict=True)
+            for between, size in smallest.items()
         ),
     )  # fmt: skip
 
