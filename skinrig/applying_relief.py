@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from model import displacement_synthesis
 from model.microstructure import KernelTable
 from model.skin import SkinAppearance, SkinMap
+from model.strain_fields import KernelRegions
 from skinrig import blend_shapes
 from skinrig.applying import Applied, ApplyError
 from skinrig.applying_microstructure import apply_microstructure
@@ -131,7 +132,7 @@ class Relief:
                 f"sites: reliefs with pixels of {sorted(pixels_um)} um, expected one size; "
                 "choose one with --site"
             )
-        regions, told = _regions(self.mesh, names)
+        regions = _regions(self.mesh, names)
         self.progress(f"grow the relief of {', '.join(names)} to {self.size_px} x {self.size_px}")
         large = self.size_px > ASIDE_FROM_PX
         neutral: Any = None
@@ -144,10 +145,13 @@ class Relief:
             patches, self.size_px, rng=rng, regions=regions, out=neutral,
             pixel_um=scale / self.size_px, patch_pixel_um=pixels_um.pop(), threads=2,
         )  # fmt: skip
-        table = KernelTable.from_json(appearance.files[sites[names[0]]["table"]].decode())
+        tables = tuple(
+            KernelTable.from_json(appearance.files[sites[name]["table"]].decode()) for name in names
+        )
+        kernels = tables[0] if regions is None else KernelRegions(tables, regions)
         self.progress("strain and convolution")
         moved = apply_microstructure(
-            self.mesh, self.weights, neutral, table, extrapolate=self.extrapolate,
+            self.mesh, self.weights, neutral, kernels, extrapolate=self.extrapolate,
             out=self.aside / "displacement.npy" if large else None,
             progress=lambda at, of: self.progress(f"tile {at} of {of}"),
         )  # fmt: skip
@@ -167,16 +171,11 @@ class Relief:
         seconds = ("strain_s", "convolution_s")
         done.figures[MICROSTRUCTURE] = {
             "sites": names,
-            "table": table.source,
+            "tables": [table.source for table in tables],
             "own_shapes": list(self.own_shapes),
             **{key: value for key, value in figures.items() if key not in seconds},
             **{f"{key[:-2]}_seconds": figures[key] for key in seconds},
         }
-        if len(names) > 1:
-            done.left_out.append(
-                (MICROSTRUCTURE, f"kernels of {', '.join(names[1:])}: the table of {names[0]} acts")
-            )
-        done.left_out += [(MICROSTRUCTURE, text) for text in told]
 
 
 def _with_states(
@@ -205,16 +204,16 @@ def _with_states(
     )
 
 
-def _patch(site: str, appearance: SkinAppearance, entry: Mapping[str, Any]) -> NDArray[np.float64]:
+def _patch(site: str, appearance: SkinAppearance, entry: Mapping[str, Any]) -> NDArray[np.float32]:
     relief = appearance.maps[str(entry["map"])]
-    values = relief.values.astype(np.float64)
-    if relief.valid is not None:
-        values = np.where(relief.valid, values, np.nan)
-    if min(values.shape) < SMALLEST_PATCH_PX:
+    if min(relief.values.shape) < SMALLEST_PATCH_PX:
         raise ApplyError(
-            f"{site}: a patch of {values.shape} px, expected {SMALLEST_PATCH_PX} px or more a side"
+            f"{site}: a patch of {relief.values.shape} px, expected {SMALLEST_PATCH_PX} px or more "
+            "a side"
         )
-    return values
+    return displacement_synthesis.leveled(
+        relief.values, pixel_um=float(entry["pixel_um"]), valid=relief.valid
+    )
 
 
 def _scale(mesh: BlendShapeMesh) -> NDArray[np.float64]:
@@ -228,10 +227,10 @@ def _scale(mesh: BlendShapeMesh) -> NDArray[np.float64]:
     return np.asarray(1e3 * np.clip(side, *np.percentile(side[seen], [2, 98])), np.float64)
 
 
-def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> tuple[Any, list[str]]:
-    """Return weights of the sites over the texture, (R, h, w), and what could not be told."""
+def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> NDArray[np.float64] | None:
+    """Return weights of the sites over the texture, (R, h, w); None for a single site."""
     if len(names) == 1:
-        return None, []
+        return None
     from rigsim.face_regions import on_mean_head, region_masks
 
     unknown = [name for name in names if name not in SITE_REGIONS]
@@ -245,7 +244,7 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> tuple[Any, list[str]
     weights = np.stack([sum(masks[r] for r in SITE_REGIONS[name]) for name in names])
     weights = weights.astype(np.float64) * atlas.covered
     # where no region speaks all sites mix evenly
-    return weights + 1e-3, []
+    return np.asarray(weights + 1e-3)
 
 
 def _atlas(mesh: BlendShapeMesh) -> Any:

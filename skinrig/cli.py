@@ -186,7 +186,11 @@ def simulate(
     captures: Captures = None,
     duration: Duration = None,
     relaxation: Annotated[
-        float | None, typer.Option(help="Time constant of a sequence's blood, s; default 0.02, of exercise 40, of alcohol 1200.")
+        float | None,
+        typer.Option(
+            help="Time constant of a sequence's blood, s; default 0.02, of exercise 40, of "
+            "alcohol 1200."
+        ),
     ] = None,
     consent: Consent = None,
     consent_expires: ConsentExpires = None,

@@ -275,6 +275,7 @@ def test_the_maps_page_lists_the_files_that_go_along():
     listed = {
         SPAN.findall(row[0])[0]
         for heading in (
+            "Files of the flash rig",
             "Files of the dome",
             "Files of the gradient rig",
             "Files of the fibre probe",

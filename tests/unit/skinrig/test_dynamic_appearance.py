@@ -55,7 +55,7 @@ def test_a_folder_of_other_maps_is_left_untouched(tmp_path):
 
 def test_two_parts_cannot_share_a_map(tmp_path):
     dynamic.add(tmp_path / "m", FACIAL_COLOR, part(1.0))
-    with pytest.raises(DynamicAppearanceError, match="a.json"):
+    with pytest.raises(DynamicAppearanceError, match=r"a\.json"):
         dynamic.add(tmp_path / "m", MICROSTRUCTURE, part(2.0))
     assert set(dynamic.read(tmp_path / "m")[1]) == {FACIAL_COLOR}
 

@@ -1,0 +1,119 @@
+"""A measured relief grown over a mesh and moved with it."""
+
+import numpy as np
+import pytest
+
+from model import store
+from model.microstructure import FOREHEAD
+from model.skin import SkinMap
+from skinrig import dynamic_appearance as dynamic
+from skinrig.applying import ApplyError, Expression, apply_expression
+from skinrig.applying_relief import Relief
+
+MICRO = (dynamic.MICROSTRUCTURE,)
+
+
+def relief_map(seed, side=160, wave_px=1.5):
+    from scipy import ndimage
+
+    rough = np.random.default_rng(seed).standard_normal((side, side))
+    smooth = ndimage.gaussian_filter(rough, wave_px)
+    return SkinMap((8.0 * smooth / smooth.std()).astype(np.float32), "um")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    sites, maps, files = {}, {}, {}
+    for seed, site in enumerate(("forehead", "cheek")):
+        maps[f"microrelief_{site}"] = relief_map(seed)
+        files[f"kernel_table_{site}.json"] = FOREHEAD.to_json().encode()
+        sites[site] = {
+            "pixel_um": 20.0, "map": f"microrelief_{site}", "table": f"kernel_table_{site}.json",
+        }  # fmt: skip
+    part = dynamic.Part(maps, files, {"sites": sites}, {}, "measured")
+    dynamic.add(tmp_path / "moving", dynamic.MICROSTRUCTURE, part)
+    return tmp_path / "moving"
+
+
+@pytest.fixture
+def sheet(tmp_path):
+    """A square of 12 mm that one shape draws out by 20 % to the right."""
+    x, y = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9))
+    uv = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
+    vertices = np.concatenate([12.0 * uv, np.zeros((81, 1), np.float32)], axis=1)
+    k = np.arange(72).reshape(8, 9)[:, :8].ravel()
+    faces = np.concatenate([np.stack([k, k + 1, k + 10], 1), np.stack([k, k + 10, k + 9], 1)])
+    drawn = np.zeros((1, 81, 3), np.float16)
+    drawn[0, :, 0] = 0.2 * vertices[:, 0]
+    path = tmp_path / "sheet.npz"
+    np.savez(
+        path, vertices_mm=vertices, uv=uv, faces=faces.astype(np.int32),
+        shape_names=np.array(["drawn"]), shape_deltas_mm=drawn,
+    )  # fmt: skip
+    return path
+
+
+def applied(folder, sheet, out, weights, **other):
+    options = {"size_px": 300, "site": "forehead", "extrapolate": "hold", "seed": 1} | other
+    relief = Relief.of(sheet, weights, out=out, progress=lambda _: None, **options)
+    return apply_expression(folder, Expression(weights), out=out, parts=MICRO, relief=relief)
+
+
+def slopes(height, axis):
+    return np.diff(height[20:-20, 20:-20].astype(float), axis=axis).std()
+
+
+def test_skin_that_is_drawn_out_is_smoother_along_the_pull(folder, sheet, tmp_path):
+    done = applied(folder, sheet, tmp_path / "out", {"drawn": 1.0}, size_px=600)
+    before = done.maps["displacement_neutral"].values
+    after = done.maps["displacement"].values
+    assert slopes(after, 1) < 0.95 * slopes(before, 1)
+    assert slopes(after, 0) > slopes(after, 1)
+    told = done.figures["microstructure"]
+    assert told["stretch_s"] == pytest.approx((1.2, 1.2), abs=2e-3)
+    assert told["pixel_um"] == pytest.approx(20.0, rel=1e-3)
+    # at rest nothing happens to it
+    rest = applied(folder, sheet, tmp_path / "rest", {"drawn": 0.0}, size_px=600)
+    np.testing.assert_array_equal(rest.maps["displacement"].values, before)
+
+
+def test_the_relief_keeps_its_size_on_the_skin(folder, sheet, tmp_path):
+    """Twice the pixels show the same waves over twice as many of them."""
+    coarse = applied(folder, sheet, tmp_path / "a", {"drawn": 0.0}, size_px=600)
+    fine = applied(folder, sheet, tmp_path / "b", {"drawn": 0.0}, size_px=1200)
+    ratio = slopes(coarse.maps["displacement"].values, 0) / slopes(
+        fine.maps["displacement"].values, 0
+    )
+    assert 1.5 < ratio < 2.2
+
+
+def test_the_same_seed_grows_the_same_relief(folder, sheet, tmp_path):
+    maps = [
+        applied(folder, sheet, tmp_path / str(k), {"drawn": 0.5}, seed=seed).maps["displacement"]
+        for k, seed in enumerate((1, 1, 2))
+    ]
+    np.testing.assert_array_equal(maps[0].values, maps[1].values)
+    assert not np.array_equal(maps[0].values, maps[2].values)
+
+
+def test_names_that_nothing_answers_to_are_refused_and_nothing_is_written(folder, sheet, tmp_path):
+    with pytest.raises(ApplyError, match="drown"):
+        applied(folder, sheet, tmp_path / "out", {"drown": 1.0})
+    with pytest.raises(ApplyError, match="site"):
+        applied(folder, sheet, tmp_path / "out", {"drawn": 1.0}, site="knee")
+    with pytest.raises(ApplyError, match="size"):
+        applied(folder, sheet, tmp_path / "out", {"drawn": 1.0}, size_px=10)
+    with pytest.raises(ApplyError, match="extrapolate"):
+        applied(folder, sheet, tmp_path / "out", {"drawn": 1.0}, extrapolate="guess")
+    assert not (tmp_path / "out").exists()
+
+
+def test_large_maps_go_beside_the_folder(folder, sheet, tmp_path, monkeypatch):
+    monkeypatch.setattr("skinrig.applying_relief.ASIDE_FROM_PX", 256)
+    out = tmp_path / "out"
+    applied(folder, sheet, out, {"drawn": 1.0})
+    large = np.load(tmp_path / "out-large" / "displacement.npy", mmap_mode="r")
+    assert large.shape == (300, 300)
+    shown = store.read(out).maps["displacement"]
+    np.testing.assert_array_equal(shown.values, large[::2, ::2])
+    assert "every 2. pixel" in shown.description
