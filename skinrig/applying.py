@@ -50,6 +50,25 @@ class Applied:
 
 
 @dataclass(frozen=True, slots=True)
+class OtherFace:
+    """A face that a rig was not fitted to.
+
+    Attributes
+    ----------
+    appearance
+        With a map ``hemoglobin`` and, for its color, ``melanin``: measured, of imported
+        photographs, or painted.
+    landmarks, landmarks_rig
+        Named points of it and of the rig's face, px of their maps; None: both are framed or
+        unwrapped alike.
+    """
+
+    appearance: SkinAppearance
+    landmarks: Mapping[str, tuple[float, float]] | None = None
+    landmarks_rig: Mapping[str, tuple[float, float]] | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Expression:
     """What is asked for.
 
@@ -61,6 +80,8 @@ class Expression:
         Divide the weights by their sum.
     clamp
         Range of a wrinkle zone's sum over blend shapes.
+    onto
+        Another face's blood and melanin that the rig is applied to; None: the rig's own.
     emotional
         Let anger redden and fear pale the whole face by the paper's factors.
     gain
@@ -72,6 +93,7 @@ class Expression:
     clamp: Clamp = "unit"
     emotional: bool = False
     gain: float = 1.0
+    onto: OtherFace | None = None
 
 
 def parse_weights(text: str) -> dict[str, float]:
@@ -177,13 +199,19 @@ def apply_expression(
                 "emotional": expression.emotional, "gain": expression.gain,
                 "figures": _without_times(done.figures),
             },
-            inputs={"appearance": hashlib.sha256(content).hexdigest()},
+            inputs={"appearance": hashlib.sha256(content).hexdigest(), **_onto(expression)},
             versions={n: metadata.version(n) for n in ("skinrig", "numpy", "scipy", "numba")},
             left_out=tuple(done.left_out),
             seed=appearance.seed,
         ),
     )  # fmt: skip
     return done
+
+
+def _onto(expression: Expression) -> dict[str, str]:
+    if expression.onto is None:
+        return {}
+    return {f"onto {name}": value for name, value in expression.onto.appearance.inputs.items()}
 
 
 def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
@@ -195,6 +223,10 @@ def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
 
 def _facial_color(appearance: SkinAppearance, expression: Expression, done: Applied) -> None:
     rig = hemoglobin_rig(appearance)
+    maps = appearance.maps
+    if expression.onto is not None:
+        rig = _carried(rig, expression.onto, done)
+        maps = expression.onto.appearance.maps
     blend = rig.evaluate(
         expression.weights,
         normalize=expression.normalize,
@@ -212,16 +244,32 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
         "valid_fraction": float(good.mean()),
         "mean_hemoglobin": float(held[good].mean()) if good.any() else None,
     }
-    if "melanin" not in appearance.maps:
-        done.left_out.append(("color", "the folder holds no melanin map"))
+    if "melanin" not in maps:
+        done.left_out.append(("color", "there is no melanin map"))
         return
-    melanin = appearance.maps["melanin"]
+    melanin = maps["melanin"]
     seen = good if melanin.valid is None else good & melanin.valid
     done.maps["melanin"] = melanin
     done.maps["color"] = SkinMap(
         colors(melanin.values, held, seen), "1", None, seen,
         f"diffuse reflectance as {OBSERVER} under {LIGHT}, white = 1",
     )  # fmt: skip
+
+
+def _carried(rig: HemoglobinRig, other: OtherFace, done: Applied) -> HemoglobinRig:
+    """Return the rig for another face's blood."""
+    if "hemoglobin" not in other.appearance.maps:
+        names = ", ".join(other.appearance.maps) or "none"
+        raise ApplyError(f"onto: got maps {names}, expected hemoglobin among them")
+    blood = other.appearance.maps["hemoglobin"]
+    shape = (blood.values.shape[0], blood.values.shape[1])
+    if other.landmarks is not None and other.landmarks_rig is not None:
+        from reconstruction.rig_transfer import carried
+
+        rig = carried(rig, shape, landmarks_rig=other.landmarks_rig, landmarks_onto=other.landmarks)
+    else:
+        done.left_out.append(("landmarks", "none: both faces are taken to be framed alike"))
+    return rig.applied_to(blood.values, valid=blood.valid, stderr=blood.stderr)
 
 
 def colors(melanin: Any, hemoglobin: Any, seen: Any) -> Any:

@@ -150,6 +150,14 @@ def apply_expression(
         bool, typer.Option("--emotional", help="Anger reddens, fear pales the whole face.")
     ] = False,
     gain: Annotated[float, typer.Option(help="One more factor of all blood.")] = 1.0,
+    onto: Annotated[
+        Path | None,
+        typer.Option(help="Maps of another face (hemoglobin, melanin) that the rig is applied to."),
+    ] = None,
+    landmarks: Annotated[
+        list[Path] | None,
+        typer.Option(help="Table name,x,y of the rig's face; a second one of the other face."),
+    ] = None,
     size: Size = 4096,
     site: At = None,
     extrapolate: Extrapolate = "hold",
@@ -169,7 +177,7 @@ def apply_expression(
     wanted = PARTS if parts is None else tuple(p.strip() for p in parts.split(","))
     expression = applying.Expression(
         given, normalize=normalize, clamp=one_of("--clamp", clamp, ("unit", "signed")),
-        emotional=emotional, gain=gain,
+        emotional=emotional, gain=gain, onto=_other_face(onto, landmarks or []),
     )  # fmt: skip
     relief = None
     if mesh is not None:
@@ -214,6 +222,27 @@ def apply_microstructure(
         progress=console.progress,
     )  # fmt: skip
     _tell(console, out, done)
+
+
+def _other_face(onto: Path | None, landmarks: list[Path]) -> Any:
+    """Return the face that a rig is applied to, with its landmarks."""
+    from model import store
+    from reconstruction import landmark_table
+    from skinrig.applying import OtherFace
+    from skinrig.errors import UsageError
+
+    if onto is None:
+        if landmarks:
+            raise UsageError("--landmarks: is for --onto, another face, which is not given")
+        return None
+    if len(landmarks) not in (0, 2):
+        raise UsageError(
+            f"--landmarks: got {len(landmarks)} tables, expected two, of the rig's face and of the "
+            "other, or none"
+        )
+    tables = [landmark_table.read(path) for path in landmarks]
+    own, other = tables if tables else (None, None)
+    return OtherFace(store.read(onto), landmarks=other, landmarks_rig=own)
 
 
 def _tell(console: Console, out: Path, done: Any) -> None:

@@ -5,13 +5,19 @@ import pytest
 
 from model import facial_color_document, store
 from model.facial_color import FacialColorError, HemoglobinRig
-from model.skin import UNITS, SkinMap
+from model.skin import UNITS, SkinAppearance, SkinMap
 from model.wrinkle_model import FILE as WRINKLE_FILE
 from model.wrinkle_model import WrinkleModel
 from model.wrinkles import Layer
 from skinrig import applying
 from skinrig import dynamic_appearance as dynamic
-from skinrig.applying import ApplyError, Expression, apply_expression, parse_weights
+from skinrig.applying import (
+    ApplyError,
+    Expression,
+    OtherFace,
+    apply_expression,
+    parse_weights,
+)
 
 SIDE = 48
 
@@ -110,6 +116,24 @@ def test_what_a_face_lacks_is_left_out_with_the_reason(face, tmp_path):
     assert ("microstructure", "the folder does not hold it") in written.left_out
     with pytest.raises(ApplyError, match="parts"):
         apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / "o", parts=("hair",))
+
+
+def test_a_rig_is_applied_to_another_faces_blood(face, tmp_path):
+    folder, _ = face
+    rng = np.random.default_rng(8)
+    other = (0.04 + 0.002 * rng.standard_normal((60, 40))).astype(np.float32)
+    onto = OtherFace(
+        SkinAppearance({"hemoglobin": SkinMap(other, UNITS["hemoglobin"])}, "measured")
+    )
+    done = apply_expression(folder, Expression({"smile": 1.0}, onto=onto), out=tmp_path / "out")
+    found = done.maps["hemoglobin"]
+    assert found.values.shape == other.shape
+    ratio = found.values[found.valid] / other[found.valid]
+    assert np.median(ratio) == pytest.approx(1.5, abs=0.03)
+    assert ("color", "there is no melanin map") in done.left_out
+    empty = OtherFace(SkinAppearance({}, "measured"))
+    with pytest.raises(ApplyError, match="hemoglobin"):
+        apply_expression(folder, Expression({"smile": 1.0}, onto=empty), out=tmp_path / "no")
 
 
 def test_the_same_evaluation_gives_the_same_bytes(face, tmp_path):
