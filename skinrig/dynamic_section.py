@@ -12,6 +12,7 @@ from model import microstructure
 from model.facial_color import HemoglobinRig
 from model.microstructure import KernelTable
 from model.skin import SkinAppearance, SkinMap
+from model.wrinkle_expressions import clamped, zone_sums
 from model.wrinkle_model import FILE as WRINKLE_FILE
 from model.wrinkle_model import WrinkleModel
 from skinrig import facial_color_evaluation as evaluation
@@ -239,9 +240,15 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
                 ),
             )
         )
+    together = dict.fromkeys(list(table.rows)[:2], 1.0)
+    sums = zone_sums(together, table)
+    clamps = [(clamp, *(float(v) for v in clamped(sums, clamp))) for clamp in ("unit", "signed")]
     return (
         f"<h3>Wrinkles</h3><div class=maps>{pictures}</div>"
         + page.table(("expression", *table.zones), rows, caption="Weights (standard error)")
+        + page.table(
+            ("clamp", *table.zones), clamps, caption=f"{' + '.join(together)}: zones' sums"
+        )
         + f"<p class=note>Map and zones explain {100 * part['explained']:.0f} % of the "
         "differences between expressions and neutral.</p>"
     )

@@ -21,6 +21,7 @@ from skinrig import (
     microrelief_section,
     page,
     population_section,
+    sequence_section,
     subsurface_section,
     surface_section,
 )
@@ -157,6 +158,8 @@ def _appearance_section(
         body += microrelief_section.section(name, appearance, truth, checks)
     elif subsurface_section.is_probe(appearance):
         body += subsurface_section.section(name, appearance, truth, checks)
+    elif sequence_section.is_sequence(appearance):
+        body += sequence_section.section(appearance)
     for key, skin_map in sorted(appearance.maps.items()):
         if skin_map.values.ndim != 2 or key.startswith("_") or on_mesh or microrelief:
             continue

@@ -1,0 +1,111 @@
+"""The report's sections on faces that move and on sequences in time."""
+
+import json
+
+import numpy as np
+
+from model import facial_color_document, store
+from model.facial_color import HemoglobinRig
+from model.skin import UNITS, SkinAppearance, SkinMap
+from model.wrinkle_model import FILE as WRINKLE_FILE
+from model.wrinkle_model import WrinkleModel
+from model.wrinkles import Layer
+from skinrig import dynamic_appearance as dynamic
+from skinrig import report
+
+SIDE = 40
+
+
+def moving(folder, truths):
+    rng = np.random.default_rng(3)
+    neutral = np.clip(0.02 + 0.004 * rng.standard_normal((SIDE, SIDE)), 0.005, 0.05)
+    rig = HemoglobinRig.from_maps(neutral, {"smile": 1.5 * neutral}, radius_px=6.0)
+    maps, document = facial_color_document.to_maps(rig)
+    stderr = np.full((SIDE, SIDE), 1e-3, np.float32)
+    maps["melanin"] = SkinMap(np.full((SIDE, SIDE), 0.03, np.float32), UNITS["melanin"])
+    maps["hemoglobin_smile"] = SkinMap(1.5 * neutral, UNITS["hemoglobin"], stderr)
+    maps["change_smile"] = SkinMap(0.5 * neutral, UNITS["hemoglobin"], stderr)
+    parameters = {
+        "alignment": [{"state": "smile", "median_error_px": 0.3, "by": "landmarks"}],
+        "storage_error": {"smile": [0.0, 0.0]},
+        "repeatability": None,
+        "truth": truths,
+    }
+    dynamic.add(
+        folder, dynamic.FACIAL_COLOR,
+        dynamic.Part(maps, {facial_color_document.DOCUMENT: document}, parameters, {}, "simulated"),
+    )  # fmt: skip
+    layer = Layer(np.full((8, 8, 2), 0.3), np.ones((8, 4, 4)) / 8.0)
+    maps, document = WrinkleModel(np.zeros((16, 16, 2)), (layer,)).to_maps()
+    dynamic.add(
+        folder, dynamic.WRINKLES,
+        dynamic.Part(
+            maps, {WRINKLE_FILE: document}, {"expressions": ["surprise"], "explained": 0.9}, {},
+            "simulated",
+        ),
+    )  # fmt: skip
+    return neutral
+
+
+def write_truth(folder, state, name, values):
+    maps = {name: SkinMap(np.asarray(values, np.float32), UNITS["hemoglobin"])}
+    store.write(
+        folder,
+        SkinAppearance(maps, "simulated", parameters={"kind": "truth", "state": state}, seed=0),
+    )
+
+
+def test_a_rig_that_has_the_true_blood_keeps_its_limit_and_one_that_has_not_misses(tmp_path):
+    neutral = moving(tmp_path / "moving", {"neutral": "truth", "smile": "truth-smile"})
+    write_truth(tmp_path / "truth", "neutral", "hemoglobin", neutral)
+    write_truth(tmp_path / "truth-smile", "smile", "hemoglobin_at_rest", 1.5 * neutral)
+    page = report.build([tmp_path])
+    assert "Moving face: moving" in page
+    assert "All 1 checks kept their limits." in page
+    assert "blood of smile, by the rig" in page
+    write_truth(tmp_path / "truth-smile", "smile", "hemoglobin_at_rest", 2.5 * neutral)
+    assert "1 of 1 checks missed their limit." in report.build([tmp_path])
+
+
+def test_without_truth_the_face_is_shown_with_its_own_errors(tmp_path):
+    moving(tmp_path / "moving", {})
+    page = report.build([tmp_path / "moving"])
+    assert "No limit was checked" in page
+    assert "Hemoglobin rig" in page
+    assert "error by way" not in page
+    # surprise and anger in the forehead: the table's 0.8 - 0.6 and 0.8 - 0.8
+    assert "zones&#x27; sums" in page or "zones' sums" in page
+
+
+def test_a_sequence_shows_its_places_and_what_is_only_bounded(tmp_path):
+    places = {"cheek": 0.03, "chin": 0.02}
+    told = {
+        "schema": "skinrig.perfusion-curves/1", "state": "smile", "shot_period_s": 5.5,
+        "cycle_s": 10.0,
+        "phases": {"captures": 22, "distinct": 20, "interval_s": 0.5},
+        "frames": [{"time_s": 5.5 * k, "phase_s": 5.5 * k % 10} for k in range(22)],
+        "curves": {
+            name: {"hemoglobin": [level] * 22, "stderr": [1e-3] * 21 + [None]}
+            for name, level in places.items()
+        },
+        "fits": {
+            name: {"start": level, "end": level, "text": "below 0.157 s"}
+            for name, level in places.items()
+        },
+        "transition": {"cheek": {"seen": False, "decided": True, "power": 0.8},
+                       "chin": {"seen": False, "decided": False}},
+        "reproducibility": {"cheek": {"sd": 1e-4}},
+        "fit_of_all": {"text": "below 0.137 s"},
+    }  # fmt: skip
+    store.write(
+        tmp_path / "curves",
+        SkinAppearance(
+            {}, "simulated", parameters={"kind": "appearance"},
+            files={"perfusion_curves.json": json.dumps(told).encode()},
+        ),
+    )  # fmt: skip
+    page = report.build([tmp_path])
+    assert "22 images meet 20 phases" in page
+    assert "below 0.137 s" in page
+    assert "no (would be seen with a chance of 80 %)" in page
+    assert "cannot be told" in page
