@@ -61,8 +61,9 @@ def estimate(numerator: Floats, denominator: Floats, variance: Floats, held: Mas
     Examples
     --------
     >>> seen = np.array([0.0, 1e-9, 1.0, 2.0])
-    >>> estimate(1.5 * seen + [0.1, 0.1, 0, 0], seen, np.full(4, 1e-6), seen >= 0).value.round(2)
-    array([1.5, 1.5, 1.5, 1.5])
+    >>> found = estimate(1.5 * seen + [0.1, 0.1, 0, 0], seen, np.full(4, 1e-6), seen >= 0)
+    >>> found.value.round(2).tolist()
+    [1.5, 1.5, 1.5, 1.5]
     """
     a, b, v = (np.where(held, x, 0.0) for x in (numerator, denominator, variance))
     prior = overall(a, b)

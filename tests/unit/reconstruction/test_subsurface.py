@@ -210,8 +210,9 @@ def test_leading_axes_are_a_loop(rng):
     assert together.predicted_per_mm2.shape == together.residual.shape == (2, 3, 28)
     for index in np.ndindex(2, 3):
         alone = fit_table(profiles[index], variance, common_error=0.01)
+        # where the iteration ends depends on the width of the vectors it is computed with
         np.testing.assert_allclose(
-            together.sigma_tr_per_mm[index], alone.sigma_tr_per_mm, rtol=1e-9
+            together.sigma_tr_per_mm[index], alone.sigma_tr_per_mm, rtol=1e-6
         )
 
 
