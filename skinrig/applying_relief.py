@@ -9,11 +9,13 @@ from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from model import displacement_synthesis
 from model.microstructure import KernelTable
 from model.skin import SkinAppearance, SkinMap
 from model.strain_fields import KernelRegions
+from model.volume_noise import VolumeNoise
 from skinrig import blend_shapes
 from skinrig.applying import Applied, ApplyError
 from skinrig.applying_microstructure import apply_microstructure
@@ -29,6 +31,12 @@ SITE_REGIONS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Regions of a face that a site's relief stands for."""
 SMALLEST_PATCH_PX: Final = 64
+LONGEST_PER_MM: Final = 1.0
+"""The relief's longest waves: longer ones are the face's own shape (Nagano2015, section 4)."""
+SHORTEST_PER_MM: Final = 25.0
+NYQUIST_SHARE: Final = 0.8
+PLACE_PX: Final = 1024
+BAND_ROWS: Final = 256
 ASIDE_FROM_PX: Final = 8192
 """Larger maps are written as .npy files beside the folder, tile by tile, and not as EXR."""
 
@@ -65,6 +73,9 @@ class Relief:
         Pixels a side of the map.
     site
         Whose relief covers the whole mesh; None: each site its own region, where there are several.
+    source
+        "patches": the measured ones, grown; "noise": noise in space as high as they are, which has
+        no seams between islands of the texture.
     extrapolate
         "hold" or "formula", beyond the table's range.
     seed
@@ -80,6 +91,7 @@ class Relief:
     own_shapes: tuple[str, ...]
     size_px: int
     site: str | None
+    source: str
     extrapolate: Literal["hold", "formula"]
     seed: int
     aside: Path
@@ -92,6 +104,7 @@ class Relief:
         *,
         size_px: int,
         site: str | None,
+        source: str = "patches",
         extrapolate: str,
         seed: int,
         out: Path,
@@ -115,7 +128,8 @@ class Relief:
         kept: Literal["hold", "formula"] = "hold" if held == "hold" else "formula"
         moved = {n: w for n, w in used.items() if n in shaped.shapes}
         aside = out.with_name(f"{out.name}-large")
-        return Relief(shaped, moved, own, size_px, site, kept, seed, aside, progress)
+        made_of = one_of("synthesize", source, ("patches", "noise"))
+        return Relief(shaped, moved, own, size_px, site, made_of, kept, seed, aside, progress)
 
     def __call__(self, appearance: SkinAppearance, part: dict[str, Any], done: Applied) -> None:
         """Grow the neutral relief, move it, and put the maps into ``done``."""
@@ -133,7 +147,6 @@ class Relief:
                 "choose one with --site"
             )
         regions = _regions(self.mesh, names)
-        self.progress(f"grow the relief of {', '.join(names)} to {self.size_px} x {self.size_px}")
         large = self.size_px > ASIDE_FROM_PX
         neutral: Any = None
         if large:
@@ -141,10 +154,18 @@ class Relief:
             neutral = np.lib.format.open_memmap(
                 self.aside / "displacement_neutral.npy", "w+", np.float32, (self.size_px,) * 2
             )
-        neutral = displacement_synthesis.grow(
-            patches, self.size_px, rng=rng, regions=regions, out=neutral,
-            pixel_um=scale / self.size_px, patch_pixel_um=pixels_um.pop(), threads=2,
-        )  # fmt: skip
+        if self.source == "noise":
+            self.progress(f"draw noise on {self.size_px} x {self.size_px} pixels")
+            rms_um = float(np.mean([np.nanstd(one) for (one,) in patches.values()]))
+            neutral = _noise(self.mesh, self.size_px, rms_um, scale, rng=rng, out=neutral)
+        else:
+            self.progress(
+                f"grow the relief of {', '.join(names)} to {self.size_px} x {self.size_px}"
+            )
+            neutral = displacement_synthesis.grow(
+                patches, self.size_px, rng=rng, regions=regions, out=neutral,
+                pixel_um=scale / self.size_px, patch_pixel_um=pixels_um.pop(), threads=2,
+            )  # fmt: skip
         tables = tuple(
             KernelTable.from_json(appearance.files[sites[name]["table"]].decode()) for name in names
         )
@@ -155,7 +176,8 @@ class Relief:
             out=self.aside / "displacement.npy" if large else None,
             progress=lambda at, of: self.progress(f"tile {at} of {of}"),
         )  # fmt: skip
-        note = "um, grown from measured patches; texture of the mesh"
+        made = "noise as high as" if self.source == "noise" else "grown from"
+        note = f"um, {made} measured patches; texture of the mesh"
         if large:
             done.left_out.append(
                 (MICROSTRUCTURE, f"EXR of {self.size_px} px: written to {self.aside.name} as .npy")
@@ -171,6 +193,7 @@ class Relief:
         seconds = ("strain_s", "convolution_s")
         done.figures[MICROSTRUCTURE] = {
             "sites": names,
+            "source": self.source,
             "tables": [table.source for table in tables],
             "own_shapes": list(self.own_shapes),
             **{key: value for key, value in figures.items() if key not in seconds},
@@ -214,6 +237,44 @@ def _patch(site: str, appearance: SkinAppearance, entry: Mapping[str, Any]) -> N
     return displacement_synthesis.leveled(
         relief.values, pixel_um=float(entry["pixel_um"]), valid=relief.valid
     )
+
+
+def _noise(
+    mesh: BlendShapeMesh,
+    size_px: int,
+    rms_um: float,
+    scale_um: NDArray[np.float64],
+    *,
+    rng: np.random.Generator,
+    out: NDArray[np.float32] | None,
+) -> NDArray[np.float32]:
+    """Return noise in space on the mesh's texture, up to half a wave in a pixel."""
+    from rigsim.atlas import spread, unwrap
+
+    finest = NYQUIST_SHARE * 0.5e3 * size_px / float(np.median(scale_um))
+    if finest <= LONGEST_PER_MM:
+        raise ApplyError(
+            f"size: {size_px} px show no wave shorter than a millimetre, expected larger maps"
+        )
+    band = (LONGEST_PER_MM, min(finest, SHORTEST_PER_MM))
+    noise = VolumeNoise.draw(rms_um=rms_um, band_per_mm=band, rng=rng)
+    # places lie smoothly between the texels of a smaller atlas: microns off at most
+    atlas = unwrap(_face(mesh), PLACE_PX)
+    places = spread(atlas.position_mm, atlas.covered, steps=8).astype(np.float64)
+    target = np.empty((size_px, size_px), np.float32) if out is None else out
+    columns = (np.arange(size_px) + 0.5) * PLACE_PX / size_px - 0.5
+    for top in range(0, size_px, BAND_ROWS):
+        rows = (np.arange(top, min(top + BAND_ROWS, size_px)) + 0.5) * PLACE_PX / size_px - 0.5
+        at = np.meshgrid(rows, columns, indexing="ij")
+        points = np.stack(
+            [
+                ndimage.map_coordinates(places[..., k], at, order=1, mode="nearest")
+                for k in range(3)
+            ],
+            axis=-1,
+        )
+        target[top : top + len(rows)] = noise.at(points)
+    return target
 
 
 def _scale(mesh: BlendShapeMesh) -> NDArray[np.float64]:

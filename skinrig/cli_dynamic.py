@@ -20,6 +20,10 @@ Mesh = Annotated[
 ]
 Size = Annotated[int, typer.Option(help="Pixels a side of the displacement map.")]
 At = Annotated[str | None, typer.Option("--site", help="Whose microrelief; default: the first.")]
+Synthesize = Annotated[
+    str,
+    typer.Option(help="Neutral relief: patches (measured ones, grown) or noise (in space)."),
+]
 Extrapolate = Annotated[
     str, typer.Option(help="Beyond the table's stretch range: hold its ends, or formula.")
 ]
@@ -160,6 +164,7 @@ def apply_expression(
     ] = None,
     size: Size = 4096,
     site: At = None,
+    synthesize: Synthesize = "patches",
     extrapolate: Extrapolate = "hold",
     seed: Annotated[int, typer.Option(help="Seed of the grown relief.")] = 0,
     json: Json = False,
@@ -182,8 +187,8 @@ def apply_expression(
     relief = None
     if mesh is not None:
         relief = Relief.of(
-            mesh, given, size_px=size, site=site, extrapolate=extrapolate, seed=seed,
-            out=out, progress=console.progress,
+            mesh, given, size_px=size, site=site, source=synthesize, extrapolate=extrapolate,
+            seed=seed, out=out, progress=console.progress,
         )  # fmt: skip
     done = applying.apply_expression(
         appearance, expression, out=out, parts=wanted, relief=relief, progress=console.progress
@@ -199,6 +204,7 @@ def apply_microstructure(
     out: Out,
     size: Size = 4096,
     site: At = None,
+    synthesize: Synthesize = "patches",
     extrapolate: Extrapolate = "hold",
     seed: Annotated[int, typer.Option(help="Seed of the grown relief.")] = 0,
     json: Json = False,
@@ -214,8 +220,8 @@ def apply_microstructure(
     console = Console(json)
     given = applying.parse_weights(weights)
     relief = Relief.of(
-        mesh, given, size_px=size, site=site, extrapolate=extrapolate, seed=seed,
-        out=out, progress=console.progress,
+        mesh, given, size_px=size, site=site, source=synthesize, extrapolate=extrapolate,
+        seed=seed, out=out, progress=console.progress,
     )  # fmt: skip
     done = applying.apply_expression(
         appearance, applying.Expression(given), out=out, parts=(MICROSTRUCTURE,), relief=relief,

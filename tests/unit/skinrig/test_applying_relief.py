@@ -117,3 +117,13 @@ def test_large_maps_go_beside_the_folder(folder, sheet, tmp_path, monkeypatch):
     shown = store.read(out).maps["displacement"]
     np.testing.assert_array_equal(shown.values, large[::2, ::2])
     assert "every 2. pixel" in shown.description
+
+
+def test_noise_in_space_is_as_high_as_the_patches_and_moves_alike(folder, sheet, tmp_path):
+    done = applied(folder, sheet, tmp_path / "out", {"drawn": 1.0}, size_px=400, source="noise")
+    before = done.maps["displacement_neutral"].values
+    after = done.maps["displacement"].values
+    assert before.std() == pytest.approx(8.0, rel=0.15)
+    assert slopes(after, 1) < 0.95 * slopes(before, 1)
+    with pytest.raises(ApplyError, match="synthesize"):
+        applied(folder, sheet, tmp_path / "no", {"drawn": 1.0}, source="paint")
