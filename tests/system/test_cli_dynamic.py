@@ -1,0 +1,84 @@
+"""`skinrig fit` and `skinrig apply` as a user calls them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from model import facial_color_document, store
+from model.facial_color import HemoglobinRig
+from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig import dynamic_appearance as dynamic
+from skinrig.cli import main
+
+SIDE = 40
+
+
+@pytest.fixture
+def moving(tmp_path):
+    rng = np.random.default_rng(3)
+    neutral = np.clip(0.02 + 0.004 * rng.standard_normal((SIDE, SIDE)), 0.005, 0.05)
+    rig = HemoglobinRig.from_maps(neutral, {"smile": 1.5 * neutral}, radius_px=6.0)
+    maps, document = facial_color_document.to_maps(rig)
+    maps["melanin"] = SkinMap(np.full((SIDE, SIDE), 0.03, np.float32), UNITS["melanin"])
+    files = {facial_color_document.DOCUMENT: document}
+    dynamic.add(
+        tmp_path / "moving", dynamic.FACIAL_COLOR, dynamic.Part(maps, files, {}, {}, "simulated")
+    )
+    return tmp_path / "moving"
+
+
+def test_an_expression_is_evaluated_and_told_in_one_document(moving, tmp_path, capsys):
+    out = tmp_path / "out"
+    code = main(
+        ["apply", "expression", str(moving), "--weights", "smile=0.5,neutral=0.5", "--out",
+         str(out), "--json"]
+    )  # fmt: skip
+    assert code == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == "skinrig.apply/1"
+    assert set(document["maps"]) == {"hemoglobin", "melanin", "color"}
+    assert document["figures"]["facial_color"]["clipped_fraction"] == 0.0
+    assert (out / store.DOCUMENT).is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--weights", "smile=0.5"], "normalize"),
+        (["--weights", "smlie=1"], "did you mean 'smile'"),
+        (["--weights", "smile"], "NAME=NUMBER"),
+        (["--weights", "smile=1", "--clamp", "none"], "--clamp"),
+        (["--weights", "smile=1", "--parts", "hair"], "parts"),
+        (["--weights", "smile=1", "--landmarks", "a.csv"], "--onto"),
+        (["--weights", "smile=1", "--mesh", "nowhere.npz"], "nowhere.npz"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_one_sentence_and_writes_nothing(
+    moving, tmp_path, capsys, arguments, words
+):
+    out = tmp_path / "out"
+    code = main(["apply", "expression", str(moving), "--out", str(out), *arguments])
+    captured = capsys.readouterr()
+    assert code in (2, 3)
+    last = captured.err.strip().splitlines()[-1]
+    assert words in last
+    assert "Traceback" not in captured.err
+    assert not out.exists()
+
+
+def test_fits_refuse_folders_without_what_they_need(moving, tmp_path, capsys):
+    plain = tmp_path / "plain"
+    store.write(plain, SkinAppearance({}, "measured", parameters={"kind": "appearance"}))
+    for command, words in (
+        (["fit", "microstructure", str(plain)], "kernels.json"),
+        (["fit", "wrinkles", f"neutral={plain}", f"smile={plain}"], "normals"),
+        (["fit", "facial-color", str(plain)], "session"),
+    ):
+        code = main([*command, "--out", str(tmp_path / "new")])
+        assert code == 3
+        assert words in capsys.readouterr().err
+        assert not (tmp_path / "new").exists()
+    # a folder of other maps is not overwritten
+    assert main(["fit", "microstructure", str(plain), "--out", str(plain)]) == 3
+    assert "nothing was touched" in capsys.readouterr().err
