@@ -32,7 +32,7 @@ test: .venv/.ready
 	@$(PYTEST) -q $(WORKERS) -m "not long"
 
 test-long: .venv/.ready
-	@$(PYTEST) -q $(WORKERS) -m long
+	@$(PYTEST) -q $(WORKERS) --durations 25 -m long
 
 bench: .venv/.ready
 	@$(SKINRIG) bench

@@ -94,7 +94,7 @@ def _flash(out: Path, seed: int, share: Share, width_px: int | None, found: Find
             )  # fmt: skip
             found.errors += _chromophore_rows(out / f"appearance-{name}", truth)
     with share("flash: fit the blood of a moving face"):
-        moving = out / f"appearance-moving-{FLASH_SUBJECTS[0]}"
+        moving = out / f"appearance-flash-moving-{FLASH_SUBJECTS[0]}"
         fit_facial_color([captures[0].session], out=moving, calibration=calibration)
         found.errors += _moving_rows(moving, out)
     found.tables.append(
@@ -171,7 +171,7 @@ def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: F
             truth=capture.truth.name if capture.truth else "",
         )  # fmt: skip
         fit_microstructure(
-            [appearance], out=out / f"appearance-moving-{GRADIENT_SITE}", paper_table=True
+            [appearance], out=out / f"appearance-gradient-moving-{GRADIENT_SITE}", paper_table=True
         )
         found.errors += _microrelief_rows(appearance, capture.truth)
     found.tables.append(
