@@ -322,7 +322,8 @@ class HemoglobinRig:
             rest = float(weights.get(NEUTRAL, 0.0)) + 1.0 - total
             raise FacialColorError(
                 f"weights: got a sum of {total:g}, expected 1; {NEUTRAL}={rest:.6g} (got "
-                f"{weights.get(NEUTRAL, 0.0):g}) makes it so, or normalize=True divides by the sum"
+                f"{weights.get(NEUTRAL, 0.0):g}) makes it so, or normalize=True "
+                "(`--normalize`) divides by the sum"
             )
         return {name: float(weight) for name, weight in weights.items()}
 

@@ -213,7 +213,7 @@ def fit(
         changes={state: _change(shared, k) for k, state in enumerate(kept) if state != NEUTRAL},
         aligned=tuple(aligned),
         shared=shared,
-        repeats=_repeats(aligned),
+        repeats=_repeats(aligned, timed=subject.timed),
         left_out=tuple(left_out),
     )
 
@@ -250,7 +250,7 @@ def _align(
     return found, left_out
 
 
-def _repeats(aligned: list[AlignedImage]) -> Repeats | None:
+def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
     """Compare repeats; None where no state has any, or too little of the face is known in all."""
     states = [one.image.state for one in aligned]
     if len(set(states)) == len(states) or "hemoglobin" not in aligned[0].image.maps:
@@ -277,6 +277,8 @@ def _repeats(aligned: list[AlignedImage]) -> Repeats | None:
         )
     except RepeatabilityError:
         return None
+    if not timed:
+        return Repeats(compared, ())
     try:
         drifts = repeatability.drift(
             melanin, states, [one.image.captured_s for one in aligned], stderr=melanin_error,

@@ -49,7 +49,8 @@ def carried(
     HemoglobinRig
         Of the other face's size; its neutral map is the smooth mean of the rig's. Use
         `HemoglobinRig.applied_to` with the other face's blood. Valid where the rig's own maps
-        are, and within the landmarks' reach.
+        are, and where the landmarks tell the place to within the rig's radius; within it the
+        statistics hardly change, so that the error of place adds nothing to theirs.
 
     Raises
     ------
@@ -69,14 +70,17 @@ def carried(
         raise RigTransferError(f"landmarks: {error}") from error
     stored = (min(rig.neutral_mean.shape[0], shape[0]), min(rig.neutral_mean.shape[1], shape[1]))
     place = _centres(shape, stored)
-    source = place + field.at(place.reshape(-1, 2))[0].reshape(place.shape)
+    moved, unsure_px = field.at(place.reshape(-1, 2))
+    source = place + moved.reshape(place.shape)
+    told = unsure_px.reshape(stored) <= rig.radius_px
     cell = np.stack(
         [
             (source[..., k] + 0.5) * rig.neutral_mean.shape[1 - k] / rig.neutral.shape[1 - k] - 0.5
             for k in (1, 0)
         ]
     )
-    mean, here = _sampled(rig.neutral_mean, rig.neutral_mean_valid, cell)
+    mean, seen = _sampled(rig.neutral_mean, rig.neutral_mean_valid, cell)
+    here = seen & told
     states: dict[str, StateMaps] = {}
     for name, state in rig.states.items():
         sampled = {part: _sampled(getattr(state, part), state.valid, cell) for part in _PARTS}

@@ -72,6 +72,8 @@ class Subject:
         Names of the spectra that the color table is built for.
     has_white
         Whether the exposure is known from a white tile.
+    timed
+        Whether times are those of capture: of photographs only that of their import is known.
     """
 
     images: tuple[StateImage, ...]
@@ -82,6 +84,7 @@ class Subject:
     camera: str
     illuminant: str
     has_white: bool
+    timed: bool
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -171,6 +174,7 @@ def read(
         camera=camera,
         illuminant=illuminant,
         has_white=has_white,
+        timed=not any("photographs" in session.manifest.extra for session in opened),
     )
 
 

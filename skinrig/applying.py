@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ from model.wrinkle_model import WrinkleModel
 from skinrig import dynamic_appearance
 from skinrig.dynamic_appearance import FACIAL_COLOR, PARTS, WRINKLES
 
+KIND = "expression"
+LEAST_SUM = 1e-6
 OBSERVER, LIGHT = "linear sRGB", "D65"
 """What colors are given for: screens and textures, not the camera that measured."""
 
@@ -42,10 +44,13 @@ class Applied:
         JSON values of each part: clipped fractions, clamped zones, seconds.
     left_out
         Parts that were not evaluated, and why.
+    inputs
+        SHA-256 of what was read besides the folder.
     """
 
     maps: dict[str, SkinMap] = field(default_factory=dict)
     figures: dict[str, Any] = field(default_factory=dict)
+    inputs: dict[str, str] = field(default_factory=dict)
     left_out: list[tuple[str, str]] = field(default_factory=list)
 
 
@@ -61,11 +66,14 @@ class OtherFace:
     landmarks, landmarks_rig
         Named points of it and of the rig's face, px of their maps; None: both are framed or
         unwrapped alike.
+    hashes
+        SHA-256 of the files they were read from, by what they are.
     """
 
     appearance: SkinAppearance
     landmarks: Mapping[str, tuple[float, float]] | None = None
     landmarks_rig: Mapping[str, tuple[float, float]] | None = None
+    hashes: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +173,8 @@ def apply_expression(
     if unknown:
         raise ApplyError(f"parts: got {unknown[0]!r}, expected out of {', '.join(PARTS)}")
     appearance, found = dynamic_appearance.read(path, parts=parts)
+    _check_target(out, path)
+    expression = normalized(expression)
     done = Applied()
     for name in PARTS:
         if name not in found or name not in parts:
@@ -192,14 +202,17 @@ def apply_expression(
         out,
         SkinAppearance(
             maps=done.maps,
-            source=appearance.source,
+            source=_source(appearance, expression),
             parameters={
-                "kind": "expression", "weights": dict(expression.weights),
-                "normalize": expression.normalize, "clamp": expression.clamp,
+                "kind": KIND, "weights": dict(expression.weights), "clamp": expression.clamp,
                 "emotional": expression.emotional, "gain": expression.gain,
                 "figures": _without_times(done.figures),
             },
-            inputs={"appearance": hashlib.sha256(content).hexdigest(), **_onto(expression)},
+            inputs={
+                "appearance": hashlib.sha256(content).hexdigest(),
+                **({} if expression.onto is None else expression.onto.hashes),
+                **done.inputs,
+            },
             versions={n: metadata.version(n) for n in ("skinrig", "numpy", "scipy", "numba")},
             left_out=tuple(done.left_out),
             seed=appearance.seed,
@@ -208,10 +221,34 @@ def apply_expression(
     return done
 
 
-def _onto(expression: Expression) -> dict[str, str]:
-    if expression.onto is None:
-        return {}
-    return {f"onto {name}": value for name, value in expression.onto.appearance.inputs.items()}
+def _check_target(out: Path, path: Path) -> None:
+    """Raise where the result would replace what it is made of, or anything but a result."""
+    if out.resolve() == path.resolve():
+        raise ApplyError(f"{out}: is the fitted folder itself; name another with --out")
+    if (out / store.DOCUMENT).is_file():
+        kind = store.read_document(out).parameters.get("kind")
+        if kind != KIND:
+            raise ApplyError(
+                f"{out}: holds maps of kind {kind!r}, expected a new folder or an older result; "
+                "nothing was touched: name another with --out"
+            )
+
+
+def normalized(expression: Expression) -> Expression:
+    """Return the expression with the weights that all parts are evaluated with."""
+    if not expression.normalize:
+        return expression
+    total = sum(expression.weights.values())
+    if abs(total) < LEAST_SUM:
+        raise ApplyError(f"weights: their sum is {total:g}: it cannot be made 1")
+    weights = {name: weight / total for name, weight in expression.weights.items()}
+    return replace(expression, weights=weights, normalize=False)
+
+
+def _source(appearance: SkinAppearance, expression: Expression) -> str:
+    other = appearance if expression.onto is None else expression.onto.appearance
+    both = {appearance.source, other.source}
+    return "simulated" if "simulated" in both else "measured"
 
 
 def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
@@ -229,7 +266,6 @@ def _facial_color(appearance: SkinAppearance, expression: Expression, done: Appl
         maps = expression.onto.appearance.maps
     blend = rig.evaluate(
         expression.weights,
-        normalize=expression.normalize,
         gains=facial_color.GLOBAL_GAINS if expression.emotional else None,
         gain=expression.gain,
     )
@@ -262,6 +298,12 @@ def _carried(rig: HemoglobinRig, other: OtherFace, done: Applied) -> HemoglobinR
         names = ", ".join(other.appearance.maps) or "none"
         raise ApplyError(f"onto: got maps {names}, expected hemoglobin among them")
     blood = other.appearance.maps["hemoglobin"]
+    melanin = other.appearance.maps.get("melanin")
+    if melanin is not None and melanin.values.shape != blood.values.shape:
+        raise ApplyError(
+            f"onto: melanin is {melanin.values.shape}, hemoglobin {blood.values.shape}, expected "
+            "one size"
+        )
     shape = (blood.values.shape[0], blood.values.shape[1])
     if other.landmarks is not None and other.landmarks_rig is not None:
         from reconstruction.rig_transfer import carried
@@ -321,7 +363,8 @@ def wrinkle_weights(model: WrinkleModel, weights: Mapping[str, float]) -> dict[s
             if row is not None and row not in rows:
                 raise ApplyError(
                     f"weights: wrinkles were not fitted to {state!r}, expected out of "
-                    f"{', '.join(sorted(rows))}; leave them out with --parts facial_color"
+                    f"{', '.join(sorted(rows))}; leave them out with --parts "
+                    "facial_color,microstructure"
                 )
         else:
             raise ApplyError(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,8 +37,12 @@ LONGEST_PER_MM: Final = 1.0
 """The relief's longest waves: longer ones are the face's own shape (Nagano2015, section 4)."""
 SHORTEST_PER_MM: Final = 25.0
 NYQUIST_SHARE: Final = 0.8
+PIXEL_TOLERANCE: Final = 0.01
+"""Sizes of pixels that count as one: calibrations of one rig differ by less."""
 PLACE_PX: Final = 1024
 BAND_ROWS: Final = 256
+SOURCES: Final = ("patches", "noise")
+EXTRAPOLATIONS: Final = ("hold", "formula")
 ASIDE_FROM_PX: Final = 8192
 """Larger maps are written as .npy files beside the folder, tile by tile, and not as EXR."""
 
@@ -82,6 +88,8 @@ class Relief:
         Of the growth.
     aside
         Folder for maps that are too large for EXR.
+    mesh_sha256
+        Of the mesh's file.
     progress
         Called with one line now and then.
     """
@@ -95,6 +103,7 @@ class Relief:
     extrapolate: Literal["hold", "formula"]
     seed: int
     aside: Path
+    mesh_sha256: str
     progress: Callable[[str], None]
 
     @staticmethod
@@ -124,12 +133,14 @@ class Relief:
         mesh = blend_shapes.load(path)
         used = {name: weight for name, weight in weights.items() if name != "neutral"}
         shaped, own = _with_states(mesh, list(used))
-        held = one_of("extrapolate", extrapolate, ("hold", "formula"))
+        held = one_of("extrapolate", extrapolate, EXTRAPOLATIONS)
         kept: Literal["hold", "formula"] = "hold" if held == "hold" else "formula"
         moved = {n: w for n, w in used.items() if n in shaped.shapes}
         aside = out.with_name(f"{out.name}-large")
-        made_of = one_of("synthesize", source, ("patches", "noise"))
-        return Relief(shaped, moved, own, size_px, site, made_of, kept, seed, aside, progress)
+        made_of = one_of("synthesize", source, SOURCES)
+        return Relief(
+            shaped, moved, own, size_px, site, made_of, kept, seed, aside, _sha256(path), progress
+        )
 
     def __call__(self, appearance: SkinAppearance, part: dict[str, Any], done: Applied) -> None:
         """Grow the neutral relief, move it, and put the maps into ``done``."""
@@ -140,8 +151,8 @@ class Relief:
         scale = _scale(self.mesh)
         rng = np.random.default_rng(self.seed)
         patches = {name: [_patch(name, appearance, sites[name])] for name in names}
-        pixels_um = {float(sites[name]["pixel_um"]) for name in names}
-        if len(pixels_um) > 1:
+        pixels_um = [float(sites[name]["pixel_um"]) for name in names]
+        if max(pixels_um) > (1.0 + PIXEL_TOLERANCE) * min(pixels_um):
             raise ApplyError(
                 f"sites: reliefs with pixels of {sorted(pixels_um)} um, expected one size; "
                 "choose one with --site"
@@ -151,12 +162,11 @@ class Relief:
         neutral: Any = None
         if large:
             self.aside.mkdir(parents=True, exist_ok=True)
-            neutral = np.lib.format.open_memmap(
-                self.aside / "displacement_neutral.npy", "w+", np.float32, (self.size_px,) * 2
-            )
+            growing = self.aside / "displacement_neutral.npy.part"
+            neutral = np.lib.format.open_memmap(growing, "w+", np.float32, (self.size_px,) * 2)
         if self.source == "noise":
             self.progress(f"draw noise on {self.size_px} x {self.size_px} pixels")
-            rms_um = float(np.mean([np.nanstd(one) for (one,) in patches.values()]))
+            rms_um = float(np.sqrt(np.mean([np.nanvar(one) for (one,) in patches.values()])))
             neutral = _noise(self.mesh, self.size_px, rms_um, scale, rng=rng, out=neutral)
         else:
             self.progress(
@@ -164,8 +174,11 @@ class Relief:
             )
             neutral = displacement_synthesis.grow(
                 patches, self.size_px, rng=rng, regions=regions, out=neutral,
-                pixel_um=scale / self.size_px, patch_pixel_um=pixels_um.pop(), threads=2,
+                pixel_um=scale / self.size_px, patch_pixel_um=float(np.mean(pixels_um)), threads=2,
             )  # fmt: skip
+        if large:
+            neutral.flush()
+            os.replace(growing, self.aside / "displacement_neutral.npy")
         tables = tuple(
             KernelTable.from_json(appearance.files[sites[name]["table"]].decode()) for name in names
         )
@@ -198,7 +211,23 @@ class Relief:
             "own_shapes": list(self.own_shapes),
             **{key: value for key, value in figures.items() if key not in seconds},
             **{f"{key[:-2]}_seconds": figures[key] for key in seconds},
+            "seed": self.seed,
         }
+        done.inputs["mesh"] = self.mesh_sha256
+        if large:
+            done.figures[MICROSTRUCTURE]["files"] = {
+                path.name: _sha256(path) for path in sorted(self.aside.glob("displacement*.npy"))
+            }
+
+
+def _sha256(path: Path) -> str:
+    if path.is_dir():  # OBJ files of a folder
+        digest = hashlib.sha256()
+        for each in sorted(path.iterdir()):
+            digest.update(each.name.encode() + bytes.fromhex(_sha256(each)))
+        return digest.hexdigest()
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _with_states(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -174,7 +175,7 @@ def apply_expression(
     Example: skinrig apply expression moving --weights smile=0.7,anger=0.3 --out expression
     """
     from skinrig import applying
-    from skinrig.applying_relief import Relief, one_of
+    from skinrig.applying_relief import EXTRAPOLATIONS, SOURCES, Relief, one_of
     from skinrig.dynamic_appearance import PARTS
 
     console = Console(json)
@@ -185,10 +186,13 @@ def apply_expression(
         emotional=emotional, gain=gain, onto=_other_face(onto, landmarks or []),
     )  # fmt: skip
     relief = None
+    one_of("--synthesize", synthesize, SOURCES)
+    one_of("--extrapolate", extrapolate, EXTRAPOLATIONS)
     if mesh is not None:
         relief = Relief.of(
-            mesh, given, size_px=size, site=site, source=synthesize, extrapolate=extrapolate,
-            seed=seed, out=out, progress=console.progress,
+            mesh, applying.normalized(expression).weights, size_px=size, site=site,
+            source=synthesize, extrapolate=extrapolate, seed=seed, out=out,
+            progress=console.progress,
         )  # fmt: skip
     done = applying.apply_expression(
         appearance, expression, out=out, parts=wanted, relief=relief, progress=console.progress
@@ -248,7 +252,11 @@ def _other_face(onto: Path | None, landmarks: list[Path]) -> Any:
         )
     tables = [landmark_table.read(path) for path in landmarks]
     own, other = tables if tables else (None, None)
-    return OtherFace(store.read(onto), landmarks=other, landmarks_rig=own)
+    read = {"onto": onto / store.DOCUMENT}
+    read |= dict(zip(("landmarks of the rig", "landmarks of the other"), landmarks, strict=False))
+    found = store.read(onto)
+    hashes = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in read.items()}
+    return OtherFace(found, landmarks=other, landmarks_rig=own, hashes=hashes)
 
 
 def _tell(console: Console, out: Path, done: Any) -> None:

@@ -60,7 +60,7 @@ def fit_facial_color(
     """
     dynamic_appearance.check_target(out)
     subject = state_images.read(sessions, calibration=calibration, progress=progress)
-    marks, marked_by = _landmarks(subject, sessions, landmarks)
+    marks, marked_by, unmarked = _landmarks(subject, sessions, landmarks)
     found = facial_color_fit.fit(
         subject, radius_px=radius_px, landmarks=marks, stored_size=stored_size, progress=progress
     )
@@ -71,8 +71,7 @@ def fit_facial_color(
         maps[f"hemoglobin_{state}"] = found.hemoglobin[state]
     truths = {
         state: folder.name
-        for state in subject.states
-        for folder in [_truth_of(sessions[0], state)]
+        for state, folder in _truths(subject, sessions).items()
         if folder is not None
     }
     dynamic_appearance.add(
@@ -96,7 +95,7 @@ def fit_facial_color(
             },
             inputs=subject.inputs,
             source=subject.source,
-            left_out=found.left_out,
+            left_out=(*found.left_out, *unmarked),
             seed=subject.seed,
         ),
     )
@@ -137,8 +136,9 @@ def _both(a: SkinMap, b: SkinMap) -> Any:
 
 def _landmarks(
     subject: Subject, sessions: Sequence[Path], folder: Path | None
-) -> tuple[Mapping[str, Landmarks] | None, str]:
-    """Return the landmarks of each state and where they come from."""
+) -> tuple[Mapping[str, Landmarks] | None, str, list[tuple[str, str]]]:
+    """Return the landmarks of each state, where they come from, and which states have none."""
+    found: dict[str, Landmarks] = {}
     if folder is not None:
         if not folder.is_dir():
             raise FacialColorInputError(
@@ -151,19 +151,25 @@ def _landmarks(
         }
         if "neutral" not in found:
             raise FacialColorInputError(f"landmarks: {folder / 'neutral.csv'} is missing")
-        return found, "tables"
-    if subject.source != "simulated":
-        return None, "features matched"
-    truth: dict[str, Landmarks] = {}
-    for state in subject.states:
-        place = _truth_of(sessions[0], state)
-        if place is None:
-            return None, "features matched"
-        points = store.read_document(place).parameters.get("landmarks_px")
-        if not isinstance(points, dict):
-            return None, "features matched"
-        truth[state] = {name: _point(place, name, value) for name, value in points.items()}
-    return truth, "the simulation's own"
+        words = "tables"
+    elif subject.source == "simulated":
+        for state, place in _truths(subject, sessions).items():
+            told = {} if place is None else store.read_document(place).parameters
+            points = told.get("landmarks_px")
+            if place is not None and isinstance(points, dict):
+                found[state] = {n: _point(place, n, value) for n, value in points.items()}
+        words = "the simulation's own"
+    if "neutral" not in found or len(found) < 2:
+        return None, "features matched", []
+    missing = [state for state in subject.states if state not in found]
+    return found, words, [(state, "landmarks: none, features were matched") for state in missing]
+
+
+def _truths(subject: Subject, sessions: Sequence[Path]) -> dict[str, Path | None]:
+    """Return the folder with each state's truth, beside the session that shows it first."""
+    return {
+        state: _truth_of(sessions[subject.of(state)[0].session], state) for state in subject.states
+    }
 
 
 def _point(place: Path, name: str, value: Any) -> tuple[float, float]:
@@ -179,8 +185,9 @@ def _point(place: Path, name: str, value: Any) -> tuple[float, float]:
 def _truth_of(session: Path, state: str) -> Path | None:
     """Return the folder with a simulated session's truth of a state, where there is one."""
     first = truth_folder(session)
-    named = first if state == "neutral" else first.with_name(f"{first.name}-{state}")
-    if not (named / store.DOCUMENT).is_file():
-        return None
-    told = store.read_document(named).parameters.get("state")
-    return named if told == state else None
+    # a session's first state has no name in its folder's
+    for named in (first, first.with_name(f"{first.name}-{state}")):
+        if (named / store.DOCUMENT).is_file():
+            if store.read_document(named).parameters.get("state") == state:
+                return named
+    return None

@@ -110,8 +110,9 @@ def fit_microstructure(
     }
     everything = [one for group in by_site.values() for one in group]
     inputs = {
-        str(path.name): hashlib.sha256((path / store.DOCUMENT).read_bytes()).hexdigest()
-        for path, _ in everything
+        f"{site} {number}": hashlib.sha256((path / store.DOCUMENT).read_bytes()).hexdigest()
+        for site, group in by_site.items()
+        for number, (path, _) in enumerate(group)
     }
     left_out = tuple(
         (site, "its table of kernels is the paper's forehead: too few kernels were fitted")
@@ -142,7 +143,7 @@ def fit_microstructure(
 
 def _site_of(given: Path) -> tuple[str, Path]:
     site, equals, path = str(given).partition("=")
-    if equals:
+    if equals and SITE.fullmatch(site):
         folder = Path(path)
     else:
         folder = given

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from reconstruction.wrinkle_zones import ZoneFit, amplitudes, fit_zones
 from skinrig import dynamic_appearance
 from skinrig.dynamic_appearance import WRINKLES, Part
 
+STATE = re.compile(r"[a-z][a-z0-9_]{0,31}")
 NORMALS = ("normals_refined", "normals")
 """Maps that are taken, the better first."""
 ZONES = 8
@@ -86,7 +88,7 @@ def fit_wrinkles(
         raise WrinkleInputError(
             f"appearances: got {', '.join(read) or 'none'}, expected neutral and an expression"
         )
-    _check_textures({state: one for state, (_, one) in read.items()})
+    unchecked = _check_textures({state: one for state, (_, one) in read.items()})
     measured = {state: _normals(folder, one, smoothing_mm) for state, (folder, one) in read.items()}
     shapes = {state: one.normals.shape for state, one in measured.items()}
     if len(set(shapes.values())) > 1:
@@ -128,10 +130,14 @@ def fit_wrinkles(
                           read.items()},
             },
             inputs={
-                folder.name: hashlib.sha256((folder / store.DOCUMENT).read_bytes()).hexdigest()
-                for folder in folders
+                state: hashlib.sha256((folder / store.DOCUMENT).read_bytes()).hexdigest()
+                for state, (folder, _) in read.items()
             },
             source="simulated" if "simulated" in sources else "measured",
+            left_out=tuple(
+                (state, "whether its texture is that of the others: no mesh lies beside its maps")
+                for state in unchecked
+            ),
             seed=read["neutral"][1].seed,
         ),
     )  # fmt: skip
@@ -140,7 +146,7 @@ def fit_wrinkles(
 
 def _state_of(given: Path) -> tuple[str, Path]:
     state, equals, path = str(given).partition("=")
-    if equals:
+    if equals and STATE.fullmatch(state):
         return state, Path(path)
     told = store.read_document(given).parameters.get("state")
     if not isinstance(told, str) or not told:
@@ -148,25 +154,25 @@ def _state_of(given: Path) -> tuple[str, Path]:
     return told, given
 
 
-def _check_textures(appearances: Mapping[str, SkinAppearance]) -> None:
-    """Refuse faces that are unwrapped differently: a texel would be other skin in each.
+def _check_textures(appearances: Mapping[str, SkinAppearance]) -> list[str]:
+    """Refuse faces that are unwrapped differently; return those that no mesh lies beside.
 
-    Faces on one texture need not have all triangles in common: each scan is cropped for itself.
+    A texel would be other skin in each. Faces on one texture need not have all triangles in
+    common: each scan is cropped for itself.
     """
     places = {
         state: _texture_triangles(appearance.files[MESH_FILE])
         for state, appearance in appearances.items()
         if MESH_FILE in appearance.files
     }
-    if not places:
-        return
-    first = next(iter(places.values()))
+    first = next(iter(places.values()), set())
     if any(len(first & one) < 0.5 * min(len(first), len(one)) for one in places.values()):
         raise WrinkleInputError(
             f"appearances: {', '.join(places)} have textures of their own, expected one for all; "
             "give each session the same template wrapped onto its scan (`skinrig simulate dome "
             "--wrapped`, or `skinrig reconstruct --scan`)"
         )
+    return [state for state in appearances if state not in places]
 
 
 def _texture_triangles(mesh: bytes) -> set[tuple[float, float]]:

@@ -8,19 +8,21 @@ import pytest
 
 from skinrig.cli import app, main
 
+GROUPS = {"import": "photos", "fit": "facial-color", "apply": "expression"}
+"""Groups of commands, with one of each."""
 COMMANDS = sorted(
     [
         command.name or command.callback.__name__.replace("_", "-")
         for command in app.registered_commands
     ]
-    + ["import"]
+    + list(GROUPS)
 )
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself_with_an_example(command, capsys):
-    argv = [command, "--help"] if command != "import" else ["import", "photos", "--help"]
+    argv = [command, *([GROUPS[command]] if command in GROUPS else []), "--help"]
     assert main(argv) == 0
     assert f"Example: skinrig {command}" in capsys.readouterr().out
 
