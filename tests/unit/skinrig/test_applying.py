@@ -136,6 +136,50 @@ def test_a_rig_is_applied_to_another_faces_blood(face, tmp_path):
         apply_expression(folder, Expression({"smile": 1.0}, onto=empty), out=tmp_path / "no")
 
 
+def test_what_a_result_is_made_of_is_never_replaced(face, tmp_path):
+    folder, _ = face
+    before = (folder / store.DOCUMENT).read_bytes()
+    with pytest.raises(ApplyError, match="the fitted folder itself"):
+        apply_expression(folder, Expression({"smile": 1.0}), out=folder)
+    other = tmp_path / "truth"
+    store.write(other, SkinAppearance({}, "simulated", parameters={"kind": "truth"}))
+    with pytest.raises(ApplyError, match="nothing was touched"):
+        apply_expression(folder, Expression({"smile": 1.0}), out=other)
+    assert (folder / store.DOCUMENT).read_bytes() == before
+    assert store.read(other).parameters["kind"] == "truth"
+    # an older result is
+    for _ in range(2):
+        apply_expression(folder, Expression({"smile": 1.0}), out=tmp_path / "out")
+
+
+def test_weights_are_normalized_for_wrinkles_as_for_blood(face, tmp_path):
+    folder, _ = face
+    twice = Expression({"smile": 2.0, "anger": 2.0}, normalize=True)
+    half = Expression({"smile": 0.5, "anger": 0.5})
+    done = apply_expression(folder, twice, out=tmp_path / "a")
+    same = apply_expression(folder, half, out=tmp_path / "b")
+    for name in ("hemoglobin", "normals"):
+        np.testing.assert_array_equal(done.maps[name].values, same.maps[name].values)
+    with pytest.raises(ApplyError, match="sum"):
+        apply_expression(
+            folder, Expression({"smile": 1.0, "anger": -1.0}, normalize=True), out=tmp_path / "c"
+        )
+
+
+def test_a_simulated_face_makes_the_result_simulated_and_sizes_must_fit(face, tmp_path):
+    folder, _ = face
+    blood = SkinMap(np.full((60, 40), 0.03, np.float32), UNITS["hemoglobin"])
+    melanin = SkinMap(np.full((30, 40), 0.03, np.float32), UNITS["melanin"])
+    onto = OtherFace(SkinAppearance({"hemoglobin": blood}, "measured"), hashes={"onto": "abc"})
+    apply_expression(folder, Expression({"smile": 1.0}, onto=onto), out=tmp_path / "out")
+    written = store.read(tmp_path / "out")
+    assert written.source == "simulated"  # the rig is
+    assert written.inputs["onto"] == "abc"
+    both = OtherFace(SkinAppearance({"hemoglobin": blood, "melanin": melanin}, "measured"))
+    with pytest.raises(ApplyError, match="one size"):
+        apply_expression(folder, Expression({"smile": 1.0}, onto=both), out=tmp_path / "no")
+
+
 def test_the_same_evaluation_gives_the_same_bytes(face, tmp_path):
     folder, _ = face
     for name in ("one", "two"):
