@@ -1,6 +1,7 @@
 """The sampler behind the photon table by itself: energy, repetition, parts put together."""
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ SEED = np.array([11, 12, 13], np.uint64)
 def recipe():
     spec = importlib.util.spec_from_file_location("make_photon_table", PATH)
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # compiled code is loaded again by its module's name
     spec.loader.exec_module(module)
     return module
 
