@@ -149,6 +149,7 @@ def choose_plan(
     sites: Sequence[str] | None = None,
     repeats: int = 1,
     sequence: SequenceOrder | None = None,
+    states: Sequence[str] = (),
 ) -> Plan:
     """Return the plan in ``file``, or the rig's own for a target, or for a subject.
 
@@ -162,9 +163,11 @@ def choose_plan(
     angles, steps
         Of a caliper; None: all. Of a probe one number, of directions.
     sites, repeats
-        Of a probe.
+        Of a probe; repeats also of a subject's states before the flash rig.
     sequence
         In time, of the flash rig.
+    states
+        Of a subject before the flash rig; none: neutral. Repeats go through all of them in turn.
 
     Raises
     ------
@@ -185,8 +188,11 @@ def choose_plan(
         )
     if sites and not (own and rig.probe):
         raise UsageError("--sites: is for the probe's own plan of skin")
-    if repeats != 1 and (file is not None or rig.probe is None):
-        raise UsageError("--repeats: is for the probe's own plans")
+    flash = own and "flash" in rig.boxes
+    if states and not flash:
+        raise UsageError("--state: is for the flash rig's own plan of a subject")
+    if repeats != 1 and not flash and (file is not None or rig.probe is None):
+        raise UsageError("--repeats: is for the probe's own plans and the flash rig's states")
     if file is not None:
         return Plan.from_json(file.read_text(encoding="utf-8"), where=str(file))
     if "gradient_sphere" in rig.boxes:
@@ -196,7 +202,7 @@ def choose_plan(
     if rig.probe is not None:
         return _probe_plan(rig, target, sites, repeats, angles)
     if target is None:
-        return flash_plan(rig)
+        return flash_plan(rig, states=states or ("neutral",), repeats=repeats, interleave=True)
     if target == "white":
         return flash_plan(rig, states=("white",), repeats=4)
     if target not in CALIBRATION_TARGETS:
@@ -309,6 +315,7 @@ def capture_session(
     repeats: int = 1,
     all_brackets: bool = False,
     sequence: SequenceOrder | None = None,
+    states: Sequence[str] = (),
 ) -> Mapping[str, Any]:
     """Capture into ``out`` and return the command's document.
 
@@ -325,7 +332,7 @@ def capture_session(
     rig = load_rig(rig_name)
     chosen = choose_plan(
         rig, plan, target, angles=angles, steps=steps, sites=sites, repeats=repeats,
-        sequence=sequence,
+        sequence=sequence, states=states,
     )  # fmt: skip
     seconds = chosen.estimated_s(rig)
     needed = needed_boxes(rig, chosen)

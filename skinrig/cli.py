@@ -273,6 +273,10 @@ def capture(
         float | None,
         typer.Option(help="Greatest force of the caliper on this skin, newton; no default."),
     ] = None,
+    state: Annotated[
+        list[str] | None,
+        typer.Option(help="State of the face before the flash rig, such as smile; repeatable."),
+    ] = None,
     sites: Sites = None,
     repeats: Repeats = 1,
     angles: Angles = None,
@@ -310,6 +314,7 @@ def capture(
         steps=range_of(steps, "--steps"), sites=names_of(sites), repeats=repeats,
         all_brackets=all_brackets,
         sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
+        states=tuple(state or ()),
     )  # fmt: skip
     console.document("skinrig.capture/1", done)
 

@@ -68,7 +68,7 @@ def simulate_flash(order: Order) -> Simulated:
 
 def _plan(rig: Rig, target: str | None, states: tuple[str, ...], repeats: int) -> Plan:
     if target is None:
-        return flash_plan(rig, states=states, repeats=repeats)
+        return flash_plan(rig, states=states, repeats=repeats, interleave=True)
     if target == "white":
         return flash_plan(rig, states=("white",), repeats=max(4, repeats))
     return flash_calibration_plan(rig, target)  # type: ignore[arg-type]

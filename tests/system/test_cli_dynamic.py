@@ -82,3 +82,25 @@ def test_fits_refuse_folders_without_what_they_need(moving, tmp_path, capsys):
     # a folder of other maps is not overwritten
     assert main(["fit", "microstructure", str(plain), "--out", str(plain)]) == 3
     assert "nothing was touched" in capsys.readouterr().err
+
+
+def test_repeats_of_states_are_captured_in_turn(tmp_path, capsys):
+    """Each expression several times, with the others in between (Jimenez2010, section 3)."""
+    plan = tmp_path / "plan.json"
+    code = main(
+        ["capture", "flash", "--dry-run", "--state", "neutral", "--state", "smile", "--repeats",
+         "2", "--port", "flash=sim://x/flash", "--camera", "cam=sim://x/cam", "--plan-out",
+         str(plan)]
+    )  # fmt: skip
+    assert code == 0
+    steps = json.loads(plan.read_text("utf-8"))["steps"]
+    shown = [(s["index"]["state"], s["index"]["repeat"]) for s in steps if s["kind"] == "subject"]
+    assert list(dict.fromkeys(shown)) == [
+        ("neutral", 0),
+        ("smile", 0),
+        ("neutral", 1),
+        ("smile", 1),
+    ]
+    code = main(["capture", "dome", "--dry-run", "--state", "smile"])
+    assert code == 2
+    assert "--state" in capsys.readouterr().err
