@@ -27,7 +27,7 @@ from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
 from model import fresnel
-from reconstruction.brdf_tables import BrdfBasis
+from model.brdf_tables import BrdfBasis
 from reconstruction.nnls_kernels import fit_points
 
 FloatArray = NDArray[np.float64]
@@ -197,7 +197,7 @@ def fit_weights(
     samples
         See :func:`surface_samples`; give large sets in chunks of some thousand points.
     basis
-        Materials; see :mod:`reconstruction.brdf_tables`.
+        Materials; see :mod:`model.brdf_tables`.
     compress
         "cbrt": misfits count as differences of cube roots, as far as they exceed the noise.
         "none": plain least squares, weighted by the variances where these are known.

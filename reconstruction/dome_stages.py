@@ -19,17 +19,17 @@ from capture.calibration import geometry
 from capture.calibration.geometry import CameraPose
 from capture.calibration.lights import LightTable
 from capture.session import Session
+from model import brdf_tables
+from model.brdf_tables import BrdfBasis
 from model.skin import SkinMap
 from reconstruction import (
     brdf_basis,
-    brdf_tables,
     photometric_stereo,
     scan_mesh,
     scan_registration,
     stages,
 )
 from reconstruction import surface_estimates as estimates
-from reconstruction.brdf_tables import BrdfBasis
 from reconstruction.dome_images import DomeImage, DomeImages
 from reconstruction.dome_motion import Motion, follow_head
 from reconstruction.evidence import Evidence, EvidenceError

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import fresnel
+from model.brdf_tables import BrdfBasis
 from reconstruction import (
     brdf_basis,
     diffuse_albedo,
@@ -18,7 +19,6 @@ from reconstruction import (
     mixture_kernels,
     photometric_stereo,
 )
-from reconstruction.brdf_tables import BrdfBasis
 from reconstruction.lumitexel_store import LumitexelStore
 from reconstruction.lumitexels import Lumitexels
 from reconstruction.scan_mesh import RefinedScan

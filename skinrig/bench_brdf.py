@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from model import microfacet
-from reconstruction import brdf_basis, brdf_tables, diffuse_albedo
-from reconstruction.brdf_tables import BrdfBasis
+from model import brdf_tables, microfacet
+from model.brdf_tables import BrdfBasis
+from reconstruction import brdf_basis, diffuse_albedo
 from skinrig import brdf_truth
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure
 

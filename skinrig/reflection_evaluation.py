@@ -12,10 +12,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model import metrics
+from model import brdf_tables, metrics
+from model.brdf_tables import BrdfBasis
 from model.skin import SkinAppearance
-from reconstruction import brdf_basis, brdf_tables
-from reconstruction.brdf_tables import BrdfBasis
+from reconstruction import brdf_basis
 from reconstruction.dome_stages import BASIS_FILE, WEIGHTS
 from reconstruction.surface_estimates import transmitted
 from skinrig.surface_evaluation import NEAR_MM

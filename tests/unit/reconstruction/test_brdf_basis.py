@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from model import fresnel
-from reconstruction import brdf_basis, brdf_tables
+from model import brdf_tables, fresnel
+from reconstruction import brdf_basis
 from skinrig import brdf_truth
 
 

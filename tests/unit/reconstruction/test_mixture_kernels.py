@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from reconstruction import brdf_basis, brdf_tables, mixture_kernels
+from model import brdf_tables
+from reconstruction import brdf_basis, mixture_kernels
 
 
 def directions(rng, *shape):

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from model import fresnel
-from reconstruction import brdf_tables
+from model import brdf_tables, fresnel
 from reconstruction import surface_estimates as estimates
 from reconstruction.lumitexels import Lumitexels
 from reconstruction.mesh_repair import RepairReport, TriangleMesh

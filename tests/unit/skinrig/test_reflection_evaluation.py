@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from model import fresnel
+from model import brdf_tables, fresnel
 from model.skin import SkinAppearance, SkinMap
-from reconstruction import brdf_tables
 from reconstruction.dome_stages import BASIS_FILE, RANK, WEIGHTS, _basis_bytes
 from skinrig import reflection_evaluation as evaluation
 

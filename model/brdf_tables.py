@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
-from model import merl
-from reconstruction import brdf_recipe
+from model import brdf_recipe, merl
 
 FloatArray = NDArray[np.float64]
 Brdf = Callable[[FloatArray, FloatArray], FloatArray]
@@ -125,7 +124,7 @@ class BrdfBasis:
 
 @lru_cache(maxsize=4)
 def default(light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
-    """Return the 59 dielectrics of :mod:`reconstruction.brdf_recipe`, made on first use (2 s).
+    """Return the 59 dielectrics of :mod:`model.brdf_recipe`, made on first use (2 s).
 
     Parameters
     ----------

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from model import fresnel, merl
-from reconstruction import brdf_recipe, brdf_tables, nnls_kernels
+from model import brdf_recipe, brdf_tables, fresnel, merl
+from reconstruction import nnls_kernels
 
 
 @pytest.fixture(scope="module")
