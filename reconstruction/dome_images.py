@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from capture import hdr, raw
 from capture.session import FrameRecord, Session
 from reconstruction.evidence import EvidenceError
+from reconstruction.hold_out import NOTHING, HoldOut
 
 __all__ = ["DomeImage", "DomeImages", "SensorNoise"]
 
@@ -90,6 +91,8 @@ class DomeImages:
     merge
         Whether the exposures of a light make one image. Those of a subject that moves do not:
         they were taken seconds apart.
+    without
+        Names of lights and views whose frames are left out.
 
     Attributes
     ----------
@@ -111,12 +114,16 @@ class DomeImages:
         noise: dict[str, SensorNoise] | None = None,
         kind: str = "olat",
         merge: bool = True,
+        without: HoldOut = NOTHING,
     ) -> None:
         self._session = session
         self._noise = dict(noise or {})
+        self._kind, self._without = kind, without
         self._shots: dict[tuple[str, str], list[FrameRecord]] = {}
         for record in session.frames(kind):
             key = record.camera, str(record.index["light"])
+            if without.holds(key[1], key[0]):
+                continue
             self._shots.setdefault(key, []).append(record)
         if not self._shots:
             raise EvidenceError(f"session {session.id}: has no frames of kind {kind!r}")
@@ -130,6 +137,12 @@ class DomeImages:
         kept = [-1] if merge else exposures
         self.captures = tuple((light, exposure) for exposure in kept for light in self.lights)
         self._darks: dict[str, tuple[Float32, Float32] | None] = {}
+
+    def apart(self) -> DomeImages:
+        """Return the same images with each exposure one of its own."""
+        return DomeImages(
+            self._session, noise=self._noise, kind=self._kind, merge=False, without=self._without
+        )
 
     def times_s(self, view: str, light: str, exposure: int = -1) -> tuple[float, ...]:
         """Return when the box lit the frames of an image, s on the box's clock.

@@ -15,10 +15,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.calibration import geometry
-from capture.calibration.geometry import CameraPose
-from capture.calibration.lights import LightTable
-from capture.session import Session
 from model import brdf_tables
 from model.brdf_tables import BrdfBasis
 from model.skin import SkinMap
@@ -30,9 +26,11 @@ from reconstruction import (
     stages,
 )
 from reconstruction import surface_estimates as estimates
-from reconstruction.dome_images import DomeImage, DomeImages
+from reconstruction.calibrated_dome import Dome, apart, calibrated, rows
+from reconstruction.dome_images import DomeImages
 from reconstruction.dome_motion import Motion, follow_head
 from reconstruction.evidence import Evidence, EvidenceError
+from reconstruction.hold_out import HoldOutError
 from reconstruction.lumitexel_store import LumitexelStore
 from reconstruction.lumitexels import Lumitexels, Surface
 from reconstruction.ray_casting import RayCaster
@@ -47,8 +45,8 @@ RANK: Final = 4
 """Common mixtures that the basis is reduced to, as many as Weyrich et al. 2005 use for a face."""
 UNUSUAL: Final = 6.0
 """Times the usual strength from which on a point's mixture is not used to find the common ones."""
-RANKS: Final = (1, 2, RANK, 2 * RANK)
-"""Ranks whose errors are recorded."""
+RANKS: Final = (1, 2, RANK, 2 * RANK, 24)
+"""Ranks whose mixtures and errors are recorded, as far as the points hold so many."""
 BASIS_POINTS: Final = 5_000
 """Points, drawn at random, that the mixtures are found on."""
 SCAN: Final = "scan.ply"
@@ -63,34 +61,33 @@ FACE_MM2: Final = 60_000.0
 POINT_LIMITS: Final = (8_000, 1_000_000)
 TEXTURE_LIMITS: Final = (128, 2048)
 
-WEIGHTS = tuple(f"basis_weight_{k}" for k in range(RANK))
-MAPS = (
-    "position", "half_vector_normals", "normals", "r_d", *WEIGHTS, "lobe_residual",
-    "normals_refined", "samples",
-)  # fmt: skip
-"""Maps that can be made of a dome session."""
+
+def weight_names(rank: int = RANK) -> tuple[str, ...]:
+    """Return the names of the maps of shares of so many lobes.
+
+    Examples
+    --------
+    >>> weight_names(2)
+    ('basis_weight_0', 'basis_weight_1')
+    """
+    return tuple(f"basis_weight_{k}" for k in range(rank))
+
+
+def maps_of(rank: int = RANK) -> tuple[str, ...]:
+    """Return the names of the maps that can be made of a dome session."""
+    return (
+        "position", "half_vector_normals", "normals", "r_d", *weight_names(rank), "lobe_residual",
+        "normals_refined", "samples",
+    )  # fmt: skip
+
+
+WEIGHTS = weight_names()
+MAPS = maps_of()
+"""Maps that can be made of a dome session, unless another rank is asked for."""
 BASIS_FILE = "brdf_basis.npz"
 MESH_FILE = "mesh.obj"
 FILES = (MESH_FILE, BASIS_FILE)
 """What goes along with the maps."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Dome:
-    """The dome as calibrated, or as drawn, with the images it took."""
-
-    images: DomeImages
-    cameras: tuple[CameraPose, ...]
-    table: LightTable
-    """The lights, one row for each of ``images.lights``."""
-    lights: LightTable
-    """One row for each of ``images.captures``."""
-    response: tuple[NDArray[np.float32], ...]
-    """Response of each camera at the pixels of its images, (h, w, 3)."""
-    absolute: bool
-    """Whether the lights' intensities are known, and so the albedo."""
-    tell: Callable[[str, float], None]
-    """Says how far a stage is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +115,13 @@ class Samples:
 def graph(evidence: Evidence) -> list[stages.Stage]:
     """Return the stages that a dome session can go through; see `stages.run`."""
     dome = _dome(evidence)
-    base = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+    base: dict[str, Any] = {
+        "revision": REVISION,
+        "inputs": dict(sorted(evidence.hashes.items())),
+    }
+    if evidence.hold_out:
+        base["held_out"] = evidence.hold_out.record()
+    weights_made = weight_names(evidence.rank or RANK)
 
     unscaled = (
         ""
@@ -130,9 +133,10 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     )
 
     def stage(
-        name: str, needs: tuple[str, ...], makes: tuple[str, ...], run: Any, refused: str = ""
-    ) -> stages.Stage:
-        return stages.Stage(name, needs, makes, run, base, refused)
+        name: str, needs: tuple[str, ...], makes: tuple[str, ...], run: Any, refused: str = "",
+        **more: Any,
+    ) -> stages.Stage:  # fmt: skip
+        return stages.Stage(name, needs, makes, run, {**base, **more}, refused)
 
     return [
         stage("surface", (), ("surface",), lambda: {"surface": _surface(evidence, dome)}),
@@ -142,7 +146,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
               lambda surface: {"motion": _motion(evidence, dome, surface)}),
         stage("lumitexels", ("surface", "motion"), ("lumitexels",),
               lambda surface, motion: {
-                  "lumitexels": _lumitexels(evidence.session, dome, surface, motion)}),
+                  "lumitexels": _lumitexels(dome, surface, motion)}),
         stage("sample counts", ("lumitexels", "texture"), ("samples",),
               lambda lumitexels, texture: _counts(dome, lumitexels, texture)),
         stage("half-vector normals", ("lumitexels", "texture"), ("half_vector_normals",),
@@ -153,9 +157,9 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
               lambda lumitexels, point_normals, texture: _albedo(
                   dome, lumitexels, point_normals, texture), unscaled),
         stage("lobes", ("lumitexels", "point_normals", "point_r_d", "texture"),
-              ("basis", "weights", *WEIGHTS, "lobe_residual", BASIS_FILE),
+              ("basis", "weights", *weights_made, "lobe_residual", BASIS_FILE),
               lambda lumitexels, point_normals, point_r_d, texture: _lobes(
-                  evidence, lumitexels, point_normals, point_r_d, texture)),
+                  evidence, lumitexels, point_normals, point_r_d, texture), ranks=list(RANKS)),
         stage("refined normals",
               ("surface", "lumitexels", "point_normals", "point_r_d", "basis", "weights",
                "texture"),
@@ -167,77 +171,23 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
 
 
 def _dome(evidence: Evidence) -> Dome:
-    rig = evidence.session.rig
+    """Return the dome with the images that may be fitted to."""
     images = DomeImages(evidence.session)
-    views = [rig.view(name) for name in images.views]
-    serials = [view.serial for view in views]
-    found = evidence.load("geometry", serials, "the cameras stand as the rig's file draws them")
-    if found is None:
-        cameras = tuple(CameraPose.nominal(view) for view in views)
-    else:
-        poses = geometry.poses_from(found, rig.subset(views=images.views))
-        cameras = tuple(poses[view.name] for view in views)
-    lit = evidence.load(
-        "lights", images.lights,
-        "the lights stand and shine as the rig's file draws them; the albedo has no absolute scale",
-    )  # fmt: skip
-    lights_rig = rig.subset(lights=images.lights)
-    lights = LightTable.nominal(lights_rig)
-    # a calibration from spheres alone says nothing of strengths, one from the plate none of places
-    nominal: dict[str, str] = {}
-    if lit is not None:
-        lights = LightTable.from_calibration(lit, lights_rig)
-        nominal = {k: lit.notes[k] for k in ("positions", "intensities") if k in lit.notes}
-        evidence.assumed += [f"the lights' {what} are {why}" for what, why in nominal.items()]
-    dead = [name for name, good in zip(lights.names, lights.valid, strict=True) if not good]
-    if dead:
-        evidence.noted["lights_left_out"] = dead
-    response = tuple(_response(lights, camera) for camera in cameras)
-    absolute = lit is not None and "intensities" not in nominal
-    return Dome(images, cameras, lights, lights, response, absolute, evidence.tell)
-
-
-def _apart(session: Session, dome: Dome) -> Dome:
-    """Return the dome with each exposure an image of its own, as a moving head needs them."""
-    images = DomeImages(session, merge=False)
-    order = [images.lights.index(light) for light, _ in images.captures]
-    names = [f"{name} {exposure}" for name, exposure in images.captures]
-    return dataclasses.replace(dome, images=images, lights=_rows(dome.table, order, names))
-
-
-def _rows(lights: LightTable, order: list[int], names: list[str]) -> LightTable:
-    """Return a table with the rows of another in a given order, also more than once."""
-    kept = {
-        field: getattr(lights, field)[order]
-        for field in (
-            "position_mm", "intensity", "exponent", "axis", "valid",
-            "position_stderr_mm", "intensity_stderr", "exponent_stderr",
-        )
-    }  # fmt: skip
-    return dataclasses.replace(lights, names=tuple(names), **kept)
-
-
-def _response(lights: LightTable, camera: CameraPose) -> NDArray[np.float32]:
-    width, height = camera.image_size
-    row, column = np.mgrid[0 : height // 2, 0 : width // 2]
-    pixels = 2.0 * np.stack([column, row], axis=-1) + 0.5
-    return lights.response(camera.serial, pixels, camera.image_size).astype(np.float32)
-
-
-def pixel_mm(dome: Dome) -> float:
-    """Return the size of an image's pixel on the subject, mm."""
-    sizes = [
-        2.0 * float(np.linalg.norm(camera.center_mm)) / float(camera.matrix[0, 0])
-        for camera in dome.cameras
-    ]
-    return float(np.median(sizes))
-
-
-def _image(dome: Dome, view: int, capture: int) -> DomeImage:
-    light, exposure = dome.images.captures[capture]
-    image = dome.images.image(dome.images.views[view], light, exposure)
-    response = dome.response[view]
-    return DomeImage(image.rgb / response, image.variance / response**2, image.valid)
+    held = evidence.hold_out = evidence.hold_out.within(images.lights, images.views)
+    evidence.noted["held_out"] = held.record()
+    if held:
+        for field, there, least in (
+            ("lights", images.lights, estimates.LEAST_LIGHTS),
+            ("views", images.views, estimates.LEAST_VIEWS),
+        ):
+            left = len(there) - len(getattr(held, field))
+            if left < least:
+                raise HoldOutError(
+                    f"hold-out: leaves {left} of {len(there)} {field}, expected at least {least}; "
+                    "hold out fewer"
+                )
+        images = DomeImages(evidence.session, without=held)
+    return calibrated(evidence, images)
 
 
 def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
@@ -248,7 +198,7 @@ def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
             f"session {session.id}: holds no scan; add one with `skinrig import mesh FILE`"
         )
     _require(dome)
-    footprint = pixel_mm(dome)
+    footprint = dome.pixel_mm
     points = int(np.clip(FACE_MM2 / footprint**2, *POINT_LIMITS))
     mesh = session.attachment(SCAN) if evidence.scan is None else evidence.scan
     scan = scan_mesh.prepare(mesh, points=points)
@@ -258,7 +208,7 @@ def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
     def stacks(view: int) -> NDArray[np.float32]:
         layers = []
         for capture in chosen:
-            image = _image(dome, view, capture)
+            image = dome.image(view, capture)
             gray = image.rgb.mean(axis=-1)
             noise = np.sqrt(image.variance.sum(axis=-1)) / 3.0
             seen = image.valid & (gray > SIGNAL * noise)
@@ -270,7 +220,7 @@ def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
         fit = scan_registration.align(
             scan.coarse,
             cameras=dome.cameras,
-            lights=_rows(dome.lights, chosen, [dome.lights.names[k] for k in chosen]),
+            lights=rows(dome.lights, chosen, [dome.lights.names[k] for k in chosen]),
             stacks=stacks,
             binning=2,
             rng=np.random.default_rng(0),
@@ -338,20 +288,18 @@ def _texture(dome: Dome, surface: RefinedScan) -> Mapping[str, Any]:
 
 
 def _motion(evidence: Evidence, dome: Dome, surface: RefinedScan) -> Motion | None:
-    images = DomeImages(evidence.session, merge=False)
-    found = follow_head(evidence.session, images, dome.cameras, surface, pixel_mm(dome))
+    images = dome.images.apart()
+    found = follow_head(evidence.session, images, dome.cameras, surface, dome.pixel_mm)
     # without tracking frames nobody knows whether the head held still
     evidence.noted["motion"] = {"tracking_frames": 0} if found is None else found.record()
     return found
 
 
-def _lumitexels(
-    session: Session, dome: Dome, surface: RefinedScan, motion: Motion | None
-) -> Samples:
+def _lumitexels(dome: Dome, surface: RefinedScan, motion: Motion | None) -> Samples:
     if motion is not None and motion.still:
         motion = None
     if motion is not None:
-        dome = _apart(session, dome)
+        dome = apart(dome)
     count = len(surface.points_mm) * len(dome.cameras) * len(dome.images.captures)
     folder = tempfile.TemporaryDirectory(prefix="skinrig-") if 12 * count > MEMORY_BYTES else None
     store = LumitexelStore(
@@ -370,7 +318,7 @@ def _lumitexels(
                 continue
             if motion is not None and not motion.usable[capture]:
                 continue
-            image = _image(dome, view, capture)
+            image = dome.image(view, capture)
             store.add(view, capture, image.rgb, image.variance, image.valid)
     return Samples(store, folder, len(dome.table.names))
 
@@ -399,7 +347,7 @@ def _normals(
         lambda part, samples: estimates.normals_from_shading(samples, surface.normals[part]),
         progress=partial(dome.tell, "normals"),
     )
-    found = estimates.with_misplacement(found, surface, pixel_mm(dome))
+    found = estimates.with_misplacement(found, surface, dome.pixel_mm)
     return {"point_normals": found, "normals": texture.normals(found, "world frame")}
 
 
@@ -413,7 +361,7 @@ def _albedo(
             samples,
             estimates.part_of(point_normals, part),
             stderr_rad=typical,
-            pixel_mm=pixel_mm(dome),
+            pixel_mm=dome.pixel_mm,
         ),
         progress=partial(dome.tell, "albedo"),
     )
@@ -436,9 +384,10 @@ def _lobes(
     folder = evidence.basis
     materials = brdf_tables.default() if folder is None else brdf_tables.load(folder)
     store = lumitexels.store
+    rank = evidence.rank or RANK
     good = np.flatnonzero(point_r_d.valid)
-    if len(good) < RANK:
-        raise EvidenceError(f"lobes: only {len(good)} points have an albedo, expected {RANK}")
+    if len(good) < rank:
+        raise EvidenceError(f"lobes: only {len(good)} points have an albedo, expected {rank}")
     drawn = np.sort(np.random.default_rng(0).permutation(good)[:BASIS_POINTS])
     fitted = []
     for part, samples in store.chunks(estimates.chunk_points(store)):
@@ -455,10 +404,16 @@ def _lobes(
                 materials,
             ).weights
         )
-    shares = _comparable(np.concatenate(fitted), materials)
-    mixes = {rank: brdf_basis.reduce(shares, rank, basis=materials) for rank in RANKS}
-    mix = mixes[RANK][1]
-    basis = materials.mixed(mix)
+    shares = _comparable(np.concatenate(fitted), materials, least=max(rank, 2 * RANK))
+    most = min(shares.shape)
+    if rank > most:
+        raise EvidenceError(f"rank: got {rank}, expected at most {most}; the data hold no more")
+    mixes = {
+        k: brdf_basis.reduce(shares, k, basis=materials)[1:]
+        for k in sorted({*RANKS, rank})
+        if k <= most
+    }
+    basis = materials.mixed(mixes[rank][0])
     found = lumitexels.collect(
         lambda part, samples: estimates.lobe_weights(
             samples, estimates.part_of(point_normals, part),
@@ -470,20 +425,22 @@ def _lobes(
         name: texture.map(
             found.values[:, k], found.stderr[:, k], found.valid, "1", "share of a common mixture"
         )
-        for k, name in enumerate(WEIGHTS)
+        for k, name in enumerate(weight_names(rank))
     }
     maps["lobe_residual"] = texture.map(
-        found.values[:, RANK], None, found.valid, "1/sr", "weighted RMS of samples - model"
+        found.values[:, rank], None, found.valid, "1/sr", "weighted RMS of samples - model"
     )
     return {
         "basis": basis,
-        "weights": found.values[:, :RANK],
+        "weights": found.values[:, :rank],
         **maps,
-        BASIS_FILE: _basis_bytes(materials, mix, {rank: m[2] for rank, m in mixes.items()}),
+        BASIS_FILE: _basis_bytes(materials, rank, mixes),
     }
 
 
-def _comparable(shares: NDArray[np.float64], materials: BrdfBasis) -> NDArray[np.float64]:
+def _comparable(
+    shares: NDArray[np.float64], materials: BrdfBasis, *, least: int
+) -> NDArray[np.float64]:
     """Return mixtures scaled to reflect equally much, without those that no sample holds down.
 
     A lobe so narrow that no pair of light and view met it can have any share.
@@ -492,26 +449,29 @@ def _comparable(shares: NDArray[np.float64], materials: BrdfBasis) -> NDArray[np
     some = total[total > 0]
     usual = float(np.median(some)) if len(some) else 0.0
     kept = (total > 0) & (total < UNUSUAL * usual)
-    if np.count_nonzero(kept) < RANKS[-1]:
+    if np.count_nonzero(kept) < least:
         raise EvidenceError(
             f"lobes: {np.count_nonzero(kept)} of {len(shares)} points show how the surface "
-            f"reflects, expected at least {RANKS[-1]}; more lights or views would show it"
+            f"reflects, expected at least {least}; more lights or views would show it"
         )
     return shares[kept] / total[kept, None]
 
 
 def _basis_bytes(
-    materials: BrdfBasis, mix: NDArray[np.float64], errors: Mapping[int, float]
+    materials: BrdfBasis, rank: int, mixes: Mapping[int, tuple[NDArray[np.float64], float]]
 ) -> bytes:
+    """Keep the lobes, and of every rank the mixtures of materials that they would be."""
+    mix = mixes[rank][0]
     stream = io.BytesIO()
     np.savez_compressed(
         stream,
         materials=np.array(materials.names),
         mix=mix,
-        table=materials.mixed(mix).table[..., :RANK],
+        table=materials.mixed(mix).table[..., :rank],
         light_radius_rad=materials.light_radius_rad,
-        ranks=np.array(list(errors)),
-        error_by_rank=np.array(list(errors.values())),
+        ranks=np.array(list(mixes)),
+        error_by_rank=np.array([error for _, error in mixes.values()]),
+        mix_by_rank=np.concatenate([mix for mix, _ in mixes.values()]),
     )
     return stream.getvalue()
 
@@ -533,5 +493,5 @@ def _refined(
         ),
         progress=partial(dome.tell, "refined normals"),
     )  # fmt: skip
-    found = estimates.with_misplacement(found, surface, pixel_mm(dome))
+    found = estimates.with_misplacement(found, surface, dome.pixel_mm)
     return {"normals_refined": texture.normals(found, "by the fitted lobes, world frame")}

@@ -12,6 +12,7 @@ from typing import Any
 
 from capture.calibration import store as calibration_store
 from capture.session import Session
+from reconstruction.hold_out import NOTHING, HoldOut
 
 TELL_S = 5.0
 """Seconds between two lines about the same stage."""
@@ -45,6 +46,10 @@ class Evidence:
         Folder of MERL tables to fit surface lobes with; None: the generated dielectrics.
     landmarks
         Table of places on the face's texture; None: those that are known.
+    hold_out
+        Lights and views of a dome that no fit may see.
+    rank
+        Common lobes of a dome's points; None: as many as usual.
     hashes
         SHA-256 of everything that was read, by what it is.
     noted
@@ -61,6 +66,8 @@ class Evidence:
     basis: Path | None = None
     landmarks: Path | None = None
     repeat: int | None = None
+    hold_out: HoldOut = NOTHING
+    rank: int | None = None
     assumed: list[str] = field(default_factory=list)
     hashes: dict[str, str] = field(default_factory=dict)
     noted: dict[str, Any] = field(default_factory=dict)

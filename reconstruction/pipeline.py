@@ -14,6 +14,7 @@ from model import store
 from model.skin import SkinAppearance, SkinMap
 from reconstruction import stages
 from reconstruction.evidence import Evidence, EvidenceError
+from reconstruction.hold_out import HoldOut
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +30,8 @@ class Recipe:
     """What the other maps mean nothing without."""
     products: Callable[[Session], Mapping[str, tuple[str, ...]]] | None = None
     """Where a name stands for more than itself, as for a map of each state: what for, by name."""
+    maps_of_rank: Callable[[int], tuple[str, ...]] | None = None
+    """Names of the maps where the number of lobes is chosen; None: this kind fits none."""
 
     def expand(self, session: Session, want: Sequence[str]) -> list[str]:
         """Return the maps and files that the wanted names stand for."""
@@ -45,7 +48,10 @@ def _flash() -> Recipe:
 def _dome() -> Recipe:
     from reconstruction import dome_stages as stages_of
 
-    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, ("position",))
+    return Recipe(
+        stages_of.MAPS, stages_of.graph, stages_of.FILES, ("position",),
+        maps_of_rank=stages_of.maps_of,
+    )  # fmt: skip
 
 
 def _gradient() -> Recipe:
@@ -108,6 +114,8 @@ def reconstruct(
     scan: str | Path | None = None,
     basis: str | Path | None = None,
     landmarks: str | Path | None = None,
+    hold_out: HoldOut | str | None = None,
+    rank: int | None = None,
     truth: str = "",
     progress: Callable[[str], None] | None = None,
 ) -> stages.Outcome:
@@ -136,6 +144,11 @@ def reconstruct(
     landmarks
         Table "name,x,y" of places on a probe's translucency map, pixels from its top left; None:
         forehead, cheek and chin of the simulated heads' texture.
+    hold_out
+        Lights and views of a dome session whose frames no fit sees, as
+        "lights=L007,L023,views=C03" or as parsed; what `skinrig render --against` compares with.
+    rank
+        Lobes that a dome's points share, 1 to 59; None: 4.
     truth
         Name of the TRUTH/ folder beside ``out``, for the report.
     progress
@@ -154,6 +167,15 @@ def reconstruct(
     """
     opened = Session.open(session)
     recipe = recipe_of(opened)
+    if hold_out is not None or rank is not None:
+        if recipe.maps_of_rank is None:
+            raise EvidenceError(
+                f"hold-out, rank: session {opened.id} is none of the dome; leave them out"
+            )
+        if rank is not None and rank < 1:
+            raise EvidenceError(f"rank: got {rank}, expected 1 or more")
+        if rank is not None:
+            recipe = replace(recipe, maps=recipe.maps_of_rank(rank))
     known = ", ".join(recipe.maps)
     if not want:
         raise EvidenceError(f"want: got nothing, expected names out of {known}")
@@ -165,6 +187,9 @@ def reconstruct(
         landmarks=landmarks,
     )  # fmt: skip
     evidence.progress = progress
+    evidence.rank = rank
+    if hold_out is not None:
+        evidence.hold_out = HoldOut.parse(hold_out) if isinstance(hold_out, str) else hold_out
     graph = recipe.graph(evidence)
     kept_names = recipe.expand(opened, (*recipe.maps, *recipe.files))
     want = recipe.expand(opened, (*want, *recipe.always))

@@ -535,6 +535,13 @@ def reconstruct(
         Path | None,
         typer.Option(help="Table name,x,y of a probe's sites in pixels of its 256 x 256 map."),
     ] = None,
+    hold_out: Annotated[
+        str | None,
+        typer.Option(help="A dome's frames that no fit sees: lights=L007,L023,views=C03."),
+    ] = None,
+    rank: Annotated[
+        int | None, typer.Option(help="Lobes that a dome's points share; default 4.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Make maps of a session; computes only what is wanted and not there yet.
@@ -549,7 +556,7 @@ def reconstruct(
     done = pipeline.reconstruct(
         session, want=[w.strip() for w in want.split(",") if w.strip()], out=out,
         calibration=calibration, state=state, scan=scan, basis=basis, landmarks=landmarks,
-        progress=console.progress, truth=truth.name if truth else "",
+        progress=console.progress, truth=truth.name if truth else "", hold_out=hold_out, rank=rank,
     )  # fmt: skip
     for text in done.assumed:
         console.say(f"assumed: {text}")

@@ -16,7 +16,7 @@ from model import brdf_tables, metrics
 from model.brdf_tables import BrdfBasis
 from model.skin import SkinAppearance
 from reconstruction import brdf_basis
-from reconstruction.dome_stages import BASIS_FILE, WEIGHTS
+from reconstruction.dome_stages import BASIS_FILE, weight_names
 from reconstruction.surface_estimates import transmitted
 from skinrig.surface_evaluation import NEAR_MM
 
@@ -133,12 +133,14 @@ def make_test(
 
 def basis_of(appearance: SkinAppearance) -> BrdfBasis | None:
     """Return the reduced basis that an appearance's weights are shares of, or None."""
-    if BASIS_FILE not in appearance.files or any(w not in appearance.maps for w in WEIGHTS):
+    if BASIS_FILE not in appearance.files:
         return None
     with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as stored:
-        names = [f"mix {k}" for k in range(len(WEIGHTS))]
-        radius = float(stored["light_radius_rad"])
-        return brdf_tables.of_columns(stored["table"], names, light_radius_rad=radius)
+        table, radius = stored["table"], float(stored["light_radius_rad"])
+    if any(name not in appearance.maps for name in weight_names(table.shape[-1])):
+        return None
+    names = [f"mix {k}" for k in range(table.shape[-1])]
+    return brdf_tables.of_columns(table, names, light_radius_rad=radius)
 
 
 def compare(
@@ -216,7 +218,7 @@ def predict(
     normals = normal_at(appearance, texels)
     cos_light = np.einsum("skc,sc->sk", light, normals)
     cos_view = np.einsum("skc,sc->sk", view, normals)
-    weights = np.stack([flat(name) for name in WEIGHTS], axis=-1)
+    weights = np.stack([flat(name) for name in weight_names(basis.size)], axis=-1)
     lobes = brdf_basis.evaluate(weights[:, None], basis, light, view, normals[:, None])
     inside = flat("r_d")[:, None] / np.pi * transmitted(cos_light, cos_view)[..., None]
     above = (cos_light > 0) & (cos_view > 0)

@@ -49,7 +49,7 @@ def estimate(scale=1.0, **changes):
     found = maps() | weights | changes
     found["r_d"] = SkinMap(scale * found["r_d"].values, "1", valid=found["r_d"].valid)
     return SkinAppearance(
-        found, "simulated", files={BASIS_FILE: _basis_bytes(materials, mix, {4: 0.0})}
+        found, "simulated", files={BASIS_FILE: _basis_bytes(materials, RANK, {RANK: (mix, 0.0)})}
     )
 
 

@@ -1,0 +1,106 @@
+"""Lights and views that a fit must not see, so that it can be judged by them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+FIELDS = ("lights", "views")
+
+
+class HoldOutError(ValueError):
+    """What is to be held out cannot be."""
+
+
+@dataclass(frozen=True, slots=True)
+class HoldOut:
+    """Names of lights and views whose frames stay out of every fit.
+
+    Attributes
+    ----------
+    lights, views
+        Names or, before `within`, places in the session's order, counted from 0.
+    """
+
+    lights: tuple[str, ...] = ()
+    views: tuple[str, ...] = ()
+
+    @staticmethod
+    def parse(text: str) -> HoldOut:
+        """Read ``lights=L007,L023,views=C03``: a word without = goes on with the list before it.
+
+        Raises
+        ------
+        HoldOutError
+            For anything but these two lists, and for empty ones.
+
+        Examples
+        --------
+        >>> HoldOut.parse("lights=L007,23,views=C03")
+        HoldOut(lights=('L007', '23'), views=('C03',))
+        """
+        lists: dict[str, list[str]] = {}
+        field = ""
+        for word in text.split(","):
+            name, equals, first = word.partition("=")
+            if equals:
+                field, word = name.strip(), first
+                if field not in FIELDS or field in lists:
+                    raise HoldOutError(
+                        f"hold-out: got {name.strip()!r} in {text!r}, expected "
+                        "lights=NAMES,views=NAMES, each at most once"
+                    )
+                lists[field] = []
+            if not field or not word.strip():
+                raise HoldOutError(
+                    f"hold-out: got {text!r}, expected lights=NAMES,views=NAMES with names or "
+                    "numbers joined by commas"
+                )
+            lists[field].append(word.strip())
+        return HoldOut(tuple(lists.get("lights", ())), tuple(lists.get("views", ())))
+
+    def within(self, lights: Sequence[str], views: Sequence[str]) -> HoldOut:
+        """Return the names, in the session's order, that these names and places mean.
+
+        Parameters
+        ----------
+        lights, views
+            Names that the session holds frames of.
+
+        Raises
+        ------
+        HoldOutError
+            For what the session does not hold.
+        """
+        return HoldOut(_found("lights", self.lights, lights), _found("views", self.views, views))
+
+    def __bool__(self) -> bool:
+        """Return whether anything is held out."""
+        return bool(self.lights or self.views)
+
+    def holds(self, light: str, view: str) -> bool:
+        """Return whether a frame of this light and view stays out of the fits."""
+        return light in self.lights or view in self.views
+
+    def record(self) -> dict[str, list[str]]:
+        """Return this as JSON values."""
+        return {"lights": list(self.lights), "views": list(self.views)}
+
+
+NOTHING = HoldOut()
+"""Every frame may be fitted to."""
+
+
+def _found(field: str, asked: Sequence[str], there: Sequence[str]) -> tuple[str, ...]:
+    chosen = set()
+    for word in asked:
+        if word in there:
+            chosen.add(word)
+        elif word.isascii() and word.isdigit() and int(word) < len(there):
+            chosen.add(there[int(word)])
+        else:
+            raise HoldOutError(
+                f"hold-out: got {word!r} among the {field}, expected names out of "
+                f"{', '.join(there)} or numbers from 0 to {len(there) - 1}"
+            )
+    return tuple(name for name in there if name in chosen)

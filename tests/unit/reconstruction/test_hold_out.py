@@ -1,0 +1,47 @@
+"""What is held out: parsed, found in a session, or refused by name."""
+
+import pytest
+
+from reconstruction.hold_out import HoldOut, HoldOutError
+
+LIGHTS = tuple(f"L{k:03}" for k in range(12))
+VIEWS = ("C00", "C03", "C07")
+
+
+def test_names_and_places_mean_lights_and_views_of_the_session():
+    held = HoldOut.parse("lights=L007, 2,L007,views=1").within(LIGHTS, VIEWS)
+    assert held == HoldOut(("L002", "L007"), ("C03",))
+    assert held.holds("L007", "C00")
+    assert held.holds("L000", "C03")
+    assert not held.holds("L000", "C00")
+
+
+def test_nothing_held_out_holds_no_frame():
+    assert not HoldOut()
+    assert not HoldOut().within(LIGHTS, VIEWS).holds("L000", "C00")
+    assert HoldOut.parse("views=C00")
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("", "lights=NAMES"),
+        ("L007", "L007"),
+        ("lamps=L007", "lamps"),
+        ("lights=", "lights="),
+        ("lights=L001,,L002", "L001,,L002"),
+        ("lights=L001,lights=L002", "at most once"),
+    ],
+)
+def test_a_list_that_says_nothing_clear_is_refused(text, named):
+    with pytest.raises(HoldOutError, match=named):
+        HoldOut.parse(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [("lights=L012", "L012"), ("lights=12", "0 to 11"), ("views=C01", "C00, C03, C07")],
+)
+def test_what_the_session_does_not_hold_is_refused_by_name(text, named):
+    with pytest.raises(HoldOutError, match=named):
+        HoldOut.parse(text).within(LIGHTS, VIEWS)
