@@ -1,0 +1,413 @@
+"""The reflectance of skin: lobes of the surface, diffuse albedo and translucency as one model.
+
+Light that a surface point reflects is the sum of what its surface turns back, a mixture of
+tabulated lobes, and of what entered the skin, was scattered and left again. Fresnel's reflection
+F_r is inside the tables and is counted nowhere else. Light that enters is multiplied by the
+transmittance F_t of its direction once, light that leaves by that of the view once.
+
+References
+----------
+Weyrich et al. 2006, doi:10.1145/1141911.1141987, sections 3 and 9 (the dome of 2005).
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model import brdf_tables, fresnel, translucency_population
+from model.brdf_tables import BrdfBasis
+from model.dipole_maps import DipoleMaps
+from model.skin import SkinAppearance, SkinMap
+
+FloatArray = NDArray[np.float64]
+
+BASIS_FILE = "brdf_basis.npz"
+WEIGHT = "basis_weight_"
+"""Maps of lobe shares are called by this and their number, from 0 on."""
+TRANSLUCENCY = "translucency"
+NORMALS = ("normals_refined", "normals")
+"""Maps of normals, the better one first."""
+_CHUNK = 1 << 16  # directions that are looked up at a time
+
+
+class SkinReflectanceError(ValueError):
+    """Maps that make no reflectance model."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SkinReflectance:
+    """Reflectance of skin over a texture.
+
+    Values of texels that are not `valid` are filled from those around, or 0: a picture may use
+    them, a statistic should not.
+
+    Attributes
+    ----------
+    r_d : ndarray of float32, shape (H, W, 3)
+        Factor of the diffuse part, f = R_d F_t(light) F_t(view) / pi, camera RGB over a perfect
+        white. Not clamped: see `dipole`.
+    weights : ndarray of float32, shape (H, W, K)
+        Shares of the lobes, at least 0.
+    lobes : BrdfBasis
+        K lobes, 1/sr, F_r inside.
+    translucency_mm : ndarray of float32, shape (H, W, 3)
+        1/sigma_tr, mm, above 0.
+    normals : ndarray of float32, shape (H, W, 3)
+        Unit vectors, rig frame, outward.
+    position_mm : ndarray of float32, shape (H, W, 3)
+        Rig frame.
+    valid : ndarray of bool, shape (H, W)
+        Texels where all of this is known.
+    eta : float
+        Refractive index of the skin over that of air, at least 1.
+    assumed : tuple of str
+        What was not measured, and what was taken for it.
+    r_d_stderr, translucency_stderr_mm : ndarray of float32, shape (H, W, 3), or None
+        Standard errors; None: not known.
+    """
+
+    r_d: NDArray[np.float32]
+    weights: NDArray[np.float32]
+    lobes: BrdfBasis
+    translucency_mm: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    position_mm: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    eta: float = fresnel.ETA_SKIN
+    assumed: tuple[str, ...] = ()
+    r_d_stderr: NDArray[np.float32] | None = None
+    translucency_stderr_mm: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that do not fit, and valid texels with values that no skin has."""
+        shape = np.shape(self.valid)
+        if len(shape) != 2 or np.asarray(self.valid).dtype != np.bool_:
+            raise SkinReflectanceError(
+                f"valid: got {np.asarray(self.valid).dtype} {shape}, expected bool (H, W)"
+            )
+        fields = {
+            "r_d": 3, "weights": self.lobes.size, "translucency_mm": 3, "normals": 3,
+            "position_mm": 3, "r_d_stderr": 3, "translucency_stderr_mm": 3,
+        }  # fmt: skip
+        for name, channels in fields.items():
+            if (given := getattr(self, name)) is None:
+                continue
+            values = np.asarray(given, np.float32)
+            if values.shape != (*shape, channels):
+                raise SkinReflectanceError(
+                    f"{name}: got shape {values.shape}, expected {(*shape, channels)}"
+                )
+            if name not in ("r_d_stderr", "translucency_stderr_mm"):
+                _require(name, np.isfinite(values).all(-1) | ~self.valid, "finite values")
+            object.__setattr__(self, name, values)
+        _require("weights", (self.weights >= 0).all(-1) | ~self.valid, "values of at least 0")
+        _require(
+            "translucency_mm", (self.translucency_mm > 0).all(-1) | ~self.valid, "values above 0"
+        )
+        length = np.linalg.norm(self.normals, axis=-1)
+        _require("normals", (np.abs(length - 1.0) < 1e-3) | ~self.valid, "unit vectors")
+        if not 1.0 <= self.eta < np.inf:
+            raise SkinReflectanceError(f"eta: got {self.eta}, expected at least 1, finite")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the texture."""
+        height, width = self.valid.shape
+        return int(height), int(width)
+
+    def dipole(self) -> DipoleMaps:
+        """Return the coefficients of the diffusion dipole, section 9; R_d > 1 is masked there."""
+        return DipoleMaps.of(
+            self.r_d,
+            self.translucency_mm,
+            eta=self.eta,
+            valid=self.valid,
+            r_d_stderr=self.r_d_stderr,
+            translucency_stderr_mm=self.translucency_stderr_mm,
+        )
+
+
+def assemble(
+    dome: SkinAppearance, *, translucency: ArrayLike | SkinMap | None = None
+) -> SkinReflectance:
+    """Put the model together from the maps of a dome session.
+
+    Parameters
+    ----------
+    dome
+        With maps `position`, `r_d`, `normals_refined` or `normals`, `basis_weight_0` and on, and
+        the file `brdf_basis.npz`.
+    translucency
+        1/sigma_tr, mm: a map over the same texture coordinates, of any size, or values that
+        broadcast to (H, W, 3). None: the map `translucency` of the appearance; without one the
+        mean of table 2 over its people and places, and `assumed` says so.
+
+    Returns
+    -------
+    SkinReflectance
+
+    Raises
+    ------
+    SkinReflectanceError
+        Naming the map or file that is missing or does not fit.
+    """
+    needed = ("position", "r_d", f"{WEIGHT}0")
+    for name in needed:
+        _map(dome, name)
+    lobes = lobes_of(dome)
+    names = [f"{WEIGHT}{k}" for k in range(lobes.size)]
+    found = next((name for name in NORMALS if name in dome.maps), None)
+    if found is None:
+        raise SkinReflectanceError(
+            f"maps: got none of {' and '.join(NORMALS)}; `skinrig reconstruct --want normals` "
+            "makes them"
+        )
+    used = ["position", "r_d", found, *names]
+    maps = [_map(dome, name) for name in used]
+    shape = maps[0].values.shape[:2]
+    valid = np.ones(shape, bool)
+    for name, one in zip(used, maps, strict=True):
+        if one.values.shape[:2] != shape:
+            raise SkinReflectanceError(
+                f"{name}: got shape {one.values.shape[:2]}, expected {shape} as of position"
+            )
+        valid &= _valid(one)
+    position, r_d, normals, *shares = maps
+    weights = np.stack([one.values for one in shares], axis=-1)
+    length = np.linalg.norm(normals.values, axis=-1, keepdims=True)
+    valid &= (length[..., 0] > 0.5) & np.isfinite(r_d.values).all(-1)
+    assumed: tuple[str, ...] = ()
+    if translucency is None and TRANSLUCENCY in dome.maps:
+        translucency = dome.maps[TRANSLUCENCY]
+        told = dome.parameters.get("assumed", [])
+        assumed = tuple(str(one) for one in told) if isinstance(told, list | tuple) else ()
+    if translucency is None:
+        translucency, what = population_mean_mm()
+        assumed = (what,)
+    depth, depth_stderr, known = _over_texture(translucency, shape)
+    valid &= known
+    return SkinReflectance(
+        r_d=r_d.values,
+        weights=weights,
+        lobes=lobes,
+        translucency_mm=depth,
+        normals=np.where(length > 0, normals.values / np.maximum(length, 1e-9), (0, 0, 1)),
+        position_mm=position.values,
+        valid=valid,
+        assumed=assumed,
+        r_d_stderr=r_d.stderr,
+        translucency_stderr_mm=depth_stderr,
+    )
+
+
+def population_mean_mm() -> tuple[FloatArray, str]:
+    """Return 1 over the mean sigma_tr of table 2 over its places, mm, (3,), and words for it."""
+    people = translucency_population.weyrich_2005()
+    mean = people.mean_per_mm.mean(axis=0)
+    told = ", ".join(f"{value:.3f}" for value in mean)
+    return 1.0 / mean, (
+        f"translucency is the population's: sigma_tr {told} per mm, the mean over people and over "
+        f"{', '.join(people.sites)} (Weyrich et al. 2005, table 2)"
+    )
+
+
+def lobes_of(appearance: SkinAppearance) -> BrdfBasis:
+    """Return the lobes that the maps `basis_weight_0` and on are shares of.
+
+    Raises
+    ------
+    SkinReflectanceError
+        When the file is missing or damaged, or lacks a map for one of its lobes.
+    """
+    if BASIS_FILE not in appearance.files:
+        raise SkinReflectanceError(
+            f"files: got no {BASIS_FILE}; `skinrig reconstruct --want {WEIGHT}0` makes it"
+        )
+    try:
+        with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as stored:
+            table, radius = stored["table"], float(stored["light_radius_rad"])
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise SkinReflectanceError(f"{BASIS_FILE}: cannot be read: {error}") from error
+    names = [f"{WEIGHT}{k}" for k in range(table.shape[-1])]
+    for name in names:
+        _map(appearance, name)
+    return brdf_tables.of_columns(table, names, light_radius_rad=radius)
+
+
+def surface_brdf(
+    model: SkinReflectance,
+    rows: ArrayLike,
+    light_dir: ArrayLike,
+    view_dir: ArrayLike,
+    normals: ArrayLike,
+) -> FloatArray:
+    """Return what the surface reflects, without the cosine of the light.
+
+    Parameters
+    ----------
+    model
+        With weights and lobes.
+    rows
+        Flat indices of texels, (n,), row-major in the texture.
+    light_dir, view_dir, normals
+        Unit vectors (n, 3) or (3,), one frame, away from the surface.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        1/sr, the same for all channels; 0 below the horizon.
+    """
+    at = _rows(model, rows)
+    return lobe_brdf(
+        model.lobes, model.weights.reshape(-1, model.lobes.size)[at], light_dir, view_dir, normals
+    )
+
+
+def lobe_brdf(
+    lobes: BrdfBasis,
+    weights: ArrayLike,
+    light_dir: ArrayLike,
+    view_dir: ArrayLike,
+    normals: ArrayLike,
+) -> FloatArray:
+    """Return a mixture of lobes, (n,), 1/sr; weights (n, K), for interpolated or edited ones."""
+    share = np.asarray(weights, np.float64)
+    to = [np.broadcast_to(v, (len(share), 3)) for v in (light_dir, view_dir, normals)]
+    found = np.empty(len(share))
+    for start in range(0, len(share), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        found[part] = np.einsum("nk,nk->n", lobes.evaluate(*(v[part] for v in to)), share[part])
+    return found
+
+
+def local_diffuse(
+    model: SkinReflectance,
+    rows: ArrayLike,
+    light_dir: ArrayLike,
+    view_dir: ArrayLike,
+    normals: ArrayLike,
+) -> FloatArray:
+    """Return R_d F_t(light) F_t(view) / pi, the diffuse part of skin that light does not spread in.
+
+    Parameters as of `surface_brdf`.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        1/sr; 0 below the horizon.
+    """
+    r_d = model.r_d.reshape(-1, 3)[_rows(model, rows)].astype(np.float64)
+    light, view, n = (np.asarray(v, np.float64) for v in (light_dir, view_dir, normals))
+    cos_light, cos_view = np.sum(light * n, axis=-1), np.sum(view * n, axis=-1)
+    passed = transmitted(cos_light, model.eta) * transmitted(cos_view, model.eta)
+    return np.asarray(r_d * passed[..., None] / np.pi)
+
+
+def transmitted(cosine: ArrayLike, eta: float = fresnel.ETA_SKIN) -> FloatArray:
+    """Return F_t, the share of light that passes the surface at a cosine; 0 below the horizon.
+
+    Examples
+    --------
+    >>> transmitted([1.0, -0.2]).round(4).tolist()
+    [0.9722, 0.0]
+    """
+    mu = np.asarray(cosine, np.float64)
+    passed = 1.0 - fresnel.reflectance(np.clip(mu, 0.0, 1.0), eta)
+    return np.asarray(np.where(mu > 0.0, passed, 0.0))
+
+
+def leaving_radiance(
+    exitance: ArrayLike, cos_view: ArrayLike, eta: float = fresnel.ETA_SKIN
+) -> FloatArray:
+    """Return the radiance towards a view of light that the skin gives back.
+
+    Parameters
+    ----------
+    exitance
+        R_d times what entered, below the surface's transmittance, (..., 3), W/mm^2.
+    cos_view
+        Cosine of the view, (...).
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        F_t(view) exitance / pi, W/(mm^2 sr).
+    """
+    passed = transmitted(cos_view, eta)[..., None]
+    return np.asarray(passed * np.asarray(exitance, np.float64) / np.pi)
+
+
+def _require(name: str, good: NDArray[np.bool_], expected: str) -> None:
+    if not good.all():
+        row, column = np.argwhere(~good)[0]
+        raise SkinReflectanceError(
+            f"{name}: expected {expected}, got others at {np.count_nonzero(~good)} valid texels, "
+            f"the first in row {row}, column {column}"
+        )
+
+
+def _map(appearance: SkinAppearance, name: str) -> SkinMap:
+    if name not in appearance.maps:
+        raise SkinReflectanceError(
+            f"maps: got no {name!r}; `skinrig reconstruct --want {name}` makes it"
+        )
+    return appearance.maps[name]
+
+
+def _valid(one: SkinMap) -> NDArray[np.bool_]:
+    return np.ones(one.values.shape[:2], bool) if one.valid is None else one.valid
+
+
+def _rows(model: SkinReflectance, rows: ArrayLike) -> NDArray[np.intp]:
+    at = np.asarray(rows)
+    if at.ndim != 1 or not np.issubdtype(at.dtype, np.integer):
+        raise SkinReflectanceError(f"rows: got {at.dtype} {at.shape}, expected integers (n,)")
+    size = model.valid.size
+    if len(at) and not (at.min() >= 0 and at.max() < size):
+        raise SkinReflectanceError(
+            f"rows: got {at.min()} to {at.max()}, expected 0 to {size - 1}, flat indices"
+        )
+    return at.astype(np.intp)
+
+
+def _over_texture(
+    given: ArrayLike | SkinMap, shape: tuple[int, ...]
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.bool_]]:
+    """Return a translucency on a texture of a shape, its standard error, and where it is known."""
+    if isinstance(given, SkinMap):
+        if given.values.ndim != 3:
+            raise SkinReflectanceError(
+                f"translucency: got shape {given.values.shape}, expected (H, W, 3)"
+            )
+        known = _resampled(_valid(given).astype(np.float32)[..., None], shape)[..., 0] > 0.999
+        stderr = None if given.stderr is None else _resampled(given.stderr, shape)
+        return _resampled(given.values, shape), stderr, known
+    values = np.asarray(given, np.float32)
+    try:
+        even = np.broadcast_to(values, (*shape, 3))
+    except ValueError as error:
+        raise SkinReflectanceError(
+            f"translucency: got shape {values.shape}, expected one that broadcasts to "
+            f"{(*shape, 3)}, or a map"
+        ) from error
+    if not (np.isfinite(values).all() and (values > 0).all()):
+        raise SkinReflectanceError("translucency: got values that are not finite, above 0 mm")
+    return even.copy(), None, np.ones(shape, bool)
+
+
+def _resampled(image: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return (h, w, C) at the texels of another size, linear, held beyond its outermost texels."""
+    for axis, size in enumerate(shape):
+        old = image.shape[axis]
+        if old == size:
+            continue
+        place = np.clip((np.arange(size) + 0.5) * old / size - 0.5, 0.0, old - 1.0)
+        low = np.minimum(place.astype(np.intp), max(old - 2, 0))
+        part = (place - low).astype(np.float32).reshape((-1, 1, 1) if axis == 0 else (1, -1, 1))
+        high = np.minimum(low + 1, old - 1)
+        image = image.take(low, axis) * (1.0 - part) + image.take(high, axis) * part
+    return image
