@@ -180,6 +180,12 @@ def simulate(
             help="The dome's scan is a template wrapped onto the face: one texture for all states.",
         ),
     ] = False,
+    subsurface: Annotated[
+        bool, typer.Option("--subsurface", help="Light in the dome spreads sideways in the skin.")
+    ] = False,
+    interreflections: Annotated[
+        bool, typer.Option("--interreflections", help="Light in the dome goes from skin to skin.")
+    ] = False,
     sequence: Sequence = None,
     prompt_period: PromptPeriod = None,
     shot_period: ShotPeriod = None,
@@ -214,7 +220,7 @@ def simulate(
         movement=movement, wrapped=wrapped, progress=console.progress,
         person=subject_of(pseudonym(subject, seed), consent or USES, consent_expires),
         sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
-        relaxation_s=relaxation,
+        relaxation_s=relaxation, subsurface=subsurface, interreflections=interreflections,
     )  # fmt: skip
     console.say(
         f"{done.session}: {done.frames} frames" + (f", truth in {done.truth}" if done.truth else "")

@@ -58,6 +58,10 @@ def simulate_dome(order: Order) -> Simulated:
         "views": len(rig.views), "move": order.move, "state": state, "movement": order.movement,
         "wrapped": order.wrapped,
     }  # fmt: skip
+    if order.target is None:
+        asked |= {"subsurface": order.subsurface, "interreflections": order.interreflections}
+    elif order.subsurface or order.interreflections:
+        raise SimulationError("subsurface, interreflections: are of a face; a target has neither")
     scene = _scene(rig, order)
     session = open_session(order, plan, rig, asked)
     try:
@@ -86,6 +90,8 @@ def simulate_dome(order: Order) -> Simulated:
                 "kind": "truth",
                 "state": state,
                 "movement": order.movement,
+                "subsurface": order.subsurface,
+                "interreflections": order.interreflections,
                 **appearance.parameters,
                 **scan,
             },
@@ -243,7 +249,7 @@ def _scene(rig: Rig, order: Order) -> Any:
     motion = head_motion(order.seed) if order.move else None
     return DomeScene(
         rig, person, dome=built, motion=motion, state=order.states[0], movement=order.movement,
-        seed=order.seed,
+        seed=order.seed, subsurface=order.subsurface, interreflections=order.interreflections,
     )  # fmt: skip
 
 

@@ -122,6 +122,8 @@ class Order:
     progress: Callable[[str], None] | None
     sequence: SequenceOrder | None = None
     relaxation_s: float | None = None
+    subsurface: bool = False
+    interreflections: bool = False
 
     def __post_init__(self) -> None:
         if self.size not in SIZES:
@@ -166,6 +168,8 @@ def simulate_session(
     progress: Callable[[str], None] | None = None,
     sequence: SequenceOrder | None = None,
     relaxation_s: float | None = None,
+    subsurface: bool = False,
+    interreflections: bool = False,
 ) -> Simulated:
     """Simulate a capture into SESSION/, and write its truth beside it.
 
@@ -230,6 +234,8 @@ def simulate_session(
         A sequence in time before the flash rig instead of ``states``.
     relaxation_s
         Time constant of its blood, s; None: of the state, see `rigsim.perfusion_course`.
+    subsurface, interreflections
+        Whether light in the dome spreads sideways inside the skin, and goes from skin to skin.
 
     Raises
     ------
@@ -244,8 +250,11 @@ def simulate_session(
         views=views, move=move, site=site, angles=None if angles is None else tuple(angles),
         steps=steps, sites=None if sites is None else tuple(sites), all_brackets=all_brackets,
         movement=movement, wrapped=wrapped, created=created, person=person, progress=progress,
-        sequence=sequence, relaxation_s=relaxation_s,
+        sequence=sequence, relaxation_s=relaxation_s, subsurface=subsurface,
+        interreflections=interreflections,
     )  # fmt: skip
+    if rig_name != "dome":
+        order.refuse(rig_name, subsurface=False, interreflections=False)
     if sequence is not None and rig_name != "flash":
         raise SimulationError(f"sequence: the {rig_name} rig knows nothing of it; leave it out")
     if sequence is None and relaxation_s is not None:

@@ -21,6 +21,7 @@ from capture.rig import load_rig
 from capture.session import Session, Subject
 from model import store
 from reconstruction import pipeline
+from reconstruction.hold_out import HoldOutError
 from reconstruction.stages import StageError
 from skinrig.simulating_dome import small_dome
 
@@ -318,6 +319,60 @@ def test_what_was_made_once_is_not_made_again(found):
     assert again.ran == ()
     assert document.stat().st_mtime_ns == written
     assert store.read(folder / "appearance").files.keys() == {"mesh.obj"}
+
+
+def test_no_frame_of_what_is_held_out_is_read(found, monkeypatch):
+    folder, first = found
+    read = []
+    plain = Session.read
+
+    def reading(self, record):
+        read.append((record.index["light"], record.camera))
+        return plain(self, record)
+
+    monkeypatch.setattr(Session, "read", reading)
+    names = {light for light, _ in _frames(folder)}, {view for _, view in _frames(folder)}
+    lights, view = sorted(names[0])[:3], sorted(names[1])[-1]
+    outcome = pipeline.reconstruct(
+        folder / "session-ellipsoid", want=("normals",), out=folder / "held-out",
+        calibration=folder / "calibration", hold_out=f"lights={','.join(lights)},views={view}",
+    )  # fmt: skip
+    assert read
+    assert not {light for light, _ in read} & set(lights)
+    assert view not in {camera for _, camera in read}
+    maps = store.read(folder / "held-out")
+    assert maps.parameters["held_out"] == {"lights": lights, "views": [view]}
+    assert "surface" not in outcome.reused
+    assert np.median(judge(maps, outcome).normals_deg) < 2 * np.median(first.normals_deg)
+    assert first.maps.parameters["held_out"] == {"lights": [], "views": []}
+    # without it they are
+    read.clear()
+    pipeline.reconstruct(
+        folder / "session-ellipsoid", want=("samples",), out=folder / "held-out",
+        calibration=folder / "calibration",
+    )  # fmt: skip
+    assert set(lights) <= {light for light, _ in read}
+    assert store.read(folder / "held-out").parameters["held_out"] == {"lights": [], "views": []}
+
+
+def _frames(folder):
+    records = Session.open(folder / "session-ellipsoid").frames("olat")
+    return {(record.index["light"], record.camera) for record in records}
+
+
+@pytest.mark.parametrize(
+    ("hold_out", "named"),
+    [("lights=" + ",".join(map(str, range(25))), "leaves 15 of 40 lights"),
+     ("views=0,1,2", "leaves 1 of 4 views"), ("lights=L999", "L999")],
+)  # fmt: skip
+def test_holding_out_too_much_or_nothing_that_is_there_is_refused(found, hold_out, named):
+    folder, _ = found
+    with pytest.raises(HoldOutError, match=named):
+        pipeline.reconstruct(
+            folder / "session-ellipsoid", want=("normals",), out=folder / "never",
+            hold_out=hold_out,
+        )  # fmt: skip
+    assert not (folder / "never").exists()
 
 
 def test_without_tracking_frames_the_record_says_that_nobody_followed_the_head(found):
