@@ -177,7 +177,8 @@ def assemble(
             )
         valid &= _valid(one)
     position, r_d, normals, *shares = maps
-    weights = np.stack([one.values for one in shares], axis=-1)
+    # shares are at least 0 at the points; drawn into texels beyond the rim they can undershoot
+    weights = np.maximum(np.stack([one.values for one in shares], axis=-1), 0.0)
     length = np.linalg.norm(normals.values, axis=-1, keepdims=True)
     valid &= (length[..., 0] > 0.5) & np.isfinite(r_d.values).all(-1)
     assumed: tuple[str, ...] = ()
