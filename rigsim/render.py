@@ -34,6 +34,7 @@ __all__ = [
     "load",
     "look_at",
     "radiance",
+    "trace",
     "visibility",
 ]
 
@@ -246,6 +247,24 @@ def g_buffer(
         Point samples; nothing is averaged over a pixel.
     """
     origins, directions = camera_rays(view, subpixels=subpixels, rows=rows, distortion=distortion)
+    return trace(caster, origins, directions)
+
+
+def trace(caster: Caster, origins: Float32Array, directions: Float32Array) -> GBuffer:
+    """Look at a mesh along a grid of rays; see `g_buffer`, which makes them for a rig's camera.
+
+    Parameters
+    ----------
+    caster
+        The mesh.
+    origins, directions
+        Start points in mm and unit vectors, shape (H, W, 3), neighbours beside each other.
+
+    Returns
+    -------
+    GBuffer
+        What each ray meets first.
+    """
     shape = directions.shape[:2]
     prim, weight = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
     _close_cracks(caster, origins, directions, prim, weight)
@@ -390,8 +409,10 @@ def radiance(
     Raises
     ------
     RenderError
-        The image holds values that are not finite.
+        A light's radiance is negative, which Mitsuba would render, or the image holds values that
+        are not finite.
     """
+    _refuse_negative_light(description)
     mi = load(choose_variant(kind))
     scene = mi.load_dict(_with_transforms(mi, description))
     image = np.array(mi.TensorXf(mi.render(scene, spp=samples, seed=seed)).numpy(), np.float32)
@@ -399,6 +420,22 @@ def radiance(
     if bad:
         raise RenderError(f"Mitsuba gave {bad} pixels that are not finite, expected none")
     return image
+
+
+_EMISSION = ("radiance", "irradiance", "intensity")
+
+
+def _refuse_negative_light(description: Mapping[str, Any], where: str = "") -> None:
+    for name, entry in description.items():
+        place = f"{where}{name}"
+        if isinstance(entry, Mapping):
+            _refuse_negative_light(entry, f"{place}.")
+            if name in _EMISSION:
+                entry = entry.get("value", 0.0)
+        if name in (*_EMISSION, "bitmap") and isinstance(entry, (int, float, list, np.ndarray)):
+            least = float(np.min(np.asarray(entry, np.float64), initial=0.0))
+            if least < 0.0 and (name != "bitmap" or "envmap" in where):
+                raise RenderError(f"{place}: got a negative value {least:g}, expected light >= 0")
 
 
 class MovedLight:

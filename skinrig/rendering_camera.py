@@ -1,0 +1,143 @@
+"""Cameras to render by: a calibrated view of a rig, or one that looks at a point."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.calibration.geometry import CameraPose
+from rigsim.mesh import Float32Array
+
+Camera = CameraPose
+"""Pinhole with distortion, in the rig frame; x right, y down, pixel (0, 0)'s centre is (0, 0)."""
+
+MOST_PX: Final = 16_384
+"""Longest side of a rendering."""
+
+
+class CameraError(ValueError):
+    """A camera that cannot be rendered by."""
+
+
+def looking_at(
+    place_mm: ArrayLike,
+    *,
+    target_mm: ArrayLike = (0.0, 0.0, 0.0),
+    up: ArrayLike = (0.0, 1.0, 0.0),
+    fov_deg: float = 25.0,
+    size_px: tuple[int, int] = (512, 512),
+    name: str = "look-at",
+) -> Camera:
+    """Return a camera without distortion that looks at a point.
+
+    Parameters
+    ----------
+    place_mm
+        Centre of projection, shape (3,), mm, rig frame.
+    target_mm
+        What it looks at.
+    up
+        Direction that is up in the image.
+    fov_deg
+        Angle that the longer side of the image spans, degrees, above 0 and below 170.
+    size_px
+        Columns and rows.
+    name
+        What records call it.
+
+    Raises
+    ------
+    CameraError
+        For a place at the target, a view along `up`, or numbers that make no image.
+
+    Examples
+    --------
+    >>> camera = looking_at((0.0, 0.0, 700.0), size_px=(201, 101))
+    >>> camera.project([[0.0, 0.0, 0.0]]).tolist()
+    [[100.0, 50.0]]
+    """
+    place, target, upward = (np.asarray(v, np.float64) for v in (place_mm, target_mm, up))
+    for field, given in (("place", place), ("target", target), ("up", upward)):
+        if given.shape != (3,) or not np.isfinite(given).all():
+            raise CameraError(f"view: got {field} {given.tolist()}, expected three finite numbers")
+    if not 0.0 < fov_deg < 170.0:
+        raise CameraError(f"fov: got {fov_deg} degrees, expected above 0 and below 170")
+    columns, rows = size_px
+    if not (2 <= columns <= MOST_PX and 2 <= rows <= MOST_PX):
+        raise CameraError(f"size: got {columns} x {rows}, expected 2 to {MOST_PX} pixels a side")
+    back = place - target
+    right = np.cross(upward, back)
+    if not np.linalg.norm(back) > 0.0 or not np.linalg.norm(right) > 1e-9 * np.linalg.norm(back):
+        raise CameraError(
+            f"view: from {place.tolist()} to {target.tolist()} with {upward.tolist()} up "
+            "there is no image; move it, or name another target"
+        )
+    back /= np.linalg.norm(back)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, -np.cross(back, right), -back])
+    focal = 0.5 * max(columns, rows) / math.tan(0.5 * math.radians(fov_deg))
+    matrix = np.array([[focal, 0.0, (columns - 1) / 2], [0.0, focal, (rows - 1) / 2], [0, 0, 1.0]])
+    return Camera(name, matrix, np.zeros(5), rotation, -rotation @ place, (columns, rows))
+
+
+def binned(camera: Camera, factor: float) -> Camera:
+    """Return a camera whose pixels are larger: `factor` = 2 is the grid of 2 x 2 cells.
+
+    Parameters
+    ----------
+    camera
+        The camera.
+    factor
+        Old pixels along the side of a new one, above 0; below 1 pixels become smaller.
+
+    Examples
+    --------
+    >>> camera = looking_at((0.0, 0.0, 700.0), size_px=(200, 100))
+    >>> half = binned(camera, 2)
+    >>> half.image_size, half.project([[0.0, 0.0, 0.0]]).tolist()
+    ((100, 50), [[49.5, 24.5]])
+    """
+    if not 0.0 < factor < math.inf:
+        raise CameraError(f"size: got {factor} old pixels in a new one, expected above 0")
+    matrix = np.array(camera.matrix)
+    matrix[:2] /= factor
+    matrix[:2, 2] += 0.5 / factor - 0.5  # a pixel's centre is at a whole number
+    columns, rows = (int(side / factor + 1e-6) for side in camera.image_size)
+    if not (1 <= columns <= MOST_PX and 1 <= rows <= MOST_PX):
+        raise CameraError(f"size: got {columns} x {rows}, expected 1 to {MOST_PX} pixels a side")
+    return dataclasses.replace(camera, matrix=matrix, image_size=(columns, rows))
+
+
+def rays(
+    camera: Camera, *, subpixels: int, rows: tuple[int, int] | None = None
+) -> tuple[Float32Array, Float32Array]:
+    """Return rays through a regular grid inside the pixels.
+
+    Parameters
+    ----------
+    camera
+        The camera.
+    subpixels
+        Rays along each side of a pixel, k.
+    rows
+        First row of pixels and the one after the last; None takes all.
+
+    Returns
+    -------
+    origins, directions : ndarray of float32
+        Shape (H k, W k, 3) each, rig frame in mm, directions of unit length.
+    """
+    if subpixels < 1:
+        raise CameraError(f"samples: got {subpixels} along a pixel's side, expected at least 1")
+    columns, height = camera.image_size
+    first, last = (0, height) if rows is None else rows
+    x = (np.arange(columns * subpixels) + 0.5) / subpixels - 0.5
+    y = (np.arange(first * subpixels, last * subpixels) + 0.5) / subpixels - 0.5
+    pixels: NDArray[np.float64] = np.stack(np.meshgrid(x, y), axis=-1)
+    directions = camera.rays(pixels).astype(np.float32)
+    origin = camera.center_mm.astype(np.float32)
+    return np.broadcast_to(origin, directions.shape), directions

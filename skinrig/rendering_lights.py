@@ -1,0 +1,203 @@
+"""Lights to render by: at a place, far away, or the LEDs of a calibrated rig.
+
+Strengths are in one unit: what a perfect white Lambertian patch that faces the light would show.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.calibration.lights import LightTable
+
+FloatArray = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+FAR_MM: Final = 1e5
+"""Where the disc of a light stands that is far away: shadow rays end there."""
+BROAD_RAD: Final = 0.04
+"""Seen larger than this (half its width) a light is shaded in parts: lobes change across it."""
+PARTS: Final = 16
+"""Into how many parts a broad light is divided."""
+GOLDEN: Final = math.pi * (3.0 - math.sqrt(5.0))
+
+
+class LightError(ValueError):
+    """A light that cannot be rendered by."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Light:
+    """A round light, at a place or far away; one of `position_mm` and `direction` is given."""
+
+    name: str
+    """What messages and records call it."""
+    intensity: Vector = (1.0, 1.0, 1.0)
+    """What a white Lambertian patch that faces the light shows, at least 0, in the channels of the
+    model; of a light at a place at `reference_mm` from it, on its axis."""
+    position_mm: Vector | None = None
+    """Centre of its disc, mm, rig frame."""
+    direction: Vector | None = None
+    """Towards a light that is far away, rig frame, any length; kept as a unit vector."""
+    radius: float = 0.0
+    """Of its disc: mm at a place, rad far away; 0 is a point, which casts hard shadows."""
+    reference_mm: float | None = None
+    """Distance at which `intensity` holds, mm; None: that of the rig's origin."""
+    axis: Vector | None = None
+    """In which it shines, any length; None: towards the rig's origin."""
+    exponent: float = 0.0
+    """Of the cosine off its axis that it falls off by; 0: the same in all directions."""
+    _reference: float = field(default=1.0, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Check the numbers, and make directions unit vectors."""
+        if (self.position_mm is None) == (self.direction is None):
+            raise LightError(f"light {self.name!r}: got both or none of place and direction")
+        for name in ("intensity", "position_mm", "direction", "axis"):
+            given = getattr(self, name)
+            if given is not None:
+                object.__setattr__(self, name, _three(self.name, name, given))
+        if min(self.intensity) < 0.0:
+            raise LightError(f"light {self.name!r}: got intensity {self.intensity}, expected >= 0")
+        if not 0.0 <= self.radius < (math.inf if self.direction is None else 0.7):
+            raise LightError(
+                f"light {self.name!r}: got radius {self.radius}, expected >= 0, in rad below 0.7"
+            )
+        if not 0.0 <= self.exponent < math.inf:
+            raise LightError(f"light {self.name!r}: got exponent {self.exponent}, expected >= 0")
+        for name in ("direction", "axis"):
+            given = getattr(self, name)
+            if given is not None:
+                object.__setattr__(self, name, _unit(self.name, name, given))
+        if self.position_mm is not None:
+            away = self.reference_mm
+            distance = math.hypot(*self.position_mm) if away is None else away
+            if not 0.0 < distance < math.inf:
+                raise LightError(
+                    f"light {self.name!r}: got a reference distance of {distance} mm, expected > 0"
+                )
+            object.__setattr__(self, "_reference", float(distance))
+            if self.axis is None and math.hypot(*self.position_mm) > 0.0:
+                inward = (-self.position_mm[0], -self.position_mm[1], -self.position_mm[2])
+                object.__setattr__(self, "axis", _unit(self.name, "axis", inward))
+
+    @staticmethod
+    def of_table(table: LightTable, name: str, *, radius_mm: float) -> Light:
+        """Return a calibrated light; renderings then have the unit of the images.
+
+        Parameters
+        ----------
+        table
+            Calibrated lights.
+        name
+            One of ``table.names``.
+        radius_mm
+            Of its disc, mm.
+
+        Raises
+        ------
+        LightError
+            There is no such light, or its calibration is not valid.
+        """
+        if name not in table.names:
+            raise LightError(f"light: got {name!r}, expected one of {', '.join(table.names)}")
+        row = table.names.index(name)
+        if not table.valid[row]:
+            raise LightError(f"light {name!r}: is dead, or its calibration is not valid")
+        place = _three(name, "position_mm", table.position_mm[row])
+        away = math.hypot(*place)
+        return Light(
+            name=name, position_mm=place, radius=radius_mm, reference_mm=away,
+            intensity=_three(name, "intensity", table.intensity[row] / away**2),
+            axis=_three(name, "axis", table.axis[row]), exponent=float(table.exponent[row]),
+        )  # fmt: skip
+
+    def reach(self, points_mm: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return the directions to the light and what a white that faces it would show.
+
+        Parameters
+        ----------
+        points_mm
+            Points, shape (n, 3), mm, rig frame.
+
+        Returns
+        -------
+        direction, white : ndarray of float64
+            Unit vectors towards the light, shape (n, 3), and strengths, shape (n, 3).
+
+        Examples
+        --------
+        >>> lamp = Light(name="near", position_mm=(0.0, 0.0, 100.0))
+        >>> towards, white = lamp.reach([[0.0, 0.0, 0.0], [0.0, 0.0, 50.0]])
+        >>> towards[1].tolist(), white[1].tolist()
+        ([0.0, 0.0, 1.0], [4.0, 4.0, 4.0])
+        """
+        points = np.atleast_2d(np.asarray(points_mm, np.float64))
+        if self.direction is not None:
+            shape = points.shape
+            return (np.broadcast_to(self.direction, shape), np.broadcast_to(self.intensity, shape))
+        offset = np.asarray(self.position_mm) - points
+        distance = np.linalg.norm(offset, axis=-1, keepdims=True)
+        if not (distance > 0.0).all():
+            raise LightError(f"light {self.name!r}: stands on the surface that it should light")
+        direction = offset / distance
+        strength = (self._reference / distance) ** 2
+        if self.exponent > 0.0 and self.axis is not None:
+            cosine = np.maximum(-(direction @ np.asarray(self.axis)), 0.0)
+            strength = strength * cosine[:, None] ** self.exponent
+        return direction, strength * np.asarray(self.intensity)
+
+    def disc(self) -> tuple[FloatArray, float]:
+        """Return the centre of the disc, mm, shape (3,), and its radius, mm: shadow rays end there.
+
+        A light that is far away stands at `FAR_MM`.
+        """
+        if self.direction is not None:
+            return np.asarray(self.direction) * FAR_MM, FAR_MM * math.tan(self.radius)
+        return np.asarray(self.position_mm, np.float64), self.radius
+
+    def parts(self, count: int = PARTS) -> tuple[Light, ...]:
+        """Return a broad light as smaller ones that together give the same; others as they are."""
+        center, radius = self.disc()
+        away = float(np.linalg.norm(center))
+        if count < 2 or away == 0.0 or radius <= BROAD_RAD * away:
+            return (self,)
+        helper = np.eye(3)[int(np.argmin(np.abs(center)))]
+        side = np.cross(helper, center)
+        side /= np.linalg.norm(side)
+        other = np.cross(center, side) / away
+        share = tuple(value / count for value in self.intensity)
+        out = []
+        for k in range(count):
+            r, turn = radius * math.sqrt((k + 0.5) / count), k * GOLDEN
+            place = center + r * (math.cos(turn) * side + math.sin(turn) * other)
+            fields: dict[str, object] = {"radius": self.radius / math.sqrt(count)}
+            if self.direction is not None:
+                fields["direction"] = _three(self.name, "direction", place)
+            else:
+                fields |= {"position_mm": _three(self.name, "position_mm", place)}
+                fields |= {"reference_mm": self._reference}
+            out.append(dataclasses.replace(self, intensity=share, **fields))  # type: ignore[arg-type]
+        return tuple(out)
+
+
+def _three(owner: str, name: str, given: ArrayLike) -> Vector:
+    values = np.asarray(given, np.float64)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise LightError(
+            f"light {owner!r}: got {name} {values.tolist()}, expected three finite numbers"
+        )
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _unit(owner: str, name: str, given: Vector) -> Vector:
+    length = math.hypot(*given)
+    if not length > 0.0:
+        raise LightError(f"light {owner!r}: got {name} {given}, expected a direction")
+    return given[0] / length, given[1] / length, given[2] / length
