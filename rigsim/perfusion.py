@@ -9,10 +9,11 @@ answer unequally, a state is not a scaling and shifting of the neutral map.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigsim.mesh import Float32Array
 from rigsim.surface_noise import line_network, smooth_noise
@@ -129,6 +130,22 @@ class Perfusion:
             total += self.compartments[..., index] * radius * radius
         # Vessels fill the dermis at most up to the limit; the fold keeps the order of values.
         return np.asarray(total / (1.0 + (total / HEMOGLOBIN_LIMIT) ** 4) ** 0.25, np.float32)
+
+    def dilated(self, change: ArrayLike) -> Perfusion:
+        """Return the perfusion after a lasting change of the vessels' radius, such as by heat.
+
+        Parameters
+        ----------
+        change
+            Relative change of the radius of vessels that follow it fully, shape (...) or a number,
+            above -1; the compartments follow unequally.
+        """
+        by = np.asarray(change, np.float32)
+        if not np.all(by > -1.0):
+            raise ValueError(f"change: got {by.min()}, expected above -1")
+        radius = 1.0 + np.asarray(_ANSWERS, np.float32) * by[..., None]
+        grown = self.compartments * radius * radius
+        return replace(self, compartments=np.asarray(grown, np.float32))
 
 
 def perfuse(

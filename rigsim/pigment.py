@@ -38,6 +38,7 @@ def melanin_map(
     base: float,
     *,
     seed: int,
+    freckles: float | None = None,
 ) -> Float32Array:
     """Draw the melanin of a face.
 
@@ -51,6 +52,8 @@ def melanin_map(
         Volume fraction of melanosomes around which the map varies, 0.001 to 0.45.
     seed
         Any integer; it also decides where the sun did not reach.
+    freckles
+        How many freckles there are, 0 to 1, fewer on dark skin; ``None`` draws it, 0.2 to 0.8.
 
     Returns
     -------
@@ -59,6 +62,8 @@ def melanin_map(
     """
     if not 0.001 <= base <= 0.45:
         raise ValueError(f"base: got {base}, expected a melanin fraction from 0.001 to 0.45")
+    if freckles is not None and not 0.0 <= freckles <= 1.0:
+        raise ValueError(f"freckles: got {freckles}, expected 0 to 1")
     rng = np.random.default_rng([seed, 1])
     # Variations are steps of log-odds against the limit: factors for pale skin, bounded for dark.
     step = 0.10 * smooth_noise(points_mm, (40.0, 18.0), seed=seed + 11)
@@ -66,7 +71,7 @@ def melanin_map(
     step += 0.12 * regions["forehead"] + 0.14 * regions["lids"] + 0.06 * regions["temples"]
     step -= 0.55 * regions["lips"] + 0.10 * regions["neck"]
     step += _tan(points_mm, base, rng)
-    step += _freckles(points_mm, regions, base, seed=seed, rng=rng)
+    step += _freckles(points_mm, regions, base, seed=seed, rng=rng, amount=freckles)
     step += _moles(points_mm, base, seed=seed, rng=rng)
     odds = base / (MELANIN_LIMIT - base) * np.exp(step)
     return np.asarray(MELANIN_LIMIT * odds / (1.0 + odds), np.float32)
@@ -93,13 +98,15 @@ def _freckles(
     *,
     seed: int,
     rng: np.random.Generator,
+    amount: float | None,
 ) -> NDArray[np.floating]:
     where = 0.9 * regions["cheeks"] + 0.9 * regions["nose"] + 0.25 * regions["forehead"] + 0.03
     where = where * (1.0 - regions["lips"])
     # Freckles belong to pale skin.
-    amount = float(rng.uniform(0.2, 0.8)) * float(np.exp(-base / 0.05))
+    drawn = float(rng.uniform(0.2, 0.8))  # drawn anyway, so that moles stay where they are
+    density = (drawn if amount is None else amount) * float(np.exp(-base / 0.05))
     spots = scattered_spots(
-        points, amount * where, cell_mm=3.6, radius_mm=(0.4, 1.1), seed=seed + 21, softness=5.0
+        points, density * where, cell_mm=3.6, radius_mm=(0.4, 1.1), seed=seed + 21, softness=5.0
     )
     return 0.9 * spots
 

@@ -80,6 +80,10 @@ class Subject:
     """The expression that the geometry is in; ``None`` at rest."""
     rest: Subject | None = None
     """The same face at rest; ``None`` for a face that is at rest itself."""
+    beard: Float32Array | None = None
+    """How much stubble lies below the surface, shape (N, N), 0 to 1; ``None``: none."""
+    oiliness: float = 1.0
+    """Factor of the share of the surface that oil covers."""
 
     @property
     def size(self) -> int:

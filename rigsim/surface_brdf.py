@@ -9,6 +9,14 @@ T is the transmittance of a smooth boundary of index 1.4. The surface part has t
 two indices and a layer, so no single analytic lobe and no mixture of lobes of one index holds it.
 Every term is reciprocal; together they send back less than they get (tests integrate it).
 
+What lies on skin (`Coating`: water, lotion, foundation, powder) replaces part of the facets by a
+film and covers part of it all with grains::
+
+    facets -> (1 - film) facets + film F(h.l; eta) D G / (4 n.l n.v)      GGX, alpha of its own
+    surface -> (1 - powder) surface + powder w p(-l.v) / (4 pi (n.l + n.v))
+
+the latter a thick layer of grains that scatter once, backwards (p: Henyey and Greenstein's).
+
 Notes
 -----
 R_d is the factor in the first term, which is what eq. (6) of Weyrich et al. takes the minimum of
@@ -61,12 +69,58 @@ FUZZ_DEPTH: Final = 0.0015
 OIL_RANGE: Final = (0.02, 0.6)
 """Share of the surface that oil covers."""
 
+STUBBLE_ABSORPTION: Final = (0.62, 0.56, 0.47)
+"""Share of the light from inside (R, G, B) that stubble below the surface takes where it is
+densest: dark, and less so in blue, which comes from above it; chosen."""
+
+POWDER_ALBEDO: Final = 0.4
+"""Share of the light that grains of powder send back after scattering once; chosen. What they
+scatter more often is matte, and part of R_d."""
+
+POWDER_ASYMMETRY: Final = -0.35
+"""Mean cosine of single scattering by grains of powder: backwards, as large rough grains do
+(Hapke 1981, doi:10.1029/JB086iB04p03039); the value is chosen."""
+
+CHANNELS: Final = (7, 11)
+"""What the lobes depend on: of bare skin, and with a coating."""
+
 R_D_LIMIT: Final = 1.25
 """No R_d is above this; skin stays below 0.9."""
 
 
 class SurfaceError(ValueError):
     """A surface or a direction is described wrongly."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coating:
+    """What lies on skin; textures of shape (N, N)."""
+
+    film: Float32Array
+    """Share of the surface under a film, 0 to 1; there it replaces facets of skin and oil."""
+    film_alpha: Float32Array
+    """GGX alpha of the film, 0.05 to 0.6."""
+    film_eta: Float32Array
+    """Refractive index of the film, 1.2 to 1.7."""
+    powder: Float32Array
+    """Share of the surface under grains of powder, 0 to 1; they cover film and skin."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name, low, high in (
+            ("film", 0.0, 1.0),
+            ("film_alpha", 0.05, 0.6),
+            ("film_eta", 1.2, 1.7),
+            ("powder", 0.0, 1.0),
+        ):
+            values = getattr(self, name)
+            if values.shape != self.film.shape or not (
+                np.all(values >= low - 1e-6) and np.all(values <= high + 1e-6)
+            ):
+                raise SurfaceError(
+                    f"{name}: got shape {values.shape}, values of {values.min()} to "
+                    f"{values.max()}, expected {self.film.shape} and {low} to {high}"
+                )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,10 +141,22 @@ class SkinSurface:
     """Share that is not behind hair of brows and lashes; it scales the surface terms."""
     normal: Float32Array
     """Unit normals of mesh and relief, shape (N, N, 3)."""
+    coating: Coating | None = None
+    """What lies on the skin; ``None``: nothing."""
 
     def packed(self) -> Float32Array:
-        """Return what the lobes depend on: r_d, roughness, oil, fuzz, bare, shape (N, N, 7)."""
-        scalars = (self.roughness, self.oil, self.fuzz, self.bare)
+        """Return what the lobes depend on.
+
+        Returns
+        -------
+        ndarray of float32
+            r_d (3), roughness, oil, fuzz, bare, shape (N, N, 7); with a coating also film,
+            film_alpha, film_eta, powder, shape (N, N, 11).
+        """
+        scalars = [self.roughness, self.oil, self.fuzz, self.bare]
+        if self.coating is not None:
+            on = self.coating
+            scalars += [on.film, on.film_alpha, on.film_eta, on.powder]
         return np.concatenate([self.r_d, np.stack(scalars, axis=-1)], axis=-1)
 
 
@@ -120,11 +186,15 @@ def skin_surface(
     hair = subject.hair[..., None]
     scale = np.float32(shading.interior_scale(ETA))
     over = np.asarray(HAIR_REFLECTANCE, np.float32)
+    if subject.beard is not None:
+        taken = np.asarray(STUBBLE_ABSORPTION, np.float32)
+        reflectance = reflectance * (1.0 - subject.beard[..., None] * taken)
     greasy = np.maximum(
         np.maximum(0.75 * regions["forehead"], regions["nose"]), 0.6 * regions["chin"]
     )
     oil = 0.06 + 0.42 * greasy + 0.2 * regions["lips"]
     oil *= 1.0 + 0.25 * smooth_noise(points, (14.0, 5.0), seed=subject.seed + 301)
+    oil *= subject.oiliness
     downy = np.maximum(regions["cheeks"], np.maximum(regions["temples"], regions["jaw"]))
     fuzz = (0.25 + 0.75 * downy) * (1.0 - regions["lips"]) * (1.0 - 0.8 * regions["nose"])
     fuzz *= 1.0 + 0.2 * smooth_noise(points, (18.0,), seed=subject.seed + 302)
@@ -147,7 +217,8 @@ def evaluate(
     Parameters
     ----------
     packed
-        r_d (3 channels), roughness, oil, fuzz, bare, shape (n, 7) or (7,).
+        r_d (3 channels), roughness, oil, fuzz, bare, shape (n, 7) or (7,); with a coating 11
+        channels, see `SkinSurface.packed`.
     normal, to_light, to_camera
         Unit vectors away from the surface, shape (n, 3) or (3,).
 
@@ -167,9 +238,10 @@ def evaluate(
     True
     """
     arrays = [np.asarray(a, np.float32) for a in (packed, normal, to_light, to_camera)]
-    if arrays[0].shape[-1] != 7 or any(a.shape[-1] != 3 for a in arrays[1:]):
+    if arrays[0].shape[-1] not in CHANNELS or any(a.shape[-1] != 3 for a in arrays[1:]):
         raise SurfaceError(
-            f"packed, directions: got shapes {[a.shape for a in arrays]}, expected (n, 7), (n, 3)"
+            f"packed, directions: got shapes {[a.shape for a in arrays]}, "
+            "expected (n, 7) or (n, 11), (n, 3)"
         )
     count = np.broadcast_shapes(*(a.shape[:-1] for a in arrays))
     if len(count) > 1:
@@ -185,7 +257,7 @@ def surface_floor(packed: ArrayLike, *, steepest_deg: float = 70.0) -> Float32Ar
     Parameters
     ----------
     packed
-        As for `evaluate`, shape (n, 7).
+        As for `evaluate`, shape (n, 7) or (n, 11).
     steepest_deg
         Light and camera are taken no more aslant than this, degrees.
 
@@ -260,13 +332,50 @@ def ggx(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
 @njit(cache=True, inline="always")
 def surface_terms(nl, nv, nh, lh, roughness, oil, fuzz):  # type: ignore[no-untyped-def]
     """Return the surface terms of f_r for cosines above zero."""
+    total = _facets(nl, nv, nh, lh, roughness, oil)
+    if fuzz > 0.0:
+        total += _down(nl, nv, fuzz)
+    return total
+
+
+@njit(cache=True, inline="always")
+def coated_terms(  # type: ignore[no-untyped-def]
+    nl, nv, nh, lh, roughness, oil, fuzz, film, film_alpha, film_eta, powder
+):
+    """Return the surface terms of f_r of skin under a coating, for cosines above zero."""
+    total = 0.0
+    if film < 1.0:
+        total = (1.0 - film) * _facets(nl, nv, nh, lh, roughness, oil)
+    if film > 0.0:
+        total += film * _fresnel(lh, film_eta) * ggx(nl, nv, nh, film_alpha)
+    if fuzz > 0.0:
+        total += _down(nl, nv, fuzz)
+    if powder > 0.0:
+        total = (1.0 - powder) * total + powder * grains(nl, nv, lh)
+    return total
+
+
+@njit(cache=True, inline="always")
+def grains(nl, nv, lh):  # type: ignore[no-untyped-def]
+    """Return the single scattering of a thick layer of grains."""
+    g = POWDER_ASYMMETRY
+    turned = 1.0 - 2.0 * lh * lh  # cosine between the way in and the way out
+    phase = (1.0 - g * g) / (1.0 + g * g - 2.0 * g * turned) ** 1.5
+    return POWDER_ALBEDO / (4.0 * math.pi) * phase / (nl + nv)
+
+
+@njit(cache=True, inline="always")
+def _facets(nl, nv, nh, lh, roughness, oil):  # type: ignore[no-untyped-def]
     total = (1.0 - oil) * _fresnel(lh, ETA) * beckmann(nl, nv, nh, roughness)
     if oil > 0.0:
         total += oil * _fresnel(lh, ETA_OIL) * ggx(nl, nv, nh, OIL_SMOOTHING * roughness)
-    if fuzz > 0.0:
-        through = 1.0 - math.exp(-fuzz * (1.0 / nl + 1.0 / nv))
-        total += FUZZ_ALBEDO / (4.0 * math.pi) * through / (nl + nv)
     return total
+
+
+@njit(cache=True, inline="always")
+def _down(nl, nv, fuzz):  # type: ignore[no-untyped-def]
+    through = 1.0 - math.exp(-fuzz * (1.0 / nl + 1.0 / nv))
+    return FUZZ_ALBEDO / (4.0 * math.pi) * through / (nl + nv)
 
 
 @njit(cache=True, inline="always")
@@ -312,9 +421,14 @@ def _evaluate(packed, normal, light, camera):  # type: ignore[no-untyped-def]
         nl, nv = min(nl, 1.0), min(nv, 1.0)
         length = math.sqrt(squared)
         nh = min((nl + nv) / length, 1.0)
-        surface = packed[i, 6] * surface_terms(
-            nl, nv, nh, 0.5 * length, packed[i, 3], packed[i, 4], packed[i, 5]
-        )
+        p = packed[i]
+        if packed.shape[1] > 7:
+            lobes = coated_terms(
+                nl, nv, nh, 0.5 * length, p[3], p[4], p[5], p[7], p[8], p[9], p[10]
+            )
+        else:
+            lobes = surface_terms(nl, nv, nh, 0.5 * length, p[3], p[4], p[5])
+        surface = p[6] * lobes
         inside = boundary(nl, nv) / math.pi
         specular[i] = surface
         for k in range(3):
@@ -323,13 +437,16 @@ def _evaluate(packed, normal, light, camera):  # type: ignore[no-untyped-def]
 
 
 __all__ = [
+    "Coating",
     "SkinSurface",
     "SurfaceError",
     "beckmann",
     "boundary",
     "boundary_transmittance",
+    "coated_terms",
     "evaluate",
     "ggx",
+    "grains",
     "skin_surface",
     "surface_floor",
     "surface_terms",
