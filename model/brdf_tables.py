@@ -171,24 +171,47 @@ def of_columns(
 def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
     """Return a basis of the MERL files in a folder, their channels averaged to one.
 
+    Parameters
+    ----------
+    folder
+        Its .binary files, however that is spelt, are taken in the order of their names; other
+        files are left alone. One file is in memory at a time.
+    light_radius_rad
+        Angular radius of the light to convolve with, rad, in [0, 0.5].
+
     Raises
     ------
     BasisError
-        When the folder holds no .binary file.
+        When the folder is missing or holds no .binary file, or one of them reflects nothing
+        anywhere.
     model.merl.MerlFileError
         When one of them is no MERL table.
     """
-    paths = sorted(Path(folder).glob("*.binary"))
+    place = Path(folder)
+    found = place.iterdir() if place.is_dir() else []
+    paths = sorted((p for p in found if p.suffix.lower() == ".binary"), key=lambda p: p.name)
     if not paths:
         raise BasisError(f"{folder}: got no .binary files, expected MERL tables")
-    columns = [_convolved(of_merl(merl.read(path)), light_radius_rad) for path in paths]
+    columns = [_of_file(path, light_radius_rad) for path in paths]
     return _padded(np.stack(columns, -1), [path.stem for path in paths], light_radius_rad)
+
+
+def _of_file(path: Path, light_radius_rad: float) -> NDArray[np.float32]:
+    mean = merl.read_mean(path)
+    if not np.nanmax(mean, initial=0.0) > 0.0:
+        raise BasisError(f"{path}: got no value above 0, expected a material that reflects")
+    if not np.nanmax(mean) < np.finfo(np.float32).max:
+        raise BasisError(f"{path}: got {np.nanmax(mean):.3g} 1/sr, expected less than 3e38")
+    return _convolved(_nearest_bin(mean), light_radius_rad).astype(np.float32)
 
 
 def of_merl(table: merl.MerlTable) -> Brdf:
     """Return a MERL table as a function, the mean of its channels, NaN where not measured."""
     mean = np.where(table.measured, np.tensordot(merl.SCALE, table.stored, 1) / 3.0, np.nan)
+    return _nearest_bin(mean)
 
+
+def _nearest_bin(mean: FloatArray) -> Brdf:
     def brdf(light: FloatArray, view: FloatArray) -> FloatArray:
         h, d, phi = merl.to_angles(light, view, [0.0, 0.0, 1.0])
         return np.asarray(mean[merl.bins(np.minimum(h, _HALF_PI), d, phi)])

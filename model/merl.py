@@ -9,6 +9,7 @@ Rusinkiewicz 1998, doi:10.1007/978-3-7091-6453-2_2 (angles).
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,8 @@ SHAPE = (90, 90, 180)
 """Bins over theta_h, theta_d and phi_d."""
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
 """BRDF in 1/sr of a stored 1, red, green, blue."""
+NOT_MEASURED = -1.0
+"""Stored where there is no value; readers take anything negative."""
 FILE_BYTES = 12 + 3 * 8 * 90 * 90 * 180
 
 _HALF_PI = 0.5 * np.pi
@@ -50,9 +53,17 @@ class MerlTable:
 
     @classmethod
     def of_values(cls, values: ArrayLike) -> MerlTable:
-        """Make a table of BRDF values in 1/sr, (90, 90, 180, 3) or broadcast; negative: none."""
+        """Make a table of BRDF values in 1/sr, (90, 90, 180, 3) or broadcast.
+
+        What is negative, in any channel, was not measured: -1 is stored for all three.
+        """
         brdf = np.broadcast_to(np.asarray(values, dtype=np.float64), (*SHAPE, 3))
-        return cls(np.ascontiguousarray(np.moveaxis(brdf / SCALE, -1, 0)))
+        none = np.any(brdf < 0.0, axis=-1)
+        stored = np.empty((3, *SHAPE))
+        for channel, scale in enumerate(SCALE):
+            np.divide(brdf[..., channel], scale, out=stored[channel])
+            stored[channel][none] = NOT_MEASURED
+        return cls(stored)
 
     def lookup(self, theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike) -> FloatArray:
         """Return the BRDF of the nearest bin.
@@ -188,7 +199,32 @@ def read(path: str | os.PathLike[str]) -> MerlTable:
     MerlFileError
         When the file is too short or long, or its header is not that of 90 x 90 x 180 bins.
     """
-    file = Path(path)
+    return MerlTable(np.stack(list(_planes(Path(path)))))
+
+
+def read_mean(path: str | os.PathLike[str]) -> FloatArray:
+    """Read the mean of a file's channels, plane by plane, with half the memory of `read`.
+
+    Returns
+    -------
+    ndarray of float64, shape (90, 90, 180)
+        1/sr; NaN where a channel was not measured.
+
+    Raises
+    ------
+    MerlFileError
+        As `read`.
+    """
+    mean = np.zeros(SHAPE)
+    for plane, scale in zip(_planes(Path(path)), SCALE, strict=True):
+        plane[plane < 0.0] = np.nan
+        plane *= scale / 3.0
+        mean += plane
+    return mean
+
+
+def _planes(file: Path) -> Iterator[FloatArray]:
+    """Yield the channels, each (90, 90, 180), of a file whose size and header are right."""
     size = file.stat().st_size
     with file.open("rb") as stream:
         start = stream.read(12)
@@ -201,10 +237,13 @@ def read(path: str | os.PathLike[str]) -> MerlTable:
         if size != FILE_BYTES:
             word = "truncated" if size < FILE_BYTES else "followed by something else"
             raise MerlFileError(f"{file}: {word}: got {size} bytes, expected {FILE_BYTES}")
-        values = np.fromfile(stream, dtype="<f8", count=3 * int(np.prod(SHAPE)))
-    if not np.all(np.isfinite(values)):
-        raise MerlFileError(f"{file}: got values that are not finite, expected negative for none")
-    return MerlTable(values.astype(np.float64, copy=False).reshape(3, *SHAPE))
+        for _ in range(3):
+            plane = np.fromfile(stream, dtype="<f8", count=int(np.prod(SHAPE)))
+            if not np.all(np.isfinite(plane)):
+                raise MerlFileError(
+                    f"{file}: got values that are not finite, expected negative for none"
+                )
+            yield plane.astype(np.float64, copy=False).reshape(SHAPE)
 
 
 def write(path: str | os.PathLike[str], table: MerlTable) -> None:

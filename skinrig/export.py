@@ -1,4 +1,4 @@
-"""Copies of a session for other programs, within what its subject agreed to."""
+"""What is handed to other programs: sessions, as agreed to by their subjects, and BRDFs."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from capture.session import Session, verify
 from capture.session.contents import undamaged_contents
 from capture.session.frames import check_file
 from capture.session.mhl import write_first_generation
+from skinrig import brdf_export
+from skinrig.errors import UsageError
 from skinrig.event_model import documents
 
 FRAMES, DOCUMENTS = "frames", "documents.jsonl"
@@ -73,12 +75,72 @@ def export(
         raise ExportError(f"to: got {to!r}, expected one of {', '.join(FORMATS)}")
     session = Session.open(session_path)
     session.require_consent(use, today=today)
-    target = Path(out)
-    if target.exists():
-        raise ExportError(f"{target}: exists; choose a new folder")
+    target = _fresh(out)
     found = verify(session_path)
     if not found.ok:
         raise ExportError(f"{session_path}: is damaged, nothing was copied: {found.problems[0]}")
+    return _sealed(target, lambda part: FORMATS[to](session, part), now)
+
+
+def export_brdfs(
+    appearance_path: str | Path,
+    out: str | Path,
+    *,
+    to: str,
+    place: brdf_export.Place | None = None,
+    now: datetime | None = None,
+) -> Exported:
+    """Write an appearance's lobes, and the BRDF of a place, for other programs; all, or nothing.
+
+    Parameters
+    ----------
+    appearance_path
+        APPEARANCE/ folder of a dome, or a fitted MODEL.
+    out
+        New folder.
+    to
+        "merl" or "rgl", see :func:`skinrig.brdf_export.write_brdfs`.
+    place
+        Where on the skin; None: lobes alone.
+    now
+        For tests.
+
+    Raises
+    ------
+    ExportError
+        For an unknown format, or a folder that exists.
+    """
+    if to not in brdf_export.SUFFIX:
+        raise ExportError(f"to: got {to!r}, expected one of {', '.join(brdf_export.SUFFIX)}")
+    target = _fresh(out)
+
+    def write(part: Path) -> None:
+        brdf_export.write_brdfs(appearance_path, part, to=to, place=place)
+
+    return _sealed(target, write, now)
+
+
+def named(use: str | None) -> str:
+    """Return the use that a command line names.
+
+    Raises
+    ------
+    skinrig.errors.UsageError
+        When it names none.
+    """
+    if use is None:
+        raise UsageError("--use: got none; say what the copy of a session is for, e.g. research")
+    return use
+
+
+def _fresh(out: str | Path) -> Path:
+    target = Path(out)
+    if target.exists():
+        raise ExportError(f"{target}: exists; choose a new folder")
+    return target
+
+
+def _sealed(target: Path, write: Callable[[Path], None], now: datetime | None) -> Exported:
     moment = now or datetime.now(UTC)
     target.parent.mkdir(parents=True, exist_ok=True)
     # of the final name, which the manifest bears, in a hidden folder beside it
@@ -86,7 +148,7 @@ def export(
     part = shelter / target.name
     try:
         part.mkdir(parents=True)
-        FORMATS[to](session, part)
+        write(part)
         files = sum(path.is_file() for path in part.rglob("*"))
         manifest = write_first_generation(part, now=moment, version=version("skinrig"))
         part.rename(target)

@@ -1,5 +1,7 @@
 """Tables of materials: the grid, MERL files, and that Fresnel reflection is inside, once."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -109,6 +111,66 @@ def test_a_folder_of_merl_files_becomes_a_basis(tmp_path, rng):
     (tmp_path / "b.binary").write_bytes(b"foreign")
     with pytest.raises(merl.MerlFileError, match=r"b\.binary"):
         brdf_tables.load(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def flaws():
+    """MERL tables of a matt 0.2 per sr with what measured files hold, all -1 below the horizon."""
+    h, d, phi = np.meshgrid(*merl.bin_centers(), indexing="ij")
+    light, view = merl.to_directions(h, d, phi)
+    values = np.where((light[..., 2] > 0.0) & (view[..., 2] > 0.0), 0.2, -1.0)[..., None].repeat(
+        3, -1
+    )
+    holes = values.copy()
+    holes[::3, 5:9, 11::7, 1] = -1.0
+    spiked = values.copy()
+    spiked[0, 0] = 1e5
+    dark = np.where(values > 0.0, 0.0, -1.0)
+    no_blue = values.copy()
+    no_blue[..., 2] = np.minimum(values[..., 2], 0.0)
+    return {"holes": holes, "spiked": spiked, "dark": dark, "no_blue": no_blue}
+
+
+def test_a_folder_of_measured_files_is_read_in_order_however_they_are_spelt(flaws, tmp_path, rng):
+    for file, which in (
+        ("Skin-B.BINARY", "no_blue"),
+        ("a.binary", "spiked"),
+        ("Z.Binary", "holes"),
+    ):
+        merl.write(tmp_path / file, merl.MerlTable.of_values(flaws[which]))
+    (tmp_path / "readme.txt").write_text("of the measurement")
+    (tmp_path / "folder").mkdir()
+    tracemalloc.start()
+    basis = brdf_tables.load(tmp_path, light_radius_rad=0.0)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 64e6  # two planes of a file and its mask, not three files of 35 MB
+    assert basis.names == ("Skin-B", "Z", "a")
+    to, at = directions(rng, 300), directions(rng, 300)
+    away = np.linalg.norm(to + at, axis=-1) < 1.9
+    found = basis.evaluate(to[away], at[away], [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(found[:, 1], 0.2, rtol=1e-6)  # holes have their neighbours' value
+    np.testing.assert_allclose(found[:, 0], 0.4 / 3.0, rtol=1e-6)  # a channel of zeros counts
+    tilted = np.arccos((to + at)[:, 2] / np.linalg.norm(to + at, axis=-1))[away] > 0.02
+    np.testing.assert_allclose(found[tilted, 2], 0.2, rtol=1e-6)  # a spike stays where it is
+    z = [0.0, 0.0, 1.0]
+    assert basis.evaluate(z, z, z)[2] == pytest.approx(1e5)
+
+
+def test_a_file_without_light_or_beyond_single_precision_is_named(flaws, tmp_path):
+    for which, message in (
+        ("dark", "no value above 0"),
+        ("nothing", "no value"),
+        ("huge", "1e\\+4"),
+    ):
+        values = flaws.get(which, flaws["holes"].copy())
+        if which == "huge":
+            values[0, 0] = 1e40
+        elif which == "nothing":
+            values = np.full(3, -1.0)
+        merl.write(tmp_path / "a.binary", merl.MerlTable.of_values(values))
+        with pytest.raises(brdf_tables.BasisError, match=rf"a\.binary: got {message}"):
+            brdf_tables.load(tmp_path)
 
 
 def test_a_mixed_basis_is_the_mixture(point_basis, rng):

@@ -39,6 +39,35 @@ def test_reading_gives_back_what_was_written(table, tmp_path):
     assert (tmp_path / "a.binary").read_bytes() == (tmp_path / "b.binary").read_bytes()
 
 
+def test_a_foreign_file_s_unmeasured_entries_come_back_to_the_byte(tmp_path, rng):
+    # -1 and other negative numbers, -0.0, denormal and huge values, as measured files hold them
+    values = rng.choice([-1.0, -1500.0, -1e-9, -0.0, 5e-324, 0.0, 1.0, 3e7], 3 * 1_458_000)
+    content = struct.pack("<3i", 90, 90, 180) + values.astype("<f8").tobytes()
+    (tmp_path / "a.binary").write_bytes(content)
+    merl.write(tmp_path / "b.binary", merl.read(tmp_path / "a.binary"))
+    assert (tmp_path / "b.binary").read_bytes() == content
+
+
+def test_the_mean_of_the_channels_is_known_where_all_are(table, tmp_path):
+    stored = table.stored.copy()
+    stored[1, 3, 4, 5] = -1e-3
+    merl.write(tmp_path / "a.binary", merl.MerlTable(stored))
+    mean = merl.read_mean(tmp_path / "a.binary")
+    known = table.measured.copy()
+    known[3, 4, 5] = False
+    np.testing.assert_array_equal(np.isfinite(mean), known)
+    expected = np.tensordot(merl.SCALE, stored, 1)[known] / 3.0
+    np.testing.assert_allclose(mean[known], expected, rtol=1e-14)
+
+
+def test_what_has_no_value_in_one_channel_is_stored_as_not_measured_in_all():
+    values = np.ones((*merl.SHAPE, 3))
+    values[1, 2, 3, 2] = -0.5
+    stored = merl.MerlTable.of_values(values).stored
+    assert stored[:, 1, 2, 3].tolist() == [-1.0, -1.0, -1.0]
+    np.testing.assert_allclose(stored[:, 0, 0, 0], 1.0 / merl.SCALE, rtol=1e-15)
+
+
 def test_truncated_and_foreign_files_are_named(table, tmp_path):
     merl.write(tmp_path / "good.binary", table)
     whole = (tmp_path / "good.binary").read_bytes()

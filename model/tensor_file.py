@@ -1,0 +1,121 @@
+"""Tensor files: named arrays in one file, as RGL's measured materials (.bsdf) are kept.
+
+Little-endian: ``tensor_file`` and a zero, version 1.0, the number of fields; for each name, number
+of dimensions, type, place in the file and shape; then the arrays.
+
+References
+----------
+Dupuy and Jakob 2018, doi:10.1145/3272127.3275059 (the materials; Mitsuba's ``tensor_io`` reads the
+same container).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAGIC = b"tensor_file\0"
+VERSION = (1, 0)
+ALIGNMENT = 8
+MOST_FIELDS = 4096
+TYPES = ("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")
+"""NumPy's names of the types, whose numbers in the file start at 1."""
+
+
+class TensorFileError(ValueError):
+    """A file that is no tensor file, or only part of one."""
+
+
+def read(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
+    """Read all arrays of a file.
+
+    Returns
+    -------
+    dict
+        By name, in the file's order.
+
+    Raises
+    ------
+    TensorFileError
+        When the file is none, of another version, or ends before what it names.
+    """
+    file = Path(path)
+    size = file.stat().st_size
+    with file.open("rb") as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            raise TensorFileError(f"{file}: is no tensor file: it does not begin with tensor_file")
+        version = _unpack(stream, "<BB", file)
+        if version != VERSION:
+            raise TensorFileError(f"{file}: got version {version}, expected {VERSION}")
+        (count,) = _unpack(stream, "<I", file)
+        if count > MOST_FIELDS:
+            raise TensorFileError(f"{file}: got {count} fields, expected at most {MOST_FIELDS}")
+        heads = [_head(stream, file) for _ in range(count)]
+        arrays: dict[str, NDArray[Any]] = {}
+        for name, dtype, offset, shape in heads:
+            values = math.prod(shape)
+            if offset + values * dtype.itemsize > size:
+                raise TensorFileError(
+                    f"{file}: truncated: {name} ends at byte {offset + values * dtype.itemsize}, "
+                    f"got {size} bytes"
+                )
+            stream.seek(offset)
+            arrays[name] = np.fromfile(stream, dtype, values).reshape(shape)
+    return arrays
+
+
+def write(path: str | os.PathLike[str], fields: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays, in the mapping's order, each at a multiple of 8 bytes.
+
+    Raises
+    ------
+    TensorFileError
+        When an array's type is none of the format's.
+    """
+    arrays = {}
+    for name, array in fields.items():
+        stored = np.dtype(array.dtype).newbyteorder("<")
+        if stored not in [np.dtype(known) for known in TYPES]:
+            raise TensorFileError(f"{name}: got type {array.dtype}, expected integers or floats")
+        arrays[name] = np.ascontiguousarray(array, stored)
+    labels = {name: name.encode() for name in arrays}
+    place = len(MAGIC) + 6 + sum(13 + len(labels[n]) + 8 * a.ndim for n, a in arrays.items())
+    with Path(path).open("wb") as stream:
+        stream.write(MAGIC + struct.pack("<BBI", *VERSION, len(arrays)))
+        places = []
+        for name, array in arrays.items():
+            place = -(-place // ALIGNMENT) * ALIGNMENT
+            places.append(place)
+            number = [np.dtype(known) for known in TYPES].index(array.dtype) + 1
+            label = labels[name]
+            stream.write(struct.pack("<H", len(label)) + label)
+            stream.write(struct.pack(f"<HBQ{array.ndim}Q", array.ndim, number, place, *array.shape))
+            place += array.nbytes
+        for start, array in zip(places, arrays.values(), strict=True):
+            stream.write(b"\0" * (start - stream.tell()))
+            array.tofile(stream)
+
+
+def _head(stream: BinaryIO, file: Path) -> tuple[str, np.dtype[Any], int, tuple[int, ...]]:
+    (length,) = _unpack(stream, "<H", file)
+    label = stream.read(length)
+    dimensions, number, offset = _unpack(stream, "<HBQ", file)
+    shape = _unpack(stream, f"<{dimensions}Q", file)
+    if not 1 <= number <= len(TYPES):
+        raise TensorFileError(f"{file}: {label!r}: got type {number}, expected 1 to {len(TYPES)}")
+    return label.decode("utf-8", "replace"), np.dtype(TYPES[number - 1]), offset, shape
+
+
+def _unpack(stream: BinaryIO, layout: str, file: Path) -> tuple[int, ...]:
+    wanted = struct.calcsize(layout)
+    content = stream.read(wanted)
+    if len(content) != wanted:
+        raise TensorFileError(f"{file}: truncated among its fields' names")
+    return struct.unpack(layout, content)

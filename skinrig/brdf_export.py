@@ -1,0 +1,217 @@
+"""Fitted lobes, and the BRDF of a place on the skin, as files of other programs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import fresnel, merl, rgl, skin_reflectance, store
+from model.brdf_tables import BrdfBasis
+from model.skin import SkinAppearance
+from skinrig.errors import UsageError
+
+FloatArray = NDArray[np.float64]
+Brdf = Callable[[FloatArray, FloatArray], FloatArray]
+"""Takes light and view, unit vectors (n, 3) where +z is the normal; gives 1/sr, (n,) or (n, 3)."""
+
+DOCUMENT = "brdfs.json"
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+class BrdfExportError(ValueError):
+    """A place on the skin, or an appearance, that has no BRDF to export."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where on the texture the skin is looked at.
+
+    Attributes
+    ----------
+    u, v
+        Texture coordinates, 0 to 1; v = 1 at the top.
+    radius_mm
+        The BRDFs of all valid texels as near as this are averaged; 0: the nearest alone.
+    diffuse
+        Whether light from inside the skin is included.
+    """
+
+    u: float
+    v: float
+    radius_mm: float = 0.0
+    diffuse: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse a place off the texture."""
+        if not (0.0 <= self.u <= 1.0 and 0.0 <= self.v <= 1.0 and 0.0 <= self.radius_mm < np.inf):
+            raise BrdfExportError(
+                f"place: got u {self.u}, v {self.v}, radius {self.radius_mm} mm, expected u and v "
+                "in 0 to 1 and a radius of at least 0"
+            )
+
+
+def place_of(at: str | None, *, radius_mm: float, diffuse: bool) -> Place | None:
+    """Return the place that a command line names as U,V; None without one.
+
+    Raises
+    ------
+    skinrig.errors.UsageError
+        When it is not two numbers.
+    """
+    if at is None:
+        return None
+    try:
+        u, v = (float(part) for part in at.split(","))
+    except ValueError as error:
+        raise UsageError(f"--at: got {at!r}, expected U,V such as 0.5,0.4") from error
+    return Place(u, v, radius_mm, diffuse)
+
+
+def write_brdfs(
+    appearance_path: str | Path, folder: Path, *, to: str, place: Place | None = None
+) -> None:
+    """Write each lobe as lobe_K, and the BRDF of a place as place, with a document that tells all.
+
+    Parameters
+    ----------
+    appearance_path
+        APPEARANCE/ folder of a dome, or a fitted MODEL.
+    folder
+        Existing folder.
+    to
+        "merl" (.binary, 35 MB each) or "rgl" (.bsdf for Mitsuba's ``measured``, RGB).
+    place
+        Where on the skin; None: lobes alone.
+
+    Raises
+    ------
+    BrdfExportError
+        Where the place has no valid texel, or a negative albedo.
+    model.skin_reflectance.SkinReflectanceError
+        Where the appearance has no lobes.
+    """
+    appearance = store.read(appearance_path)
+    lobes = skin_reflectance.lobes_of(appearance)
+    files: dict[str, object] = {}
+    for k in range(lobes.size):
+        name = f"lobe_{k}{SUFFIX[to]}"
+        told = f"lobe {k}, equal in all channels: highlights have the light's color"
+        _write(to, folder / name, _lobe(lobes, k), told, lobes.light_radius_rad)
+        files[name] = {"what": told, "light_from_inside": False}
+    if place is not None:
+        at, entry = _place(appearance, lobes, place)
+        name = f"place{SUFFIX[to]}"
+        _write(to, folder / name, at, str(entry["what"]), lobes.light_radius_rad)
+        files[name] = entry
+    document = {
+        "schema": "skinrig.brdfs/1",
+        "format": to,
+        "source": appearance.source,
+        "light_radius_rad": lobes.light_radius_rad,
+        "light": "angular radius of the round light that the BRDFs were measured with and hold: a "
+        "renderer's lights of this size should be points, a wider light is nearly right",
+        "unit": "1/sr, without the cosine, Fresnel's reflection included",
+        "files": files,
+    }
+    text = json.dumps(document, indent=1, allow_nan=False)
+    (folder / DOCUMENT).write_text(text + "\n", encoding="utf-8")
+
+
+def merl_table(brdf: Brdf) -> merl.MerlTable:
+    """Tabulate a BRDF at the middles of MERL's bins; -1 where light or view are below the horizon.
+
+    Parameters
+    ----------
+    brdf
+        See :data:`Brdf`.
+    """
+    theta_h, theta_d, phi_d = merl.bin_centers()
+    d, phi = np.meshgrid(theta_d, phi_d, indexing="ij")
+    values = np.full((*merl.SHAPE, 3), -1.0)
+    for i, h in enumerate(theta_h):
+        light, view = merl.to_directions(h, d, phi)
+        above = (light[..., 2] > 0.0) & (view[..., 2] > 0.0)
+        found = np.asarray(brdf(light[above], view[above]))
+        values[i][above] = found.reshape(len(found), -1)
+    return merl.MerlTable.of_values(values)
+
+
+def _lobe(lobes: BrdfBasis, k: int) -> Brdf:
+    one = lobes.mixed(np.eye(lobes.size)[k : k + 1])
+    return lambda light, view: one.evaluate(light, view, _UP)[:, 0]
+
+
+def _place(
+    appearance: SkinAppearance, lobes: BrdfBasis, place: Place
+) -> tuple[Brdf, dict[str, object]]:
+    """Return the mean BRDF over the texels of a place, and what to tell of it."""
+    model = skin_reflectance.assemble(appearance)
+    row, column = _nearest_valid(model.valid, place)
+    near = np.zeros_like(model.valid)
+    near[row, column] = True
+    if place.radius_mm > 0.0:
+        apart = np.linalg.norm(model.position_mm - model.position_mm[row, column], axis=-1)
+        near = model.valid & (apart <= place.radius_mm)
+    r_d = model.r_d[near].astype(np.float64).mean(axis=0)
+    if place.diffuse and not np.all(r_d >= 0.0):
+        raise BrdfExportError(
+            f"place: r_d is {r_d.tolist()} there, below 0; take another place, a wider radius, or "
+            "--without-diffuse"
+        )
+    surface = lobes.mixed(model.weights[near].astype(np.float64).mean(axis=0)[None])
+
+    def brdf(light: FloatArray, view: FloatArray) -> FloatArray:
+        found = np.repeat(surface.evaluate(light, view, _UP), 3, axis=-1)
+        if place.diffuse:
+            through = 1.0 - fresnel.reflectance(light[:, 2], model.eta)
+            through = through * (1.0 - fresnel.reflectance(view[:, 2], model.eta))
+            found = found + through[:, None] * r_d / np.pi
+        return np.asarray(found)
+
+    inside = "with light from inside" if place.diffuse else "the surface alone"
+    entry: dict[str, object] = {
+        "what": f"mean of {int(near.sum())} texels, {inside}; camera RGB over a perfect white",
+        "light_from_inside": place.diffuse,
+        "position_mm": model.position_mm[row, column].tolist(),
+        "radius_mm": place.radius_mm,
+        "texels": int(near.sum()),
+        "r_d": r_d.tolist(),
+    }
+    return brdf, entry
+
+
+def _nearest_valid(valid: NDArray[np.bool_], place: Place) -> tuple[int, int]:
+    height, width = valid.shape
+    row = min(int((1.0 - place.v) * height), height - 1)
+    column = min(int(place.u * width), width - 1)
+    if not valid[row, column]:
+        raise BrdfExportError(
+            f"place: u {place.u}, v {place.v} is texel row {row}, column {column}, where the "
+            f"reflectance is not known ({np.count_nonzero(valid)} of {valid.size} texels are)"
+        )
+    return row, column
+
+
+def _write_merl(path: Path, brdf: Brdf, description: str) -> None:
+    del description  # the format has no place for it
+    merl.write(path, merl_table(brdf))
+
+
+def _write_rgl(path: Path, brdf: Brdf, description: str) -> None:
+    rgl.write(path, rgl.of_brdf(brdf, description=description))
+
+
+_WRITERS: Mapping[str, Callable[[Path, Brdf, str], None]] = {
+    "merl": _write_merl,
+    "rgl": _write_rgl,
+}
+SUFFIX: Mapping[str, str] = {"merl": ".binary", "rgl": ".bsdf"}
+
+
+def _write(to: str, path: Path, brdf: Brdf, told: str, light_radius_rad: float) -> None:
+    _WRITERS[to](path, brdf, f"{told}; measured with a light of radius {light_radius_rad:.6g} rad")
