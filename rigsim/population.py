@@ -50,6 +50,9 @@ from rigsim.surface_noise import scattered_spots, smooth_noise
 HEADS: Final = 6
 """Shapes of head that the members share."""
 
+KEPT: Final = 6
+"""Heads that are kept laid out."""
+
 HAIR_LIMIT: Final = 0.02
 """Texels with more hair than this part are not skin."""
 
@@ -131,15 +134,24 @@ class Member:
         size
             Texels along one side, 64 to 8192.
         """
-        mesh, atlas, points = _laid_out(self.head, size)
-        regions = face_regions.region_masks(points)
+        flat = self._flat(size)
+        points, regions = flat.perfusion.points_mm, flat.perfusion.regions
         old = (self.age_years - 15.0) / 60.0
-        along_u, along_v = atlas.texel_mm()
-        texel_mm = float(np.median(np.maximum(along_u, along_v)[atlas.covered]))
-        height = relief.height_um(points, regions, texel_mm=texel_mm, seed=self.seed)
+        height = relief.height_um(points, regions, texel_mm=_texel_mm(flat.atlas), seed=self.seed)
         height = np.asarray(height * np.float32(0.7 + 0.75 * old), np.float32)
         roughness = relief.roughness_map(points, regions, seed=self.seed)
         rougher = np.clip(roughness * np.float32(0.95 + 0.17 * old), 0.15, 0.5)
+        return dataclasses.replace(
+            flat,
+            roughness=np.asarray(rougher, np.float32),
+            height_um=height,
+            normal=relief.relief_normals(flat.atlas, height),
+        )
+
+    def _flat(self, size: int) -> Subject:
+        """Return the face without relief and of even roughness: all that its color needs."""
+        mesh, atlas, points, regions = _laid_out(self.head, size)
+        even = np.zeros((size, size), np.float32)
         return Subject(
             preset=_nearest_preset(self.melanin),
             seed=self.seed,
@@ -147,11 +159,11 @@ class Member:
             atlas=atlas,
             melanin=self._melanin(points, regions),
             perfusion=perfuse(points, regions, seed=self.seed, amount=self.blood),
-            roughness=np.asarray(rougher, np.float32),
-            height_um=height,
+            roughness=even + np.float32(0.3),
+            height_um=even,
             hair=relief.hair_map(points, seed=self.seed),
-            normal=relief.relief_normals(atlas, height),
-            beard=_stubble(points, regions, self.beard, texel_mm, seed=self.seed),
+            normal=atlas.normal,
+            beard=_stubble(points, regions, self.beard, _texel_mm(atlas), seed=self.seed),
             oiliness=self.oil,
         )
 
@@ -184,7 +196,7 @@ class Member:
         mask : ndarray of bool
             Bare skin, shape (N, N).
         """
-        face = self.face(size)
+        face = self._flat(size)
         surface = conditioned_surface(face, camera, light, dict(self.applied))
         return surface.r_d, face.atlas.covered & (face.hair < HAIR_LIMIT)
 
@@ -418,21 +430,30 @@ def _stubble(
     return np.asarray(np.clip(0.45 * dense + 0.55 * dots, 0.0, 1.0), np.float32)
 
 
+def _texel_mm(atlas: Atlas) -> float:
+    along_u, along_v = atlas.texel_mm()
+    return float(np.median(np.maximum(along_u, along_v)[atlas.covered]))
+
+
 @lru_cache(maxsize=HEADS)
 def _head_mesh(head: int) -> Mesh:
     return build_head(np.random.default_rng([head, 600]))
 
 
-@lru_cache(maxsize=HEADS)
-def _laid_out(head: int, size: int) -> tuple[Mesh, Atlas, Float32Array]:
-    """Return a head, its texture, and the texels on the mean head; of a face at 1024 80 MB."""
+@lru_cache(maxsize=KEPT)
+def _laid_out(head: int, size: int) -> tuple[Mesh, Atlas, Float32Array, Mapping[str, Float32Array]]:
+    """Return a head, its texture, the texels on the mean head and its regions.
+
+    A head takes 8 MB at 256 texels, 120 MB at 1024.
+    """
     if not SIZE_RANGE[0] <= size <= SIZE_RANGE[1]:
         raise PopulationError(
             f"size: got {size}, expected {SIZE_RANGE[0]} to {SIZE_RANGE[1]} texels"
         )
     mesh = _head_mesh(head)
     atlas = unwrap(mesh, size)
-    return mesh, atlas, face_regions.on_mean_head(atlas.position_mm, mesh)
+    points = face_regions.on_mean_head(atlas.position_mm, mesh)
+    return mesh, atlas, points, face_regions.region_masks(points)
 
 
 __all__ = ["GROUPS", "HEADS", "Group", "Member", "PopulationError", "shifted", "table_1"]

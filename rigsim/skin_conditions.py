@@ -256,8 +256,7 @@ def coated(subject: Subject, surface: SkinSurface, conditions: Mapping[str, floa
     wanted = {name: a for name, a in checked(conditions).items() if a > 0.0 and name != "normal"}
     if not wanted:
         return surface
-    rest = subject if subject.rest is None else subject.rest
-    points = face_regions.on_mean_head(rest.atlas.position_mm, rest.mesh)
+    points = subject.perfusion.points_mm
     for name, amount in wanted.items():
         surface = conditioned(
             surface, name, amount, points_mm=points, seed=subject.seed + CONDITIONS.index(name)

@@ -46,7 +46,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike
 
-from rigsim import face_regions, shading
+from rigsim import shading
 from rigsim.mesh import Float32Array
 from rigsim.scenes.skin_glow import HAIR_REFLECTANCE
 from rigsim.skin_color import skin_color
@@ -179,9 +179,7 @@ def skin_surface(
     SkinSurface
         Textures; oil gathers on forehead, nose and chin, vellus hair on cheeks, temples and jaw.
     """
-    resting = subject if subject.rest is None else subject.rest
-    points = face_regions.on_mean_head(resting.atlas.position_mm, resting.mesh)
-    regions = face_regions.region_masks(points)
+    points, regions = subject.perfusion.points_mm, subject.perfusion.regions
     reflectance = skin_color(camera, light).rgb(subject.melanin, subject.hemoglobin(state))
     hair = subject.hair[..., None]
     scale = np.float32(shading.interior_scale(ETA))

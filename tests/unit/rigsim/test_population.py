@@ -36,6 +36,7 @@ def test_a_face_is_its_members_alone():
     one, again = person.r_d(64, CAMERA, LIGHT), person.r_d(64, CAMERA, LIGHT)
     np.testing.assert_array_equal(one[0], again[0])
     np.testing.assert_array_equal(one[1], again[1])
+    np.testing.assert_array_equal(one[0], person.surface(64, CAMERA, LIGHT).r_d)
     other = dataclasses.replace(person, seed=person.seed + 1)
     assert np.abs(other.r_d(64, CAMERA, LIGHT)[0] - one[0]).max() > 0.01
 
