@@ -171,11 +171,17 @@ class Light:
         side = np.cross(helper, center)
         side /= np.linalg.norm(side)
         other = np.cross(center, side) / away
-        share = tuple(value / count for value in self.intensity)
+        k = np.arange(count)
+        reach = radius * np.sqrt((k + 0.5) / count)
+        places = center + reach[:, None] * (
+            np.cos(k * GOLDEN)[:, None] * side + np.sin(k * GOLDEN)[:, None] * other
+        )
+        # a white that faces the middle sees the others aslant, and at a place farther away
+        cosine = away / np.linalg.norm(places, axis=-1)
+        whole = float(np.sum(cosine if self.direction is not None else cosine**3))
+        share = tuple(value / whole for value in self.intensity)
         out = []
-        for k in range(count):
-            r, turn = radius * math.sqrt((k + 0.5) / count), k * GOLDEN
-            place = center + r * (math.cos(turn) * side + math.sin(turn) * other)
+        for place in places:
             fields: dict[str, object] = {"radius": self.radius / math.sqrt(count)}
             if self.direction is not None:
                 fields["direction"] = _three(self.name, "direction", place)
