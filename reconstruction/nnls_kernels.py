@@ -347,7 +347,9 @@ def _reweigh(value, variance, model, count, weight, scatter):  # type: ignore[no
     for i in range(count):
         mean += model[i]
     mean /= count
-    floor = 0.02 * max(mean, 1e-30)
+    if mean < 1e-30:  # a model without light has no cube roots to weigh by
+        return scatter
+    floor = 0.02 * mean
     above = 0.0
     below = 0.0
     for i in range(count):
@@ -359,7 +361,7 @@ def _reweigh(value, variance, model, count, weight, scatter):  # type: ignore[no
         # An outlier tells nothing of the others' misfit.
         above += share * (min(r * r, HUBER * HUBER * total) - variance[i])
         below += share * spread
-    scatter = max(above / below, 1e-8 * max(mean, 1e-30) ** (2.0 / 3.0))
+    scatter = max(above / below, 1e-8 * mean ** (2.0 / 3.0))
     for i in range(count):
         u = max(float64(model[i]), floor)
         total = float64(variance[i]) + scatter * 9.0 * u * u ** (1.0 / 3.0)

@@ -294,11 +294,15 @@ def require_spread(directions: Floating) -> None:
     PhotometricStereoError
         Where no normal follows from lights in these directions.
     """
-    singular = np.linalg.svd(directions, compute_uv=False)
-    if len(singular) < 3 or singular[2] < FLATTEST * singular[0]:
+    *_, singular, axes = np.linalg.svd(np.asarray(directions, np.float64), full_matrices=True)
+    least = FLATTEST * singular[0]
+    if len(singular) < 3 or singular[2] < least:
+        unseen = axes[np.count_nonzero(singular >= least) :]
+        ways = " and ".join(str(tuple(round(float(v), 2) + 0.0 for v in axis)) for axis in unseen)
         raise PhotometricStereoError(
             f"light_directions: got {len(directions)} lights in one line or plane with the surface"
-            " point, expected directions that span space; move a light out of the plane"
+            f" point, which show nothing of a normal along {ways}; expected directions that span"
+            " space: move a light out of the plane"
         )
 
 

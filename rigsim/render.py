@@ -426,16 +426,16 @@ _EMISSION = ("radiance", "irradiance", "intensity")
 
 
 def _refuse_negative_light(description: Mapping[str, Any], where: str = "") -> None:
+    shines = ("bitmap",) if description.get("type") == "envmap" else _EMISSION
     for name, entry in description.items():
-        place = f"{where}{name}"
+        value = entry
         if isinstance(entry, Mapping):
-            _refuse_negative_light(entry, f"{place}.")
-            if name in _EMISSION:
-                entry = entry.get("value", 0.0)
-        if name in (*_EMISSION, "bitmap") and isinstance(entry, (int, float, list, np.ndarray)):
-            least = float(np.min(np.asarray(entry, np.float64), initial=0.0))
-            if least < 0.0 and (name != "bitmap" or "envmap" in where):
-                raise RenderError(f"{place}: got a negative value {least:g}, expected light >= 0")
+            _refuse_negative_light(entry, f"{where}{name}.")
+            value = entry.get("value")
+        if name in shines and isinstance(value, (int, float, list, tuple, np.ndarray)):
+            least = float(np.min(np.asarray(value, np.float64), initial=0.0))
+            if least < 0.0:
+                raise RenderError(f"{where}{name}: got a value {least:g}, expected light >= 0")
 
 
 class MovedLight:

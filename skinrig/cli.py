@@ -602,17 +602,29 @@ def bench(
     stage: Annotated[list[str] | None, typer.Option(help="Stage; repeatable; default all.")] = None,
     budget: Annotated[float, typer.Option(help="Seconds to spend, about.")] = 300.0,
     toy: Annotated[bool, typer.Option("--toy", help="Smallest sizes, no limits judged.")] = False,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for bench.json.")] = None,
+    extremes: Annotated[
+        bool, typer.Option("--extremes", help="Try stiff and extreme cases instead.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for bench.json, or extremes.json.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Measure error against run time; exit code 1 when a limit is missed.
 
     Example: skinrig bench --stage chromophores --json
-    """
-    from skinrig.bench_stages import run_stages
 
+    Example: skinrig bench --extremes
+    """
     console = Console(json)
-    document = run_stages(stage, budget_s=budget, toy=toy, out=out, console=console)
+    if extremes:
+        from skinrig.extremes_section import run_extremes
+
+        document = run_extremes(stage or (), out=out, console=console)
+    else:
+        from skinrig.bench_stages import run_stages
+
+        document = run_stages(stage, budget_s=budget, toy=toy, out=out, console=console)
     console.document(document.pop("schema"), document)
     if not document["passed"]:
         raise typer.Exit(errors.LIMIT_MISSED)

@@ -17,6 +17,7 @@ from reconstruction.flash_stages import NOISE_STDERR
 from skinrig import (
     dynamic_section,
     evaluation,
+    extremes_section,
     figures,
     microrelief_section,
     page,
@@ -110,6 +111,8 @@ def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
     for document in documents:
         if document["schema"] == "skinrig.bench/1":
             sections.append(_bench_section(document, checks))
+        elif document["schema"] == extremes_section.SCHEMA:
+            sections.append(extremes_section.section(document, checks))
         else:
             sections.append(_document_section(document))
     for folder in found.calibrations:

@@ -159,6 +159,13 @@ def test_extremes_give_masks_and_no_nan(face, basis):
         assert np.all(found.weights[4].sum() > 0.0)
 
 
+def test_points_without_any_light_get_no_weights_every_time(face, basis):
+    dark = samples_of(face, variance=None)
+    dark = dataclasses.replace(dark, value=np.zeros_like(dark.value))
+    for _ in range(3):  # what a call leaves in memory must not matter to the next
+        assert not brdf_basis.fit_weights(dark, basis).weights.any()
+
+
 def test_grazing_saturated_and_unknown_samples_are_left_out(face):
     light = face.light.copy()
     flat = np.cross(face.normals, [0.0, 1.0, 0.0])

@@ -1,0 +1,68 @@
+"""Every extreme holds in both precisions, and a case that does not hold is seen."""
+
+import json
+
+import pytest
+
+from skinrig import extremes
+from skinrig.cli import main
+from skinrig.report import build
+
+CASES = extremes.all_cases()
+HEAVY = {"kernel of no relief"}  # searches all kernels twice
+
+
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(c, marks=pytest.mark.long if c.name in HEAVY else ()) for c in CASES],
+    ids=[f"{c.stage}: {c.name}" for c in CASES],
+)
+def test_an_extreme_holds_in_float32_and_float64(case):
+    outcomes = extremes.try_case(case).outcomes
+    assert set(outcomes) == {"float32", "float64"}
+    assert [one.got for one in outcomes.values() if not one.passed] == []
+
+
+def test_there_are_60_extremes_with_names_of_their_own():
+    assert len(CASES) >= 60
+    assert len({(case.stage, case.name) for case in CASES}) == len(CASES)
+
+
+def a_case(run):
+    return extremes.Case("a case", "nothing", "much", "it breaks", "it holds", run)
+
+
+def broken(_):
+    raise ZeroDivisionError("by zero")
+
+
+@pytest.mark.parametrize(
+    ("run", "word"),
+    [
+        (lambda real: extremes.near(real(1.0), 2.0), "got 1"),
+        (lambda real: extremes.within([real("nan")], 0.0, 1.0), "finite"),
+        (lambda real: extremes.clean([real("inf")], [True]), "NaN or infinity"),
+        (lambda real: extremes.masked([True, False]), "share of 0.5"),
+        (lambda real: extremes.refused(lambda: real(1.0), ValueError), "expected ValueError"),
+        (lambda real: extremes.rising([real(2.0), real(1.0)]), "rise"),
+        (broken, "ZeroDivisionError"),
+    ],
+)
+def test_what_does_not_hold_is_told(run, word):
+    result = extremes.try_case(a_case(run))
+    assert not result.passed
+    assert all(word in one.got for one in result.outcomes.values())
+
+
+def test_the_command_writes_the_table_and_the_report_shows_it(tmp_path, capsys):
+    assert main(["bench", "--extremes", "--stage", "hdr", "--out", str(tmp_path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == extremes.SCHEMA
+    assert {case["stage"] for case in document["cases"]} == {"hdr"}
+    assert json.loads((tmp_path / "extremes.json").read_text())["cases"]
+    assert "Stiff and extreme cases" in build([tmp_path])
+
+
+def test_an_unknown_stage_names_the_known_ones(capsys):
+    assert main(["bench", "--extremes", "--stage", "hrd"]) == 3
+    assert "hdr" in capsys.readouterr().err
