@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 
 from model.skin_reflectance import SkinReflectance, lobe_brdf, transmitted
 from rigsim.mesh import Float32Array, Mesh, build_mesh
-from rigsim.render import Caster, GBuffer, trace, visibility
+from rigsim.render import Caster, GBuffer, trace
 from skinrig import rendering_camera
 from skinrig.rendering_camera import Camera
 from skinrig.rendering_geometry import FittedSurface, Rows
+from skinrig.rendering_interior import Interior, entering
 from skinrig.rendering_lights import Light
 
 __all__ = [
@@ -110,6 +111,7 @@ def render(
     rest: Mesh | None = None,
     blockers: Mesh | None = None,
     caster: Caster | None = None,
+    interior: Interior | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Rendering:
     """Render a fitted model.
@@ -138,6 +140,8 @@ def render(
         What else casts shadows but is not seen.
     caster
         Of the mesh, where there is one already.
+    interior
+        Of the model on the mesh, where there is one already; for "dipole".
     progress
         Called with a line of text now and then.
 
@@ -163,6 +167,7 @@ def render(
     rays = Caster(laid.mesh) if caster is None else caster
     shadows = rays if blockers is None else Caster(joined(laid.mesh, blockers), choice=rays.choice)
     columns, height = camera.image_size
+    inside = _inside(laid, subsurface, lamps, shadows, shadow_samples, interior)
     film = _Film(height, columns)
     seen = _Sighting()
     band = max(1, BAND_RAYS // (columns * subpixels**2))
@@ -171,7 +176,7 @@ def render(
         buffers = trace(rays, *rendering_camera.rays(camera, subpixels=subpixels, rows=part))
         index = seen.outside(buffers)
         points = _Points.of(laid, buffers, index)
-        shaded = _shade(laid, points, lamps, shadows, subsurface, shadow_samples)
+        shaded = _shade(points, lamps, shadows, shadow_samples, laid, inside)
         film.put(part, subpixels, index, points, shaded)
         if progress is not None and part[1] < height:
             progress(f"render: {100 * part[1] // height} %")
@@ -298,6 +303,24 @@ class _Film:
             mask[rows] = (some & (total(good) == count)).reshape(tall, width)
 
 
+def _inside(
+    laid: FittedSurface,
+    subsurface: Subsurface,
+    lamps: Sequence[Light],
+    shadows: Caster,
+    shadow_samples: int,
+    interior: Interior | None,
+) -> Callable[[_Points, FloatArray], FloatArray]:
+    """Return what gives the light that comes from inside at points, of what enters there."""
+    if subsurface == "none":
+        return lambda points, entered: np.zeros_like(entered)
+    if subsurface == "local":
+        return lambda points, entered: entered * points.rows.r_d
+    below = Interior.of(laid) if interior is None else interior
+    light = below.entered(lamps, shadows, shadow_samples)
+    return lambda points, entered: below.leaving(light, points.position_mm, points.rows, entered)
+
+
 def _lamps(lights: Light | Sequence[Light]) -> list[Light]:
     given = [lights] if isinstance(lights, Light) else list(lights)
     if not given:
@@ -306,63 +329,31 @@ def _lamps(lights: Light | Sequence[Light]) -> list[Light]:
 
 
 def _shade(
-    laid: FittedSurface,
     points: _Points,
     lamps: Sequence[Light],
     shadows: Caster,
-    subsurface: Subsurface,
     shadow_samples: int,
+    laid: FittedSurface,
+    inside: Callable[[_Points, FloatArray], FloatArray],
 ) -> _Shaded:
     """Return what points send to the camera by all lights."""
     count = len(points.uv)
-    diffuse, surface = np.zeros((count, 3)), np.zeros((count, 3))
+    entered, surface = np.zeros((count, 3)), np.zeros((count, 3))
     lit = np.zeros(count, np.bool_)
-    cos_view = _dot(points.rows.normals, points.view)
-    leaving = transmitted(cos_view, laid.model.eta)
+    rows = points.rows
+    cos_view = np.einsum("nk,nk->n", rows.normals, points.view, dtype=np.float64)
     for lamp in lamps:
-        towards, white = lamp.reach(points.position_mm)
-        cosine = _dot(points.rows.normals, towards)
-        faced = np.flatnonzero((cosine > 0.0) & (cos_view > 0.0) & (white > 0.0).any(axis=-1))
-        seen = seen_share(
-            shadows, points.position_mm[faced], points.face_normal[faced], lamp, shadow_samples
-        )
-        lit[faced] |= seen >= LIT
-        faced, seen = faced[seen > 0.0], seen[seen > 0.0]
-        arriving = white[faced] * (cosine[faced] * seen)[:, None]
-        if subsurface == "local":
-            entered = arriving * transmitted(cosine[faced], laid.model.eta)[:, None]
-            diffuse[faced] += entered * points.rows.r_d[faced] * leaving[faced][:, None]
-        lobe = lobe_brdf(
-            laid.model.lobes, points.rows.weights[faced], towards[faced], points.view[faced],
-            points.rows.normals[faced],
+        through, arriving, towards, seen = entering(
+            lamp, points.position_mm, points.face_normal, rows.normals, shadows, shadow_samples,
+            laid.model.eta,
         )  # fmt: skip
-        surface[faced] += np.pi * lobe[:, None] * arriving
-    return _Shaded(diffuse, surface, lit)
-
-
-def seen_share(
-    caster: Caster, position_mm: Float32Array, normal: Float32Array, lamp: Light, samples: int
-) -> FloatArray:
-    """Return which share of a light points see, shape (n,), 0 to 1.
-
-    Parameters
-    ----------
-    caster
-        What casts shadows.
-    position_mm, normal
-        Points and the unit normals of the triangles that they lie on, shape (n, 3).
-    lamp
-        The light.
-    samples
-        Points on its disc; one where it has no radius.
-    """
-    center, radius = lamp.disc()
-    found = visibility(
-        caster, np.ascontiguousarray(position_mm), np.ascontiguousarray(normal), center,
-        radius_mm=radius, samples=samples if radius > 0.0 else 1,
-    )  # fmt: skip
-    return found.astype(np.float64)
-
-
-def _dot(a: NDArray[np.floating], b: NDArray[np.floating]) -> FloatArray:
-    return np.einsum("nk,nk->n", a.astype(np.float64), b.astype(np.float64))
+        entered += through
+        lit |= seen >= LIT
+        shown = np.flatnonzero((seen > 0.0) & (cos_view > 0.0))
+        lobe = lobe_brdf(
+            laid.model.lobes, rows.weights[shown], towards[shown], points.view[shown],
+            rows.normals[shown],
+        )  # fmt: skip
+        surface[shown] += np.pi * lobe[:, None] * arriving[shown]
+    leaving = transmitted(cos_view, laid.model.eta)[:, None]
+    return _Shaded(leaving * inside(points, entered), surface, lit & (cos_view > 0.0))

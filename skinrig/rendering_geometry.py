@@ -123,7 +123,11 @@ class FittedSurface:
         normals = np.asarray(model.normals, np.float32)
         if moved and rest is not None:
             normals = carried_normals(normals, unwrap(rest, width), atlas)
-        layers = [model.r_d, model.weights, normals, model.translucency_mm]
+        depth = np.asarray(model.translucency_mm, np.float32)
+        usual = np.median(
+            depth[model.valid], axis=0
+        )  # where nothing is known light must spread, too
+        layers = [model.r_d, model.weights, normals, np.where(depth > 0.0, depth, usual)]
         values = np.concatenate([np.asarray(layer, np.float32) for layer in layers], axis=-1)
         return FittedSurface(
             model, mesh, atlas, normals, moved, np.nan_to_num(values), np.asarray(model.valid)
