@@ -1,0 +1,154 @@
+"""The non-negative mixtures nearest to mixtures with negative shares, compiled.
+
+Active sets through the materials' matrix of products (Lawson and Hanson 1974, Solving Least Squares
+Problems, chapter 23), started from the shares that are positive.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+DEPENDENT = 1e-12
+"""A material whose part outside those in use is a smaller share of its square is not used."""
+STOP = 1e-10
+"""A material joins while it would lower the misfit by more than this share of the mixture."""
+ROWS = 512  # rows that share their working memory
+
+
+def nearest(gram: FloatArray, wanted: FloatArray) -> FloatArray:
+    """Return the non-negative mixtures x that are nearest: least (x - t)' G (x - t).
+
+    Parameters
+    ----------
+    gram : ndarray, shape (K, K)
+        Products of the materials, symmetric and positive semidefinite.
+    wanted : ndarray, shape (T, K)
+        The mixtures t. Rows without a negative share come back as they are.
+
+    Returns
+    -------
+    ndarray of float64, shape (T, K)
+
+    Examples
+    --------
+    >>> nearest(np.array([[1.0, 0.8], [0.8, 1.0]]), np.array([[1.0, -0.5]])).round(6).tolist()
+    [[0.6, 0.0]]
+    """
+    out = np.array(wanted, np.float64, order="C")
+    beyond = np.flatnonzero((out < 0.0).any(axis=1))
+    if len(beyond):
+        rows = np.ascontiguousarray(out[beyond])
+        _nearest(np.ascontiguousarray(gram, np.float64), rows)
+        out[beyond] = rows
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _factor(gram, active, used, low):  # type: ignore[no-untyped-def]
+    """Fill the Cholesky factor of the active rows; return the first dependent one, or -1."""
+    for i in range(used):
+        for j in range(i + 1):
+            s = gram[active[i], active[j]]
+            for k in range(j):
+                s -= low[i, k] * low[j, k]
+            if i == j:
+                if s <= DEPENDENT * gram[active[i], active[i]]:
+                    return i
+                low[i, i] = math.sqrt(s)
+            else:
+                low[i, j] = s / low[j, j]
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def _back(low, used, y):  # type: ignore[no-untyped-def]
+    """Solve low low' y = y in place."""
+    for i in range(used):
+        for k in range(i):
+            y[i] -= low[i, k] * y[k]
+        y[i] /= low[i, i]
+    for i in range(used - 1, -1, -1):
+        for k in range(i + 1, used):
+            y[i] -= low[k, i] * y[k]
+        y[i] /= low[i, i]
+
+
+@njit(cache=True, nogil=True)
+def _one(gram, t, x, rhs, active, low, y, refused):  # type: ignore[no-untyped-def]
+    size = len(t)
+    norm = 0.0
+    for p in range(size):
+        s = 0.0
+        for q in range(size):
+            s += gram[p, q] * t[q]
+        rhs[p] = s
+        norm += s * t[p]
+    norm = math.sqrt(max(norm, 0.0))
+    used = 0
+    for p in range(size):
+        x[p] = max(t[p], 0.0)
+        refused[p] = gram[p, p] <= 0.0
+        if x[p] > 0.0 and not refused[p]:
+            active[used] = p
+            used += 1
+    entering = -1
+    for _ in range(6 * size + 6):
+        while used > 0:
+            gone = _factor(gram, active, used, low)
+            if gone >= 0:
+                refused[active[gone]] = True
+            else:
+                for i in range(used):
+                    y[i] = rhs[active[i]]
+                _back(low, used, y)
+                reach = 1.0
+                for i in range(used):
+                    if y[i] <= 0.0:
+                        now = x[active[i]]
+                        part = now / (now - y[i]) if now > 0.0 else 0.0
+                        if gone < 0 or part < reach:
+                            gone, reach = i, part
+                for i in range(used):
+                    p = active[i]
+                    x[p] = max(x[p] + reach * (y[i] - x[p]), 0.0)
+                if gone < 0:
+                    break
+                if active[gone] == entering:
+                    refused[entering] = True  # it came in and went at once: not again
+            x[active[gone]] = 0.0
+            used -= 1
+            for i in range(gone, used):
+                active[i] = active[i + 1]
+        best, entering = STOP * norm, -1
+        for p in range(size):
+            if x[p] == 0.0 and not refused[p]:
+                gain = rhs[p]
+                for i in range(used):
+                    gain -= gram[p, active[i]] * x[active[i]]
+                gain /= math.sqrt(gram[p, p])
+                if gain > best:
+                    best, entering = gain, p
+        if entering < 0:
+            return
+        active[used] = entering
+        used += 1
+
+
+@njit(parallel=True, cache=True)
+def _nearest(gram, rows):  # type: ignore[no-untyped-def]
+    count, size = rows.shape
+    for block in prange((count + ROWS - 1) // ROWS):
+        x, rhs, y = np.empty(size), np.empty(size), np.empty(size)
+        active = np.empty(size, np.int64)
+        low = np.empty((size, size))
+        refused = np.empty(size, np.bool_)
+        for row in range(block * ROWS, min((block + 1) * ROWS, count)):
+            _one(gram, rows[row], x, rhs, active, low, y, refused)
+            for p in range(size):
+                rows[row, p] = x[p]

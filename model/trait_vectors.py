@@ -1,0 +1,359 @@
+"""What a trait changes, from people with and without it, and how sure that is.
+
+A trait vector is a weighted sum of the samples, its *contrast* c: the mean of those with the trait
+minus the mean of those without, or the slope over a continuous trait (one formula: the contrast is
+t - mean(t) over the sum of its squares). Everything about its confidence follows from the contrast
+and the n samples in an orthonormal frame of at most n coordinates, however long they are.
+
+References
+----------
+Weyrich et al. 2005, "Measuring and modeling human skin reflectance", section 11.
+MacKinnon and White 1985, doi:10.1016/0304-4076(85)90158-7 (standard errors, HC2: for two groups
+they are those of Welch). Phipson and Smyth 2010, doi:10.2202/1544-6115.1585 (p-values).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+Kind = Literal["binary", "continuous"]
+Contrast = Literal["means", "regression"]
+
+FEW = 5
+"""A group of fewer people gets a warning."""
+SAME = 1.0 - 1e-9
+"""Traits correlated by more than this are one and the same."""
+CONFOUNDED = 0.5
+"""Traits correlated by more than this get a warning."""
+DOUBTFUL_P = 0.05
+DOUBTFUL_COSINE = 0.95
+_CHUNK = 64
+
+
+class TraitError(ValueError):
+    """Traits, samples or amounts from which nothing can be made."""
+
+
+@dataclass(frozen=True, slots=True)
+class Confidence:
+    """How sure the direction of a trait vector is, in the reduced space.
+
+    Attributes
+    ----------
+    p_value : float
+        Share of random exchanges of the labels that give whole samples a difference at least as
+        long: even over (0, 1] where there is no trait. 1 where nothing can be exchanged. (In a
+        space that was chosen for these labels it would not be even.)
+    expected_cosine : float
+        Cosine between this vector and the true one of the whole samples, with what the errors of
+        both lengths make of it taken off: sqrt(1 - noise^2 / length^2) where the space holds all,
+        less by what it does not hold. 0 where the noise exceeds the length, or is not known.
+    bootstrap_cosine : (float, float, float)
+        16th, 50th and 84th percentile of the cosine to vectors with their residuals drawn anew;
+        zeros where no residuals are known.
+    relative_noise : float
+        noise / length; inf where the length is 0 or the noise not known.
+    """
+
+    p_value: float
+    expected_cosine: float
+    bootstrap_cosine: tuple[float, float, float]
+    relative_noise: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TraitVector:
+    """What one trait changes in a sample.
+
+    Attributes
+    ----------
+    name : str
+    kind : {"binary", "continuous"}
+    vector : ndarray of float64, shape (d,)
+        Change of a sample by the trait (binary), or per unit of it (continuous).
+    stderr : ndarray of float64, shape (d,)
+        Of each number before the space was reduced; 0 where `confidence.relative_noise` is inf.
+    coordinates : ndarray of float64, shape (K,)
+        The vector in the reduced space.
+    members, others : int
+        People with the trait and without; for a continuous one all people and 0.
+    confidence : Confidence
+    confounded : tuple of (str, float)
+        Other traits and the correlation with them, beyond 0.5, largest first.
+    warnings : tuple of str
+    """
+
+    name: str
+    kind: Kind
+    vector: FloatArray
+    stderr: FloatArray
+    coordinates: FloatArray
+    members: int
+    others: int
+    confidence: Confidence
+    confounded: tuple[tuple[str, float], ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def warning(self) -> str:
+        """All warnings, one sentence each; empty without one."""
+        return "; ".join(self.warnings)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trait:
+    """A trait of n people, as given."""
+
+    name: str
+    kind: Kind
+    values: FloatArray
+    """(n,); 0 and 1 for a binary trait, else in the trait's unit."""
+    contrast: FloatArray
+    """(n,) weights of the samples in the trait's vector; they sum to 0."""
+
+    @property
+    def members(self) -> int:
+        """People with the trait; all for a continuous one."""
+        return int(self.values.sum()) if self.kind == "binary" else len(self.values)
+
+
+def traits_of(
+    labels: Mapping[str, ArrayLike],
+    continuous: Mapping[str, ArrayLike],
+    count: int,
+    *,
+    contrast: Contrast = "means",
+) -> tuple[Trait, ...]:
+    """Check labels and return the traits.
+
+    Parameters
+    ----------
+    labels : mapping of str to array_like of bool, shape (n,)
+        User-assigned: whether each of the people has the trait.
+    continuous : mapping of str to array_like, shape (n,)
+        Values such as an age; finite.
+    count : int
+        n, at least 2.
+    contrast : {"means", "regression"}
+        "means": differences of complement means, whatever else differs between the groups.
+        "regression": what a trait adds beside all other traits given, by least squares.
+
+    Returns
+    -------
+    tuple of Trait
+
+    Raises
+    ------
+    TraitError
+        For a trait that nobody or everybody has, a value that does not vary, or shapes that do not
+        fit; by regression also for traits that cannot be told apart.
+
+    Examples
+    --------
+    >>> traits_of({"lotion": [True, False, False]}, {}, 3)[0].contrast.round(6).tolist()
+    [1.0, -0.5, -0.5]
+    """
+    if contrast not in ("means", "regression"):
+        raise TraitError(f"contrast: got {contrast!r}, expected 'means' or 'regression'")
+    both = set(labels) & set(continuous)
+    if both or not (labels or continuous):
+        raise TraitError(
+            f"traits: got {', '.join(sorted(both))} both as label and as continuous value"
+            if both
+            else "traits: got none, expected at least one label or continuous value"
+        )
+    if count < 2:
+        raise TraitError(f"samples: got {count}, expected at least 2")
+    values: list[tuple[str, Kind, FloatArray]] = []
+    for name, given in labels.items():
+        values.append((name, "binary", _label(name, given, count)))
+    for name, given in continuous.items():
+        values.append((name, "continuous", _value(name, given, count)))
+    if contrast == "means":
+        rows = [v - v.mean() for _, _, v in values]
+        found = [row / (row @ row) for row in rows]
+    else:
+        scale = np.array([np.std(v) for _, _, v in values])
+        design = np.column_stack([np.ones(count), *((v - v.mean()) / s for (_, _, v), s in
+                                                    zip(values, scale, strict=True))])  # fmt: skip
+        if np.linalg.matrix_rank(design) < design.shape[1]:
+            raise TraitError(
+                f"traits: {', '.join(name for name, _, _ in values)} of {count} people cannot be "
+                "told apart by regression; leave out those that follow from the others, or use "
+                "differences of means"
+            )
+        found = list(np.linalg.pinv(design)[1:] / scale[:, None])
+    return tuple(Trait(name, kind, v, c) for (name, kind, v), c in zip(values, found, strict=True))
+
+
+def _label(name: str, given: ArrayLike, count: int) -> FloatArray:
+    label = np.asarray(given)
+    if label.shape != (count,):
+        raise TraitError(f"label {name!r}: got shape {label.shape}, expected ({count},)")
+    if label.dtype != np.bool_ and not np.isin(label, (0, 1)).all():
+        raise TraitError(f"label {name!r}: got {label.dtype} values, expected True and False")
+    value = label.astype(np.float64)
+    if value.min() == value.max():
+        who = "everybody" if value[0] else "nobody"
+        raise TraitError(
+            f"label {name!r}: {who} of {count} has it, expected some with and some without; label "
+            "other faces, or leave the trait out"
+        )
+    return value
+
+
+def _value(name: str, given: ArrayLike, count: int) -> FloatArray:
+    value = np.asarray(given, np.float64)
+    if value.shape != (count,):
+        raise TraitError(f"{name}: got shape {value.shape}, expected ({count},)")
+    if not np.isfinite(value).all():
+        bad = int(np.count_nonzero(~np.isfinite(value)))
+        raise TraitError(f"{name}: got {bad} of {count} values that are not finite")
+    spread = value - value.mean()
+    if not spread @ spread > (1e-12 * np.abs(value).max()) ** 2 * count:
+        raise TraitError(f"{name}: got {value[0]:g} for all of {count}, expected values that vary")
+    return value
+
+
+def correlations(traits: tuple[Trait, ...]) -> FloatArray:
+    """Return the correlations of the traits' values, (t, t)."""
+    centered = np.array([t.values - t.values.mean() for t in traits])
+    size = np.sqrt((centered**2).sum(axis=1, keepdims=True))
+    centered /= size
+    return np.asarray(centered @ centered.T)
+
+
+def residuals(trait: Trait, samples: FloatArray, *, beside: tuple[Trait, ...] = ()) -> FloatArray:
+    """Return what the trait leaves of samples (n, d), and each one's leverage in a last column.
+
+    Parameters
+    ----------
+    beside
+        Other traits in the same regression; none for a difference of means.
+    """
+    columns = [np.ones(len(samples)), *(t.values - t.values.mean() for t in (trait, *beside))]
+    q = np.linalg.qr(np.column_stack(columns))[0]
+    left = samples - q @ (q.T @ samples)
+    return np.column_stack([left, np.minimum((q**2).sum(axis=1), 1.0)])
+
+
+def error_weights(trait: Trait, leverage: FloatArray, parameters: int) -> FloatArray:
+    """Return the weights of squared residuals in the vector's squared standard errors, (n,).
+
+    One's own for people whom the trait's group leaves free (HC2); the mean of all others' for the
+    only one of a group, whose residual is 0. All 0 where no residual is free.
+    """
+    free = leverage < 1.0 - 1e-9
+    count = int(np.count_nonzero(free))
+    squared = trait.contrast**2
+    weight = np.where(free, squared / np.where(free, 1.0 - leverage, 1.0), 0.0)
+    alone = float(squared[~free].sum())
+    freedom = len(leverage) - parameters
+    if count == 0 or freedom < 1:
+        return np.zeros(len(leverage))
+    return np.asarray(weight + np.where(free, alone / freedom, 0.0))
+
+
+def confidence(
+    trait: Trait,
+    scores: FloatArray,
+    *,
+    whole: FloatArray | None = None,
+    beside: tuple[Trait, ...] = (),
+    permutations: int = 999,
+    resamples: int = 400,
+    rng: np.random.Generator,
+) -> Confidence:
+    """Return how sure a trait's direction is.
+
+    Parameters
+    ----------
+    trait
+        See `traits_of`.
+    scores : ndarray, shape (n, r)
+        What the reduced space holds of the samples, in an orthonormal frame.
+    whole : ndarray, shape (n, r), optional
+        The samples in the same frame; as `scores` by default.
+    beside
+        Other traits in the same regression.
+    permutations, resamples : int
+        Random exchanges of labels and of residuals, at least 1.
+    rng
+        Draws them.
+
+    Notes
+    -----
+    Exchanges are exact for a difference of means; by regression they treat the part of the label
+    that the other traits do not explain as exchangeable.
+    """
+    n = len(scores)
+    c = trait.contrast
+    if whole is None:
+        whole = scores
+    vector, true = c @ scores, c @ whole
+    length, far = float(np.linalg.norm(vector)), float(np.linalg.norm(true))
+    beyond = 0
+    for start in range(0, permutations, _CHUNK):
+        many = min(_CHUNK, permutations - start)
+        mixed = rng.permuted(np.broadcast_to(c, (many, n)), axis=1)
+        beyond += int(
+            np.count_nonzero(np.linalg.norm(mixed @ whole, axis=1) >= far * (1.0 - 1e-12))
+        )
+    p = (1 + beyond) / (1 + permutations)
+    left = residuals(trait, scores, beside=beside)
+    off, leverage = left[:, :-1], left[:, -1]
+    weights = error_weights(trait, leverage, 2 + len(beside))
+    noise = float(np.sqrt(weights @ (off**2).sum(axis=1)))
+    if not weights.any() or length == 0.0:
+        return Confidence(p, 0.0, (0.0, 0.0, 0.0), float("inf"))
+    all_left = residuals(trait, whole, beside=beside)[:, :-1]
+    squared = float(far**2 - weights @ (all_left**2).sum(axis=1))
+    along = float(vector @ true - weights @ (off * all_left).sum(axis=1))
+    expected = max(along, 0.0) / (length * np.sqrt(squared)) if squared > 0.0 else 0.0
+    free = leverage < 1.0 - 1e-9
+    pool = off[free] / np.sqrt(1.0 - leverage[free])[:, None]
+    cosines = np.empty(resamples)
+    for k in range(resamples):
+        drawn = np.bincount(rng.integers(0, len(pool), n), weights=c, minlength=len(pool))
+        other = vector + drawn @ pool
+        cosines[k] = vector @ other / max(length * float(np.linalg.norm(other)), 1e-300)
+    low, middle, high = (float(v) for v in np.quantile(cosines, (0.16, 0.5, 0.84)))
+    return Confidence(p, float(min(expected, 1.0)), (low, middle, high), noise / length)
+
+
+def doubts(
+    trait: Trait, sure: Confidence, confounded: tuple[tuple[str, float], ...]
+) -> tuple[str, ...]:
+    """Return what to warn of, a sentence each."""
+    said = []
+    if trait.kind == "binary":
+        others = len(trait.values) - trait.members
+        for count, which in ((trait.members, "with"), (others, "without")):
+            if count < FEW:
+                said.append(f"{trait.name}: only {count} faces {which} it, expected {FEW} or more")
+    elif len(trait.values) < FEW:
+        said.append(f"{trait.name}: only {len(trait.values)} faces, expected {FEW} or more")
+    if np.isinf(sure.relative_noise):
+        said.append(f"{trait.name}: its error is not known, too few faces")
+    elif sure.p_value > DOUBTFUL_P:
+        said.append(
+            f"{trait.name}: shuffled labels give as much (p = {sure.p_value:.2g}); it may be noise"
+        )
+    elif sure.expected_cosine < DOUBTFUL_COSINE:
+        said.append(
+            f"{trait.name}: noisy, its cosine to the true direction is about "
+            f"{sure.expected_cosine:.2f}"
+        )
+    for other, r in confounded:
+        said.append(
+            f"{trait.name}: the same faces as {other}, cannot be told apart"
+            if abs(r) > SAME
+            else f"{trait.name}: goes along with {other} (correlation {r:+.2f})"
+        )
+    return tuple(said)
