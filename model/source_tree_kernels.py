@@ -1,0 +1,131 @@
+"""Builds a tree over weighted points: halves along the longest side, sums and spreads of nodes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+LEAF = 8
+"""Most sources of a node that is not halved."""
+
+# columns of what a walk reads of each node
+CENTER, RADIUS, REACH, AREA, SPREAD = 0, 3, 4, 5, 6
+"""Centroid (3), distance of its farthest source, the farthest that a source reaches from it, area,
+and area's second moment about it."""
+VISITED = 8
+
+
+@njit(cache=True, nogil=True)
+def split(place, leaf):  # type: ignore[no-untyped-def]
+    """Return the sources' order and the nodes' first and last sources, nodes before their halves.
+
+    ``place`` is (S, 3). A node ``i`` with ``skip[i] == i + 1`` is a leaf; any other's halves are
+    node ``i + 1`` and what follows it.
+    """
+    count = len(place)
+    order = np.arange(count)
+    most = 4 * max(count // leaf, 1) + 4
+    low, high = np.empty(most, np.int32), np.empty(most, np.int32)
+    stack = np.empty((128, 2), np.int64)
+    stack[0, 0], stack[0, 1] = 0, count
+    top, nodes = 1, 0
+    while top > 0:
+        top -= 1
+        lo, hi = stack[top, 0], stack[top, 1]
+        low[nodes], high[nodes] = lo, hi
+        nodes += 1
+        if hi - lo <= leaf:
+            continue
+        axis, longest = 0, -1.0
+        for k in range(3):
+            least = most_ = place[order[lo], k]
+            for i in range(lo, hi):
+                value = place[order[i], k]
+                least, most_ = min(least, value), max(most_, value)
+            if most_ - least > longest:
+                axis, longest = k, most_ - least
+        middle = (lo + hi) // 2
+        _select(place, order, axis, lo, hi - 1, middle)
+        stack[top, 0], stack[top, 1] = middle, hi
+        stack[top + 1, 0], stack[top + 1, 1] = lo, middle
+        top += 2
+    skip = np.empty(nodes, np.int32)
+    for i in range(nodes - 1, -1, -1):
+        j = i + 1
+        while j < nodes and low[j] < high[i]:
+            j = skip[j]
+        skip[i] = j
+    return order, low[:nodes].copy(), high[:nodes].copy(), skip
+
+
+@njit(cache=True, nogil=True)
+def _select(place, order, axis, lo, hi, middle):  # type: ignore[no-untyped-def]
+    """Reorder so that what lies below ``middle`` is no greater than what lies above (Hoare)."""
+    while lo < hi:
+        pivot = place[order[(lo + hi) // 2], axis]
+        i, j = lo, hi
+        while i <= j:
+            while place[order[i], axis] < pivot:
+                i += 1
+            while place[order[j], axis] > pivot:
+                j -= 1
+            if i <= j:
+                order[i], order[j] = order[j], order[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            hi = j
+        elif middle >= i:
+            lo = i
+        else:
+            return
+
+
+@njit(cache=True, nogil=True)
+def summarize(place, area, reach, low, high):  # type: ignore[no-untyped-def]
+    """Return what a walk reads of each node, (N, 8), from sources in the tree's order."""
+    nodes = len(low)
+    found = np.zeros((nodes, VISITED), np.float32)
+    for node in range(nodes):
+        total = x = y = z = 0.0
+        for i in range(low[node], high[node]):
+            a = area[i]
+            total += a
+            x += a * place[i, 0]
+            y += a * place[i, 1]
+            z += a * place[i, 2]
+        # rounded first: distances are from the centroid that is kept
+        found[node, 0], found[node, 1], found[node, 2] = x / total, y / total, z / total
+        x, y, z = np.float64(found[node, 0]), np.float64(found[node, 1]), np.float64(found[node, 2])
+        farthest = moment = widest = 0.0
+        for i in range(low[node], high[node]):
+            away = (place[i, 0] - x) ** 2 + (place[i, 1] - y) ** 2 + (place[i, 2] - z) ** 2
+            moment += area[i] * away
+            farthest = max(farthest, away)
+            widest = max(widest, math.sqrt(away) + reach[i])
+        found[node, RADIUS] = math.sqrt(farthest)
+        found[node, REACH] = widest
+        found[node, AREA] = total
+        found[node, SPREAD] = moment
+    return found
+
+
+@njit(cache=True, nogil=True)
+def light_moments(place, area, entered, low, high, seen):  # type: ignore[no-untyped-def]
+    """Return light (3) and its first moments about the centroid (3 x 3) of each node, (N, 12)."""
+    nodes = len(low)
+    found = np.zeros((nodes, 12), np.float32)
+    moment = np.empty(12)
+    for node in range(nodes):
+        moment[:] = 0.0
+        for i in range(low[node], high[node]):
+            for c in range(3):
+                power = area[i] * entered[i, c]
+                moment[c] += power
+                for k in range(3):
+                    moment[3 + 3 * c + k] += power * (place[i, k] - seen[node, k])
+        for k in range(12):
+            found[node, k] = moment[k]
+    return found
