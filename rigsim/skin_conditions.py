@@ -6,8 +6,8 @@ which changes nothing at all, to 1.
 
 ======== ========================================================================================
 normal   nothing
-cold     vessels narrow by 14 %, most in the cheeks and nose; half of the oil; facets 6 % rougher
-hot      vessels widen by 16 %, most in the cheeks; oil 1.6 times; a thin film of sweat on forehead,
+cold     vessels narrow by 25 %, most in the cheeks and nose; half of the oil; facets 6 % rougher
+hot      vessels widen by 28 %, most in the cheeks; oil 1.6 times; a thin film of sweat on forehead,
          nose and upper lip
 sweat    water (index 1.333) on 70 % of forehead and nose and on patches of the rest, very smooth
 lotion   an oily emulsion (index 1.45) on 75 %, smooth; facets 15 % smoother; vellus hair lies down
@@ -86,8 +86,8 @@ class _Change:
 
 _CHANGES: Final[Mapping[str, _Change]] = {
     "normal": _Change(),
-    "cold": _Change(vessels=-0.14, oil=0.5, roughness=1.06),
-    "hot": _Change(vessels=0.16, oil=1.6, film=_Film(0.3, 0.12, 1.333, 1.0, 0.7, 3.0)),
+    "cold": _Change(vessels=-0.25, oil=0.5, roughness=1.06),
+    "hot": _Change(vessels=0.28, oil=1.6, film=_Film(0.3, 0.12, 1.333, 1.0, 0.7, 3.0)),
     "sweat": _Change(vessels=0.06, film=_Film(0.7, 0.09, 1.333, 0.6, 0.8, 3.5)),
     "lotion": _Change(roughness=0.85, fuzz=0.4, film=_Film(0.75, 0.17, 1.45, 0.0, 0.15, 12.0)),
     "makeup": _Change(oil=0.5, fuzz=0.7, cover=0.7, film=_Film(0.45, 0.3, 1.5, 0.0, 0.1, 9.0)),

@@ -80,6 +80,31 @@ def names_of(text: str | None) -> tuple[str, ...] | None:
     return None if text is None else tuple(part.strip() for part in text.split(","))
 
 
+def amounts_of(texts: Sequence[str] | None, option: str) -> dict[str, float]:
+    """Return the amounts of ``NAME`` or ``NAME=AMOUNT``; a name alone stands for 1.
+
+    Examples
+    --------
+    >>> amounts_of(["lotion=0.6", "powder"], "--condition")
+    {'lotion': 0.6, 'powder': 1.0}
+
+    Raises
+    ------
+    UsageError
+    """
+    found: dict[str, float] = {}
+    for text in texts or ():
+        name, sign, amount = text.partition("=")
+        try:
+            value = float(amount) if sign else 1.0
+        except ValueError as exc:
+            raise UsageError(f"{option}: got {text!r}, expected NAME or NAME=AMOUNT") from exc
+        if not name or name in found:
+            raise UsageError(f"{option}: got {text!r}, expected each NAME once, or NAME=AMOUNT")
+        found[name] = value
+    return found
+
+
 def range_of(text: str | None, option: str) -> tuple[int, int] | None:
     """Return the first and last number of ``FIRST..LAST``; None for None.
 

@@ -186,6 +186,13 @@ def simulate(
     interreflections: Annotated[
         bool, typer.Option("--interreflections", help="Light in the dome goes from skin to skin.")
     ] = False,
+    condition: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Condition of the face in the dome, NAME or NAME=AMOUNT up to 1: cold, hot, "
+            "sweat, lotion, makeup, powder; repeatable."
+        ),
+    ] = None,
     sequence: Sequence = None,
     prompt_period: PromptPeriod = None,
     shot_period: ShotPeriod = None,
@@ -207,7 +214,7 @@ def simulate(
 
     Example: skinrig simulate flash --out session-flash --subject IV
     """
-    from skinrig.acquisition import names_of, numbers_of, range_of, sequence_of
+    from skinrig.acquisition import amounts_of, names_of, numbers_of, range_of, sequence_of
     from skinrig.consent import subject_of
     from skinrig.simulation import USES, pseudonym, simulate_session
 
@@ -221,6 +228,7 @@ def simulate(
         person=subject_of(pseudonym(subject, seed), consent or USES, consent_expires),
         sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
         relaxation_s=relaxation, subsurface=subsurface, interreflections=interreflections,
+        conditions=amounts_of(condition, "--condition"),
     )  # fmt: skip
     console.say(
         f"{done.session}: {done.frames} frames" + (f", truth in {done.truth}" if done.truth else "")

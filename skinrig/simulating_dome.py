@@ -41,6 +41,7 @@ def simulate_dome(order: Order) -> Simulated:
         "dome", repeats=1, site=None, angles=None, steps=None, sites=None, all_brackets=False,
     )  # fmt: skip
     state = _state(order)
+    conditions = _conditions(order)
     rig = small_dome(
         load_rig("dome"),
         lights=order.lights or LIGHTS[order.size],
@@ -62,6 +63,8 @@ def simulate_dome(order: Order) -> Simulated:
         asked |= {"subsurface": order.subsurface, "interreflections": order.interreflections}
     elif order.subsurface or order.interreflections:
         raise SimulationError("subsurface, interreflections: are of a face; a target has neither")
+    if conditions:
+        asked["conditions"] = conditions
     scene = _scene(rig, order)
     session = open_session(order, plan, rig, asked)
     try:
@@ -121,6 +124,20 @@ def _state(order: Order) -> str:
     if order.target is not None and order.states[0] != "neutral":
         raise SimulationError(f"state: got {order.states[0]!r}, but a target has none")
     return order.states[0]
+
+
+def _conditions(order: Order) -> dict[str, float]:
+    """Return the conditions of the face, checked."""
+    from rigsim.skin_conditions import ConditionError, checked
+
+    if order.target is not None and order.conditions:
+        raise SimulationError(
+            f"condition: got {', '.join(order.conditions)}, but a target has none"
+        )
+    try:
+        return checked(order.conditions)
+    except ConditionError as error:
+        raise SimulationError(str(error)) from error
 
 
 def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, bytes]:
@@ -250,6 +267,7 @@ def _scene(rig: Rig, order: Order) -> Any:
     return DomeScene(
         rig, person, dome=built, motion=motion, state=order.states[0], movement=order.movement,
         seed=order.seed, subsurface=order.subsurface, interreflections=order.interreflections,
+        conditions=order.conditions,
     )  # fmt: skip
 
 

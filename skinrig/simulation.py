@@ -124,6 +124,7 @@ class Order:
     relaxation_s: float | None = None
     subsurface: bool = False
     interreflections: bool = False
+    conditions: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.size not in SIZES:
@@ -170,6 +171,7 @@ def simulate_session(
     relaxation_s: float | None = None,
     subsurface: bool = False,
     interreflections: bool = False,
+    conditions: Mapping[str, float] | None = None,
 ) -> Simulated:
     """Simulate a capture into SESSION/, and write its truth beside it.
 
@@ -236,6 +238,8 @@ def simulate_session(
         Time constant of its blood, s; None: of the state, see `rigsim.perfusion_course`.
     subsurface, interreflections
         Whether light in the dome spreads sideways inside the skin, and goes from skin to skin.
+    conditions
+        Conditions of the face in the dome with their amounts, see `rigsim.skin_conditions`.
 
     Raises
     ------
@@ -251,10 +255,10 @@ def simulate_session(
         steps=steps, sites=None if sites is None else tuple(sites), all_brackets=all_brackets,
         movement=movement, wrapped=wrapped, created=created, person=person, progress=progress,
         sequence=sequence, relaxation_s=relaxation_s, subsurface=subsurface,
-        interreflections=interreflections,
+        interreflections=interreflections, conditions=dict(conditions or {}),
     )  # fmt: skip
     if rig_name != "dome":
-        order.refuse(rig_name, subsurface=False, interreflections=False)
+        order.refuse(rig_name, subsurface=False, interreflections=False, conditions={})
     if sequence is not None and rig_name != "flash":
         raise SimulationError(f"sequence: the {rig_name} rig knows nothing of it; leave it out")
     if sequence is None and relaxation_s is not None:

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, Protocol
 
 import numpy as np
@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from capture.rig import Light, Rig, RigError, View
 from model import spectra
 from model.skin import UNITS, SkinAppearance, SkinMap
-from rigsim import surface_brdf
+from rigsim import skin_conditions, surface_brdf
 from rigsim.atlas import sample, spread, unwrap
 from rigsim.dome_build import BuiltDome
 from rigsim.head_motion import HeadMotion
@@ -46,6 +46,8 @@ from rigsim.surface_brdf import SkinSurface, skin_surface
 from rigsim.targets import Target
 from rigsim.variant import VariantChoice
 
+Float16Array = NDArray[np.float16]
+
 POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of an LED's energy from pulse to pulse."""
 
@@ -55,6 +57,17 @@ HAIR_LIMIT: Final = 0.02
 KEPT_FRAMES: Final = 16
 KEPT_BYTES: Final = 2**28
 """Latest frames that are kept, the more of the two, so that a second exposure costs nothing."""
+
+KEPT_GLOW_BYTES: Final = 2**29
+"""Latest light from inside that is kept: it is the same for all cameras, which ask one after the
+other for many lights."""
+
+HALF_RANGE: Final = 1000.0
+"""Its greatest value where it is kept with 11 bits, which resolve 1e-10 of that."""
+
+
+COATING: Final = ("film", "film_alpha", "film_eta", "powder")
+"""Names of the maps of a coating, in the order of `rigsim.surface_brdf.SkinSurface.packed`."""
 
 
 class SceneError(ValueError):
@@ -100,6 +113,8 @@ class DomeScene:
     movement
         Whether the face moves and wrinkles with the state. A subject that is already posed
         (`Subject.posed`) stays in its pose.
+    conditions
+        Conditions of the skin with their amounts, see `rigsim.skin_conditions`; targets have none.
     sensor
         Sensor of every view; ``None`` takes what each view states.
     seed
@@ -123,6 +138,7 @@ class DomeScene:
         motion: HeadMotion | None = None,
         state: str = "neutral",
         movement: bool = True,
+        conditions: Mapping[str, float] | None = None,
         sensor: Sensor | None = None,
         seed: int = 0,
         interreflections: bool = False,
@@ -145,6 +161,11 @@ class DomeScene:
             dome = BuiltDome(rig, rig, axes)
         self.dome = dome
         self.rig = dome.rig
+        self.conditions = skin_conditions.checked(conditions or {})
+        if isinstance(subject, Subject):
+            subject = skin_conditions.conditioned_subject(subject, self.conditions)
+        elif self.conditions:
+            raise SceneError(f"conditions: got {', '.join(self.conditions)}, but a target has none")
         if movement and isinstance(subject, Subject) and subject.pose is None:
             subject = subject.posed(state)
         self.subject = subject
@@ -165,7 +186,9 @@ class DomeScene:
         self._hits: OrderedDict[tuple[str, float], tuple[Hits, Caster]] = OrderedDict()
         self._bounce: SkinBounce | None = None
         self._bleeding: dict[str, SkinBleeding] = {}
-        self._glow: dict[tuple[str, int, float], Float32Array] = {}
+        self._glow: OrderedDict[tuple[str, int, float], tuple[np.float32, Float16Array]] = (
+            OrderedDict()
+        )
         self._vector: dict[tuple[str, float], VectorLight] = {}
         self._frames: OrderedDict[tuple[str, int, float], Float32Array] = OrderedDict()
 
@@ -312,7 +335,9 @@ class DomeScene:
 
             ``r_d``: factor of the diffuse term, white-balanced, see `rigsim.surface_brdf`;
             ``normals``: unit, rig frame, with relief; ``position_mm``: rig frame;
-            ``roughness``, ``oil``, ``fuzz``: of the surface terms; ``uv``: (H, W, 2);
+            ``roughness``, ``oil``, ``fuzz``: of the surface terms, under a condition also
+            ``film``, ``film_alpha``, ``film_eta``, ``powder`` (`rigsim.surface_brdf.Coating`);
+            ``uv``: (H, W, 2);
             ``hair``: part covered by hair (brows, lashes);
             ``mask``: bool, pixels wholly on skin.
 
@@ -327,10 +352,12 @@ class DomeScene:
         surface = olat.unpack_surface(hits.surface)
         normals = _unit(hits.scatter(hits.normals()))
         maps = hits.scatter(surface)
-        hair = hits.scatter(1.0 - surface[:, 6:])[..., 0]
+        hair = hits.scatter(1.0 - surface[:, 6:7])[..., 0]
         coverage = hits.coverage()
         uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
+        coating = dict(zip(COATING, np.moveaxis(maps, -1, 0)[7:], strict=False))
         return {
+            **coating,
             "r_d": maps[..., :3],
             "normals": normals,
             "position_mm": hits.scatter(hits.position_mm),
@@ -358,7 +385,8 @@ class DomeScene:
             without noise), ``reflectance`` (at normal incidence), ``roughness``, ``oil``, ``fuzz``,
             ``normals_tangent`` (`Subject.tangent_normal`: texture frame, relief and wrinkles alone;
             comparable between states texel by texel); of a face that has moved also
-            ``position_at_rest``; valid on bare skin.
+            ``position_at_rest``, of one under conditions its coating (`Coating`); valid on bare
+            skin. All is that of the skin under its conditions.
         """
         subject = self._face()
         surface = self.surface(self._view(view_name))
@@ -381,6 +409,14 @@ class DomeScene:
                 "texture frame, relief and wrinkles: +x along u, +y along v, +z off the mesh",
             ),
         }
+        if surface.coating is not None:
+            on = surface.coating
+            maps |= {
+                "film": (on.film, "1", "share of the surface under a film"),
+                "film_alpha": (on.film_alpha, "1", "GGX alpha of the film"),
+                "film_eta": (on.film_eta, "1", "refractive index of the film"),
+                "powder": (on.powder, "1", "share of the surface under grains"),
+            }
         if subject.rest is not None:
             where = "rig frame, the same skin before it moved"
             maps["position_at_rest"] = (subject.rest.atlas.position_mm, "mm", where)
@@ -390,7 +426,11 @@ class DomeScene:
                 for name, (values, unit, text) in maps.items()
             },
             "simulated",
-            parameters={"preset": subject.preset, "subject_seed": subject.seed},
+            parameters={
+                "preset": subject.preset,
+                "subject_seed": subject.seed,
+                "conditions": dict(self.conditions),
+            },
             left_out=tuple(self.left_out),
             seed=self.seed,
         )
@@ -426,7 +466,7 @@ class DomeScene:
         texture = self._texture(self._view(view_name))
         points = np.atleast_2d(np.asarray(uv, np.float32))
         values = sample(texture, points, np.ones(len(points), np.bool_))
-        return surface_brdf.evaluate(values[:, :7], _unit(values[:, 7:]), to_light, to_camera)
+        return surface_brdf.evaluate(values[:, :-3], _unit(values[:, -3:]), to_light, to_camera)
 
     # inside -----------------------------------------------------------------------------------
 
@@ -444,16 +484,16 @@ class DomeScene:
             raise SceneError(str(error)) from error
 
     def surface(self, view: View) -> SkinSurface:
-        """Return how the face reflects for a camera."""
+        """Return how the face reflects for a camera, under its conditions."""
         camera = view.spectral_sensitivity
         if camera not in self._surfaces:
-            self._surfaces[camera] = skin_surface(
-                self._face(), camera, self._illuminant, state=self.state
-            )
+            face = self._face()
+            bare = skin_surface(face, camera, self._illuminant, state=self.state)
+            self._surfaces[camera] = skin_conditions.coated(face, bare, self.conditions)
         return self._surfaces[camera]
 
     def _texture(self, view: View) -> Float32Array:
-        """Return the surface and its normals with relief, shape (N, N, 10)."""
+        """Return the surface and its normals with relief, shape (N, N, 10) or (N, N, 14)."""
         camera = view.spectral_sensitivity
         if camera not in self._textures:
             atlas, surface = self._face().atlas, self.surface(view)
@@ -518,10 +558,16 @@ class DomeScene:
             )
         key = (camera, light, t_s)
         if key not in self._glow:
-            self._glow.clear()  # all cameras look at one light before the next
-            self._glow[key] = self._bleeding[camera].glow(self._lamp(light, t_s))
+            glow = self._bleeding[camera].glow(self._lamp(light, t_s))
+            most = max(1, KEPT_GLOW_BYTES // (2 * glow.size))
+            while len(self._glow) >= most:
+                self._glow.popitem(last=False)
+            unit = np.float32(max(float(glow.max()), 1e-30) / HALF_RANGE)
+            self._glow[key] = unit, np.asarray(glow / unit, np.float16)
+        self._glow.move_to_end(key)
+        unit, kept = self._glow[key]
         uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
-        return sample(self._glow[key], uv, np.ones(len(uv), np.bool_))
+        return unit * sample(kept.astype(np.float32), uv, np.ones(len(uv), np.bool_))
 
     def _pose(self, t_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if self.motion is None or not isinstance(self.subject, Subject):
@@ -569,12 +615,12 @@ class DomeScene:
             caster = Caster(mesh, choice=self._caster.choice)
             # The relief turns with the surface below it.
             turned = spread(unwrap(mesh, atlas.size).normal - atlas.normal, atlas.covered)
-            texture = np.concatenate([texture[..., :7], texture[..., 7:] + turned], axis=-1)
+            texture = np.concatenate([texture[..., :-3], texture[..., -3:] + turned], axis=-1)
 
         def look_up(buffers: GBuffer, rows: NDArray[np.int32]) -> tuple[Float32Array, Float32Array]:
             uv = buffers.uv.reshape(-1, 2)[rows]
             values = sample(texture, uv, np.ones(len(rows), np.bool_))
-            return _unit(values[:, 7:]), np.maximum(values[:, :7], 0.0)
+            return _unit(values[:, -3:]), np.maximum(values[:, :-3], 0.0)
 
         hits = olat.find_hits(
             caster,

@@ -19,13 +19,14 @@ from numpy.typing import ArrayLike, NDArray
 from capture.rig import View
 from rigsim.mesh import Float32Array, Int32Array
 from rigsim.render import OFFSET_MM, Caster, GBuffer, g_buffer
-from rigsim.surface_brdf import R_D_LIMIT, boundary, ggx, surface_terms, through
+from rigsim.surface_brdf import R_D_LIMIT, boundary, coated_terms, ggx, surface_terms, through
 
 FloatArray = NDArray[np.float64]
 UInt16Array = NDArray[np.uint16]
 
 LookUp = Callable[[GBuffer, NDArray[np.int32]], tuple[Float32Array, Float32Array]]
-"""Gives the shading normals, shape (n, 3), and the surfaces, shape (n, 7), of a G-buffer's rays."""
+"""Gives the shading normals, shape (n, 3), and the surfaces of a G-buffer's rays, shape (n, 7) or
+with a coating (n, 11)."""
 
 BAND_RAYS: Final = 1 << 20
 """Camera rays worked on at a time; bounds memory at full resolution."""
@@ -46,6 +47,10 @@ FULL: Final = 65535.0
 NORMAL_SCALE: Final = 32767.0
 FUZZ_LIMIT: Final = 0.01
 """Largest optical depth of vellus hair that a row can hold."""
+BARE: Final = 7
+"""Columns of a surface without a coating."""
+ETA_COLUMN: Final = 9
+"""The column that holds the index of a coating's film."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,9 +96,9 @@ class Hits:
     uv: UInt16Array
     """Texture coordinates times `FULL`, shape (n, 2)."""
     surface: UInt16Array
-    """Square roots of r_d over its limit (3), roughness, oil, fuzz over its limit, bare; times
-    `FULL`; shape (n, 7). Matt rows hold their reflectance as r_d, metal ones too and their alpha
-    as roughness."""
+    """Square roots of r_d over its limit (3), roughness, oil, fuzz over its limit, bare; with a
+    coating also film, its alpha, its index - 1, powder; times `FULL`; shape (n, 7) or (n, 11). Matt
+    rows hold their reflectance as r_d, metal ones too and their alpha as roughness."""
     camera_mm: FloatArray
     """Centre of projection, shape (3,)."""
     kind: int
@@ -126,12 +131,14 @@ class Hits:
 
 
 def pack_surface(values: Float32Array) -> UInt16Array:
-    """Return rows of r_d (3), roughness, oil, fuzz, bare as `Hits.surface` holds them."""
+    """Return rows of `rigsim.surface_brdf.SkinSurface.packed` as `Hits.surface` holds them."""
     unit = np.asarray(values, np.float32).copy()
     if not (np.isfinite(unit).all() and unit.min(initial=0.0) >= 0.0):
         raise ValueError("surface: got values that are negative or not finite, expected >= 0")
     unit[:, :3] = np.sqrt(unit[:, :3] / np.float32(R_D_LIMIT))
     unit[:, 5] /= np.float32(FUZZ_LIMIT)
+    if unit.shape[1] > BARE:
+        unit[:, ETA_COLUMN] = np.maximum(unit[:, ETA_COLUMN] - np.float32(1.0), 0.0)
     if unit.max(initial=0.0) > 1.0 + 1e-6:
         raise ValueError(f"surface: got {unit.max(axis=0)} of its limits, expected at most 1")
     return np.rint(np.minimum(unit, 1.0) * np.float32(FULL)).astype(np.uint16)
@@ -142,6 +149,8 @@ def unpack_surface(surface: UInt16Array) -> Float32Array:
     unit = np.asarray(surface, np.float32) / np.float32(FULL)
     unit[:, :3] = np.float32(R_D_LIMIT) * unit[:, :3] ** 2
     unit[:, 5] *= np.float32(FUZZ_LIMIT)
+    if unit.shape[1] > BARE:
+        unit[:, ETA_COLUMN] += np.float32(1.0)
     return unit
 
 
@@ -163,7 +172,7 @@ def find_hits(
     view
         The camera, in the frame of the mesh.
     look_up
-        Gives shading normals (n, 3) and surfaces (n, 7) for a G-buffer's rows.
+        Gives shading normals (n, 3) and surfaces, (n, 7) or (n, 11), for a G-buffer's rows.
     subpixels
         Rays along each side of a pixel.
     kind
@@ -470,7 +479,13 @@ def _shade(  # type: ignore[no-untyped-def]
                 blue += lobe * r2
                 continue
             oil, fuzz, bare = surface[i, 4] / FULL, surface[i, 5] / FULL, surface[i, 6] / FULL
-            lobe = surface_terms(nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz)
+            if surface.shape[1] > BARE:
+                lobe = coated_terms(
+                    nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz, surface[i, 7] / FULL,
+                    surface[i, 8] / FULL, 1.0 + surface[i, 9] / FULL, surface[i, 10] / FULL,
+                )  # fmt: skip
+            else:
+                lobe = surface_terms(nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz)
             gloss = math.pi * strength * bare * lobe
             inside = strength * boundary(nl, nv) if diffuse else 0.0
             red += gloss + inside * r0

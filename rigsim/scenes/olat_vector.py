@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from rigsim.mesh import Float32Array
 from rigsim.render import Caster, load
 from rigsim.scenes.olat import (
+    BARE,
     DISC_POINTS,
+    ETA_COLUMN,
     FULL,
     FUZZ_LIMIT,
     Hits,
@@ -26,7 +28,14 @@ from rigsim.scenes.olat import (
     sum_rows,
 )
 from rigsim.skin_layers import ETA
-from rigsim.surface_brdf import ETA_OIL, FUZZ_ALBEDO, OIL_SMOOTHING, R_D_LIMIT
+from rigsim.surface_brdf import (
+    ETA_OIL,
+    FUZZ_ALBEDO,
+    OIL_SMOOTHING,
+    POWDER_ALBEDO,
+    POWDER_ASYMMETRY,
+    R_D_LIMIT,
+)
 
 
 class VectorLight:
@@ -46,10 +55,10 @@ class VectorLight:
         self.hits = hits
         mi = load(self._choice)
         self._start = mi.Point3f(*_columns(lift(hits, caster)))
-        # Normal, r_d, roughness, oil, fuzz, bare as ten half words: a dome holds sixteen views.
+        # Normal and surface as ten half words, or fourteen: a dome holds sixteen views.
         halves = np.concatenate([hits.normal.view(np.uint16), hits.surface], axis=1)
         words = np.ascontiguousarray(halves).view(np.uint32)
-        self._words = [mi.UInt32(np.ascontiguousarray(words[:, k])) for k in range(5)]
+        self._words = [mi.UInt32(np.ascontiguousarray(words[:, k])) for k in range(words.shape[1])]
         self._across, self._along = (mi.Float(points) for points in disc_points(DISC_POINTS))
 
     def light_up(
@@ -86,7 +95,7 @@ class VectorLight:
 
         side, other = lamp.radii()
         center, axis = vector(lamp.position_mm), vector(lamp.axis)
-        normal, (red, green, blue, roughness, oil, fuzz, bare) = self._unpacked(dr, mi)
+        normal, (red, green, blue, roughness, oil, fuzz, bare, *coating) = self._unpacked(dr, mi)
         slot = dr.arange(mi.UInt32, len(self.hits.position_mm)) % DISC_POINTS
         across = dr.gather(mi.Float, self._across, slot)
         along = dr.gather(mi.Float, self._along, slot)
@@ -112,8 +121,15 @@ class VectorLight:
         cl, cv = dr.maximum(nl, 1e-6), dr.maximum(nv, 1e-6)
         surface = (1.0 - oil) * _fresnel(dr, lh, ETA) * _beckmann(dr, cl, cv, nh, roughness)
         surface += oil * _fresnel(dr, lh, ETA_OIL) * _ggx(dr, cl, cv, nh, OIL_SMOOTHING * roughness)
+        if coating:
+            film, alpha, eta, _ = coating
+            surface *= 1.0 - film
+            surface += film * _fresnel(dr, lh, eta) * _ggx(dr, cl, cv, nh, dr.maximum(alpha, 0.01))
         through = 1.0 - dr.exp(-fuzz * (1.0 / cl + 1.0 / cv))
         surface += FUZZ_ALBEDO / (4.0 * math.pi) * through / (cl + cv)
+        if coating:
+            powder = coating[3]
+            surface = (1.0 - powder) * surface + powder * _grains(cl, cv, lh)
         # Where not both are above, the half vector may lie in the surface: 0 * inf.
         gloss = dr.select(active, math.pi * strength * bare * surface, 0.0)
         leaving = 1.0 - _fresnel(dr, cv, ETA)
@@ -130,7 +146,7 @@ class VectorLight:
         return sum_rows(self.hits, r, g, b, color)
 
     def _unpacked(self, dr: Any, mi: Any) -> tuple[Any, list[Any]]:
-        """Return unit normals, and r_d (3), roughness, oil, fuzz, bare."""
+        """Return unit normals, and the columns of `rigsim.surface_brdf.SkinSurface.packed`."""
         low = [word & 0xFFFF for word in self._words]
         high = [word >> 16 for word in self._words]
         halves = [half for pair in zip(low, high, strict=True) for half in pair]
@@ -139,14 +155,24 @@ class VectorLight:
         normal = dr.normalize(mi.Vector3f(*(mi.Float(half) for half in signed)))
         unit = [mi.Float(half) * (1.0 / FULL) for half in halves[3:]]
         colors = [R_D_LIMIT * root * root for root in unit[:3]]
-        return normal, [*colors, unit[3], unit[4], FUZZ_LIMIT * unit[5], unit[6]]
+        known = [*colors, unit[3], unit[4], FUZZ_LIMIT * unit[5], *unit[6:]]
+        if len(known) > BARE:
+            known[ETA_COLUMN] = 1.0 + known[ETA_COLUMN]
+        return normal, known
 
 
 def _columns(rows: Float32Array) -> list[Float32Array]:
     return [np.ascontiguousarray(rows[:, k], np.float32) for k in range(rows.shape[1])]
 
 
-def _fresnel(dr: Any, cosine: Any, eta: float) -> Any:
+def _grains(nl: Any, nv: Any, lh: Any) -> Any:
+    g = POWDER_ASYMMETRY
+    spread = 1.0 + g * g - 2.0 * g * (1.0 - 2.0 * lh * lh)
+    phase = (1.0 - g * g) / (spread * spread**0.5)
+    return POWDER_ALBEDO / (4.0 * math.pi) * phase / (nl + nv)
+
+
+def _fresnel(dr: Any, cosine: Any, eta: Any) -> Any:
     c = dr.clip(cosine, 0.0, 1.0)
     inside = dr.sqrt(1.0 - (1.0 - c * c) / (eta * eta))
     rs = (c - eta * inside) / (c + eta * inside)

@@ -316,6 +316,37 @@ def test_the_vectorized_kernel_and_the_plain_one_agree(rig, face, scene):
         assert agree.mean() > 0.995
 
 
+def test_both_kernels_agree_on_skin_under_a_coating(rig, face):
+    """A film over the oil and grains over both, by two codes of one formula."""
+    if not choose_variant("rgb").is_vectorized:
+        pytest.skip("no LLVM: there is one kernel only")
+    on = {"lotion": 0.8, "powder": 0.5}
+    plain = VariantChoice("scalar_rgb", "asked for by the test", "")
+    scenes = [DomeScene(rig, face, conditions=on, choice=c) for c in (None, plain)]
+    bare = DomeScene(rig, face)
+    for light in (0, 3):
+        one, two = (scene.radiance("C", [light])[0] for scene in scenes)
+        assert one.sum() == pytest.approx(two.sum(), rel=2e-3)
+        assert (np.abs(one - two) < 1e-4 * two.max()).mean() > 0.995
+        assert np.abs(one - bare.radiance("C", [light])[0]).max() > 0.05 * one.max()
+
+
+def test_a_condition_is_in_the_truth(rig, face):
+    scene = DomeScene(rig, face, conditions={"sweat": 0.5})
+    truth, maps = scene.truth(), scene.truth_appearance()
+    inside = truth["mask"]
+    np.testing.assert_allclose(truth["film_eta"][inside], 1.333, atol=2e-3)
+    assert 0.05 < truth["film"][inside].mean() < 0.5
+    assert {"film", "film_alpha", "film_eta", "powder"} <= set(maps.maps)
+    assert maps.parameters["conditions"] == {"sweat": 0.5}
+    uv = truth["uv"][inside][::50]
+    up = truth["normals"][inside][::50]
+    total, specular = scene.brdf(uv, up, up)
+    assert np.all(total[:, 0] > specular)
+    with pytest.raises(SceneError, match="conditions: got hot"):
+        DomeScene(rig, make_target("white"), conditions={"hot": 1.0})
+
+
 def test_what_cannot_be_is_refused(rig, face, scene):
     with pytest.raises(SceneError, match="is no LED"):
         DomeScene(load_rig("flash").resized(64), face)

@@ -1,0 +1,212 @@
+"""What conditions and coatings do to skin: energy, reciprocity, directions of change, extremes."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from rigsim import surface_brdf
+from rigsim.skin_conditions import (
+    CONDITIONS,
+    ConditionError,
+    coated,
+    conditioned,
+    conditioned_subject,
+    conditioned_surface,
+)
+from rigsim.subject import make_subject
+from rigsim.surface_brdf import Coating, SurfaceError
+
+CAMERA, LIGHT = "Nikon 5100 (NPL)", "LED-B3"
+UP = np.array([0.0, 0.0, 1.0])
+ETA = {"water": 1.333, "lotion": 1.45, "foundation": 1.5}
+
+
+@pytest.fixture(scope="module")
+def face():
+    return make_subject("II", seed=2, size=64)
+
+
+@pytest.fixture(scope="module")
+def bare(face):
+    return surface_brdf.skin_surface(face, CAMERA, LIGHT)
+
+
+def gloss(surface, light, view, points):
+    """Return the mean surface term of the chosen texels, 1/sr."""
+    return surface_brdf.evaluate(surface.packed()[points], UP, light, view)[1].mean()
+
+
+def slanted(angle_deg, turn_deg=0.0):
+    angle, turn = math.radians(angle_deg), math.radians(turn_deg)
+    return np.array(
+        [math.sin(angle) * math.cos(turn), math.sin(angle) * math.sin(turn), math.cos(angle)]
+    )
+
+
+def hemisphere(polar=200, around=256):
+    """Return directions and weights of solid angle times cosine; Gauss in cosine squared."""
+    node, weight = np.polynomial.legendre.leggauss(polar)
+    sine2 = 0.5 * (node + 1.0)
+    phi = 2.0 * np.pi * (np.arange(around) + 0.5) / around
+    sine, cosine = np.sqrt(sine2)[:, None], np.sqrt(1.0 - sine2)[:, None]
+    way = np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine * np.ones_like(phi)], axis=-1)
+    return way.reshape(-1, 3), np.repeat(weight * 0.5 * math.pi / around, around)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 40.0, 70.0, 85.0])
+@pytest.mark.parametrize("powder", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize(("eta", "alpha"), [(1.333, 0.09), (1.5, 0.3)])
+def test_coated_skin_sends_back_less_light_than_it_gets(angle_deg, powder, eta, alpha):
+    """The whitest that there is: R_d of 0.9 under a whole film, or of powder's own under grains."""
+    way, weight = hemisphere()
+    r_d = (1.0 - powder) * 0.9 + powder * 0.55
+    packed = [r_d, r_d, r_d, 0.3, 0.6, surface_brdf.FUZZ_DEPTH, 1.0, 1.0, alpha, eta, powder]
+    total, specular = surface_brdf.evaluate(packed, UP, slanted(angle_deg), way)
+    assert 0.0 < weight @ specular
+    assert weight @ total[:, 0] < 1.0
+
+
+def test_light_and_camera_may_change_places_on_coated_skin(rng):
+    way = rng.standard_normal((500, 2, 3))
+    way[..., 2] = np.abs(way[..., 2]) + 1e-3
+    way /= np.linalg.norm(way, axis=-1, keepdims=True)
+    low = np.array([0, 0, 0, 0.1, 0, 0, 0, 0, 0.05, 1.2, 0])
+    high = np.array([1, 1, 1, 0.5, 0.6, 0.003, 1, 1, 0.6, 1.7, 1])
+    packed = rng.uniform(low, high, (500, 11))
+    there = surface_brdf.evaluate(packed, UP, way[:, 0], way[:, 1])
+    back = surface_brdf.evaluate(packed, UP, way[:, 1], way[:, 0])
+    for a, b in zip(there, back, strict=True):
+        np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-7)
+
+
+def test_a_film_of_nothing_and_no_grains_are_bare_skin(rng):
+    way, _ = hemisphere(12, 16)
+    bare = [0.5, 0.4, 0.3, 0.3, 0.3, 0.001, 0.9]
+    one = surface_brdf.evaluate(bare, UP, slanted(50.0), way)
+    two = surface_brdf.evaluate([*bare, 0.0, 0.2, 1.4, 0.0], UP, slanted(50.0), way)
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def test_grains_alone_follow_the_closed_form_of_a_thick_layer():
+    """Light from above and back: w p(pi) / (4 pi 2), p = (1 - g^2) / (1 + g)^3 for g < 0."""
+    g, w = surface_brdf.POWDER_ASYMMETRY, surface_brdf.POWDER_ALBEDO
+    packed = [0.0, 0.0, 0.0, 0.3, 0.2, 0.0, 1.0, 0.0, 0.2, 1.4, 1.0]
+    back = surface_brdf.evaluate(packed, UP, UP, UP)[1][0]
+    assert back == pytest.approx(w * (1.0 - g * g) / (1.0 + g) ** 3 / (8.0 * math.pi), rel=1e-5)
+    way, weight = hemisphere(64, 128)
+    for angle in (0.0, 40.0, 85.0):
+        sent = weight @ surface_brdf.evaluate(packed, UP, slanted(angle), way)[1]
+        assert sent < w
+        # grains that scatter evenly send back w / 2 (1 - c ln(1 + 1 / c)); these ones more
+        c = math.cos(math.radians(angle))
+        if angle < 60.0:
+            assert sent > 0.5 * w * (1.0 - c * math.log1p(1.0 / c))
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+def test_nothing_of_a_condition_is_the_surface_itself(condition, face, bare):
+    assert conditioned(bare, condition, 0.0) is bare
+    assert coated(face, bare, {condition: 0.0}) is bare
+    assert conditioned_subject(face, {condition: 0.0}) is face
+
+
+def test_normal_is_the_surface_itself(face, bare):
+    assert conditioned(bare, "normal") is bare
+    again = conditioned_surface(face, CAMERA, LIGHT, {"normal": 1.0})
+    np.testing.assert_array_equal(again.packed(), bare.packed())
+
+
+def test_films_shine_more_in_the_mirror_direction_and_powder_and_cold_less(face, bare):
+    points = face.hair == 0.0
+    light, view = slanted(30.0), slanted(30.0, 180.0)
+    before = gloss(bare, light, view, points)
+    now = {
+        name: gloss(conditioned_surface(face, CAMERA, LIGHT, {name: 1.0}), light, view, points)
+        for name in CONDITIONS
+    }
+    assert now["cold"] < before < now["hot"] < now["sweat"]
+    assert now["lotion"] > 1.5 * before
+    assert now["powder"] < 0.8 * before
+
+
+def test_powder_throws_light_back_to_where_it_came_from(face, bare):
+    points = face.hair == 0.0
+    light = slanted(65.0)
+    powdered = conditioned_surface(face, CAMERA, LIGHT, {"powder": 1.0})
+    assert gloss(powdered, light, light, points) > 2.0 * gloss(bare, light, light, points)
+
+
+def test_heat_reddens_and_cold_pales(face, bare):
+    skin = (face.hair == 0.0) & face.atlas.covered
+    ratio = {
+        name: np.median((s.r_d[..., 0] / s.r_d[..., 1])[skin])
+        for name, s in (
+            ("normal", bare),
+            *((n, conditioned_surface(face, CAMERA, LIGHT, {n: 1.0})) for n in ("hot", "cold")),
+        )
+    }
+    assert ratio["cold"] < 0.995 * ratio["normal"]
+    assert ratio["hot"] > 1.005 * ratio["normal"]
+
+
+def test_makeup_evens_the_color_out_and_covers_towards_its_own(face, bare):
+    skin = (face.hair == 0.0) & face.atlas.covered
+    even = conditioned(bare, "makeup")
+    assert np.all(even.r_d[skin].std(axis=0) < 0.4 * bare.r_d[skin].std(axis=0))
+    np.testing.assert_allclose(
+        np.median(even.r_d[skin], axis=0), np.median(bare.r_d[skin], axis=0), rtol=0.01
+    )
+    bronze = conditioned(bare, "makeup", foundation=[0.4, 0.2, 0.1])
+    gap = np.abs(bare.r_d - [0.4, 0.2, 0.1])[skin]
+    np.testing.assert_allclose(np.abs(bronze.r_d - [0.4, 0.2, 0.1])[skin], 0.3 * gap, atol=1e-5)
+
+
+def test_more_of_it_is_more(face, bare):
+    film = [conditioned(bare, "lotion", a).coating.film.mean() for a in (0.3, 0.6, 1.0)]
+    np.testing.assert_allclose(np.array(film) / film[-1], [0.3, 0.6, 1.0], rtol=1e-5)
+
+
+def test_one_film_over_another_covers_what_it_left(bare):
+    both = conditioned(conditioned(bare, "lotion"), "sweat").coating
+    assert both.film.mean() == pytest.approx(1.0 - 0.25 * 0.3, rel=1e-5)
+    assert ETA["water"] < both.film_eta.mean() < ETA["lotion"]
+
+
+def test_the_darkest_face_under_everything_stays_in_range(face):
+    dark = make_subject("darkest", seed=1, size=64)
+    surface = conditioned_surface(dark, CAMERA, LIGHT, dict.fromkeys(CONDITIONS, 1.0))
+    packed = surface.packed()
+    assert np.isfinite(packed).all()
+    assert packed.min() >= 0.0
+    total, specular = surface_brdf.evaluate(packed.reshape(-1, 11), UP, slanted(40.0), UP)
+    assert np.all(total >= specular[:, None])
+
+
+def test_a_posed_face_keeps_its_pose_under_a_condition(face):
+    smiling = face.posed("smile")
+    hot = conditioned_subject(smiling, {"hot": 1.0})
+    assert hot.pose is smiling.pose
+    assert hot.hemoglobin().mean() > 1.1 * smiling.hemoglobin().mean()
+    assert hot.rest.hemoglobin().mean() == pytest.approx(hot.hemoglobin().mean())
+
+
+@pytest.mark.parametrize(
+    ("condition", "amount", "match"),
+    [("mud", 1.0, "mud"), ("hot", 1.2, "amount of hot: got 1.2"), ("hot", math.nan, "nan")],
+)
+def test_an_unknown_condition_is_refused(condition, amount, match, bare):
+    with pytest.raises(ConditionError, match=match):
+        conditioned(bare, condition, amount)
+
+
+def test_a_coating_or_foundation_out_of_range_is_refused(bare):
+    even = np.ones((4, 4), np.float32)
+    with pytest.raises(SurfaceError, match="film_eta: got"):
+        Coating(even, 0.2 * even, even, even)
+    with pytest.raises(SurfaceError, match="powder: got"):
+        Coating(even, 0.2 * even, 1.4 * even, dataclasses.replace(bare).oil)
+    with pytest.raises(ConditionError, match="foundation"):
+        conditioned(bare, "makeup", foundation=[2.0, 0.0, 0.0])
