@@ -97,7 +97,9 @@ class TraitSpace:
     seed: int
     names: tuple[str, ...] = ()
     notes: Mapping[str, str] = field(default_factory=dict)
-    """What to know about the space, such as errors of storage."""
+    """What else to know about the samples."""
+    storage_error: Mapping[str, float] = field(default_factory=dict)
+    """Relative error that storing has left in each trait's vector; empty in a fresh space."""
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit each other."""
@@ -244,12 +246,15 @@ class TraitSpace:
         return self.traits[name]
 
     def mean_with(self, name: str) -> FloatArray:
-        """Return the mean sample of those with a binary trait, (d,)."""
+        """Return the mean sample of those with a binary trait, (d,), as far as the space holds it.
+
+        The nearest sample of the feasible set, where the space is too small to hold the mean.
+        """
         trait = self.trait(name)
         if trait.kind != "binary":
             raise TraitError(f"trait: got {name!r}, a continuous one, expected one with a group")
         share = trait.others / (trait.members + trait.others)
-        return np.asarray(self.center + share * trait.vector)
+        return self.feasible.project(self.center + share * trait.vector, self._products())
 
     def cosine(self, name: str, direction: ArrayLike) -> float:
         """Return the cosine between a trait's vector and a direction (d,), under the metric."""
@@ -335,10 +340,13 @@ class TraitSpace:
         if not any(amounts.values()):
             zero = np.zeros_like(moved)
             return EditOutcome(given.astype(dtype), zero, zero, zero)
-        metric = self.metric if self.metric is not None and self.metric.ndim == 2 else None
-        found = self.feasible.project(wanted, metric)
+        found = self.feasible.project(wanted, self._products())
         clipped = reduced_spaces.lengths(found - wanted, self.metric)
         return EditOutcome(found.astype(dtype), moved, clipped, clipped)
+
+    def _products(self) -> FloatArray | None:
+        """Return the metric where it joins several numbers; weights alone move no projection."""
+        return self.metric if self.metric is not None and self.metric.ndim == 2 else None
 
     def _mixed(self, s: FloatArray, amounts: Mapping[str, float]) -> FloatArray:
         total = sum(amounts.values())
