@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import float32, njit
 
-from model.dipole_sum import FINE, UNREACHED
+from model.dipole_sum import FINE, OWN, UNREACHED
 from model.source_tree_kernels import AREA, RADIUS, REACH, SPREAD
 
 BUFFER = 512
@@ -64,6 +64,19 @@ def _far(count, away2, area, light, pull, sigma, depth, height, scale, total):  
 
 
 @njit(error_model="numpy")
+def _disc(r2, sigma, depth, height, scale):  # type: ignore[no-untyped-def]
+    """Return the profile at a radius, and the share of light within it."""
+    value = within = 0.0
+    for z in (depth, height):
+        d = max(math.sqrt(r2 + z * z), 1e-300)
+        x = sigma * d
+        e = math.exp(-x) * z / d
+        value += (1.0 + x) * e / (d * d)
+        within += math.exp(-sigma * z) - e
+    return scale / _TWO_PI * value, scale * within
+
+
+@njit(error_model="numpy")
 def _near(count, away2, reach, area, light, sigma, depth, height, scale, own, total):  # type: ignore[no-untyped-def]
     """Add light and mass of sources within their reach, float64; see `dipole_sum.kernel`.
 
@@ -73,22 +86,20 @@ def _near(count, away2, reach, area, light, sigma, depth, height, scale, own, to
         a = reach[i]
         fine = a <= FINE * depth
         r2 = float(away2[i]) if fine else a * a
-        value = within = 0.0
-        for z in (depth, height):
-            d = max(math.sqrt(r2 + z * z), 1e-300)
-            x = sigma * d
-            e = math.exp(-x) * z / d
-            value += (1.0 + x) * e / (d * d)
-            within += math.exp(-sigma * z) - e
-        value *= scale / _TWO_PI
+        value, within = _disc(r2, sigma, depth, height, scale)
         total[1] += value * area[i]
         total[0] += value * light[i]
         if not fine:
             disc = math.pi * r2
-            bump = 3.0 * (scale * within - disc * value) / disc
-            bump *= (1.0 - away2[i] / r2) ** 2 * area[i]
-            total[1] += bump
-            total[0] += bump * (own if own == own else light[i] / area[i])
+            missing = within - disc * value
+            shape = 3.0 / disc * (1.0 - away2[i] / r2) ** 2
+            total[1] += shape * missing * area[i]
+            total[0] += shape * missing * light[i]
+            if own == own:
+                r2 *= OWN * OWN
+                value, within = _disc(r2, sigma, depth, height, scale)
+                missing = within - math.pi * r2 * value
+                total[0] += shape * missing * (own * area[i] - light[i])
 
 
 @njit

@@ -29,6 +29,8 @@ FloatArray = NDArray[np.float64]
 
 REACH = 2.0
 """Reach of a source in sides of a square of its area: twelve sources tell the light at a point."""
+OWN = 0.25
+"""Part of its reach, half a source's side, within which a source counts as the exit point's own."""
 FINE = 1e-4
 """Below this part of the source's depth a reach changes nothing, and rounding would."""
 UNREACHED = 1e-10
@@ -131,13 +133,30 @@ def kernel(radius_mm: ArrayLike, reach_mm: ArrayLike, media: Media) -> FloatArra
     radius_mm, reach_mm
         Distance and reach of the source, mm; broadcast with the media.
     """
+    carried, own = kernel_parts(radius_mm, reach_mm, media)
+    return carried + own
+
+
+def kernel_parts(
+    radius_mm: ArrayLike, reach_mm: ArrayLike, media: Media
+) -> tuple[FloatArray, FloatArray]:
+    """Return the kernel in two parts: `own` is light that comes out nearer than sources can tell.
+
+    It is the part of the bump that a reach of a quarter would have.
+    """
     r, a = np.asarray(radius_mm, np.float64), np.asarray(reach_mm, np.float64)
     inside = (r < a) & (a > FINE * media.depth_mm)
-    edge = profile(np.where(a > 0.0, a, 1.0), media)
-    area = np.pi * np.where(a > 0.0, a, 1.0) ** 2
-    missing = share_within(a, media) - area * edge
-    bump = np.where(inside, 3.0 * missing / area * (1.0 - (r / np.where(a > 0, a, 1)) ** 2) ** 2, 0)
-    return np.asarray(np.where(inside, edge + bump, profile(r, media)))
+    a = np.where(a > 0.0, a, 1.0)
+    edge, missing = profile(a, media), _missing(a, media)
+    shape = np.where(inside, 3.0 / (np.pi * a**2) * (1.0 - (r / a) ** 2) ** 2, 0.0)
+    own = _missing(OWN * a, media)
+    far = np.where(inside, edge, profile(r, media))
+    return np.asarray(far + shape * (missing - own)), np.asarray(shape * own)
+
+
+def _missing(reach_mm: FloatArray, media: Media) -> FloatArray:
+    """Return the share of light within a reach above that of an even disc as at its edge."""
+    return share_within(reach_mm, media) - np.pi * reach_mm**2 * profile(reach_mm, media)
 
 
 def exitance_directly(
@@ -150,6 +169,7 @@ def exitance_directly(
     *,
     eta: float = fresnel.ETA_SKIN,
     normalize: bool = True,
+    entered_at: ArrayLike | None = None,
 ) -> FloatArray:
     """Sum over all sources for every exit point; see `model.dipole_gather.exitance`.
 
@@ -159,6 +179,7 @@ def exitance_directly(
     area, light = np.asarray(source_area_mm2, np.float64), np.asarray(entered, np.float64)
     albedo = np.broadcast_to(np.asarray(r_d, np.float64), (len(at), 3))
     length = np.broadcast_to(np.asarray(translucency_mm, np.float64), (len(at), 3))
+    own = None if entered_at is None else np.asarray(entered_at, np.float64)
     reach = REACH * np.sqrt(area)
     found = np.zeros((len(at), 3))
     if not len(source):
@@ -173,8 +194,9 @@ def exitance_directly(
         nearest = light[np.argmin(away, axis=1)]
         for c in range(3):
             media = Media.of(albedo[part, c, None], length[part, c, None], eta=eta)
-            share = kernel(away, reach, media) * area
-            mass, total = share.sum(axis=1), share @ light[:, c]
+            carried, near = (share * area for share in kernel_parts(away, reach, media))
+            mass, total = (carried + near).sum(axis=1), carried @ light[:, c]
+            total += near @ light[:, c] if own is None else near.sum(axis=1) * own[part, c]
             if normalize:
                 reached = mass > UNREACHED
                 total = np.where(reached, total / np.where(reached, mass, 1.0), nearest[:, c])
