@@ -1,0 +1,166 @@
+"""Loops over the values of one response: counting them in bins, moving them to other ranks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+CELLS = 16384
+"""Even cells over the edges, in each of which a table bounds the bin."""
+EQUAL = 1e-12
+"""Shares that differ by less are rounding: far below the share of one texel."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bound_bins(edges: Any, count: int, scale: float, least: Any, most: Any) -> None:
+    """Bound the bin of all values in each cell.
+
+    Parameters
+    ----------
+    edges : (n,) float64
+        Not falling; the first ``count`` count.
+    scale : float
+        Cells per unit from the first edge on.
+    least, most : (CELLS,) int, written
+        A value's cell and an edge's are found by the same arithmetic, which keeps their order:
+        edges of cells before are certainly below the value, those of later ones above.
+    """
+    passed = 0
+    for cell in range(CELLS):
+        least[cell] = max(passed - 1, 0)
+        while passed < count and (edges[passed] - edges[0]) * scale < cell + 1:
+            passed += 1
+        most[cell] = max(passed - 1, 0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def find(x: Any, edges: Any, count: int, scale: float, least: Any, most: Any) -> int:
+    """Return which of the first ``count`` edges is the last at or below ``x``; the first if none.
+
+    Parameters as of `bound_bins`.
+    """
+    cell = (x - edges[0]) * scale
+    if not cell >= 0.0:
+        return 0
+    if cell >= CELLS:
+        return count - 1
+    low, high = least[int(cell)], most[int(cell)]
+    while low < high:
+        middle = (low + high + 1) // 2
+        if edges[middle] <= x:
+            low = middle
+        else:
+            high = middle - 1
+    return low
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def count(
+    values: Any, weights: Any, edges: Any, scale: float, least: Any, most: Any, sums: Any
+) -> Any:
+    """Add the weights of values to their bins; the end bins take what lies beyond.
+
+    Parameters
+    ----------
+    values : (n,) float
+    weights : (n,) float, or empty: all 1
+    edges : (B + 1,) float64, rising
+    scale, least, most
+        Of the first B edges (`bound_bins`).
+    sums : (B,) float64, added to
+
+    Returns
+    -------
+    tuple
+        Weight below and above the edges, least and largest value of a weight above 0, sum of
+        squared weights.
+    """
+    B = edges.size - 1
+    below, above, squares = 0.0, 0.0, 0.0
+    lowest, highest = np.inf, -np.inf
+    for k in range(values.size):
+        weight = 1.0
+        if weights.size:
+            weight = float(weights[k])
+            if weight <= 0.0:
+                continue
+        x = float(values[k])
+        sums[find(x, edges, B, scale, least, most)] += weight
+        squares += weight * weight
+        lowest, highest = min(lowest, x), max(highest, x)
+        if x < edges[0]:
+            below += weight
+        if x > edges[B]:
+            above += weight
+    return below, above, lowest, highest, squares
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def plan(source: Any, target: Any, edges: Any, begin: Any, end: Any, to: Any, slope: Any) -> int:
+    """Lay out the rising, piecewise straight map from one distribution to another.
+
+    Parameters
+    ----------
+    source, target : (B + 1,) float64
+        Cumulated shares at the edges, from 0 to 1, straight in between.
+    edges : (B + 1,) float64
+    begin, end, to, slope : (2 B + 2,) float64, written
+        Pieces: values from ``begin`` to ``end`` go to ``to`` and on with ``slope``.
+
+    Returns
+    -------
+    int
+        Number of pieces.
+    """
+    B = edges.size - 1
+    i, j, pieces, rank = 0, 0, 0, 0.0
+    while i < B and j < B:
+        if source[i + 1] <= rank:
+            i += 1
+            continue
+        if target[j + 1] <= rank + EQUAL:
+            j += 1
+            continue
+        # ends that differ by rounding are one: else bins left empty would be crossed
+        until = source[i + 1]
+        if target[j + 1] < until - EQUAL:
+            until = target[j + 1]
+        share, width = source[i + 1] - source[i], edges[i + 1] - edges[i]
+        begin[pieces] = edges[i] + width * ((rank - source[i]) / share)
+        end[pieces] = edges[i] + width * ((until - source[i]) / share)
+        share, width = target[j + 1] - target[j], edges[j + 1] - edges[j]
+        first = min(max((rank - target[j]) / share, 0.0), 1.0)
+        last = min(max((until - target[j]) / share, 0.0), 1.0)
+        to[pieces] = edges[j] + width * first
+        reach = end[pieces] - begin[pieces]
+        gain = edges[j] + width * last - to[pieces]
+        slope[pieces] = gain / reach if reach > 0.0 else 0.0
+        pieces += 1
+        rank = until
+    return pieces
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def move(values: Any, source: Any, target: Any, edges: Any, out: Any) -> None:
+    """Write each value's counterpart of the same rank under the target's distribution.
+
+    Parameters
+    ----------
+    values : (n,) float
+    source, target, edges
+        As of `plan`; the edges reach to where the values end.
+    out : (n,) float, written
+    """
+    size = 2 * edges.size
+    begin, end, to, slope = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    pieces = plan(source, target, edges, begin, end, to, slope)
+    reach = end[pieces - 1] - begin[0]
+    scale = CELLS / reach if reach > 0.0 else 0.0
+    least, most = np.empty(CELLS, np.int16), np.empty(CELLS, np.int16)
+    bound_bins(begin, pieces, scale, least, most)
+    for k in range(values.size):
+        x = float(values[k])
+        p = find(x, begin, pieces, scale, least, most)
+        out[k] = to[p] + slope[p] * (min(max(x, begin[p]), end[p]) - begin[p])
