@@ -36,36 +36,31 @@ def bound_bins(edges: Any, count: int, scale: float, least: Any, most: Any) -> N
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find(x: Any, edges: Any, count: int, scale: float, least: Any, most: Any) -> int:
-    """Return which of the first ``count`` edges is the last at or below ``x``; the first if none.
+def find(x: float, edges: Any, scale: float, least: Any, most: Any) -> int:
+    """Return which edge is the last at or below ``x``; the first if none is.
 
     Parameters as of `bound_bins`.
     """
-    cell = (x - edges[0]) * scale
-    if not cell >= 0.0:
-        return 0
-    if cell >= CELLS:
-        return count - 1
-    low, high = least[int(cell)], most[int(cell)]
-    while low < high:
+    cell = int(min(max((x - edges[0]) * scale, 0.0), CELLS - 1.0))
+    low, high = int(least[cell]), int(most[cell])
+    while high - low > 8:
         middle = (low + high + 1) // 2
         if edges[middle] <= x:
             low = middle
         else:
             high = middle - 1
+    while low < high and edges[low + 1] <= x:
+        low += 1
     return low
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def count(
-    values: Any, weights: Any, edges: Any, scale: float, least: Any, most: Any, sums: Any
-) -> Any:
-    """Add the weights of values to their bins; the end bins take what lies beyond.
+def count(values: Any, edges: Any, scale: float, least: Any, most: Any, sums: Any) -> Any:
+    """Count values in bins; the end bins take what lies beyond.
 
     Parameters
     ----------
     values : (n,) float
-    weights : (n,) float, or empty: all 1
     edges : (B + 1,) float64, rising
     scale, least, most
         Of the first B edges (`bound_bins`).
@@ -74,25 +69,40 @@ def count(
     Returns
     -------
     tuple
-        Weight below and above the edges, least and largest value of a weight above 0, sum of
-        squared weights.
+        Values below and above the edges, least and largest value.
     """
-    B = edges.size - 1
-    below, above, squares = 0.0, 0.0, 0.0
-    lowest, highest = np.inf, -np.inf
+    bottom, top = edges[0], edges[-1]
+    below, above, lowest, highest = 0, 0, np.inf, -np.inf
     for k in range(values.size):
-        weight = 1.0
-        if weights.size:
-            weight = float(weights[k])
-            if weight <= 0.0:
-                continue
         x = float(values[k])
-        sums[find(x, edges, B, scale, least, most)] += weight
+        sums[find(x, edges, scale, least, most)] += 1.0
+        lowest, highest = min(lowest, x), max(highest, x)
+        below += x < bottom
+        above += x > top
+    return float(below), float(above), lowest, highest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def count_weighted(
+    values: Any, weights: Any, edges: Any, scale: float, least: Any, most: Any, sums: Any
+) -> Any:
+    """Add the weights of values to their bins; values of weight 0 are no values.
+
+    Parameters as of `count`; ``weights`` is (n,) float. Returns weights below and above, least
+    and largest value, sum of squared weights.
+    """
+    bottom, top = edges[0], edges[-1]
+    below, above, lowest, highest, squares = 0.0, 0.0, np.inf, -np.inf, 0.0
+    for k in range(values.size):
+        x, weight = float(values[k]), float(weights[k])
+        if weight <= 0.0:
+            continue
+        sums[find(x, edges, scale, least, most)] += weight
         squares += weight * weight
         lowest, highest = min(lowest, x), max(highest, x)
-        if x < edges[0]:
+        if x < bottom:
             below += weight
-        if x > edges[B]:
+        if x > top:
             above += weight
     return below, above, lowest, highest, squares
 
@@ -162,5 +172,5 @@ def move(values: Any, source: Any, target: Any, edges: Any, out: Any) -> None:
     bound_bins(begin, pieces, scale, least, most)
     for k in range(values.size):
         x = float(values[k])
-        p = find(x, begin, pieces, scale, least, most)
+        p = find(x, begin, scale, least, most)
         out[k] = to[p] + slope[p] * (min(max(x, begin[p]), end[p]) - begin[p])

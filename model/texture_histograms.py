@@ -72,12 +72,16 @@ class Bins:
         ([0.5, 0.25, 0.25], 0.25)
         """
         flat = np.ascontiguousarray(values).reshape(-1)
-        some = np.empty(0, flat.dtype) if weights is None else np.asarray(weights, flat.dtype)
         sums = np.zeros(BINS)
-        below, above, least, most, squares = histogram_kernels.count(
-            flat, np.ascontiguousarray(some).reshape(-1), self.edges, self.scale, self.least,
-            self.most, sums,
-        )  # fmt: skip
+        table = (self.edges, self.scale, self.least, self.most, sums)
+        if weights is None:
+            below, above, least, most = histogram_kernels.count(flat, *table)
+            squares = float(flat.size)
+        else:
+            some = np.ascontiguousarray(weights, flat.dtype).reshape(-1)
+            below, above, least, most, squares = histogram_kernels.count_weighted(
+                flat, some, *table
+            )
         total = float(sums.sum())
         if not total > 0.0:
             raise HistogramError("weights: got none above 0, expected at least one")
