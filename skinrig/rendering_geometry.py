@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,6 +133,25 @@ class FittedSurface:
         return FittedSurface(
             model, mesh, atlas, normals, moved, np.nan_to_num(values), np.asarray(model.valid)
         )
+
+    def of_medium(self, sigma_tr_per_mm: ArrayLike) -> FittedSurface:
+        """Return the same surface above a medium of one sigma_tr, three channels, 1/mm."""
+        depth = (1.0 / np.asarray(sigma_tr_per_mm, np.float64)).astype(np.float32)
+        spread_out = np.broadcast_to(depth, self.model.translucency_mm.shape).copy()
+        values = self._values.copy()
+        values[..., -3:] = depth
+        model = dataclasses.replace(
+            self.model, translucency_mm=spread_out, translucency_stderr_mm=None
+        )
+        return dataclasses.replace(self, model=model, _values=values)
+
+    def with_lobes(self, model: SkinReflectance) -> FittedSurface:
+        """Return the same surface with the lobes and shares of another model of the same maps."""
+        values = np.concatenate(
+            [self._values[..., :3], model.weights, self._values[..., -6:]], axis=-1
+        )
+        own = dataclasses.replace(self.model, lobes=model.lobes, weights=model.weights)
+        return dataclasses.replace(self, model=own, _values=values.astype(np.float32))
 
     def at(self, uv: Float32Array) -> Rows:
         """Look the maps up at texture coordinates, bilinearly, among valid texels where there are.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,9 @@ from skinrig.rendering_geometry import FittedSurface, Rows
 from skinrig.rendering_lights import Light
 
 FloatArray = NDArray[np.float64]
+
+POINTS: Final = 2
+"""Points along each side of a texel that light is looked for at."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,14 +56,23 @@ class Interior:
     def entered(self, lamps: Sequence[Light], shadows: Caster, samples: int) -> FloatArray:
         """Return what passes the surface at the texels, over what a white patch shows, (S, 3)."""
         atlas = self.laid.atlas
-        position = atlas.position_mm.reshape(-1, 3)[self.texels]
+        position, du, dv = (
+            layer.reshape(-1, 3)[self.texels]
+            for layer in (atlas.position_mm, atlas.dp_du_mm, atlas.dp_dv_mm)
+        )
         faces = shadows.face_normals[atlas.prim.reshape(-1)[self.texels]]
         normals = self.laid.normals.reshape(-1, 3)[self.texels]
         total = np.zeros((len(self.texels), 3))
-        for lamp in lamps:
-            total += entering(
-                lamp, position, faces, normals, shadows, samples, self.laid.model.eta
-            )[0]
+        # several points of each texel, or shadows would end in steps
+        offsets = ((np.arange(POINTS) + 0.5) / POINTS - 0.5) / atlas.size
+        for across in offsets:
+            for along in offsets:
+                place = position + np.float32(across) * du + np.float32(along) * dv
+                for lamp in lamps:
+                    light = entering(
+                        lamp, place, faces, normals, shadows, samples, self.laid.model.eta
+                    )[0]
+                    total += light / POINTS**2
         return total
 
     def leaving(

@@ -1,0 +1,92 @@
+"""The same face with fewer lobes: a model reduced to common mixtures of its own lobes."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.brdf_tables import BrdfBasis
+from model.skin_reflectance import SkinReflectance
+from reconstruction import brdf_basis
+
+FloatArray = NDArray[np.float64]
+
+POINTS: Final = 5_000
+"""Texels, drawn at random, that the mixtures are found on."""
+SWEEPS: Final = 60
+"""Passes over the shares of all texels; each sets one share to its best while others stand."""
+
+
+class RankError(ValueError):
+    """More lobes than a model has."""
+
+
+def reduced(model: SkinReflectance, rank: int, *, rng: np.random.Generator) -> SkinReflectance:
+    """Return the model with `rank` lobes that are mixtures of its own.
+
+    The mixtures are found by non-negative factorization at some texels; then every texel gets the
+    shares whose BRDF is nearest to its old one, over the tables' nodes by solid angle. A fit to
+    the samples would be better still: `skinrig reconstruct --rank`.
+
+    Parameters
+    ----------
+    model
+        The model.
+    rank
+        Lobes, 1 to those it has.
+    rng
+        Draws the texels, and seeds the factorization.
+
+    Raises
+    ------
+    RankError
+        The model has fewer lobes.
+    """
+    if not 1 <= rank <= model.lobes.size:
+        raise RankError(
+            f"bases: got {rank}, but the model has {model.lobes.size} lobes; fit more with "
+            f"`skinrig reconstruct SESSION --rank {rank} --want basis_weight_0,r_d,normals`"
+        )
+    if rank == model.lobes.size:
+        return model
+    shares = model.weights.reshape(-1, model.lobes.size).astype(np.float64)
+    known = np.flatnonzero(model.valid.reshape(-1) & (shares.sum(axis=-1) > 0.0))
+    drawn = np.sort(rng.permutation(known)[:POINTS])
+    seed = int(rng.integers(2**31))
+    _, mix, _ = brdf_basis.reduce(shares[drawn], rank, basis=model.lobes, seed=seed)
+    fewer = nearest_shares(shares, mix, model.lobes)
+    weights = fewer.reshape(*model.shape, rank).astype(np.float32)
+    return dataclasses.replace(model, weights=weights, lobes=model.lobes.mixed(mix))
+
+
+def nearest_shares(shares: FloatArray, mix: FloatArray, lobes: BrdfBasis) -> FloatArray:
+    """Return non-negative shares of mixtures whose BRDFs are nearest to given ones.
+
+    Parameters
+    ----------
+    shares
+        Of the lobes, shape (n, K).
+    mix
+        Mixtures of the lobes, shape (R, K).
+    lobes
+        The K lobes.
+
+    Returns
+    -------
+    ndarray of float64
+        Shape (n, R), by cyclic coordinate descent, whose error never grows.
+    """
+    strength = lobes.strength()
+    gram = lobes.kinship() * np.outer(strength, strength)
+    square = mix @ gram @ mix.T
+    wanted = shares @ gram @ mix.T
+    size = np.maximum(np.diag(square), 1e-300)
+    found = np.zeros_like(wanted)
+    for _ in range(SWEEPS):
+        for k in range(len(mix)):
+            rest = wanted[:, k] - found @ square[:, k] + found[:, k] * size[k]
+            found[:, k] = np.maximum(rest / size[k], 0.0)
+    return found

@@ -1,0 +1,96 @@
+"""The folder that a rendering is written to: whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import store
+from skinrig.console import plain
+
+DOCUMENT: Final = "render.json"
+SCHEMA: Final = "skinrig.render/1"
+
+
+class RenderingFolderError(ValueError):
+    """A folder that renderings cannot be written to."""
+
+
+def check(out: Path) -> None:
+    """Refuse a folder that holds something else, before anything is rendered.
+
+    Raises
+    ------
+    RenderingFolderError
+        ``out`` exists and is neither empty nor an older rendering.
+    """
+    if out.is_file() or (out.is_dir() and not (out / DOCUMENT).is_file() and any(out.iterdir())):
+        raise RenderingFolderError(
+            f"{out}: exists and is no rendering; nothing was written: name another folder"
+        )
+
+
+def write(
+    out: Path,
+    *,
+    images: Mapping[str, NDArray[np.float32]],
+    pictures: Mapping[str, bytes],
+    document: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Write images as OpenEXR, pictures as PNG and the record; an older rendering is replaced.
+
+    Parameters
+    ----------
+    out
+        The folder.
+    images
+        By name without extension, (H, W) or (H, W, 3).
+    pictures
+        PNG files by name without extension.
+    document
+        What the record says.
+
+    Returns
+    -------
+    dict
+        The record, with the names of the files.
+
+    Raises
+    ------
+    RenderingFolderError
+        See `check`.
+    """
+    check(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    fresh = out.with_name(f".{out.name}.{uuid.uuid4().hex}.part")
+    fresh.mkdir()
+    old = out.with_name(f".{out.name}.{uuid.uuid4().hex}.old")
+    try:
+        for name, image in images.items():
+            store.write_exr(fresh / f"{name}.exr", np.asarray(image, np.float32))
+        for name, data in pictures.items():
+            (fresh / f"{name}.png").write_bytes(data)
+        files = sorted(path.name for path in fresh.iterdir())
+        record = plain({"schema": SCHEMA, **document, "out": out, "files": files})
+        text = json.dumps(record, indent=1, sort_keys=True, allow_nan=False)
+        (fresh / DOCUMENT).write_text(text + "\n", encoding="utf-8")
+        if out.exists():
+            out.rename(old)
+        try:
+            fresh.rename(out)
+        except OSError:
+            if old.exists():
+                old.rename(out)
+            raise
+    except BaseException:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+    return dict(record)
