@@ -93,7 +93,7 @@ class SourceTree:
         _expect("source_area_mm2", area, (len(place),))
         if np.any(area < 0.0):
             raise GatherError("source_area_mm2: got negative values, expected at least 0")
-        some = np.flatnonzero(area > 0.0)
+        size, some = len(place), np.flatnonzero(area > 0.0)
         place, area = place[some], area[some]
         center = place.mean(axis=0) if len(some) else np.zeros(3)
         near = (place - center).astype(np.float32)
@@ -101,12 +101,11 @@ class SourceTree:
             none = np.zeros(0, np.int32)
             seen = np.zeros((0, source_tree_kernels.VISITED), np.float32)
             empty = np.zeros(0, np.float32)
-            return SourceTree(center, some, near, empty, empty, seen, none, none, none, len(place))
+            return SourceTree(center, some, near, empty, empty, seen, none, none, none, size)
         order, low, high, skip = source_tree_kernels.split(near, source_tree_kernels.LEAF)
         near, area = near[order], area[order].astype(np.float32)
         reach = (REACH * np.sqrt(area)).astype(np.float32)
         seen = source_tree_kernels.summarize(near, area, reach, low, high)
-        size = len(np.asarray(source_mm))
         return SourceTree(center, some[order], near, reach, area, seen, low, high, skip, size)
 
 
