@@ -13,6 +13,7 @@ Weyrich et al. 2006, doi:10.1145/1141911.1141987, sections 3 and 9 (the dome of 
 from __future__ import annotations
 
 import io
+import zipfile
 from dataclasses import dataclass
 
 import numpy as np
@@ -231,8 +232,16 @@ def lobes_of(appearance: SkinAppearance) -> BrdfBasis:
     try:
         with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as stored:
             table, radius = stored["table"], float(stored["light_radius_rad"])
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except KeyError as error:
+        raise SkinReflectanceError(
+            f"{BASIS_FILE}: {error.args[0]}; an older version made it: reconstruct the maps again"
+        ) from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise SkinReflectanceError(f"{BASIS_FILE}: cannot be read: {error}") from error
+    if table.ndim != 4 or not table.shape[-1]:
+        raise SkinReflectanceError(
+            f"{BASIS_FILE}: got a table of shape {table.shape}, expected lobes on its last axis"
+        )
     names = [f"{WEIGHT}{k}" for k in range(table.shape[-1])]
     for name in names:
         _map(appearance, name)

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig import cli_dynamic, cli_rendering, errors
+from skinrig import cli_dynamic, cli_reflectance, cli_rendering, errors
 from skinrig.console import Console
 
 app = typer.Typer(
@@ -406,6 +406,7 @@ def calibrate(
 import_app = typer.Typer(help="Bring in what other devices made.", no_args_is_help=True)
 app.command()(cli_rendering.render)
 app.add_typer(import_app, name="import")
+cli_dynamic.fit_app.command("reflectance")(cli_reflectance.fit_reflectance)
 app.add_typer(cli_dynamic.fit_app, name="fit")
 app.add_typer(cli_dynamic.apply_app, name="apply")
 

@@ -1,0 +1,205 @@
+"""From a dome's maps and a probe's measurements to one model: `skinrig fit reflectance`."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from model import skin_reflectance, store
+from model.skin import SkinAppearance, SkinMap
+from model.skin_reflectance import TRANSLUCENCY, SkinReflectance
+from reconstruction.probe_stages import SUBSURFACE_FILE
+from reconstruction.translucency import population_prior
+from skinrig import probe_sites
+from skinrig.errors import UsageError
+from skinrig.probe_sites import PlacedTranslucency
+
+KEY = "reflectance_model"
+"""Of `parameters`: how the translucency of a model came about."""
+
+
+class ReflectanceInputError(ValueError):
+    """Folders that no reflectance model can be made of."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedReflectance:
+    """An assembled model, and what it was made of.
+
+    Attributes
+    ----------
+    model
+    placed
+        None where no probe was given.
+    assumed
+        By the dome's and the probe's maps, and here.
+    left_out
+    """
+
+    model: SkinReflectance
+    placed: PlacedTranslucency | None
+    assumed: tuple[str, ...]
+    left_out: tuple[tuple[str, str], ...]
+
+
+def fit_reflectance(
+    dome: Path, probe: Path | None = None, *, out: Path, landmarks: Path | None = None
+) -> FittedReflectance:
+    """Write the model of one subject: the dome's maps with translucency on their texture.
+
+    Parameters
+    ----------
+    dome
+        APPEARANCE/ of a dome session with normals, R_d and lobes.
+    probe
+        APPEARANCE/ of a session of the fibre probe on the same subject; None: the mean of people
+        stands in, with their spread as standard error.
+    out
+        Folder to write.
+    landmarks
+        Table ``name,x,y`` of the probe's sites in texels of the dome's maps.
+
+    Raises
+    ------
+    model.skin_reflectance.SkinReflectanceError, ReflectanceInputError, ProbeSiteError
+        Naming the folder or map that is missing or does not fit.
+    """
+    if landmarks is not None and probe is None:
+        raise UsageError("--landmarks: places a probe's sites, but no probe's maps are given")
+    for given in (dome, probe):
+        if given is not None and given.resolve() == out.resolve():
+            raise ReflectanceInputError(f"{out}: is one of the inputs; name another --out")
+    surface = store.read(dome)
+    inputs = {"dome": _digest(dome)}
+    placed = None
+    assumed = list(_assumed(surface))
+    left_out = list(surface.left_out)
+    files = dict(surface.files)
+    sources = {surface.source}
+    if probe is not None:
+        measured = store.read(probe)
+        inputs["probe"] = _digest(probe)
+        sources.add(measured.source)
+        try:
+            placed = probe_sites.place(measured, _position(surface), landmarks=landmarks)
+        except ValueError as error:
+            raise ReflectanceInputError(f"{probe}: {error}") from error
+        depth = placed.map
+        if landmarks is not None:
+            inputs["landmarks"] = hashlib.sha256(landmarks.read_bytes()).hexdigest()
+        assumed += [f"probe: {text}" for text in _assumed(measured)] + list(placed.assumed)
+        left_out += [(f"translucency of {what}", why) for what, why in placed.left_out]
+        files[SUBSURFACE_FILE] = measured.files[SUBSURFACE_FILE]
+    else:
+        depth, what = _of_people(_position(surface))
+        assumed.append(what)
+    model = skin_reflectance.assemble(surface, translucency=depth)
+    appearance = SkinAppearance(
+        maps={**surface.maps, TRANSLUCENCY: depth},
+        source="simulated" if "simulated" in sources else "measured",
+        parameters={
+            **surface.parameters,
+            "assumed": assumed,
+            "appearances": [path.name for path in (dome, probe) if path is not None],
+            KEY: _record(placed),
+        },
+        inputs={**surface.inputs, **inputs},
+        versions={n: metadata.version(n) for n in ("skinrig", "numpy", "scipy", "numba")},
+        left_out=tuple(left_out),
+        files=files,
+        seed=surface.seed,
+    )
+    store.write(out, appearance)
+    return FittedReflectance(model, placed, tuple(assumed), tuple(left_out))
+
+
+def summary(found: FittedReflectance) -> list[tuple[str, float, float, float]]:
+    """Return rows for people: what, and its median in red, green and blue over valid texels."""
+    model, coefficients = found.model, found.model.dipole()
+
+    def medians(values: np.ndarray) -> tuple[float, float, float]:
+        flat = values[model.valid].astype(np.float64)
+        if not len(flat):
+            return (float("nan"),) * 3
+        with np.errstate(all="ignore"):
+            by = [np.median(v[np.isfinite(v)]) if np.isfinite(v).any() else np.nan for v in flat.T]
+        return float(by[0]), float(by[1]), float(by[2])
+
+    return [
+        ("R_d", *medians(model.r_d)),
+        ("1/sigma_tr, mm", *medians(model.translucency_mm)),
+        ("1 - alpha'", *medians(coefficients.deficit)),
+        ("sigma_a, 1/mm", *medians(coefficients.sigma_a_per_mm)),
+        ("sigma_s', 1/mm", *medians(coefficients.sigma_s_prime_per_mm)),
+        ("share with R_d above 1 or below 0", *_share(model, coefficients.outlier)),
+    ]
+
+
+def _share(model: SkinReflectance, where: np.ndarray) -> tuple[float, float, float]:
+    count = max(int(np.count_nonzero(model.valid)), 1)
+    red, green, blue = (float(np.count_nonzero(where[..., c])) / count for c in range(3))
+    return red, green, blue
+
+
+def _of_people(position: SkinMap) -> tuple[SkinMap, str]:
+    """Return the mean translucency of people as a map, their spread as its standard error."""
+    mean_mm, what = skin_reflectance.population_mean_mm()
+    prior = population_prior()
+    deviation = np.hypot(prior.person_deviation, prior.place_deviation)
+    shape = position.values.shape
+    return (
+        SkinMap(
+            np.broadcast_to(mean_mm, shape).astype(np.float32),
+            "mm",
+            np.broadcast_to(mean_mm * np.sinh(deviation), shape).astype(np.float32),
+            position.valid,
+            "1/sigma_tr of red, green and blue light: the mean of people, not measured",
+        ),
+        what,
+    )
+
+
+def _position(surface: SkinAppearance) -> SkinMap:
+    if "position" not in surface.maps:
+        raise ReflectanceInputError(
+            "dome: got no map 'position'; give maps that `skinrig reconstruct` made of a dome's "
+            "session"
+        )
+    return surface.maps["position"]
+
+
+def _assumed(appearance: SkinAppearance) -> tuple[str, ...]:
+    told = appearance.parameters.get("assumed", ())
+    return tuple(str(text) for text in told) if isinstance(told, list | tuple) else ()
+
+
+def _digest(folder: Path) -> str:
+    return hashlib.sha256((folder / store.DOCUMENT).read_bytes()).hexdigest()
+
+
+def _record(placed: PlacedTranslucency | None) -> dict[str, object]:
+    if placed is None:
+        return {"translucency": "mean of people"}
+    return {
+        "translucency": "measured",
+        "conflicts": [": ".join(pair) for pair in placed.conflicts],
+        "p_value": list(placed.p_value),
+        "sites": [
+            {
+                "site": site.name,
+                "texel": list(site.texel),
+                "position_mm": list(site.position_mm),
+                "sigma_tr_per_mm": _finite(site.sigma_tr_per_mm),
+                "stderr_per_mm": _finite(site.stderr_per_mm),
+            }
+            for site in placed.sites
+        ],
+    }
+
+
+def _finite(values: tuple[float, ...]) -> list[float | None]:
+    return [value if np.isfinite(value) else None for value in values]

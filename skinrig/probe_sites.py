@@ -1,0 +1,279 @@
+"""Where a fibre probe was set down on a scanned face, and what it measured in between."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.skin import SkinAppearance, SkinMap
+from reconstruction import translucency
+from reconstruction.probe_stages import CHANNELS, SUBSURFACE_FILE
+from reconstruction.translucency import TranslucencyMap
+
+FloatArray = NDArray[np.float64]
+
+FROM_NOSE_MM: Final[Mapping[str, tuple[float, float]]] = {
+    "forehead": (0.0, 76.0),
+    "cheek": (-45.0, 0.0),
+    "cheek left": (-45.0, 0.0),
+    "cheek right": (45.0, 0.0),
+    "chin": (0.0, -70.0),
+}
+"""Places of a mean face, mm to the right and up of the tip of the nose as seen from the front; chin
+is below it. Left and right as seen in the picture."""
+GRID: Final = 256
+"""Places a side that translucency is interpolated at before it is laid on the texture."""
+NEAR_MM: Final = 15.0
+"""Farther than this from every measured texel a place is not on the scan."""
+ROUND_MM: Final = (40.0, 200.0)
+"""Radii of what counts as a head; other shapes are measured along x and y."""
+
+
+class ProbeSiteError(ValueError):
+    """Measurements of a probe that cannot be placed on a face."""
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """One place of the probe.
+
+    Attributes
+    ----------
+    name
+    sigma_tr_per_mm, stderr_per_mm
+        Of each channel; NaN and infinity where there is no valid fit.
+    texel
+        Row and column on the face's texture.
+    position_mm
+        In the rig frame.
+    """
+
+    name: str
+    sigma_tr_per_mm: tuple[float, ...]
+    stderr_per_mm: tuple[float, ...]
+    texel: tuple[int, int]
+    position_mm: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedTranslucency:
+    """A probe's translucency on a face's texture.
+
+    Attributes
+    ----------
+    map
+        1/sigma_tr, mm, with standard errors.
+    sites
+        Those it rests on.
+    left_out
+        Site, with or without its channel, and why it has no say.
+    conflicts
+        Site and channel whose repeats contradict each other, and how.
+    assumed
+        What was taken for granted in placing them.
+    p_value
+        By channel: chance that people hold a face so unlike their mean.
+    """
+
+    map: SkinMap
+    sites: tuple[Site, ...]
+    left_out: tuple[tuple[str, str], ...]
+    conflicts: tuple[tuple[str, str], ...]
+    assumed: tuple[str, ...]
+    p_value: tuple[float, ...]
+
+
+def place(
+    probe: SkinAppearance, position: SkinMap, *, landmarks: Path | None = None
+) -> PlacedTranslucency:
+    """Interpolate a probe's measurements over the texture of a face.
+
+    Distances over the face are those along its girth and its height, from where texels are, so
+    that a texture may be laid out in any charts.
+
+    Parameters
+    ----------
+    probe
+        With the file `subsurface.json`.
+    position
+        Map `position` of the face, mm, rig frame.
+    landmarks
+        Table ``name,x,y`` in texels of that map; sites it lacks, and all without it, are found by
+        a mean face's distances from the tip of the nose.
+
+    Raises
+    ------
+    ProbeSiteError
+        Where nothing was measured at a place that is known and on the scan.
+    reconstruction.translucency.TranslucencyError
+        Where no measurement is usable, or the table is faulty.
+    """
+    measured = _measured(probe)
+    height, width = position.values.shape[:2]
+    known = np.ones((height, width), bool) if position.valid is None else position.valid
+    if not known.any():
+        raise ProbeSiteError("position: got no valid texel, expected those of a face")
+    given: dict[str, tuple[float, float]] = {}
+    if landmarks is not None:
+        given = translucency.read_landmarks(landmarks, texture_px=(height, width))
+    at_mm = position.values.astype(np.float64)
+    sites: list[Site] = []
+    left_out: list[tuple[str, str]] = []
+    guessed: list[str] = []
+    for name, (sigma_tr, stderr) in measured.items():
+        if name in given:
+            column, row = given[name][0] * width, (1.0 - given[name][1]) * height
+            wanted = at_mm[min(int(row), height - 1), min(int(column), width - 1)]
+        elif name in FROM_NOSE_MM:
+            wanted = _mean_place(name, at_mm[known])
+            guessed.append(name)
+        else:
+            left_out.append((name, "its place on a face is not known; a table may name it"))
+            continue
+        away = np.where(known, np.linalg.norm(at_mm - wanted, axis=-1), np.inf)
+        texel = np.unravel_index(np.argmin(away), away.shape)
+        if away[texel] > NEAR_MM:
+            left_out.append((name, f"the scan ends {away[texel]:.0f} mm before it"))
+            continue
+        found = at_mm[texel]
+        sites.append(
+            Site(name, sigma_tr, stderr, (int(texel[0]), int(texel[1])), tuple(found.tolist()))
+        )
+    if not sites:
+        why = "; ".join(f"{name}: {reason}" for name, reason in left_out)
+        raise ProbeSiteError(f"sites: got none on the face: {why}")
+    assumed: tuple[str, ...] = ()
+    if guessed:
+        assumed = (
+            f"{', '.join(guessed)} of the probe lie where a mean face has them, measured from the "
+            "tip of the nose",
+        )
+    chart = _Chart.of(at_mm[known], sites)
+    found_map = _interpolated(chart, sites)
+    spread = chart.lay(found_map, at_mm)
+    valid = known & found_map.valid.all(axis=(0, 1)).all()
+    return PlacedTranslucency(
+        map=SkinMap(
+            spread[..., :3], "mm", spread[..., 3:], valid,
+            "1/sigma_tr of red, green and blue light, between measured sites by kriging",
+        ),
+        sites=tuple(sites),
+        left_out=(*left_out, *found_map.left_out),
+        conflicts=found_map.conflicts,
+        assumed=assumed,
+        p_value=tuple(float(p) for p in found_map.p_value),
+    )  # fmt: skip
+
+
+def _measured(
+    probe: SkinAppearance,
+) -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Return sigma_tr and its standard error of each site by channel."""
+    if SUBSURFACE_FILE not in probe.files:
+        raise ProbeSiteError(
+            f"probe: has no {SUBSURFACE_FILE}; `skinrig reconstruct --want subsurface` makes it of "
+            "a session of the fibre probe"
+        )
+    try:
+        rows = json.loads(probe.files[SUBSURFACE_FILE])["sites"]
+        names = list(dict.fromkeys(str(row["site"]) for row in rows))
+        found: dict[str, dict[str, tuple[float, float]]] = {name: {} for name in names}
+        for row in rows:
+            sigma_tr, stderr = row["sigma_tr_per_mm"], row["sigma_tr_stderr"]
+            found[str(row["site"])][str(row["channel"])] = (
+                math.nan if sigma_tr is None else float(sigma_tr),
+                math.inf if stderr is None else float(stderr),
+            )
+    except (ValueError, KeyError, TypeError) as error:
+        raise ProbeSiteError(f"{SUBSURFACE_FILE}: cannot be read: {error!r}") from error
+    none = (math.nan, math.inf)
+    return {
+        name: (
+            tuple(by.get(c, none)[0] for c in CHANNELS),
+            tuple(by.get(c, none)[1] for c in CHANNELS),
+        )
+        for name, by in found.items()
+    }
+
+
+def _mean_place(name: str, points_mm: FloatArray) -> FloatArray:
+    """Return the point of a scan at a mean face's distance from the foremost point, its nose."""
+    nose = points_mm[np.argmax(points_mm[:, 2])]
+    across, up = FROM_NOSE_MM[name]
+    away = np.hypot(points_mm[:, 0] - nose[0] - across, points_mm[:, 1] - nose[1] - up)
+    # of what lies behind each other the foremost
+    near = away < away.min() + 1.0
+    return np.asarray(points_mm[near][np.argmax(points_mm[near, 2])])
+
+
+@dataclass(frozen=True, slots=True)
+class _Chart:
+    """Coordinates over a face: along its girth and its height, mm, above a corner."""
+
+    axis_mm: tuple[float, float] | None
+    """x and z of the vertical axis; None: the surface is not round, x counts."""
+    radius_mm: float
+    corner_mm: FloatArray
+    size_mm: FloatArray
+
+    @staticmethod
+    def of(points_mm: FloatArray, sites: Sequence[Site]) -> _Chart:
+        """Find the axis of a face: the centre of the circle nearest to its girth."""
+        middle = np.median([site.position_mm[1] for site in sites])
+        girth = points_mm[np.abs(points_mm[:, 1] - middle) < 60.0]
+        axis, radius = None, 1.0
+        if len(girth) >= 3:
+            # x^2 + z^2 = 2 a x + 2 b z + c (Kasa 1976)
+            columns = np.column_stack([2.0 * girth[:, 0], 2.0 * girth[:, 2], np.ones(len(girth))])
+            (a, b, c), _, rank, _ = np.linalg.lstsq(
+                columns, (girth[:, [0, 2]] ** 2).sum(axis=1), rcond=None
+            )
+            square = c + a**2 + b**2
+            if rank == 3 and ROUND_MM[0] ** 2 < square < ROUND_MM[1] ** 2:
+                axis, radius = (float(a), float(b)), math.sqrt(square)
+        free = _Chart(axis, radius, np.zeros(2), np.ones(2))
+        over = free.coordinates(points_mm)
+        low, high = over.min(axis=0), over.max(axis=0)
+        return _Chart(axis, radius, low, np.maximum(high - low, 1.0))
+
+    def coordinates(self, points_mm: FloatArray) -> FloatArray:
+        """Return (..., 2): along the girth and up, mm, from the corner."""
+        along = points_mm[..., 0]
+        if self.axis_mm is not None:
+            a, b = self.axis_mm
+            along = self.radius_mm * np.arctan2(points_mm[..., 0] - a, points_mm[..., 2] - b)
+        return np.asarray(np.stack([along, points_mm[..., 1]], axis=-1) - self.corner_mm)
+
+    def lay(self, found: TranslucencyMap, points_mm: FloatArray) -> NDArray[np.float32]:
+        """Return values and standard errors, (H, W, 6), at the places of texels, linear."""
+        both = np.concatenate([found.values, found.stderr], axis=-1)
+        share = self.coordinates(points_mm) / self.size_mm
+        x = np.clip(share[..., 0] * GRID - 0.5, 0.0, GRID - 1.0)
+        y = np.clip((1.0 - share[..., 1]) * GRID - 0.5, 0.0, GRID - 1.0)
+        i, j = np.minimum(y.astype(np.intp), GRID - 2), np.minimum(x.astype(np.intp), GRID - 2)
+        p, q = (y - i)[..., None], (x - j)[..., None]
+        upper = both[i, j] * (1.0 - q) + both[i, j + 1] * q
+        lower = both[i + 1, j] * (1.0 - q) + both[i + 1, j + 1] * q
+        return np.asarray(upper * (1.0 - p) + lower * p, np.float32)
+
+
+def _interpolated(chart: _Chart, sites: Sequence[Site]) -> TranslucencyMap:
+    at = chart.coordinates(np.array([site.position_mm for site in sites])) / chart.size_mm
+    sigma_tr = np.array([site.sigma_tr_per_mm for site in sites])
+    good = np.isfinite(sigma_tr)
+    return translucency.interpolate(
+        np.clip(at, 0.0, 1.0),
+        np.where(good, sigma_tr, 1.0),
+        np.array([site.stderr_per_mm for site in sites]),
+        (GRID, GRID),
+        valid=good,
+        names=[site.name for site in sites],
+        texture_mm=(float(chart.size_mm[0]), float(chart.size_mm[1])),
+    )
