@@ -150,23 +150,18 @@ def analyze(
     filters = _filters(shape, levels, orientations, values.dtype.str)
     spectrum = fft.rfft2(values, norm="forward", workers=threads)
 
-    def back(part: Any, size: tuple[int, int]) -> Array:
-        return np.asarray(
-            fft.irfft2(part, s=size, norm="forward", workers=threads, overwrite_x=True)
-        )
-
     bands = []
     with ThreadPoolExecutor(threads) as pool:
         for level in filters.levels:
             part = np.empty((orientations, *level.weight.shape), spectrum.dtype)
             _by_rows(pool, pyramid_kernels.split, level, spectrum, part, filters, filters.factor)
-            bands.append(back(part, level.size))
+            bands.append(_inverse(part, level.size, threads))
     low = filters.low
     return Responses(
         shape,
-        back(spectrum * filters.high, shape),
+        _inverse(spectrum * filters.high, shape, threads),
         tuple(bands),
-        back(spectrum[low.rows, : low.columns] * low.weight, low.size),
+        _inverse(spectrum[low.rows, : low.columns] * low.weight, low.size, threads),
     )
 
 
@@ -202,9 +197,13 @@ def synthesize(responses: Responses, *, workers: int | None = None) -> Array:
             part = forth(band)
             phase = np.conj(filters.factor)
             _by_rows(pool, pyramid_kernels.merge, level, part, spectrum, filters, phase)
-    return np.asarray(
-        fft.irfft2(spectrum, s=shape, norm="forward", workers=threads, overwrite_x=True)
-    )
+    return _inverse(spectrum, shape, threads)
+
+
+def _inverse(spectra: Any, size: tuple[int, int], threads: int) -> Array:
+    """Return the images of half spectra, which are overwritten."""
+    columns = fft.ifft(spectra, axis=-2, norm="forward", workers=threads, overwrite_x=True)
+    return np.asarray(fft.irfft(columns, n=size[1], axis=-1, norm="forward", workers=threads))
 
 
 def thread_count(workers: int | None) -> int:

@@ -89,7 +89,9 @@ class Bins:
             sums / total, below / total, above / total, least, most, total * total / squares
         )
 
-    def match(self, values: Array, source: Counted, target: Floats) -> Array:
+    def match(
+        self, values: Array, source: Counted, target: Floats, *, out: Array | None = None
+    ) -> Array:
         """Move values so that their histogram becomes the target's.
 
         Parameters
@@ -100,6 +102,8 @@ class Bins:
             What `count` said about them.
         target : ndarray, shape (256,)
             At least 0, sums to 1.
+        out : ndarray or None
+            Where to write, contiguous; may be ``values`` itself.
 
         Returns
         -------
@@ -115,9 +119,9 @@ class Bins:
         own, wanted = cumulated(source.shares), cumulated(target)
         edges = self.edges.copy()
         edges[0], edges[-1] = min(edges[0], source.least), max(edges[-1], source.most)
-        out = np.empty_like(flat)
-        histogram_kernels.move(flat, own, wanted, edges, out)
-        return out.reshape(np.shape(values))
+        moved = np.empty(np.shape(values), flat.dtype) if out is None else out
+        histogram_kernels.move(flat, own, wanted, edges, moved.reshape(-1))
+        return moved
 
 
 def cumulated(shares: ArrayLike) -> Floats:

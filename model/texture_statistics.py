@@ -259,8 +259,8 @@ def match(
                     break
                 far = distances[iteration, c] > tolerance
                 if far[1:].any():
-                    moved = _moved(pool, pyramid, counted, bins, wanted[c], far)
-                    now = steerable_pyramid.synthesize(moved, workers=workers)
+                    _move(pool, pyramid, counted, bins, wanted[c], far)
+                    now = steerable_pyramid.synthesize(pyramid, workers=workers)
                     counted[0] = bins[0].count(now, None if weights is None else weights[0])
                 if far.any():
                     now = bins[0].match(now, counted[0], wanted[c, 0])
@@ -320,27 +320,27 @@ def _count(
     return list(pool.map(one, range(len(bins))))
 
 
-def _moved(
+def _move(
     pool: ThreadPoolExecutor,
     pyramid: Responses,
     counted: list[Counted],
     bins: list[Bins],
     wanted: Floats,
     far: Mask,
-) -> Responses:
-    """Match the responses of a pyramid; the first histogram of all is the image's own."""
+) -> None:
+    """Match the responses of a pyramid in place; the first histogram of all is the image's."""
 
-    def one(r: int, response: Array) -> Array:
-        return bins[r].match(response, counted[r], wanted[r]) if far[r] else response
+    def one(r: int, response: Array) -> None:
+        if far[r]:
+            bins[r].match(response, counted[r], wanted[r], out=response)
 
-    done = list(pool.map(one, range(1, len(bins)), pyramid))
-    K = len(pyramid.bands[0])
-    bands = tuple(np.stack(done[1 + K * k : 1 + K * (k + 1)]) for k in range(len(pyramid.bands)))
-    return Responses(pyramid.shape, done[0], bands, done[-1])
+    list(pool.map(one, range(1, len(bins)), pyramid))
 
 
 def _blended(original: Array, new: Array, blend: Array, mask: Mask) -> Array:
     """Keep the original where nothing is to change, and continue the result past the mask."""
+    if mask.all() and blend.min() >= 1.0:
+        return new.astype(original.dtype, copy=False)
     mixed = (original + blend * (new - original)).astype(original.dtype, copy=False)
     return fill_smoothly(mixed[..., None], mask)[..., 0]
 
