@@ -86,6 +86,23 @@ def render(
     exposure: Annotated[
         float | None, typer.Option(help="Factor of the PNGs; default: skin is shown well.")
     ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            help="Session whose photographs the model was not fitted to (reconstruct --hold-out): "
+            "render what they show, and compare."
+        ),
+    ] = None,
+    photographs: Annotated[
+        int, typer.Option(help="With --against: most photographs, even over those held out.")
+    ] = 24,
+    ablation: Annotated[
+        bool,
+        typer.Option(
+            "--ablation/--no-ablation",
+            help="With --against: also compare without each part of the model.",
+        ),
+    ] = True,
     seed: Annotated[int, typer.Option(help="Of the environment's lights, and of --bases.")] = 0,
     json: Json = False,
 ) -> None:
@@ -117,6 +134,16 @@ def render(
         progress=console.progress,
     )
     console.progress(f"read {', '.join(str(path) for path in appearance)}")
+    if against is not None:
+        from skinrig import rendering_evaluation
+
+        found = rendering_evaluation.evaluate_folders(
+            appearance[0], against, out, calibration=calibration, translucency=translucency,
+            subsurface=subsurface,  # type: ignore[arg-type]
+            count=photographs, ablation=ablation, seed=seed, progress=console.progress,
+        )  # fmt: skip
+        rendering_evaluation.tell(console, found)
+        return
     if shadow_boundary:
         subject = figures.Subject.of(appearance[0], mesh=mesh)
         done = figures.draw_shadow_boundary(subject, out, effort, size_px=size)

@@ -1,0 +1,299 @@
+"""How far a rendering is from a photograph of the same camera and light.
+
+Both are white-balanced linear camera RGB over what a perfect white Lambertian patch at the rig's
+origin shows that faces the light. The luminance is that of ITU-R BT.709 with the camera's channels
+in place of its primaries.
+
+A pixel counts as **lit** where it and its eight neighbors lie wholly on skin that was measured and
+every ray of them sees the whole light, by the geometry that is rendered; and where the photograph
+is not saturated and at least `LEAST_SIGNAL` times its own noise. How well the two agree has no part
+in it. Everything else on the skin, shadows and their borders, counts in `total_error` only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+LUMINANCE: Final = (0.2126, 0.7152, 0.0722)
+LEAST_SIGNAL: Final = 10.0
+"""Times its standard deviation that a photograph's luminance must be."""
+LIMIT: Final = 0.05
+"""Median relative error of the luminance on lit pixels that a model has to stay below."""
+PERCENTILES: Final = (50.0, 68.0, 90.0, 95.0)
+WHITE_PERCENTILE: Final = 99.0
+"""Luminance of a photograph's skin that is shown as white before structures are compared."""
+
+
+class PhotographError(ValueError):
+    """Images that cannot be compared."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photograph:
+    """One linear photograph.
+
+    Attributes
+    ----------
+    rgb, variance
+        (H, W, 3), see this module.
+    valid
+        (H, W) bool; False where it is saturated.
+    """
+
+    rgb: Float
+    variance: Float
+    valid: Bool
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.rgb)
+        if len(shape) != 3 or shape[2] != 3 or np.shape(self.variance) != shape:
+            raise PhotographError(
+                f"photograph: got rgb {shape} and variance {np.shape(self.variance)}, "
+                "expected (H, W, 3) both"
+            )
+        if np.shape(self.valid) != shape[:2]:
+            raise PhotographError(f"valid: got {np.shape(self.valid)}, expected {shape[:2]}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairError:
+    """A rendering beside a photograph.
+
+    Attributes
+    ----------
+    relative
+        (H, W) |rendering - photograph| / photograph of the luminance; NaN where not `lit`.
+    signed
+        The same without the absolute value.
+    lit
+        (H, W) bool, see this module.
+    noise
+        Median of what the photograph's noise alone does to `relative`; NaN without lit pixels.
+    total_error
+        Sum over the skin of |rendering - photograph| over that of the photograph, lit or not.
+    ssim
+        Mean structural similarity of the tone-mapped pair over the skin, -1 to 1.
+    """
+
+    relative: Float
+    signed: Float
+    lit: Bool
+    noise: float
+    total_error: float
+    ssim: float
+
+    @property
+    def median(self) -> float:
+        """Median relative error over lit pixels; NaN without any."""
+        return float(np.median(self.relative[self.lit])) if self.lit.any() else float("nan")
+
+
+def luminance(rgb: ArrayLike) -> Float:
+    """Return the luminance of white-balanced linear RGB, (...).
+
+    Examples
+    --------
+    >>> round(float(luminance([1.0, 1.0, 1.0])), 6)
+    1.0
+    """
+    return np.asarray(np.asarray(rgb, np.float64) @ np.array(LUMINANCE))
+
+
+def lit_pixels(photograph: Photograph, *, covered: ArrayLike, lit: ArrayLike) -> Bool:
+    """Return which pixels count as lit, see this module.
+
+    Parameters
+    ----------
+    photograph
+        The photograph.
+    covered, lit
+        (H, W) bool of the rendering: wholly on measured skin; wholly in the light.
+    """
+    light = luminance(photograph.rgb)
+    sigma = _sigma(photograph)
+    inner = ndimage.binary_erosion(
+        np.asarray(covered, bool) & np.asarray(lit, bool), np.ones((3, 3)), border_value=0
+    )
+    return np.asarray(
+        inner & photograph.valid & (light > 0) & (light >= LEAST_SIGNAL * sigma) & (sigma > 0)
+    )
+
+
+def compare(
+    photograph: Photograph, rendering: ArrayLike, *, covered: ArrayLike, lit: ArrayLike
+) -> PairError:
+    """Compare a rendering with a photograph.
+
+    Parameters
+    ----------
+    photograph
+        The photograph.
+    rendering
+        (H, W, 3), in its unit.
+    covered, lit
+        (H, W) bool of the rendering: pixels wholly on measured skin, and those of them wholly in
+        the light. One mask for all renderings that are to be compared with each other.
+
+    Raises
+    ------
+    PhotographError
+        When shapes differ or no pixel is covered.
+    """
+    image = np.asarray(rendering, np.float64)
+    skin = np.asarray(covered, bool) & photograph.valid
+    if image.shape != photograph.rgb.shape or skin.shape != image.shape[:2]:
+        raise PhotographError(
+            f"rendering: got {image.shape}, covered {skin.shape}, expected {photograph.rgb.shape}"
+        )
+    if not skin.any():
+        raise PhotographError("covered: got no pixel of measured skin that is not saturated")
+    chosen = lit_pixels(photograph, covered=covered, lit=lit)
+    real, made = luminance(photograph.rgb), luminance(image)
+    signed = np.full(real.shape, np.nan)
+    signed[chosen] = made[chosen] / real[chosen] - 1.0
+    noise = (_sigma(photograph)[chosen] / real[chosen]) * 0.6745  # median of a normal deviate
+    return PairError(
+        np.abs(signed),
+        signed,
+        chosen,
+        float(np.median(noise)) if chosen.any() else float("nan"),
+        float(np.sum(np.abs(made - real)[skin]) / max(float(np.sum(real[skin])), 1e-30)),
+        similarity(photograph.rgb, image, skin),
+    )
+
+
+def tone_mapped(rgb: ArrayLike, white: float) -> Float:
+    """Return linear light by the sRGB curve, 0 to 1, with `white` as 1; brighter is 1.
+
+    Examples
+    --------
+    >>> tone_mapped([0.0, 0.5, 2.0], 1.0).round(4).tolist()
+    [0.0, 0.7354, 1.0]
+    """
+    value = np.clip(np.asarray(rgb, np.float64) / white, 0.0, 1.0)
+    curve = 1.055 * np.maximum(value, 0.0031308) ** (1.0 / 2.4) - 0.055
+    return np.where(value <= 0.0031308, 12.92 * value, curve)
+
+
+def similarity(photograph: ArrayLike, rendering: ArrayLike, skin: Bool) -> float:
+    """Return the mean structural similarity over the skin of a tone-mapped pair.
+
+    Both are exposed so that `WHITE_PERCENTILE` of the photograph's skin is white, and black beside
+    the skin. Windows are Gaussian, 1.5 pixels (Wang et al. 2004, doi:10.1109/TIP.2003.819861).
+    """
+    from skimage.metrics import structural_similarity
+
+    light = luminance(photograph)[skin]
+    white = max(float(np.percentile(light, WHITE_PERCENTILE)), 1e-30)
+    pair = [tone_mapped(image, white) * skin[..., None] for image in (photograph, rendering)]
+    if min(skin.shape) < 11:
+        raise PhotographError(f"image: got {skin.shape}, expected at least 11 x 11 pixels")
+    _, full = structural_similarity(
+        *pair, data_range=1.0, channel_axis=-1, gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False, full=True,
+    )  # fmt: skip
+    return float(np.mean(np.asarray(full)[skin]))
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """Errors of many pairs.
+
+    Attributes
+    ----------
+    pairs, pixels
+        Photographs, and their lit pixels.
+    median, p68, p90, p95
+        Percentiles of the relative error of the luminance over all lit pixels.
+    interval
+        68 % interval of the median, photographs drawn again 200 times.
+    bias
+        Median of the signed error.
+    noise
+        Median of what noise alone does, mean over the photographs.
+    total_error, ssim
+        Means over the photographs, see `PairError`.
+    """
+
+    pairs: int
+    pixels: int
+    median: float
+    p68: float
+    p90: float
+    p95: float
+    interval: tuple[float, float]
+    bias: float
+    noise: float
+    total_error: float
+    ssim: float
+
+
+def summarize(pairs: Sequence[PairError], *, rng: np.random.Generator) -> Summary:
+    """Put pairs together.
+
+    Raises
+    ------
+    PhotographError
+        When they have no lit pixel.
+    """
+    values = [pair.relative[pair.lit] for pair in pairs]
+    signed = [pair.signed[pair.lit] for pair in pairs]
+    if not values or not sum(len(v) for v in values):
+        raise PhotographError("photographs: got no lit pixel; are they underexposed?")
+    every = np.concatenate(values)
+    p50, p68, p90, p95 = (float(p) for p in np.percentile(every, PERCENTILES))
+    again = [
+        float(np.median(np.concatenate(drawn)))
+        for drawn in ([values[k] for k in rng.integers(len(values), size=len(values))]
+                      for _ in range(200))
+        if sum(len(v) for v in drawn)
+    ]  # fmt: skip
+    low, high = np.quantile(again, [0.16, 0.84])
+    some = [pair for pair in pairs if pair.lit.any()]
+    return Summary(
+        pairs=len(pairs),
+        pixels=len(every),
+        median=p50,
+        p68=p68,
+        p90=p90,
+        p95=p95,
+        interval=(float(low), float(high)),
+        bias=float(np.median(np.concatenate(signed))),
+        noise=float(np.mean([pair.noise for pair in some])),
+        total_error=float(np.mean([pair.total_error for pair in pairs])),
+        ssim=float(np.mean([pair.ssim for pair in pairs])),
+    )
+
+
+def by_band(
+    pairs: Sequence[PairError], bands: Sequence[NDArray[np.str_]]
+) -> Mapping[str, tuple[int, float]]:
+    """Return lit pixels and their median relative error by the band that each pixel lies in.
+
+    Parameters
+    ----------
+    pairs
+        See `compare`.
+    bands
+        Of each pair the names of bands, (H, W); "" is none.
+    """
+    names = np.concatenate([band[p.lit] for p, band in zip(pairs, bands, strict=True)])
+    errors = np.concatenate([p.relative[p.lit] for p in pairs])
+    return {
+        str(name): (int(np.count_nonzero(names == name)), float(np.median(errors[names == name])))
+        for name in np.unique(names)
+        if name
+    }
+
+
+def _sigma(photograph: Photograph) -> Float:
+    return np.asarray(np.sqrt(np.asarray(photograph.variance, np.float64) @ np.square(LUMINANCE)))

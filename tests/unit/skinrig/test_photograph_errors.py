@@ -1,0 +1,118 @@
+"""Errors of renderings against photographs: what counts as lit, and what each number means."""
+
+import numpy as np
+import pytest
+
+from skinrig import photograph_errors as errors
+from skinrig.photograph_errors import Photograph, PhotographError
+
+SIDE = 24
+
+
+def scene(rng):
+    """Return a smooth photograph with some noise, and where it is skin and lit."""
+    row, column = np.mgrid[:SIDE, :SIDE] / SIDE
+    light = 0.2 + 0.5 * row + 0.2 * np.sin(9 * column)
+    rgb = light[..., None] * np.array([1.0, 0.7, 0.5])
+    covered = np.zeros((SIDE, SIDE), bool)
+    covered[2:-2, 2:-2] = True
+    lit = covered & (column < 0.7)
+    sigma = 0.005
+    noisy = rgb + sigma * rng.standard_normal(rgb.shape)
+    valid = np.ones((SIDE, SIDE), bool)
+    return rgb, Photograph(noisy, np.full(rgb.shape, sigma**2), valid), covered, lit
+
+
+def test_a_rendering_that_is_right_differs_by_the_noise_alone(rng):
+    rgb, photo, covered, lit = scene(rng)
+    pair = errors.compare(photo, rgb, covered=covered, lit=lit)
+    count = np.count_nonzero(pair.lit)
+    # the median of `count` absolute normal deviates, within 4 standard errors
+    assert abs(pair.median / pair.noise - 1) < 4 * 1.17 / np.sqrt(count)
+    assert pair.ssim > 0.98
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.05, 1.3])
+def test_a_rendering_that_is_too_bright_by_a_factor_is_off_by_that(rng, factor):
+    rgb, photo, covered, lit = scene(rng)
+    exact = Photograph(rgb, photo.variance, photo.valid)
+    pair = errors.compare(exact, factor * rgb, covered=covered, lit=lit)
+    assert pair.median == pytest.approx(abs(factor - 1))
+    assert pair.total_error == pytest.approx(abs(factor - 1))
+    assert np.sign(np.nanmedian(pair.signed)) == np.sign(factor - 1)
+
+
+def test_missing_structure_counts_more_against_similarity_than_an_even_error_as_large(rng):
+    rgb, photo, covered, lit = scene(rng)
+    fine = rgb * (1 + 0.03 * rng.choice([-1.0, 1.0], rgb.shape[:2]))[..., None]
+    exact = Photograph(fine, photo.variance, photo.valid)
+    smooth = errors.compare(exact, rgb, covered=covered, lit=lit)
+    even = errors.compare(exact, 1.03 * fine, covered=covered, lit=lit)
+    assert smooth.median == pytest.approx(even.median, rel=0.1)
+    assert smooth.ssim < even.ssim < 1.0
+
+
+def test_only_pixels_whose_neighbors_are_in_the_light_too_count_as_lit(rng):
+    _, photo, covered, lit = scene(rng)
+    lit[10, 10] = False
+    found = errors.lit_pixels(photo, covered=covered, lit=lit)
+    assert not found[9:12, 9:12].any()
+    assert found[7, 7]
+    assert not found[2].any()  # beside the skin's border
+    assert found[3, 5]
+
+
+def test_saturated_and_noisy_pixels_do_not_count(rng):
+    rgb, photo, covered, lit = scene(rng)
+    valid = photo.valid.copy()
+    valid[8, 8] = False
+    variance = np.array(photo.variance)
+    variance[12, 12] = 1.0
+    found = errors.lit_pixels(Photograph(rgb, variance, valid), covered=covered, lit=lit)
+    assert not found[8, 8]
+    assert not found[12, 12]
+    assert found[8, 9]
+    # how well the two agree has no part in it
+    pair = errors.compare(Photograph(rgb, variance, valid), 7 * rgb, covered=covered, lit=lit)
+    assert (pair.lit == found).all()
+
+
+def test_photographs_are_summed_up_over_pixels_with_an_interval_over_photographs(rng):
+    rgb, photo, covered, lit = scene(rng)
+    exact = Photograph(rgb, photo.variance, photo.valid)
+    pairs = [
+        errors.compare(exact, f * rgb, covered=covered, lit=lit) for f in (1.01, 1.02, 1.03, 1.1)
+    ]
+    found = errors.summarize(pairs, rng=rng)
+    assert found.pairs == 4
+    assert found.pixels == 4 * np.count_nonzero(pairs[0].lit)
+    assert 0.02 <= found.median <= 0.03
+    assert found.interval[0] < found.median < found.interval[1]
+    assert found.p95 == pytest.approx(0.1)
+    assert found.bias == pytest.approx(found.median)
+
+
+def test_errors_by_band_are_those_of_the_pixels_in_it(rng):
+    rgb, photo, covered, lit = scene(rng)
+    exact = Photograph(rgb, photo.variance, photo.valid)
+    factor = np.where(np.arange(SIDE)[:, None] < 12, 1.02, 1.2)[..., None]
+    pair = errors.compare(exact, factor * rgb, covered=covered, lit=lit)
+    bands = np.where(np.arange(SIDE)[:, None] < 12, "light", "dark") + np.zeros((1, SIDE), "U1")
+    found = errors.by_band([pair], [np.where(covered, bands, "")])
+    assert found["light"][1] == pytest.approx(0.02)
+    assert found["dark"][1] == pytest.approx(0.2)
+    assert found["light"][0] + found["dark"][0] == np.count_nonzero(pair.lit)
+
+
+def test_images_that_cannot_be_compared_are_refused(rng):
+    rgb, photo, covered, lit = scene(rng)
+    with pytest.raises(PhotographError, match="expected"):
+        errors.compare(photo, rgb[:5], covered=covered, lit=lit)
+    with pytest.raises(PhotographError, match="no pixel"):
+        errors.compare(photo, rgb, covered=covered & False, lit=lit)
+    dark = errors.compare(photo, rgb, covered=covered, lit=lit & False)
+    assert np.isnan(dark.median)
+    with pytest.raises(PhotographError, match="no lit pixel"):
+        errors.summarize([dark], rng=rng)
+    with pytest.raises(PhotographError, match="variance"):
+        Photograph(rgb, np.zeros((2, 2)), photo.valid)
