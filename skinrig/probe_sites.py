@@ -132,7 +132,10 @@ def place(
             column, row = given[name][0] * width, (1.0 - given[name][1]) * height
             wanted = at_mm[min(int(row), height - 1), min(int(column), width - 1)]
         elif name in FROM_NOSE_MM:
-            wanted = _mean_place(name, at_mm[known])
+            wanted, off_mm = _mean_place(name, at_mm[known])
+            if off_mm > NEAR_MM:
+                left_out.append((name, f"the scan ends {off_mm:.0f} mm before it"))
+                continue
             guessed.append(name)
         else:
             left_out.append((name, "its place on a face is not known; a table may name it"))
@@ -203,14 +206,16 @@ def _measured(
     }
 
 
-def _mean_place(name: str, points_mm: FloatArray) -> FloatArray:
-    """Return the point of a scan at a mean face's distance from the foremost point, its nose."""
+def _mean_place(name: str, points_mm: FloatArray) -> tuple[FloatArray, float]:
+    """Return the point at a mean face's distance from the foremost one, the nose, and how far off.
+
+    Distances are as seen from the front; of what lies behind each other the foremost counts.
+    """
     nose = points_mm[np.argmax(points_mm[:, 2])]
     across, up = FROM_NOSE_MM[name]
     away = np.hypot(points_mm[:, 0] - nose[0] - across, points_mm[:, 1] - nose[1] - up)
-    # of what lies behind each other the foremost
     near = away < away.min() + 1.0
-    return np.asarray(points_mm[near][np.argmax(points_mm[near, 2])])
+    return np.asarray(points_mm[near][np.argmax(points_mm[near, 2])]), float(away.min())
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,126 @@
+"""A probe's places found on a face, and translucency laid on its texture."""
+
+import json
+
+import numpy as np
+import pytest
+
+from model.skin import SkinAppearance, SkinMap
+from reconstruction.translucency import TranslucencyError
+from skinrig import probe_sites
+from skinrig.probe_sites import ProbeSiteError
+
+CHANNELS = ("red", "green", "blue")
+MEASURED = {
+    "forehead": (0.50, 0.90, 1.50), "cheek": (0.62, 1.10, 1.60), "chin": (0.70, 1.30, 1.90),
+}  # fmt: skip
+
+
+def face(side=65, *, flat=False):
+    """Return the map of positions of a round face with a nose, and the tip of the nose."""
+    u, v = np.meshgrid(np.linspace(-1.2, 1.2, side), np.linspace(1.0, -1.0, side))
+    x, y = (70.0 * np.sin(u), 120.0 * v) if not flat else (60.0 * u, 120.0 * v)
+    z = (80.0 * np.cos(u) * np.sqrt(1.2 - v**2) - 70.0) if not flat else np.zeros_like(x)
+    z = z + 18.0 * np.exp(-(x**2 + (y + 5.0) ** 2) / 150.0)
+    place = np.stack([x + 1.5, y, z], axis=-1).astype(np.float32)
+    return SkinMap(place, "mm"), place.reshape(-1, 3)[np.argmax(place[..., 2])]
+
+
+def probe(measured=MEASURED, stderr=0.02, files=None):
+    rows = [
+        {"site": site, "channel": channel, "sigma_tr_per_mm": value,
+         "sigma_tr_stderr": None if value is None else stderr * value, "measurements": 3}
+        for site, values in measured.items()
+        for channel, value in zip(CHANNELS, values, strict=True)
+    ]  # fmt: skip
+    document = json.dumps({"schema": "skinrig.subsurface/1", "sites": rows}).encode()
+    return SkinAppearance(
+        {}, "measured", files={"subsurface.json": document} if files is None else files
+    )
+
+
+def test_sites_lie_at_a_mean_faces_distances_from_the_nose_and_the_map_runs_through_them():
+    position, nose = face()
+    found = probe_sites.place(probe(), position)
+    assert [site.name for site in found.sites] == list(MEASURED)
+    for site in found.sites:
+        across, up = probe_sites.FROM_NOSE_MM[site.name]
+        assert (
+            np.hypot(site.position_mm[0] - nose[0] - across, site.position_mm[1] - nose[1] - up)
+            < 4.0
+        )
+        measured = 1.0 / np.array(MEASURED[site.name])
+        stderr = found.map.stderr[site.texel]
+        assert (np.abs(found.map.values[site.texel] - measured) < 2.0 * stderr).all()
+        assert (stderr < 0.03 * measured).all()
+    # at the ears nobody measured
+    assert found.map.stderr[10, 0, 0] > 2.0 * found.map.stderr[found.sites[0].texel][0]
+    assert found.left_out == ()
+    assert "mean face" in found.assumed[0]
+
+
+def test_the_layout_of_the_texture_does_not_matter():
+    position, _ = face()
+    straight = probe_sites.place(probe(), position).map
+    order = np.random.default_rng(1).permutation(65 * 65)
+    mixed = SkinMap(position.values.reshape(-1, 3)[order].reshape(65, 65, 3), "mm")
+    laid = probe_sites.place(probe(), mixed).map
+    np.testing.assert_allclose(
+        laid.values.reshape(-1, 3), straight.values.reshape(-1, 3)[order], rtol=1e-5
+    )
+
+
+def test_a_table_says_where_sites_are_and_names_others(tmp_path):
+    position, _ = face()
+    table = tmp_path / "sites.csv"
+    table.write_text("name,x,y\ncheek,50,40\nscar,20,20\n")
+    found = probe_sites.place(
+        probe({**MEASURED, "scar": (0.6, 1.0, 1.5)}), position, landmarks=table
+    )
+    at = {site.name: site.texel for site in found.sites}
+    assert at["cheek"] == (40, 50)
+    assert at["scar"] == (20, 20)
+    assert "cheek" not in found.assumed[0]
+    assert "forehead, chin" in found.assumed[0]
+
+
+def test_sites_that_are_unknown_or_off_the_scan_are_left_out_with_the_reason():
+    position, _ = face()
+    upper = SkinMap(position.values, "mm", valid=position.values[..., 1] > -20.0)
+    found = probe_sites.place(probe({**MEASURED, "elbow": (0.6, 1.0, 1.5)}), upper)
+    why = dict(found.left_out)
+    assert "not known" in why["elbow"]
+    assert "the scan ends" in why["chin"]
+    assert [site.name for site in found.sites] == ["forehead", "cheek"]
+    np.testing.assert_array_equal(found.map.valid, upper.valid)
+    with pytest.raises(ProbeSiteError, match="elbow: its place"):
+        probe_sites.place(probe({"elbow": (0.6, 1.0, 1.5)}), position)
+
+
+def test_a_channel_without_a_fit_is_left_out_and_one_without_any_is_masked():
+    position, _ = face()
+    found = probe_sites.place(probe({**MEASURED, "cheek": (None, 1.1, 1.6)}), position)
+    assert [what for what, _ in found.left_out] == ["cheek, channel 0"]
+    assert found.map.valid.all()
+    without_red = {name: (None, *values[1:]) for name, values in MEASURED.items()}
+    assert not probe_sites.place(probe(without_red), position).map.valid.any()
+    nothing = dict.fromkeys(MEASURED, (None, None, None))
+    with pytest.raises(TranslucencyError, match="no usable measurement"):
+        probe_sites.place(probe(nothing), position)
+
+
+def test_flat_patches_and_single_texels_have_a_map_too():
+    flat, _ = face(flat=True)
+    assert probe_sites.place(probe(), flat).map.valid.all()
+    one = SkinMap(np.zeros((1, 1, 3), np.float32), "mm")
+    with pytest.raises(ProbeSiteError, match="the scan ends"):
+        probe_sites.place(probe(), one)
+    none = SkinMap(np.zeros((4, 4, 3), np.float32), "mm", valid=np.zeros((4, 4), bool))
+    with pytest.raises(ProbeSiteError, match="no valid texel"):
+        probe_sites.place(probe(), none)
+
+
+@pytest.mark.parametrize("files", [{}, {"subsurface.json": b"{}"}, {"subsurface.json": b"\xff"}])
+def test_a_probe_without_sites_is_named(files):
+    with pytest.raises(ProbeSiteError, match=r"subsurface\.json"):
+        probe_sites.place(probe(files=files), face()[0])
