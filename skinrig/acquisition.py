@@ -164,6 +164,11 @@ def sequence_of(
     return order if prompt_period is None else replace(order, prompt_period_s=prompt_period)
 
 
+def read_plan(file: Path) -> Plan:
+    """Return the plan in a JSON file, as ``--plan-out`` and `skinrig plan` write it."""
+    return Plan.from_json(file.read_text(encoding="utf-8"), where=str(file))
+
+
 def choose_plan(
     rig: Rig,
     file: Path | None,
@@ -219,7 +224,7 @@ def choose_plan(
     if repeats != 1 and not flash and (file is not None or rig.probe is None):
         raise UsageError("--repeats: is for the probe's own plans and the flash rig's states")
     if file is not None:
-        return Plan.from_json(file.read_text(encoding="utf-8"), where=str(file))
+        return read_plan(file)
     if "gradient_sphere" in rig.boxes:
         return _gradient_plan(rig, target, angles, steps)
     if "dome" in rig.boxes:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig import cli_dynamic, cli_reflectance, cli_rendering, errors
+from skinrig import cli_dynamic, cli_editing, cli_planning, cli_reflectance, cli_rendering, errors
 from skinrig.console import Console
 
 app = typer.Typer(
@@ -193,6 +193,10 @@ def simulate(
             "sweat, lotion, makeup, powder; repeatable."
         ),
     ] = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option(help="Of the dome: the lights and cameras of a plan by `skinrig plan`."),
+    ] = None,
     sequence: Sequence = None,
     prompt_period: PromptPeriod = None,
     shot_period: ShotPeriod = None,
@@ -214,7 +218,14 @@ def simulate(
 
     Example: skinrig simulate flash --out session-flash --subject IV
     """
-    from skinrig.acquisition import amounts_of, names_of, numbers_of, range_of, sequence_of
+    from skinrig.acquisition import (
+        amounts_of,
+        names_of,
+        numbers_of,
+        range_of,
+        read_plan,
+        sequence_of,
+    )
     from skinrig.consent import subject_of
     from skinrig.simulation import USES, pseudonym, simulate_session
 
@@ -229,6 +240,7 @@ def simulate(
         sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
         relaxation_s=relaxation, subsurface=subsurface, interreflections=interreflections,
         conditions=amounts_of(condition, "--condition"),
+        plan=None if plan is None else read_plan(plan),
     )  # fmt: skip
     console.say(
         f"{done.session}: {done.frames} frames" + (f", truth in {done.truth}" if done.truth else "")
@@ -404,7 +416,10 @@ def calibrate(
 
 
 import_app = typer.Typer(help="Bring in what other devices made.", no_args_is_help=True)
+app.command()(cli_planning.plan)
 app.command()(cli_rendering.render)
+app.command()(cli_editing.edit)
+cli_dynamic.fit_app.command("traits")(cli_editing.fit_traits)
 app.add_typer(import_app, name="import")
 cli_dynamic.fit_app.command("reflectance")(cli_reflectance.fit_reflectance)
 app.add_typer(cli_dynamic.fit_app, name="fit")

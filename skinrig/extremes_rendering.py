@@ -83,8 +83,9 @@ def _zero_triangles(_: Real) -> str:
 def _wrong_unit(_: Real) -> str:
     from rigsim.mesh import MeshError, build_mesh
 
+    points = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
     return refused(
-        lambda: build_mesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], [[0, 1, 2]], np.zeros((3, 2))),
+        lambda: build_mesh(points, np.array([[0, 1, 2]]), np.zeros((3, 2))),
         MeshError, "millimetres",
     )  # fmt: skip
 

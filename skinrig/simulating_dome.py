@@ -10,6 +10,7 @@ import numpy as np
 
 from capture.plan import Plan
 from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
+from capture.plan.rows import lights_of
 from capture.rig import Rig, load_rig
 from model import store
 from model.skin import SkinAppearance
@@ -42,13 +43,9 @@ def simulate_dome(order: Order) -> Simulated:
     )  # fmt: skip
     state = _state(order)
     conditions = _conditions(order)
-    rig = small_dome(
-        load_rig("dome"),
-        lights=order.lights or LIGHTS[order.size],
-        views=order.views or VIEWS[order.size],
-        width_px=order.width_px or WIDTHS_PX[order.size],
-    )
-    plan = _plan(rig, order.target, order.size)
+    rig = _rig(order)
+    planned = order.plan if order.target is None else None
+    plan = planned or _plan(rig, order.target, order.size)
     figures = light_figures(plan, rig)
     if order.progress is not None:
         for line in light_lines(plan, rig):
@@ -57,7 +54,7 @@ def simulate_dome(order: Order) -> Simulated:
         "rig": "dome", "width_px": rig.views[0].width_px, "subject": order.subject,
         "target": order.target or "", "mesh": str(order.mesh or ""), "lights": len(rig.lights),
         "views": len(rig.views), "move": order.move, "state": state, "movement": order.movement,
-        "wrapped": order.wrapped,
+        "wrapped": order.wrapped, "plan": "" if order.plan is None else order.plan.to_json(),
     }  # fmt: skip
     if order.target is None:
         asked |= {"subsurface": order.subsurface, "interreflections": order.interreflections}
@@ -97,6 +94,7 @@ def simulate_dome(order: Order) -> Simulated:
                 "interreflections": order.interreflections,
                 **appearance.parameters,
                 **scan,
+                "landmarks_mm": _landmarks(scene.subject),
             },
             inputs={"session": session.content_hash},
             files=_truth_files(scene, appearance, order.seed),
@@ -155,6 +153,12 @@ def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, byte
             sites={name: landmarks[name] for name in SITES},
         ),
     }
+
+
+def _landmarks(subject: Any) -> dict[str, list[float]]:
+    """Return named points of the skin, x, y, z in mm, rig frame."""
+    points = subject.surface_landmarks()
+    return dict(zip(points.names, points.on(subject.mesh).round(4).tolist(), strict=True))
 
 
 def _blend_shapes(subject: Any) -> bytes:
@@ -235,6 +239,29 @@ def spread(places: np.ndarray[Any, Any], count: int) -> list[int]:
         nearest[chosen] = np.inf
         chosen.append(int(np.argmin(nearest)))
     return chosen
+
+
+def _rig(order: Order) -> Rig:
+    """Return the dome with the lights, cameras and pixels of an order."""
+    width_px = order.width_px or WIDTHS_PX[order.size]
+    if order.plan is None:
+        return small_dome(
+            load_rig("dome"),
+            lights=order.lights or LIGHTS[order.size],
+            views=order.views or VIEWS[order.size],
+            width_px=width_px,
+        )
+    if (order.lights, order.views) != (None, None):
+        raise SimulationError("lights, views: a plan names its own; leave them out")
+    dome = load_rig("dome")
+    if order.plan.rig != dome.name:
+        raise SimulationError(f"plan: got one of {order.plan.rig!r}, expected {dome.name!r}")
+    lit = {name for step in order.plan.steps for name in lights_of(step)}
+    seen = {name for step in order.plan.steps for name in step.cameras}
+    return dome.subset(
+        lights=[x.name for x in dome.lights if x.name in lit],
+        views=[v.name for v in dome.views if v.name in seen],
+    ).resized(width_px)
 
 
 def _plan(rig: Rig, target: str | None, size: str) -> Plan:

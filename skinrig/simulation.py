@@ -125,6 +125,7 @@ class Order:
     subsurface: bool = False
     interreflections: bool = False
     conditions: Mapping[str, float] = field(default_factory=dict)
+    plan: Plan | None = None
 
     def __post_init__(self) -> None:
         if self.size not in SIZES:
@@ -172,6 +173,7 @@ def simulate_session(
     subsurface: bool = False,
     interreflections: bool = False,
     conditions: Mapping[str, float] | None = None,
+    plan: Plan | None = None,
 ) -> Simulated:
     """Simulate a capture into SESSION/, and write its truth beside it.
 
@@ -240,6 +242,8 @@ def simulate_session(
         Whether light in the dome spreads sideways inside the skin, and goes from skin to skin.
     conditions
         Conditions of the face in the dome with their amounts, see `rigsim.skin_conditions`.
+    plan
+        Of the dome: what is captured of a face; its lights and cameras are those of targets, too.
 
     Raises
     ------
@@ -256,9 +260,12 @@ def simulate_session(
         movement=movement, wrapped=wrapped, created=created, person=person, progress=progress,
         sequence=sequence, relaxation_s=relaxation_s, subsurface=subsurface,
         interreflections=interreflections, conditions=dict(conditions or {}),
+        plan=plan,
     )  # fmt: skip
     if rig_name != "dome":
-        order.refuse(rig_name, subsurface=False, interreflections=False, conditions={})
+        order.refuse(
+            rig_name, subsurface=False, interreflections=False, conditions={}, plan=None
+        )  # fmt: skip
     if sequence is not None and rig_name != "flash":
         raise SimulationError(f"sequence: the {rig_name} rig knows nothing of it; leave it out")
     if sequence is None and relaxation_s is not None:

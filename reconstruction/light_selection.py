@@ -1,0 +1,346 @@
+"""Which lights tell most of a surface's normals: Fisher information, and a greedy choice by it.
+
+A Lambertian sample s = rho E cos(theta) of a light in direction l tells of the logarithm of its
+signal, with g the derivatives of log cos(theta) by the normal's two tilts and of log rho by itself,
+
+    I = w g g^T,    g = (l.t1 / l.n, l.t2 / l.n, 1),    w = s^2 / var(s)
+
+Its inverse, summed over the lights that reach a point, bounds the covariance of tilts and albedo.
+Lights are chosen one after the other, each the one that lowers the mean squared error of the points
+most, and those that later ones made superfluous are taken off again (an A-optimal exchange).
+
+References
+----------
+Fedorov 1972, Theory of Optimal Experiments (exchange); Pukelsheim 2006,
+doi:10.1137/1.9780898719109 (A-optimality).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+UNKNOWN_RAD = np.radians(10.0)
+"""Error that a point without an estimate counts as: about what a scan's normals are off."""
+_VAGUE = 1e-6
+"""Information held before the first light: tilts and log albedo known to a thousand."""
+
+
+class SelectionError(ValueError):
+    """Lights that nothing can be chosen of."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Information:
+    """What each of L lights tells of each of P points.
+
+    Attributes
+    ----------
+    tilt : ndarray of float64, shape (P, L, 2)
+        l.t / l.n for two tangents.
+    weight : ndarray of float64, shape (P, L)
+        Inverse variance of the logarithm of the sample; 0 where the light does not reach the point.
+    importance : ndarray of float64, shape (P,)
+        How much a point counts, e.g. its area.
+    systematic_rad : ndarray of float64, shape (P,)
+        Error of each tilt that no light removes.
+    """
+
+    tilt: Floats
+    weight: Floats
+    importance: Floats
+    systematic_rad: Floats
+
+    def __post_init__(self) -> None:
+        """Check shapes and values."""
+        points, lights = self.weight.shape if self.weight.ndim == 2 else (0, 0)
+        for name, shape in (
+            ("tilt", (points, lights, 2)), ("importance", (points,)), ("systematic_rad", (points,)),
+        ):  # fmt: skip
+            if getattr(self, name).shape != shape:
+                raise SelectionError(f"{name}: got {getattr(self, name).shape}, expected {shape}")
+        if not points or not lights:
+            raise SelectionError(f"weight: got shape {self.weight.shape}, expected (P, L)")
+        for name in ("tilt", "weight", "importance", "systematic_rad"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise SelectionError(f"{name}: got NaN or infinity, expected finite values")
+        if (self.weight < 0).any() or (self.importance < 0).any():
+            raise SelectionError("weight, importance: got a negative value, expected 0 or more")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Errors that a set of lights leaves.
+
+    Attributes
+    ----------
+    tilt_rad : ndarray of float64, shape (P,)
+        Standard error of each of two tilts (their root mean square), the systematic part included.
+    log_albedo : ndarray of float64, shape (P,)
+        Standard error of log rho.
+    valid : ndarray of bool, shape (P,)
+        At least `least` lights reach the point.
+    valid_share : float
+        By importance.
+    median_rad : float
+        Median angle between estimate and truth over the valid points: where half of the angles,
+        Rayleigh distributed at each point, lie below. pi / 2 where no point is valid.
+    """
+
+    tilt_rad: Floats
+    log_albedo: Floats
+    valid: Bools
+    valid_share: float
+    median_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Selection:
+    """Lights in the order of their choice, and what each further one buys.
+
+    Attributes
+    ----------
+    lights : tuple of int
+        Those kept, in the order of choice.
+    path : tuple of (int, float, float)
+        After each light that was taken: how many, predicted median error in rad, share valid.
+    prediction : Prediction
+        Of the lights kept.
+    reached : bool
+        Whether what was wanted is predicted.
+    """
+
+    lights: tuple[int, ...]
+    path: tuple[tuple[int, float, float], ...]
+    prediction: Prediction
+    reached: bool
+
+
+def information(
+    normals: ArrayLike,
+    to_light: ArrayLike,
+    relative_variance: ArrayLike,
+    *,
+    importance: ArrayLike | None = None,
+    systematic_rad: ArrayLike = 0.0,
+) -> Information:
+    """Return what lights tell of points.
+
+    Parameters
+    ----------
+    normals : array_like, shape (P, 3)
+        Unit normals.
+    to_light : array_like, shape (P, L, 3) or (L, 3)
+        Unit vectors from the points to the lights.
+    relative_variance : array_like, shape (P, L)
+        Variance of each sample over its square, > 0; infinite where there is none.
+    importance : array_like, shape (P,), optional
+        How much a point counts; 1 by default.
+    systematic_rad : array_like, shape (P,) or ()
+        Error of each tilt that stays whatever the lights.
+
+    Examples
+    --------
+    >>> up = [[0.0, 0.0, 1.0]]
+    >>> ring = np.array([[0.6, 0, 0.8], [-0.6, 0, 0.8], [0, 0.6, 0.8], [0, -0.6, 0.8]])
+    >>> found = information(up, ring, np.full((1, 4), 1e-4))
+    >>> round(float(np.degrees(predict(found, range(4), least=3).tilt_rad[0])), 3)
+    0.54
+    """
+    n = np.asarray(normals, np.float64)
+    way = np.broadcast_to(np.asarray(to_light, np.float64), (len(n), *np.shape(to_light)[-2:]))
+    helper = np.where(np.abs(n[:, [0]]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(n, helper)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    second = np.cross(n, first)
+    cosine = np.einsum("plk,pk->pl", way, n)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = np.where(cosine > 0, 1.0 / np.asarray(relative_variance, np.float64), 0.0)
+        tilt = np.stack([np.einsum("plk,pk->pl", way, t) for t in (first, second)], -1)
+        tilt = np.where(cosine[..., None] > 1e-9, tilt / cosine[..., None], 0.0)
+    count = len(n)
+    return Information(
+        tilt,
+        weight,
+        np.ones(count) if importance is None else np.asarray(importance, np.float64),
+        np.array(np.broadcast_to(np.asarray(systematic_rad, np.float64), (count,))),
+    )
+
+
+def predict(found: Information, lights: ArrayLike, *, least: int) -> Prediction:
+    """Return the errors that these lights leave.
+
+    Parameters
+    ----------
+    found : Information
+    lights : array_like of int
+        Numbers along L.
+    least : int
+        Fewest lights that must reach a point, at least 3.
+    """
+    chosen = np.asarray(list(lights), np.intp)  # type: ignore[arg-type]
+    covariance = np.asarray(np.linalg.inv(_start(found, chosen)), np.float64)
+    reached = np.count_nonzero(found.weight[:, chosen] > 0, axis=1)
+    return _judged(found, covariance, reached, least)
+
+
+def select(
+    found: Information,
+    *,
+    median_rad: float,
+    valid_share: float,
+    least: int,
+    most: int | None = None,
+    fixed: tuple[int, ...] = (),
+) -> Selection:
+    """Choose as few lights as reach an error.
+
+    Parameters
+    ----------
+    found : Information
+    median_rad : float
+        Wanted median angle, rad.
+    valid_share : float
+        Wanted share of the points that have an estimate, 0 to 1.
+    least : int
+        Fewest lights that must reach a point, at least 3.
+    most : int, optional
+        Largest number to choose; all by default.
+    fixed : tuple of int
+        Lights that are used anyway.
+
+    Returns
+    -------
+    Selection
+        `reached` says whether what is wanted is predicted; if not, the selection holds the `most`
+        best lights.
+    """
+    if least < 3:
+        raise SelectionError(f"least: got {least}, expected at least 3 lights a point")
+    lights = found.weight.shape[1]
+    most = lights if most is None else min(most, lights)
+    chosen = list(fixed)
+    path: list[tuple[int, float, float]] = []
+    prediction = predict(found, chosen, least=least)
+    while len(chosen) < most and not _good(prediction, median_rad, valid_share):
+        gain = _gains(found, chosen, least)
+        gain[chosen] = -np.inf
+        chosen.append(int(np.argmax(gain)))
+        prediction = predict(found, chosen, least=least)
+        path.append((len(chosen), prediction.median_rad, prediction.valid_share))
+    if _good(prediction, median_rad, valid_share):
+        chosen, prediction = _pruned(
+            found, chosen, prediction, median_rad, valid_share, least, fixed
+        )
+    reached = _good(prediction, median_rad, valid_share)
+    return Selection(tuple(chosen), tuple(path), prediction, reached)
+
+
+def _pruned(
+    found: Information,
+    chosen: list[int],
+    prediction: Prediction,
+    median_rad: float,
+    valid_share: float,
+    least: int,
+    fixed: tuple[int, ...],
+) -> tuple[list[int], Prediction]:
+    """Take off lights, the earliest first, that later ones made superfluous."""
+    for light in list(chosen):
+        if light in fixed:
+            continue
+        without = [other for other in chosen if other != light]
+        now = predict(found, without, least=least)
+        if _good(now, median_rad, valid_share):
+            chosen, prediction = without, now
+    return chosen, prediction
+
+
+def _good(prediction: Prediction, median_rad: float, valid_share: float) -> bool:
+    return prediction.median_rad <= median_rad and prediction.valid_share >= valid_share
+
+
+def _start(found: Information, chosen: NDArray[np.intp]) -> Floats:
+    """Return the information of these lights, (P, 3, 3)."""
+    weight = found.weight[:, chosen]
+    g = np.concatenate([found.tilt[:, chosen], np.ones((*weight.shape, 1))], axis=-1)
+    return np.asarray(np.einsum("pl,pli,plj->pij", weight, g, g) + _VAGUE * np.eye(3))
+
+
+def _gains(found: Information, chosen: list[int], least: int) -> Floats:
+    """Return by how much each light would lower the mean squared error of the points, (L,).
+
+    Points that too few lights reach count `UNKNOWN_RAD` and more, the more the fewer reach them, so
+    that a light towards them is worth something before the last one comes.
+    """
+    at = np.asarray(chosen, np.intp)
+    covariance = np.linalg.inv(_start(found, at))
+    reached = np.count_nonzero(found.weight[:, at] > 0, axis=1)
+    g = np.concatenate([found.tilt, np.ones((*found.weight.shape, 1))], axis=-1)
+    moved = np.einsum("pij,plj->pli", covariance, g)  # Sherman and Morrison 1950
+    bend = np.einsum("pli,pli->pl", moved, g)
+    drop = found.weight * np.sum(moved[..., :2] ** 2, -1) / (1.0 + found.weight * bend)
+    trace = covariance[:, 0, 0] + covariance[:, 1, 1]
+    floor = np.square(found.systematic_rad)
+    unknown = UNKNOWN_RAD**2
+    now = _loss(0.5 * trace + floor, reached, least, unknown)
+    then = _loss(
+        0.5 * (trace[:, None] - drop) + floor[:, None],
+        reached[:, None] + (found.weight > 0),
+        least,
+        unknown,
+    )
+    return np.asarray(found.importance @ (now[:, None] - then))
+
+
+def _loss(variance: Floats, reached: NDArray[np.intp], least: int, unknown: float) -> Floats:
+    missing = np.clip(least - reached, 0, None) / least
+    return np.where(missing > 0, unknown * (1.0 + missing), np.minimum(variance, unknown))
+
+
+def _judged(
+    found: Information, covariance: Floats, reached: NDArray[np.intp], least: int
+) -> Prediction:
+    variance = 0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1]) + found.systematic_rad**2
+    valid = np.asarray(reached >= least)
+    total = float(found.importance.sum())
+    share = float(found.importance[valid].sum()) / total if total > 0 else 0.0
+    return Prediction(
+        np.sqrt(variance),
+        np.sqrt(covariance[:, 2, 2]),
+        valid,
+        share,
+        median_of_rayleigh(np.sqrt(variance[valid]), found.importance[valid]),
+    )
+
+
+def median_of_rayleigh(scale: ArrayLike, weight: ArrayLike | None = None) -> float:
+    """Return the median of a mixture of Rayleigh distributions; pi / 2 for none.
+
+    Parameters
+    ----------
+    scale : array_like, shape (P,)
+        Standard deviations of the two components.
+    weight : array_like, shape (P,), optional
+
+    Examples
+    --------
+    >>> round(median_of_rayleigh([1.0, 1.0]), 4)
+    1.1774
+    """
+    s = np.asarray(scale, np.float64)
+    w = np.ones(len(s)) if weight is None else np.asarray(weight, np.float64)
+    if not len(s) or not w.sum() > 0:
+        return float(np.pi / 2)
+    low, high = 0.0, 2.0 * float(s.max()) + 1e-300
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        with np.errstate(divide="ignore", over="ignore"):
+            below = float(np.sum(w * -np.expm1(-0.5 * (middle / np.maximum(s, 1e-300)) ** 2)))
+        low, high = (middle, high) if below < 0.5 * w.sum() else (low, middle)
+    return 0.5 * (low + high)

@@ -1,0 +1,78 @@
+"""The command `skinrig plan`."""
+
+from __future__ import annotations
+
+import json as json_text
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from skinrig import errors
+from skinrig.console import Console
+
+Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
+
+
+def plan(
+    rig: Annotated[str, typer.Argument(help="Name of a rig: dome.")],
+    want: Annotated[
+        str,
+        typer.Option(
+            help="Medians over the face that must be reached, such as normals<=1deg,r_d<=3%; "
+            "empty: what the whole rig, or --forecast, will give."
+        ),
+    ] = "",
+    subject: Annotated[
+        str, typer.Option(help="Preset of the face that is forecast, I to VI.")
+    ] = "III",
+    width: Annotated[
+        int | None, typer.Option(help="Pixels across the cameras; default: the rig's own.")
+    ] = None,
+    most_lights: Annotated[int | None, typer.Option(help="No more lights than these.")] = None,
+    valid_share: Annotated[
+        float, typer.Option(help="Of the skin that the whole rig reaches, so much must stay.")
+    ] = 0.9,
+    forecast: Annotated[
+        Path | None, typer.Option(help="A plan, JSON: say what it will give instead.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="File for the plan, JSON.")] = None,
+    confirm: Annotated[
+        Path | None,
+        typer.Option(help="Folder: simulate the plan, reconstruct, and compare with the forecast."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the face.")] = 0,
+    json: Json = False,
+) -> None:
+    """Choose the smallest plan that reaches an error, and say what it leaves out.
+
+    Example: skinrig plan dome --want "normals<=1deg,r_d<=3%" --out plan.json
+
+    Example: skinrig plan dome --forecast plan.json
+    """
+    from skinrig.planning import choose, confirmed, lines
+
+    console = Console(json)
+    choice = choose(
+        rig, want, subject=subject, seed=seed, width_px=width, most_lights=most_lights,
+        valid_share=valid_share, forecast=forecast,
+    )  # fmt: skip
+    for line in lines(choice):
+        console.say(line)
+    document = choice.to_document()
+    reached = choice.reached
+    if confirm is not None:
+        found = confirmed(choice, confirm, subject=subject, seed=seed, progress=console.progress)
+        document["confirmation"] = found
+        for row in found:
+            console.say(
+                f"measured: {row['name']} {row['median']:.3g} {row['unit']}, "
+                f"{'within' if row['within'] else 'OUTSIDE'} the forecast's interval"
+            )
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(json_text.dumps(choice.plan.to_json(), indent=1) + "\n", encoding="utf-8")
+        console.say(f"next: skinrig capture {rig} --plan {out} --out session")
+    console.document(document.pop("schema"), document)
+    if not reached:
+        raise typer.Exit(errors.LIMIT_MISSED)

@@ -1,0 +1,90 @@
+"""What is wanted of a plan, and the dome's own choice."""
+
+import json
+
+import numpy as np
+import pytest
+
+from capture.plan import Plan
+from capture.rig import load_rig
+from skinrig import planning, planning_dome
+from skinrig.cli import main
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("normal<=1deg", "did you mean normals"),
+        ("normals<1", "NUMBERdeg"),
+        ("normals<=1%", "expected deg"),
+        ("normals<=0deg", "above 0"),
+        ("normals<=--deg", "above 0"),
+        ("normals<=1deg,normals<=2deg", "twice"),
+    ],
+)
+def test_what_cannot_be_wanted_is_told(text, word):
+    with pytest.raises(planning.PlanningError, match=word):
+        planning.read_wants(text, "dome")
+
+
+def test_a_rig_that_has_no_plans_of_its_own_is_told(capsys):
+    assert main(["plan", "moon", "--want", "normals<=1deg"]) == 3
+    assert "expected one of dome" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return load_rig("dome").resized(320)
+
+
+@pytest.fixture(scope="module")
+def look(rig):
+    return planning_dome.sight(rig, "III", points=300)
+
+
+def test_lights_from_behind_reach_no_point_that_looks_ahead(rig, look):
+    ahead = look.normals[:, 2] > 0.95
+    behind = [k for k, light in enumerate(rig.lights) if light.position_mm[2] < -300]
+    told = look.information(range(len(rig.views))).weight
+    assert behind
+    assert not told[np.ix_(ahead, behind)].any()
+    assert told[ahead].any()
+
+
+def test_darker_skin_and_fewer_cameras_tell_less(rig, look):
+    dark = planning_dome.sight(rig, "VI", points=300)
+    every = look.information(range(16)).weight.sum()
+    assert dark.information(range(16)).weight.sum() < every
+    assert look.information(range(4)).weight.sum() < every
+
+
+def test_a_plan_keeps_what_it_promises_and_says_what_it_leaves_out(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(planning_dome, "POINTS", 300)
+    file = tmp_path / "plan.json"
+    code = main(["plan", "dome", "--want", "normals<=1.5deg", "--width", "320", "--out", str(file),
+                 "--json"])  # fmt: skip
+    document = json.loads(capsys.readouterr().out)
+    assert code == 0
+    assert document["schema"] == planning.SCHEMA
+    assert document["reached"]
+    plan = Plan.from_json(file.read_text())
+    lit = {step.index["light"] for step in plan.steps if step.kind == "olat"}
+    assert lit == set(document["knobs"]["lights"])
+    assert len(lit) < 150
+    assert document["saved_seconds"] > 0
+    assert any("lights" in what for what, _ in document["left_out"])
+    assert document["light"]["flashes_per_s"] < 3
+    # the inverse question gives the same answer
+    assert main(["plan", "dome", "--forecast", str(file), "--width", "320", "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    for one, other in zip(document["forecasts"], again["forecasts"], strict=True):
+        assert other["median"] == pytest.approx(one["median"], rel=1e-9)
+
+
+def test_what_is_out_of_reach_says_why(capsys, monkeypatch):
+    monkeypatch.setattr(planning_dome, "POINTS", 200)
+    assert main(["plan", "dome", "--want", "normals<=0.05deg", "--width", "320",
+                 "--most-lights", "25"]) == 1  # fmt: skip
+    said = capsys.readouterr().out
+    assert "NOT REACHED" in said
+    assert "more pixels would help" in said
