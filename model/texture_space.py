@@ -256,7 +256,7 @@ class TextureSpace:
         mean = centers.mean(axis=0)
         spread = np.mean([c for _, c in moments], axis=0)
         spread = spread + (centers - mean).T @ (centers - mean) / count
-        axes = _principal_axes(spread)
+        axes = _principal_axes(spread, unit or 1.0)
         plain = cls(
             mean, axes, np.tile(np.linspace(0.0, 1.0, BINS + 1),
                                 (len(mean), levels * orientations + 3, 1)),
@@ -285,7 +285,7 @@ class TextureSpace:
     def load(cls, path: str | Path) -> TextureSpace:
         """Read what `save` wrote; TextureError when it is not that."""
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 mean, axes, edges = (stored[name] for name in ("mean", "axes", "edges"))
                 levels, orientations, images = (int(n) for n in stored["counts"])
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
@@ -318,16 +318,16 @@ def checked_image(image: ArrayLike, valid: ArrayLike | None) -> tuple[Array, Mas
     return values, mask
 
 
-def _principal_axes(covariance: Floats) -> Floats:
+def _principal_axes(covariance: Floats, unit: float) -> Floats:
     """Return eigenvectors as rows by falling variance, well defined without variance too."""
     C = len(covariance)
     preferred = _OPPONENT if C == 3 else np.eye(C)
-    total = float(np.trace(covariance))
-    scaled = covariance / total if total > 0.0 else np.zeros((C, C))
-    # far below any measured variance; orders what has none
-    ordered = scaled + 1e-12 * preferred.T @ np.diag(np.arange(C, 0.0, -1.0)) @ preferred
+    # orders directions without variance; about that of the rounding of float32
+    least = 1e-9 * np.trace(covariance) + 1e-13 * unit**2
+    ordered = covariance + least * preferred.T @ np.diag(np.arange(C, 0.0, -1.0)) @ preferred
     axes = np.linalg.eigh(ordered)[1].T[::-1]
-    largest = axes[np.arange(C), np.abs(axes).argmax(axis=1)]
+    # of equal components the first decides the sign
+    largest = axes[np.arange(C), (np.abs(axes) - 1e-3 * np.arange(C)).argmax(axis=1)]
     return np.ascontiguousarray(axes * np.sign(largest)[:, None])
 
 
@@ -368,6 +368,6 @@ def _uneven_edges(quantiles: Array, unit: float) -> Floats:
     share = 0.5 * (at - low) / (high - low) + 0.5 * occurrence
     widths = np.diff(np.interp(np.linspace(0.0, 1.0, BINS + 1), share, at))
     # a value that occurs very often holds several edges: keep them apart
-    widths = np.maximum(widths, 1e-6 * (high - low) / BINS)
+    widths = np.maximum(widths, 1e-12 * (high - low))
     widths *= (high - low) / widths.sum()
     return np.asarray(low + np.concatenate([[0.0], np.cumsum(widths)]))
