@@ -44,7 +44,7 @@ STANDARD_MM: Final = MappingProxyType(
 """Twenty points that a face is marked by, left and right as seen in the image, and about where they
 lie when it is unrolled from the tip of its nose, mm; round figures for faces without landmarks."""
 
-REGIONS: Final = ("face", "beard", "no-beard")
+REGIONS: Final = ("face", "beard", "no-beard", "skin")
 
 
 class RegionError(ValueError):
@@ -64,8 +64,9 @@ def region(name: str, frame: CommonFrame) -> NDArray[np.bool_]:
     Parameters
     ----------
     name
-        "face" (all), "beard" (upper lip, chin, jaw and lower cheeks without the lips) or
-        "no-beard" (the rest, down to the height of the chin).
+        "face" (all), "beard" (upper lip, chin, jaw and lower cheeks without the lips), "no-beard"
+        (the rest, down to the height of the chin), or "skin" (all but eyes, brows, nostrils and
+        lips).
     frame
         The common map; standard places stand in for landmarks that it lacks.
 
@@ -83,6 +84,8 @@ def region(name: str, frame: CommonFrame) -> NDArray[np.bool_]:
         mark: frame.landmark(mark) if mark in frame.names else np.array(place)
         for mark, place in STANDARD_MM.items()
     }
+    if name == "skin":
+        return ~(_lips(at, grid) | _eyes(at, grid) | _nostrils(at, grid))
     beard = _inside(_beard_outline(at), grid) & ~_lips(at, grid)
     if name == "beard":
         return beard
@@ -113,6 +116,24 @@ def _beard_outline(at: dict[str, Floats]) -> Floats:
             tuple(left - 0.6 * below),
         ]
     )
+
+
+def _eyes(at: dict[str, Floats], grid: Floats) -> NDArray[np.bool_]:
+    """Return the eyes with the brows above them."""
+    out = np.zeros(grid.shape[:2], np.bool_)
+    for side in ("left", "right"):
+        inner, outer = at[f"eye inner {side}"], at[f"eye outer {side}"]
+        middle = 0.5 * (inner + outer) + np.array([0.0, 7.0])
+        half = np.array([0.5 * abs(outer[0] - inner[0]) + 8.0, 20.0])
+        out |= (((grid - middle) / half) ** 2).sum(axis=-1) <= 1.0
+    return out
+
+
+def _nostrils(at: dict[str, Floats], grid: Floats) -> NDArray[np.bool_]:
+    left, right = at["nose wing left"], at["nose wing right"]
+    middle = 0.5 * (left + right) - np.array([0.0, 4.0])
+    half = np.array([0.5 * abs(right[0] - left[0]), 7.0])
+    return np.asarray((((grid - middle) / half) ** 2).sum(axis=-1) <= 1.0, np.bool_)
 
 
 def _lips(at: dict[str, Floats], grid: Floats) -> NDArray[np.bool_]:

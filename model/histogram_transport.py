@@ -1,0 +1,166 @@
+"""Histograms described by their quantiles, in which a shift is a shift.
+
+The mean of two histograms has two humps; the mean of their quantile functions has one, between
+them (the barycenter of optimal transport on a line). A change of quantiles moves what a histogram
+counts to other values, whichever histogram it is applied to, never makes a share negative, and the
+opposite change brings it back.
+
+References
+----------
+Villani 2003, Topics in Optimal Transportation, section 2.2 (the line), doi:10.1090/gsm/058
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+LEVELS = 256
+"""Quantiles of a histogram, at even shares (k + 1/2) / 256."""
+
+
+class TransportError(ValueError):
+    """Histograms, edges or changes that do not fit each other."""
+
+
+def shares() -> Floats:
+    """Return the shares at which quantiles are taken, (256,)."""
+    return (np.arange(LEVELS) + 0.5) / LEVELS
+
+
+def quantiles(histograms: ArrayLike, edges: ArrayLike) -> Floats:
+    """Return the quantiles of histograms whose bins are filled evenly.
+
+    Parameters
+    ----------
+    histograms
+        (..., bins), at least 0, each of sum 1.
+    edges
+        (..., bins + 1), rising; the same leading axes.
+
+    Returns
+    -------
+    ndarray of float64, shape (..., 256)
+        Rising, in the unit of the edges.
+
+    Examples
+    --------
+    >>> even = quantiles([0.25] * 4, [0.0, 1.0, 2.0, 3.0, 4.0])
+    >>> even[[0, 128, -1]].tolist()
+    [0.0078125, 2.0078125, 3.9921875]
+    """
+    h, e = _checked(histograms, edges)
+    at = shares()
+    out = np.empty((len(h), LEVELS))
+    for k in range(len(h)):
+        filled, place = _rising(np.concatenate([[0.0], np.cumsum(h[k])]), e[k])
+        out[k] = np.interp(at, filled / filled[-1], place)
+    return out.reshape(*np.shape(histograms)[:-1], LEVELS)
+
+
+def widened(histograms: ArrayLike, edges: ArrayLike, change: ArrayLike) -> Floats:
+    """Return edges stretched so far that nothing leaves them when quantiles change.
+
+    Parameters
+    ----------
+    histograms, edges, change
+        As of `moved`.
+
+    Returns
+    -------
+    ndarray of float64, shape (..., bins + 1)
+        The edges themselves where nothing leaves them.
+    """
+    h, e = _checked(histograms, edges)
+    by = _change(histograms, change)
+    out = e.copy()
+    for k in range(len(h)):
+        if not by[k].any():
+            continue
+        counted = np.flatnonzero(h[k])
+        low = min(e[k, 0], e[k, counted[0]] + by[k, 0])
+        high = max(e[k, -1], e[k, counted[-1] + 1] + by[k, -1])
+        if low < e[k, 0] or high > e[k, -1]:
+            out[k] = low + (e[k] - e[k, 0]) * ((high - low) / (e[k, -1] - e[k, 0]))
+    return out.reshape(np.shape(edges))
+
+
+def moved(
+    histograms: ArrayLike, edges: ArrayLike, change: ArrayLike, *, onto: ArrayLike | None = None
+) -> Floats:
+    """Return histograms with what they count moved by a change of their quantiles.
+
+    Parameters
+    ----------
+    histograms, edges
+        As of `quantiles`.
+    change
+        (..., 256): by how much each quantile is to move, in the unit of the edges.
+    onto
+        Edges of the result, the histograms' own by default.
+
+    Returns
+    -------
+    ndarray of float64, shape (..., bins)
+        At least 0, each of sum 1. Where a change would exchange the order of values, they come to
+        lie together; what would leave the edges is counted in the last bin. A change of 0 is the
+        identity.
+
+    Examples
+    --------
+    >>> moved([0.0, 1.0, 0.0], [0.0, 1.0, 2.0, 3.0], np.full(256, 0.5)).round(3).tolist()
+    [0.0, 0.5, 0.5]
+    """
+    h, e = _checked(histograms, edges)
+    to = e if onto is None else _checked(histograms, onto)[1]
+    by = _change(histograms, change)
+    out = np.empty_like(h)
+    at = shares()
+    for k in range(len(h)):
+        if not by[k].any() and to is e:
+            out[k] = h[k]
+            continue
+        filled = np.concatenate([[0.0], np.cumsum(h[k])])
+        filled /= filled[-1]
+        # both ends of an empty stretch move as the quantiles beside them do
+        place = np.maximum.accumulate(e[k] + np.interp(filled, at, by[k]))
+        span = e[k][-1] - e[k][0]
+        apart = place + 1e-12 * span * np.arange(len(place))
+        cumulated = np.interp(to[k], apart, filled, left=0.0, right=1.0)
+        cumulated[0], cumulated[-1] = 0.0, 1.0
+        out[k] = np.diff(cumulated)
+    return out.reshape(np.shape(histograms))
+
+
+def _change(histograms: ArrayLike, change: ArrayLike) -> Floats:
+    shape = (*np.shape(histograms)[:-1], LEVELS)
+    by = np.broadcast_to(np.asarray(change, np.float64), shape).reshape(-1, LEVELS)
+    if not np.isfinite(by).all():
+        raise TransportError("change: got values that are not finite")
+    return by
+
+
+def _checked(histograms: ArrayLike, edges: ArrayLike) -> tuple[Floats, Floats]:
+    given = np.asarray(histograms, np.float64)
+    over = np.asarray(edges, np.float64)
+    if given.ndim < 1 or over.shape != (*given.shape[:-1], given.shape[-1] + 1):
+        raise TransportError(
+            f"edges: got shape {over.shape} for histograms {given.shape}, expected one more"
+        )
+    h = given.reshape(-1, given.shape[-1])
+    if not np.isfinite(h).all() or h.min() < 0 or not np.allclose(h.sum(axis=1), 1.0, atol=1e-5):
+        raise TransportError("histograms: got negative shares or a sum that is not 1")
+    return h, over.reshape(-1, given.shape[-1] + 1)
+
+
+def _rising(filled: Floats, place: Floats) -> tuple[Floats, Floats]:
+    """Leave out what does not rise, so that an empty stretch has no quantiles in it.
+
+    Of a run of equal shares its two ends count, the second a little later.
+    """
+    step = np.diff(filled) > 0
+    keep = np.concatenate([[step[0]], step[:-1] | step[1:], [step[-1]]])
+    filled, place = filled[keep], place[keep]
+    return filled + 1e-15 * np.arange(len(filled)), place

@@ -1,0 +1,171 @@
+"""The albedo of a face as a vector that traits can be learned from and added to.
+
+Two kinds: histograms of R_d, as published, or quantiles of its logarithm, in which a darker skin
+lies between a light and a dark one and not half on each, and pigment is a factor on every skin.
+Vectors of quantiles are in units of each response's spread in the population, so that all count.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model import histogram_transport, texture_statistics
+from model.feasible_sets import Free, Histograms
+from model.texture_space import TextureSpace
+from model.trait_vectors import Contrast
+from model.traits import TraitSpace
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+VectorKind = Literal["quantiles", "histograms"]
+
+KINDS: Final = ("quantiles", "histograms")
+NEGLIGIBLE: Final = 1e-3
+"""Spread of a response, over that of the first channel of the image, that tells nothing."""
+LEAST: Final = 1e-3
+"""Reflectance below which a logarithm is taken of this; no skin is as dark."""
+
+
+class AlbedoVectorError(ValueError):
+    """Vectors of a kind that there is not."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlbedoTraits:
+    """Traits of the albedo in one region.
+
+    Attributes
+    ----------
+    kind
+        What the vectors of `traits` hold.
+    texture
+        Color space and bin edges of the population, for R_d (histograms) or its logarithm.
+    traits
+        Learned on vectors of that kind.
+    """
+
+    kind: VectorKind
+    texture: TextureSpace
+    traits: TraitSpace
+
+    def __post_init__(self) -> None:
+        """Refuse another kind, and vectors of another length."""
+        if self.kind not in KINDS:
+            raise AlbedoVectorError(f"vectors: got {self.kind!r}, expected {' or '.join(KINDS)}")
+        if len(self.traits.center) != self.texture.size:
+            raise AlbedoVectorError(
+                f"vectors: got {len(self.traits.center)} numbers, expected {self.texture.size}"
+            )
+
+    def target(
+        self, histograms: ArrayLike, amounts: Mapping[str, float]
+    ) -> tuple[Floats, TextureSpace, float]:
+        """Return a histogram vector with more or less of some traits.
+
+        Parameters
+        ----------
+        histograms
+            (23808,), as `model.texture_statistics.describe` gives it of `encoded` albedo.
+        amounts
+            Trait to amount.
+
+        Returns
+        -------
+        vector : ndarray, shape (23808,)
+            A valid one. All amounts 0: as given.
+        texture : TextureSpace
+            What its bins are: the population's, with edges as far apart as the edit needs them.
+        clipped : float
+            Share of the change that was not possible.
+        """
+        given = np.asarray(histograms, np.float64)
+        if not any(amounts.values()):
+            for name in amounts:
+                self.traits.trait(name)
+            return given, self.texture, 0.0
+        if self.kind == "histograms":
+            found = self.traits.outcome(given, amounts)
+            return np.asarray(found.sample, np.float64), self.texture, float(found.share)
+        change = sum(
+            (amount * self.traits.trait(name).vector for name, amount in amounts.items()),
+            np.zeros(self.texture.size),
+        )
+        before = self.texture.histograms(given)
+        scale = spread(self.texture)[..., None]
+        by = change.reshape(before.shape) * scale
+        wide = histogram_transport.widened(before, self.texture.edges, by)
+        after = histogram_transport.moved(before, self.texture.edges, by, onto=wide)
+        wanted = histogram_transport.quantiles(before, self.texture.edges) + by
+        got = histogram_transport.quantiles(after, wide)
+        asked = float(np.sqrt(np.mean((by / scale) ** 2)))
+        missed = float(np.sqrt(np.mean(((got - wanted) / scale) ** 2)))
+        space = dataclasses.replace(self.texture, edges=wide)
+        return after.reshape(-1), space, min(missed / asked, 1.0) if asked > 0 else 0.0
+
+
+def encoded(r_d: ArrayLike, kind: VectorKind) -> Floats:
+    """Return what statistics are taken of: R_d for histograms, its logarithm for quantiles."""
+    given = np.asarray(r_d, np.float64)
+    if kind == "histograms":
+        return given
+    if kind != "quantiles":
+        raise AlbedoVectorError(f"vectors: got {kind!r}, expected {' or '.join(KINDS)}")
+    return np.asarray(np.log(np.maximum(given, LEAST)))
+
+
+def spread(texture: TextureSpace) -> Floats:
+    """Return the scale of each response in a population, (C, responses): middle half its edges.
+
+    Edges lie half evenly and half by how often values occur, so that the middle half of them spans
+    what is common. Responses of next to no spread (rounding errors, levels larger than the
+    face) get `NEGLIGIBLE` of the first, so that they count for nothing.
+    """
+    e = texture.edges
+    bins = e.shape[-1] - 1
+    middle = e[..., bins - bins // 4] - e[..., bins // 4]
+    return np.maximum(middle, NEGLIGIBLE * float(middle[0, 0]))
+
+
+def telling(texture: TextureSpace) -> Bools:
+    """Return the responses of more than negligible spread, (C, responses)."""
+    scale = spread(texture)
+    return np.asarray(scale > 1.001 * NEGLIGIBLE * scale[0, 0], np.bool_)
+
+
+def vector(
+    r_d: ArrayLike, texture: TextureSpace, kind: VectorKind, *, valid: Bools, region: ArrayLike
+) -> Floats:
+    """Return the vector of an albedo map, (23808,); see `model.texture_statistics.describe`."""
+    found = texture_statistics.describe(
+        encoded(r_d, kind), space=texture, valid=valid, region=region
+    )
+    if kind == "histograms":
+        return found
+    q = histogram_transport.quantiles(texture.histograms(found), texture.edges)
+    return (q / spread(texture)[..., None]).reshape(-1)
+
+
+def fit(
+    vectors: ArrayLike,
+    labels: Mapping[str, ArrayLike],
+    continuous: Mapping[str, ArrayLike],
+    texture: TextureSpace,
+    kind: VectorKind,
+    *,
+    contrast: Contrast = "means",
+    seed: int = 0,
+) -> AlbedoTraits:
+    """Learn the traits of albedo vectors (n, 23808), see `model.traits.TraitSpace.fit`."""
+    inside = Free() if kind == "quantiles" else Histograms()
+    found = TraitSpace.fit(
+        vectors, labels, continuous=continuous, space="pca", feasible=inside, contrast=contrast,
+        seed=seed,
+    )  # fmt: skip
+    return AlbedoTraits(kind, texture, found)

@@ -1,0 +1,102 @@
+"""Masks that say where an edit holds: pictures laid over a texture, and regions of the face."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from model import store
+from reconstruction import common_regions
+from reconstruction.common_parameterization import Chart, CommonFrame
+
+Image = NDArray[np.float32]
+
+FEATHER_MM = 6.0
+"""Distance over which an edit of a region fades."""
+
+
+class MaskError(ValueError):
+    """A picture that is no mask of a texture."""
+
+
+def read(path: Path, shape: tuple[int, int]) -> Image:
+    """Read a mask for a texture.
+
+    Parameters
+    ----------
+    path
+        PNG (its gray, over its largest value) or EXR (values 0 to 1); row 0 at the top, over
+        the whole texture. Another size is interpolated.
+    shape
+        Rows and columns of the texture.
+
+    Returns
+    -------
+    ndarray of float32, shape (H, W)
+        0 to 1.
+
+    Raises
+    ------
+    MaskError
+        For a file that is no picture, values outside 0 to 1, another aspect, and one that is
+        0 everywhere.
+    """
+    kind = path.suffix.lower()
+    if kind == ".exr":
+        image = store.read_exr(path)
+    elif kind == ".png":
+        image = _png(path)
+    else:
+        raise MaskError(f"mask: got {path.name}, expected a .png or .exr file")
+    gray = np.asarray(image.mean(axis=-1) if image.ndim == 3 else image, np.float32)
+    if not np.isfinite(gray).all() or gray.min() < 0 or gray.max() > 1:
+        raise MaskError(f"mask: {path} holds values outside 0 to 1")
+    if gray.shape[0] * shape[1] != gray.shape[1] * shape[0]:
+        raise MaskError(
+            f"mask: {path} has {gray.shape[1]} x {gray.shape[0]} pixels, expected the shape of the "
+            f"texture, {shape[1]} x {shape[0]}"
+        )
+    if gray.shape != shape:
+        rows = (np.arange(shape[0]) + 0.5) * gray.shape[0] / shape[0] - 0.5
+        columns = (np.arange(shape[1]) + 0.5) * gray.shape[1] / shape[1] - 0.5
+        at = np.meshgrid(rows, columns, indexing="ij")
+        gray = map_coordinates(gray, at, order=1, mode="nearest").astype(np.float32)
+    if not gray.any():
+        raise MaskError(f"mask: {path} is black everywhere, nothing would be edited")
+    return gray
+
+
+def feathered(name: str, frame: CommonFrame) -> NDArray[np.float64]:
+    """Return a region of the common map whose rim fades over `FEATHER_MM`, (N, N), 0 to 1."""
+    inside = common_regions.region(name, frame).astype(np.float64)
+    if name == "face":
+        return inside
+    soft = gaussian_filter(inside, max(0.4 * FEATHER_MM / frame.pixel_mm, 0.5))
+    share = np.clip(1.5 * soft - 0.25, 0.0, 1.0)
+    return np.asarray(share * share * (3.0 - 2.0 * share))
+
+
+def on_texture(name: str, frame: CommonFrame, chart: Chart) -> Image:
+    """Return a region's share at the texels of a face, (H, W); off the face it is 0."""
+    if name == "face":
+        return np.ones(chart.on_surface.shape, np.float32)
+    share, inside = chart.read(feathered(name, frame))
+    return np.where(inside, np.clip(share, 0.0, 1.0), 0.0).astype(np.float32)
+
+
+def _png(path: Path) -> Image:
+    import cv2
+
+    try:
+        raw = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise MaskError(f"mask: {path}: {error.strerror}") from error
+    image = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if len(raw) else None
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        raise MaskError(f"mask: {path} cannot be read as PNG")
+    if image.ndim == 3 and image.shape[2] in (2, 4):
+        image = image[..., :-1]
+    return (image / np.iinfo(image.dtype).max).astype(np.float32)

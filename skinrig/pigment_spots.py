@@ -1,0 +1,283 @@
+"""Freckles, moles and hair follicles: small spots with more pigment than the skin around them.
+
+A spot multiplies R_d by what more melanin leaves of each channel, read from the table of skin
+colors at the face's own melanin and blood, so that a freckle on light skin is brown and one on
+dark skin is faint. Spots are balls around points of the surface, in mm: what they do is continuous
+over the islands of a texture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from model import color_table
+from model.color_table import ColorTable
+from model.tissue_optics import ANISOTROPY_SKIN
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+CAMERA, ILLUMINANT = "Nikon 5100 (NPL)", "LED-B3"
+"""Of the dome's camera RGB."""
+MOST_MELANIN: Final = 0.45
+"""Volume fraction, just inside the table."""
+MOST_SPOTS: Final = 50_000
+_PACKING: Final = 0.6
+"""Least distance of spots over that at which they would stand on a square grid."""
+
+
+class SpotError(ValueError):
+    """Spots that cannot be drawn as asked."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpotKind:
+    """What spots of one kind look like.
+
+    Attributes
+    ----------
+    diameter_mm
+        Median.
+    spread
+        Standard deviation of the diameter's logarithm.
+    melanin
+        Times the melanin of the skin around.
+    edge
+        Share of the radius over which a spot ends, in (0, 1].
+    density_per_cm2
+        Usual number.
+    range_mm
+        Diameters that are looked for where spots are removed.
+    """
+
+    diameter_mm: float
+    spread: float
+    melanin: float
+    edge: float
+    density_per_cm2: float
+    range_mm: tuple[float, float]
+
+
+KINDS: Final[Mapping[str, SpotKind]] = MappingProxyType(
+    {
+        "freckles": SpotKind(2.2, 0.35, 2.2, 0.8, 2.0, (0.8, 6.0)),
+        "moles": SpotKind(3.5, 0.3, 8.0, 0.35, 0.03, (1.5, 10.0)),
+        "follicles": SpotKind(0.45, 0.2, 4.0, 0.6, 40.0, (0.2, 1.5)),
+    }
+)
+"""Chosen sizes and numbers, in round figures: ephelides of 1 to 3 mm, common nevi of 2 to 6 mm, some
+tens of beard hairs a cm^2."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spots:
+    """Spots that were drawn.
+
+    Attributes
+    ----------
+    gain
+        (H, W, 3) factor of R_d, in (0, 1]; exactly 1 outside the spots and the mask.
+    center_mm
+        (n, 3), rig frame.
+    diameter_mm
+        (n,).
+    transmitted
+        (3,): what the middle of a spot leaves of each channel.
+    """
+
+    gain: Image
+    center_mm: Floats
+    diameter_mm: Floats
+    transmitted: Floats
+
+
+def draw(
+    kind: str,
+    r_d: ArrayLike,
+    position_mm: ArrayLike,
+    surface: ArrayLike,
+    mask: ArrayLike,
+    *,
+    amount: float = 1.0,
+    density_per_cm2: float | None = None,
+    rng: np.random.Generator,
+    table: ColorTable | None = None,
+) -> Spots:
+    """Draw spots into a mask.
+
+    Parameters
+    ----------
+    kind
+        One of `KINDS`.
+    r_d
+        (H, W, 3), whose median color in the mask says what the skin holds.
+    position_mm
+        (H, W, 3), rig frame.
+    surface
+        (H, W) bool: texels that show the surface.
+    mask
+        (H, W), 0 to 1: where, and how strongly.
+    amount
+        Of pigment, at least 0: 1 as `KINDS` has it, 0 none.
+    density_per_cm2
+        At least 0; as `KINDS` has it by default.
+    rng
+        Says where they are.
+    table
+        Colors of skin; by default of the dome's camera and light.
+
+    Raises
+    ------
+    SpotError
+        For another kind, negative amounts, an empty mask, or more than `MOST_SPOTS` spots.
+    """
+    what = _kind(kind)
+    density = what.density_per_cm2 if density_per_cm2 is None else float(density_per_cm2)
+    for name, value in (("amount", amount), ("density_per_cm2", density)):
+        if not (np.isfinite(value) and value >= 0):
+            raise SpotError(f"{name} of {kind}: got {value}, expected at least 0")
+    place = np.asarray(position_mm, np.float64)
+    share = np.where(np.asarray(surface, np.bool_), np.asarray(mask, np.float64), 0.0)
+    if not share.any():
+        raise SpotError(f"mask of {kind}: no texel of the surface lies in it")
+    transmitted = _transmitted(
+        np.asarray(r_d, np.float64)[share > 0], what.melanin, amount, table or _table()
+    )
+    area = texel_area_mm2(place, np.asarray(surface, np.bool_))
+    wanted = float((area * share).sum()) / 100.0 * density
+    if wanted > MOST_SPOTS:
+        raise SpotError(f"density of {kind}: asks for {wanted:.0f} spots, at most {MOST_SPOTS}")
+    number = int(np.floor(wanted + rng.random())) if amount > 0 else 0
+    centers = _scatter(place[share > 0], (area * share)[share > 0], number, density, rng)
+    diameter = what.diameter_mm * np.exp(what.spread * rng.standard_normal(len(centers)))
+    depth = _profile(place, share > 0, centers, diameter, area, what.edge, rng) * share
+    gain = np.exp(depth[..., None] * np.log(transmitted)).astype(np.float32)
+    return Spots(gain, centers, diameter, transmitted)
+
+
+def texel_area_mm2(position_mm: Floats, surface: Bools) -> Floats:
+    """Return the area that each texel shows, (H, W), mm^2; 0 off the surface.
+
+    Rims of islands, where a neighbor is missing, take the median.
+    """
+    both = []
+    for axis in (0, 1):
+        step = np.zeros_like(position_mm)
+        along = np.moveaxis(step, axis, 0)
+        at = np.moveaxis(position_mm, axis, 0)
+        along[1:-1] = 0.5 * (at[2:] - at[:-2])
+        both.append(step)
+    whole = surface.copy()
+    for axis in (0, 1):
+        for shift in (-1, 1):
+            whole &= np.roll(surface, shift, axis)
+    whole[[0, -1]] = False
+    whole[:, [0, -1]] = False
+    area = np.linalg.norm(np.cross(both[0], both[1]), axis=-1)
+    usual = float(np.median(area[whole])) if whole.any() else 1.0
+    return np.where(surface, np.where(whole, np.minimum(area, 9.0 * usual), usual), 0.0)
+
+
+def _kind(kind: str) -> SpotKind:
+    if kind not in KINDS:
+        raise SpotError(f"spots: got {kind!r}, expected one of {', '.join(KINDS)}")
+    return KINDS[kind]
+
+
+def _table() -> ColorTable:
+    return color_table.build(CAMERA, ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
+
+
+def _transmitted(colors: Floats, times: float, amount: float, table: ColorTable) -> Floats:
+    """Return what `times` the melanin leaves of each channel of the median color, (3,)."""
+    usable = colors[(colors > 0).all(axis=1)]
+    if not len(usable):
+        raise SpotError("r_d: is 0 all over the mask, there is no skin to color")
+    color = np.median(usable, axis=0)
+    size = table.size
+    apart = np.abs(np.log(table.rgb) - np.log(color)).sum(axis=-1)
+    i, j = np.unravel_index(int(np.argmin(apart)), apart.shape)
+    c_m = table.c_m_max * (max(int(i), 1) / (size - 1)) ** 3
+    c_hd = table.c_hd_max * (int(j) / (size - 1)) ** 3
+    more = max(min(c_m * (1.0 + amount * (times - 1.0)), MOST_MELANIN), c_m)
+    ratio = table.lookup(more, c_hd) / table.lookup(c_m, c_hd)
+    return np.minimum(np.asarray(ratio, np.float64), 1.0)
+
+
+def _scatter(
+    points: Floats, weight: Floats, number: int, density: float, rng: np.random.Generator
+) -> Floats:
+    """Return points no two of which are closer than a part of their mean distance (Poisson disc).
+
+    Points are drawn by area; one that is too near to an earlier one is passed over.
+    """
+    if number == 0:
+        return np.empty((0, 3))
+    least = _PACKING * 10.0 / np.sqrt(density)
+    drawn = rng.choice(len(points), size=min(12 * number + 64, 20 * MOST_SPOTS),
+                       p=weight / weight.sum())  # fmt: skip
+    cells: dict[tuple[int, int, int], list[Floats]] = {}
+    kept: list[Floats] = []
+    for k in drawn:
+        at = points[k]
+        x, y, z = (int(c) for c in np.floor(at / least))
+        near = (
+            other
+            for dx in (-1, 0, 1)
+            for dy in (-1, 0, 1)
+            for dz in (-1, 0, 1)
+            for other in cells.get((x + dx, y + dy, z + dz), ())
+        )
+        if any(((at - other) ** 2).sum() < least**2 for other in near):
+            continue
+        cells.setdefault((x, y, z), []).append(at)
+        kept.append(at)
+        if len(kept) == number:
+            break
+    return np.array(kept)
+
+
+def _profile(
+    place: Floats,
+    where: Bools,
+    centers: Floats,
+    diameter: Floats,
+    area: Floats,
+    edge: float,
+    rng: np.random.Generator,
+) -> Floats:
+    """Return how deep each texel lies in a spot, (H, W), 0 to 1.
+
+    A spot smaller than a texel darkens it by its share of the area.
+    """
+    depth = np.zeros(where.shape)
+    if not len(centers):
+        return depth
+    points = place[where]
+    half_texel = 0.5 * np.sqrt(np.median(area[where]))
+    inside = np.zeros(len(points))
+    tree = cKDTree(points)
+    turn = rng.normal(0.0, 1.0, (len(centers), 3, 3))
+    phase = rng.uniform(0.0, 2 * np.pi, (len(centers), 3))
+    for center, d, way, start in zip(centers, diameter, turn, phase, strict=True):
+        radius = 0.5 * d
+        wide = np.hypot(radius, half_texel)
+        near = np.asarray(tree.query_ball_point(center, 1.35 * wide), np.intp)
+        away = points[near] - center
+        # an outline that is not quite round: three waves in space, shallow beside the radius
+        waves = np.sin(away @ way.T * (2.0 / wide) + start).mean(axis=1)
+        reach = np.linalg.norm(away, axis=1) / (wide * (1.0 + 0.25 * waves))
+        soft = max(edge, half_texel / wide)
+        rise = np.clip((1.0 - reach) / soft + 0.5 * min(soft, 1.0), 0.0, 1.0)
+        profile = rise * rise * (3.0 - 2.0 * rise) * (radius / wide) ** 2
+        inside[near] = np.maximum(inside[near], profile)
+    depth[where] = inside
+    return depth

@@ -1,0 +1,143 @@
+"""Small dark spots of skin found in the common map and filled from around.
+
+Spots are what a closing by a disc brightens: darker than all around within their size. Lines, such
+as brows and folds, are not taken for spots. What is filled in is a membrane through the skin
+around, with no grain of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from reconstruction import texture_fill
+from reconstruction.common_parameterization import Chart
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+SIGMAS: Final = 5.0
+"""Times the usual depth of the skin's grain from which on a spot is one."""
+LEAST_DEPTH: Final = 0.03
+"""Natural logarithm of brightness; less is not seen."""
+LONGEST: Final = 3.0
+"""Length over width of what is still a spot."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Removal:
+    """Spots found, and what the skin would be without them.
+
+    Attributes
+    ----------
+    fill
+        (H, W, 3): R_d as filled from around, at the texels.
+    share
+        (H, W), 0 to 1: how far a texel belongs to a spot.
+    spots
+        How many were found.
+    """
+
+    fill: Image
+    share: Image
+    spots: int
+
+
+def find(
+    r_d: ArrayLike,
+    valid: ArrayLike,
+    chart: Chart,
+    *,
+    pixel_mm: float,
+    range_mm: tuple[float, float],
+) -> Removal:
+    """Find spots of a face and fill them.
+
+    Parameters
+    ----------
+    r_d
+        (H, W, 3).
+    valid
+        (H, W): texels that were measured.
+    chart
+        Where the texels lie in a map without seams.
+    pixel_mm
+        Side of its pixels.
+    range_mm
+        Smallest and largest diameter.
+    """
+    image, known = chart.gather(r_d, valid)
+    spots, count = dark_spots(image, known, pixel_mm=pixel_mm, range_mm=range_mm)
+    filled = texture_fill.push_pull(image, (known & ~spots).astype(np.float32))
+    soft = ndimage.gaussian_filter(spots.astype(np.float64), 0.7)
+    share, inside = chart.read(np.minimum(1.0, 2.0 * soft))
+    fill, _ = chart.read(filled.values)
+    use = inside & chart.outermost
+    return Removal(fill, np.where(use, np.clip(share, 0.0, 1.0), 0.0).astype(np.float32), count)
+
+
+def dark_spots(
+    image: ArrayLike, known: ArrayLike, *, pixel_mm: float, range_mm: tuple[float, float]
+) -> tuple[Bools, int]:
+    """Return the pixels of small dark spots, (N, N), with their rims, and how many spots there are.
+
+    Parameters
+    ----------
+    image
+        (N, N, 3), above 0 where known.
+    known
+        (N, N).
+    pixel_mm
+        Side of a pixel.
+    range_mm
+        Smallest and largest diameter.
+    """
+    good = np.asarray(known, np.bool_)
+    color = np.asarray(image, np.float64)
+    floor = 1e-3 * max(float(np.median(color[good])), 1e-9) if good.any() else 1.0
+    light = np.log(np.maximum(color, floor)).mean(axis=-1)
+    small, large = (0.5 * d / pixel_mm for d in range_mm)
+    smooth = ndimage.gaussian_filter(light, max(0.5 * small, 0.5))
+    closed = ndimage.grey_closing(smooth, footprint=_disc(max(large, 1.5)))
+    depth = np.where(good, closed - smooth, 0.0)
+    grain = float(np.median(depth[good])) if good.any() else 0.0
+    least = max(SIGMAS * grain, LEAST_DEPTH)
+    seeds = np.zeros(good.shape, np.bool_)
+    found = 0
+    # deep thresholds part spots that touch, shallow ones find the faint
+    for threshold in least * np.array([8.0, 4.0, 2.0, 1.0]):
+        label = ndimage.label(depth > threshold)[0]
+        for number, window in enumerate(ndimage.find_objects(label), start=1):
+            part = label[window] == number
+            if (seeds[window] & part).any():
+                continue
+            rows, columns = np.nonzero(part)
+            width = np.sqrt(len(rows) / np.pi)
+            slim = _longest(rows, columns) > LONGEST * width
+            if not slim and max(0.4 * small, 0.5) <= width <= 1.2 * large:
+                seeds[window] |= part
+                found += 1
+    rim = max(1, round(0.35 * (small + large) / 2))
+    spots = ndimage.binary_dilation(
+        seeds, _disc(1.0), iterations=rim, mask=(depth > 0.2 * least) | seeds
+    )
+    return ndimage.binary_dilation(spots, _disc(1.0)) & good, found
+
+
+def _longest(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> float:
+    """Return half the length of a set of pixels along its longest axis, as of an ellipse."""
+    if len(rows) < 3:
+        return 1.0
+    spread = np.cov(np.stack([rows, columns]).astype(np.float64))
+    return float(2.0 * np.sqrt(max(np.linalg.eigvalsh(spread)[-1], 0.0)))
+
+
+def _disc(radius: float) -> Bools:
+    reach = max(1, int(np.ceil(radius)))
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    return np.asarray(x * x + y * y <= radius * radius + 0.5, np.bool_)

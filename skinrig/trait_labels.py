@@ -1,0 +1,114 @@
+"""What a user says of faces: a table of names, of traits that they have or not, and of values."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class LabelError(ValueError):
+    """A table of labels that cannot be used."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Labels:
+    """Labels of n faces.
+
+    Attributes
+    ----------
+    names
+        Of the faces, n.
+    binary
+        Trait to (n,) bool.
+    continuous
+        Trait to (n,) float.
+    ignored
+        Names in the table without a face.
+    """
+
+    names: tuple[str, ...]
+    binary: dict[str, NDArray[np.bool_]]
+    continuous: dict[str, NDArray[np.float64]]
+    ignored: tuple[str, ...]
+
+
+def read(path: Path, faces: Sequence[str]) -> Labels:
+    """Read a table of labels for some faces.
+
+    Parameters
+    ----------
+    path
+        CSV with the header ``name,TRAIT,...``: a column of 0 and 1 alone is a trait that a face has
+        or not, any other one of numbers is a value such as an age. Lines that begin with ``#``
+        are skipped.
+    faces
+        Names that the table must have, in the order of the result.
+
+    Raises
+    ------
+    LabelError
+        Naming line and column.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise LabelError(f"{path}: is no UTF-8 text") from error
+    rows = [
+        (number, [cell.strip() for cell in next(csv.reader([line]))])
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not rows:
+        raise LabelError(f"{path}: is empty, expected a line name,TRAIT,...")
+    header = rows[0][1]
+    traits = header[1:]
+    if header[0] != "name" or not traits:
+        raise LabelError(
+            f"{path}, line {rows[0][0]}: got columns {header}, expected name,TRAIT,..."
+        )
+    if len(set(header)) < len(header) or not all(header):
+        twice = next(c for c in header if header.count(c) > 1 or not c)
+        raise LabelError(f"{path}: column {twice!r} is there twice or has no name")
+    values: dict[str, list[float]] = {}
+    for number, cells in rows[1:]:
+        where = f"{path}, line {number}"
+        if len(cells) != len(header):
+            raise LabelError(f"{where}: got {len(cells)} cells, expected {len(header)}")
+        cells[0] = cells[0].removeprefix("appearance-")
+        if cells[0] in values:
+            raise LabelError(f"{where}: {cells[0]!r} is there twice")
+        values[cells[0]] = [
+            _number(cell, f"{where}, column {trait}")
+            for cell, trait in zip(cells[1:], traits, strict=True)
+        ]
+    missing = [name for name in faces if name not in values]
+    if missing:
+        raise LabelError(
+            f"{path}: has no line for {', '.join(missing)}; its names are those of the folders, "
+            f"with or without appearance-: {', '.join(list(values)[:5])}, ..."
+        )
+    table = np.array([values[name] for name in faces], np.float64)
+    whole = np.array(list(values.values()), np.float64)
+    kinds = [bool(np.isin(column, (0.0, 1.0)).all()) for column in whole.T]
+    return Labels(
+        tuple(faces),
+        {t: table[:, k] > 0.5 for k, t in enumerate(traits) if kinds[k]},
+        {t: table[:, k] for k, t in enumerate(traits) if not kinds[k]},
+        tuple(name for name in values if name not in faces),
+    )
+
+
+def _number(cell: str, where: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError as error:
+        raise LabelError(f"{where}: got {cell!r}, expected 0, 1 or a number") from error
+    if not math.isfinite(value):
+        raise LabelError(f"{where}: got {cell!r}, expected a finite number")
+    return value
