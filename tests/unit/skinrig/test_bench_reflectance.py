@@ -1,0 +1,24 @@
+"""The points that the reflectance benchmark judges lobes by."""
+
+import numpy as np
+
+from skinrig import bench_reflectance
+
+
+def test_points_of_the_benchmark_lie_above_their_horizon_and_keep_lights_apart(rng):
+    p = bench_reflectance.face_points("III", points=6, samples=40, rng=rng)
+    assert p.seen.mean() > 0.9
+    assert 0.02 < p.left_out.mean() < 0.6
+    np.testing.assert_allclose(np.linalg.norm(p.light, axis=-1), 1.0, atol=1e-6)
+    # noise is what the variance says: 4 standard errors of the mean of squared deviates
+    deviates = ((p.f - p.total) / np.sqrt(p.variance)) ** 2
+    assert abs(deviates.mean() - 1.0) < 4 * np.sqrt(2.0 / deviates.size)
+    assert (p.surface[p.seen] > 0).all()
+    assert (p.total.min(axis=-1) > p.surface * (1 - 1e-5))[p.seen].all()
+
+
+def test_more_lobes_predict_lights_that_were_left_out_better():
+    stage = bench_reflectance.model(toy=True)
+    by_rank = {p.knobs["rank"]: p.error for p in stage.points if "rank" in p.knobs}
+    assert by_rank[1] > 1.5 * by_rank[4]
+    assert stage.limits[0].passed
