@@ -112,6 +112,7 @@ def environment_lights(
             direction=_vector(towards.reshape(-1, 3)[pixel[k]]),
             intensity=_vector(color[k]),
             radius=float(radius[k]),
+            divisible=False,
         )
         for k in range(count)
     )

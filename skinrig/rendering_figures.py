@@ -300,11 +300,10 @@ def _rendered(
     effort: Effort,
     interior: Interior | None = None,
 ) -> Rendering:
-    if interior is not None:
-        interior = Interior(laid, interior.texels, interior.tree)
     return render(
         laid.model, laid, camera, lights, subsurface=effort.subsurface,
-        subpixels=effort.subpixels, shadow_samples=effort.shadow_samples, interior=interior,
+        subpixels=effort.subpixels, shadow_samples=effort.shadow_samples,
+        interior=None if interior is None else interior.of_surface(laid),
         caster=Caster(laid.mesh), progress=effort.progress,
     )  # fmt: skip
 

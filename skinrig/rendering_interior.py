@@ -1,17 +1,18 @@
-"""Light inside a rendered face: what enters each texel by all lights, and where it comes out."""
+"""Light inside a rendered face: what enters everywhere by all lights, and where it comes out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from model import dipole_gather
 from model.dipole_gather import SourceTree
 from model.skin_reflectance import transmitted
+from rigsim.atlas import unwrap
 from rigsim.mesh import Float32Array
 from rigsim.render import Caster, thread_count, visibility
 from skinrig.rendering_geometry import FittedSurface, Rows
@@ -20,57 +21,81 @@ from skinrig.rendering_lights import Light
 FloatArray = NDArray[np.float64]
 
 POINTS: Final = 2
-"""Points along each side of a texel that light is looked for at."""
+"""Points along each side of a piece that light is looked for at."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Interior:
-    """The skin below a surface, ready for any light.
+    """The skin below a surface, ready for any light: S pieces of it that light enters by.
 
     Attributes
     ----------
     laid
         Surface and maps.
-    texels
-        Flat indices of the texels that light enters by, shape (S,).
+    position_mm, across_mm, along_mm, normals
+        Middle of each piece, its two sides, and the maps' normal, shape (S, 3).
+    prim
+        Its triangle, shape (S,).
     tree
-        Their places and areas.
+        Places and areas of the pieces.
     """
 
     laid: FittedSurface
-    texels: NDArray[np.intp]
+    position_mm: Float32Array
+    across_mm: Float32Array
+    along_mm: Float32Array
+    normals: Float32Array
+    prim: NDArray[np.int32]
     tree: SourceTree
 
     @staticmethod
-    def of(laid: FittedSurface) -> Interior:
-        """Take every texel of the mesh as a place where light enters."""
-        atlas = laid.atlas
-        texels = np.flatnonzero(atlas.covered)
-        across = np.cross(
-            atlas.dp_du_mm.reshape(-1, 3)[texels], atlas.dp_dv_mm.reshape(-1, 3)[texels]
+    def of(
+        laid: FittedSurface, *, finer: int = 1, near: tuple[ArrayLike, float] | None = None
+    ) -> Interior:
+        """Divide the skin into texels.
+
+        Parameters
+        ----------
+        laid
+            Surface and maps.
+        finer
+            Pieces along each side of a texel.
+        near
+            A place, mm, and a distance, mm, within which the skin is taken; None: all of it.
+        """
+        atlas = laid.atlas if finer == 1 else unwrap(laid.mesh, laid.atlas.size * finer)
+        chosen = atlas.covered
+        if near is not None:
+            place, far = np.asarray(near[0], np.float32), near[1]
+            chosen = chosen & (np.linalg.norm(atlas.position_mm - place, axis=-1) < far)
+        rows, columns = np.nonzero(chosen)
+        uv = np.stack([(columns + 0.5) / atlas.size, 1.0 - (rows + 0.5) / atlas.size], axis=-1)
+        position, across, along = (
+            layer[chosen] for layer in (atlas.position_mm, atlas.dp_du_mm, atlas.dp_dv_mm)
         )
-        area = np.linalg.norm(across.astype(np.float64), axis=-1) / atlas.size**2
-        tree = SourceTree.of(atlas.position_mm.reshape(-1, 3)[texels], area)
-        return Interior(laid, texels, tree)
+        across, along = across / np.float32(atlas.size), along / np.float32(atlas.size)
+        area = np.linalg.norm(np.cross(across.astype(np.float64), along), axis=-1)
+        return Interior(
+            laid, position, across, along, laid.at(uv.astype(np.float32)).normals,
+            atlas.prim[chosen], SourceTree.of(position, area),
+        )  # fmt: skip
+
+    def of_surface(self, laid: FittedSurface) -> Interior:
+        """Return the same pieces below other maps on the same mesh with the same normals."""
+        return replace(self, laid=laid)
 
     def entered(self, lamps: Sequence[Light], shadows: Caster, samples: int) -> FloatArray:
-        """Return what passes the surface at the texels, over what a white patch shows, (S, 3)."""
-        atlas = self.laid.atlas
-        position, du, dv = (
-            layer.reshape(-1, 3)[self.texels]
-            for layer in (atlas.position_mm, atlas.dp_du_mm, atlas.dp_dv_mm)
-        )
-        faces = shadows.face_normals[atlas.prim.reshape(-1)[self.texels]]
-        normals = self.laid.normals.reshape(-1, 3)[self.texels]
-        total = np.zeros((len(self.texels), 3))
-        # several points of each texel, or shadows would end in steps
-        offsets = ((np.arange(POINTS) + 0.5) / POINTS - 0.5) / atlas.size
-        for across in offsets:
-            for along in offsets:
-                place = position + np.float32(across) * du + np.float32(along) * dv
+        """Return what passes the surface by the pieces, over what a white patch shows, (S, 3)."""
+        faces = shadows.face_normals[self.prim]
+        total = np.zeros((len(self.prim), 3))
+        # several points of each piece, or shadows would end in steps
+        offsets = (np.arange(POINTS, dtype=np.float32) + np.float32(0.5)) / POINTS - 0.5
+        for u in offsets:
+            for v in offsets:
+                place = self.position_mm + u * self.across_mm + v * self.along_mm
                 for lamp in lamps:
                     light = entering(
-                        lamp, place, faces, normals, shadows, samples, self.laid.model.eta
+                        lamp, place, faces, self.normals, shadows, samples, self.laid.model.eta
                     )[0]
                     total += light / POINTS**2
         return total
@@ -84,7 +109,7 @@ class Interior:
         Parameters
         ----------
         entered
-            At the texels, see `entered`.
+            By the pieces, see `entered`.
         position_mm, rows
             Points, shape (n, 3), and what the maps hold there.
         entered_at

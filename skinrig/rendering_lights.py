@@ -50,6 +50,8 @@ class Light:
     """Distance at which `intensity` holds, mm; None: that of the rig's origin."""
     axis: Vector | None = None
     """In which it shines, any length; None: towards the rig's origin."""
+    divisible: bool = True
+    """Whether it is shaded in parts where it is broad; not where it is one of many itself."""
     exponent: float = 0.0
     """Of the cosine off its axis that it falls off by; 0: the same in all directions."""
     _reference: float = field(default=1.0, init=False, repr=False)
@@ -165,7 +167,7 @@ class Light:
         """Return a broad light as smaller ones that together give the same; others as they are."""
         center, radius = self.disc()
         away = float(np.linalg.norm(center))
-        if count < 2 or away == 0.0 or radius <= BROAD_RAD * away:
+        if not self.divisible or count < 2 or away == 0.0 or radius <= BROAD_RAD * away:
             return (self,)
         helper = np.eye(3)[int(np.argmin(np.abs(center)))]
         side = np.cross(helper, center)

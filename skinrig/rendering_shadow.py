@@ -11,7 +11,6 @@ Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10.3.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -43,6 +42,10 @@ SLANT_RAD: Final = 0.6
 """Angle of the light to the skin's normal."""
 LIGHT_RAD: Final = 0.002
 """Angular radius of the light: a half shadow of 0.1 mm."""
+NEAR_MM: Final = 25.0
+"""Light that enters farther away does not reach the picture's middle."""
+FACE_TEXELS: Final = 2048
+"""Pieces that a face is divided into along a side of its texture: 0.15 mm."""
 PATCH_MM: Final = 60.0
 PATCH_TEXELS: Final = 256
 SITE: Final = (0.12, 0.72)
@@ -84,7 +87,8 @@ class Boundary:
         one, two = (float(w) for w in share[0])
         target = np.array([1.0 - one - two, one, two]) @ corners
         normal = caster.face_normals[prim[0]].astype(np.float64)
-        return _boundary("face", laid, caster, target, normal, size_px)
+        finer = max(1, FACE_TEXELS // laid.atlas.size)
+        return _boundary("face", laid, caster, target, normal, size_px, finer=finer)
 
     @staticmethod
     def on_plane(model: SkinReflectance, *, size_px: int) -> Boundary:
@@ -116,7 +120,7 @@ class Boundary:
             laid.model, laid, self.camera, self.light,
             subsurface="local" if sigma_tr_per_mm is None else "dipole", subpixels=subpixels,
             blockers=self.card, caster=self.caster,
-            interior=dataclasses.replace(self.interior, laid=laid),
+            interior=self.interior.of_surface(laid),
         )  # fmt: skip
 
 
@@ -127,6 +131,8 @@ def _boundary(
     target: FloatArray,
     normal: FloatArray,
     size_px: int,
+    *,
+    finer: int = 1,
 ) -> Boundary:
     """Put camera, light and card around a point of the skin."""
     up = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
@@ -143,7 +149,8 @@ def _boundary(
     card = build_mesh(corners, [[0, 1, 2], [0, 2, 3]], np.zeros((4, 2)))
     x, y, z = towards.tolist()
     light = Light(name="card", direction=(x, y, z), radius=LIGHT_RAD)
-    return Boundary(name, laid, camera, light, card, caster, Interior.of(laid))
+    below = Interior.of(laid, finer=finer, near=(target, NEAR_MM))
+    return Boundary(name, laid, camera, light, card, caster, below)
 
 
 def profile(seen: Rendering) -> tuple[FloatArray, FloatArray]:
