@@ -29,11 +29,14 @@ from skinrig import (
     bench_perfusion,
     bench_photometric,
     bench_probe,
+    bench_reflectance,
     bench_shared_melanin,
     bench_skin_stretch,
     bench_subsurface,
+    bench_subsurface_gather,
     bench_surface,
     bench_synthesis,
+    bench_texture,
     bench_tissue,
     bench_translucency,
     bench_transport,
@@ -56,6 +59,7 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "facial-color": bench_facial_color.rig,
     "diffuse-albedo": bench_brdf.albedo,
     "brdf": bench_brdf.surface,
+    "reflectance": bench_reflectance.model,
     "normals": bench_photometric.normals,
     "gradient-normals": bench_gradient_normals.normals,
     "hdr": bench_hdr.merging,
@@ -71,12 +75,14 @@ STAGES: dict[str, Callable[..., StageBenchmark]] = {
     "normal-histogram": bench_kernels.histograms,
     "kernel-fit": bench_kernels.search,
     "displacement-synthesis": bench_synthesis.growth,
+    "texture-matching": bench_texture.matching,
     "microstructure": bench_microstructure.truth,
     "microstructure-passes": bench_microstructure.passes,
     "perfusion-curves": bench_perfusion.curves,
     "probe-session": bench_probe.session,
     "subsurface-fit": bench_subsurface.tiers,
     "subsurface-batch": bench_subsurface.batches,
+    "subsurface-gather": bench_subsurface_gather.gathering,
     "anisotropy": bench_translucency.directions,
     "translucency": bench_translucency.sites,
     "photon-transport": bench_transport.photon_transport,
@@ -157,6 +163,8 @@ def run_stages(
                 f"{word}: {limit.name}: {limit.got:.4g} {limit.unit} "
                 f"({limit.sense} {limit.bound:g})"
             )
+        for what, why in stage.left_out:
+            console.say(f"left out: {what}: {why}")
         console.say()
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
