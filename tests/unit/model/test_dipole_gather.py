@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from model import dipole_gather, dipole_sum, source_tree_kernels
+from model import dipole, dipole_gather, dipole_sum, source_tree_kernels
 from model.dipole_gather import GatherError, SourceTree, exitance, gather
 from model.dipole_sum import Media, exitance_directly
 from model.fresnel import ETA_SKIN
@@ -119,6 +119,14 @@ def test_a_shadow_edge_has_the_profile_of_the_dipoles_integral_the_finer_the_sou
         worst.append(np.abs(out - truth).max())
     assert worst[1] < 0.02
     assert worst[2] < 0.3 * worst[0]
+
+
+def test_the_depth_of_the_source_inverts_eq_5_near_both_ends():
+    r_d = np.concatenate([np.geomspace(1e-6, 0.5, 200), 1.0 - np.geomspace(0.49, 1e-9, 300)])
+    media = Media.of(r_d, 2.0, eta=ETA_SKIN)
+    expected = 2.0 * np.sqrt(3.0 * dipole.invert_to_deficit(r_d, ETA_SKIN))
+    np.testing.assert_allclose(media.depth_mm, expected, rtol=1e-5)
+    assert (np.diff(media.depth_mm) < 0.0).all()
 
 
 def test_light_that_sources_cannot_resolve_stays_and_none_is_lost():
