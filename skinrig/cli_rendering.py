@@ -90,7 +90,8 @@ def render(
         Path | None,
         typer.Option(
             help="Session whose photographs the model was not fitted to (reconstruct --hold-out): "
-            "render what they show, and compare."
+            "render what they show, and compare; with --components take the photograph of --view "
+            "and --light apart."
         ),
     ] = None,
     photographs: Annotated[
@@ -134,7 +135,7 @@ def render(
         progress=console.progress,
     )
     console.progress(f"read {', '.join(str(path) for path in appearance)}")
-    if against is not None:
+    if against is not None and not components:
         from skinrig import rendering_evaluation
 
         found = rendering_evaluation.evaluate_folders(
@@ -158,7 +159,11 @@ def render(
     subjects = [
         figures.Subject.of(path, mesh=mesh, translucency=translucency) for path in appearance
     ]
-    if bases is None:
+    if against is not None:
+        done = figures.draw_photograph(
+            subjects[0], against, view, lights[0].name, out, effort, calibration=calibration
+        )
+    elif bases is None:
         done = figures.draw(
             subjects[0], camera, lights, out, effort, components=components, assumed=stage.assumed
         )

@@ -131,6 +131,68 @@ def draw(
     )  # fmt: skip
 
 
+def draw_photograph(
+    subject: Subject,
+    session: Path,
+    view: str,
+    light: str,
+    out: Path,
+    effort: Effort,
+    *,
+    calibration: Path | None = None,
+) -> dict[str, Any]:
+    """Take a photograph that the model has not seen apart: the paper's figure 12, (a) to (e).
+
+    Parameters
+    ----------
+    subject
+        The fitted model on its own mesh.
+    session
+        SESSION/ that holds the photograph.
+    view, light
+        Names of its camera and light.
+    out, effort
+        As for `draw`.
+    calibration
+        CALIBRATION/ folder.
+
+    Raises
+    ------
+    UsageError
+        The session holds no such photograph that the model has not seen.
+    """
+    from skinrig.photographs import Photographs
+
+    rendering_folder.check(out)
+    photographs = Photographs.of(session, subject.appearance, calibration=calibration)
+    shot = next((s for s in photographs.shots if (s.view, s.light) == (view, light)), None)
+    if shot is None:
+        some = ", ".join(f"{s.view} {s.light}" for s in photographs.shots[:8])
+        raise UsageError(
+            f"--view {view} --light {light}: the session holds no such photograph that the model "
+            f"has not seen; there are {some}{' ...' if len(photographs.shots) > 8 else ''}"
+        )
+    start = time.perf_counter()
+    camera, lamp = photographs.camera(shot), photographs.light(shot)
+    photo = photographs.photograph(shot).rgb.astype(np.float32)
+    seen = _rendered(subject.laid, camera, [lamp], effort)
+    exposure = effort.exposure or exposure_of(seen.radiance, seen.coverage)
+    left = np.where(seen.covered[..., None], photo - seen.diffuse, 0.0).astype(np.float32)
+    return rendering_folder.write(
+        out,
+        images={
+            "photograph": photo, "diffuse": seen.diffuse, "photograph_less_diffuse": left,
+            "radiance": seen.radiance, "surface": seen.surface, "coverage": seen.coverage,
+        },
+        pictures={"components": sheet([component_panels(seen, exposure, photo)])},
+        document={
+            **_record([subject], camera, [lamp], effort, seen, photographs.assumed),
+            "kind": "components", "exposure": exposure, "session": session,
+            "held_out": shot.held_out, "seconds": time.perf_counter() - start,
+        },
+    )  # fmt: skip
+
+
 def component_panels(
     seen: Rendering, exposure: float, photograph: NDArray[np.floating] | None = None
 ) -> list[Panel]:
