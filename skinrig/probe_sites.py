@@ -21,13 +21,13 @@ FloatArray = NDArray[np.float64]
 
 FROM_NOSE_MM: Final[Mapping[str, tuple[float, float]]] = {
     "forehead": (0.0, 76.0),
-    "cheek": (-45.0, 0.0),
-    "cheek left": (-45.0, 0.0),
-    "cheek right": (45.0, 0.0),
-    "chin": (0.0, -70.0),
+    "cheek": (-48.0, 0.0),
+    "cheek left": (-48.0, 0.0),
+    "cheek right": (48.0, 0.0),
+    "chin": (0.0, -72.0),
 }
-"""Places of a mean face, mm to the right and up of the tip of the nose as seen from the front; chin
-is below it. Left and right as seen in the picture."""
+"""Places of the simulator's mean head, mm to the right and up of the tip of the nose as seen from
+the front; chin is below it. Left and right as seen in the picture."""
 GRID: Final = 256
 """Places a side that translucency is interpolated at before it is laid on the texture."""
 NEAR_MM: Final = 15.0

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.translucency import TranslucencyError
+from reconstruction.translucency import SITE_UV, TranslucencyError
+from rigsim.head import build_head
 from skinrig import probe_sites
 from skinrig.probe_sites import ProbeSiteError
 
@@ -124,3 +125,15 @@ def test_flat_patches_and_single_texels_have_a_map_too():
 def test_a_probe_without_sites_is_named(files):
     with pytest.raises(ProbeSiteError, match=r"subsurface\.json"):
         probe_sites.place(probe(files=files), face()[0])
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_sites_of_simulated_heads_are_found_within_a_centimetre_over_the_skin(seed):
+    mesh = build_head(np.random.default_rng(seed), columns=84, rows=90)
+    points = mesh.vertices_mm[: len(mesh.vertices_mm) // 85 * 85]
+    found = probe_sites.place(probe(), SkinMap(points.reshape(-1, 85, 3), "mm"))
+    for site in found.sites:
+        true = mesh.vertices_mm[np.argmin(np.linalg.norm(mesh.uv - SITE_UV[site.name], axis=1))]
+        # below the chin skin faces down: places one behind the other are one height
+        axes = [0, 1] if site.name == "chin" else [0, 1, 2]
+        assert np.linalg.norm((np.array(site.position_mm) - true)[axes]) < 10.0
