@@ -134,7 +134,7 @@ def estimate(
     if f.ndim < 2:
         raise ValueError(f"brdf_samples: got shape {f.shape}, expected (..., M, C)")
     lead, (samples, channels) = f.shape[:-2], f.shape[-2:]
-    n = np.asarray(normals, dtype=np.float32)
+    n = np.ascontiguousarray(normals, dtype=np.float32)
     if n.shape != (*lead, 3):
         raise ValueError(f"normals: got shape {n.shape}, expected {(*lead, 3)}")
     if discard is not None and discard < 0:

@@ -72,6 +72,17 @@ def clean_diffuse(p):
     return through[..., None] * p.r_d[:, None] / np.pi
 
 
+def test_normals_and_directions_may_be_one_for_all_points():
+    p = scene("light", points=8)
+    one = p.normals[:1]
+    light, view = p.light[:1], p.view[:1]
+    args = (np.repeat(a, 8, axis=0) for a in (light, view, one))
+    apart = estimate(p.f, *args, eta=1.3, variance=p.variance)
+    args = (np.broadcast_to(a, (8, *a.shape[1:])) for a in (light, view, one))
+    together = estimate(p.f, *args, eta=1.3, variance=p.variance)
+    np.testing.assert_array_equal(apart.r_d, together.r_d)
+
+
 def test_unknown_noise_is_found_from_the_samples():
     p = scene("light", noise=0.03)
     found = fitted(p, variance=None)
