@@ -11,7 +11,15 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig import cli_dynamic, cli_editing, cli_planning, cli_reflectance, cli_rendering, errors
+from skinrig import (
+    cli_analysing,
+    cli_dynamic,
+    cli_editing,
+    cli_planning,
+    cli_reflectance,
+    cli_rendering,
+    errors,
+)
 from skinrig.console import Console
 
 app = typer.Typer(
@@ -424,6 +432,7 @@ app.add_typer(import_app, name="import")
 cli_dynamic.fit_app.command("reflectance")(cli_reflectance.fit_reflectance)
 app.add_typer(cli_dynamic.fit_app, name="fit")
 app.add_typer(cli_dynamic.apply_app, name="apply")
+app.add_typer(cli_analysing.analyse_app, name="analyse")
 
 
 @import_app.command("photos")

@@ -8,7 +8,7 @@ import pytest
 
 from skinrig.cli import app, main
 
-GROUPS = {"import": "photos", "fit": "facial-color", "apply": "expression"}
+GROUPS = {"import": "photos", "fit": "facial-color", "apply": "expression", "analyse": "brdf"}
 """Groups of commands, with one of each."""
 COMMANDS = sorted(
     [

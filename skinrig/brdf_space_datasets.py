@@ -1,0 +1,350 @@
+"""Points of simulated faces before a dome, and what an estimator makes of them: datasets A and B.
+
+A point is a random texel of bare skin with its own normal, seen by a dome's cameras under its
+lights (without shadows). Samples have noise; R_d is estimated as the dome does and subtracted, what
+is left is fitted by the tabulated materials.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import load_rig
+from model import brdf_tables, fresnel
+from reconstruction import brdf_basis, brdf_space, diffuse_albedo
+from rigsim import surface_brdf
+from rigsim.mesh import Float32Array
+from rigsim.population import HAIR_LIMIT, Member, table_1
+from rigsim.skin_conditions import CONDITIONS, conditioned_surface
+from rigsim.surface_brdf import SkinSurface
+
+FloatArray = NDArray[np.float64]
+
+LEAST_COS_LIGHT: Final = 0.12
+LEAST_COS_VIEW: Final = 0.25
+NOISE: Final = 0.02
+"""Standard deviation of a sample's radiance, as a share of itself and of 2 % of white."""
+DARK_SHARE: Final = 0.02
+SAMPLES: Final = 160
+"""Pairs of light and view of a point, drawn among all that are above the horizon."""
+CHUNK: Final = 1000
+"""Points that are worked on at a time."""
+REPEATED: Final = 100
+"""Points of a label, at most, that are fitted twice to tell what noise alone leaves."""
+SIZE: Final = 256
+PERSON: Final = 4
+"""Member of table 1 whose face dataset A is of."""
+
+
+class DatasetError(ValueError):
+    """A dataset is asked for that cannot be made."""
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    """BRDF samples of P points, as `reconstruction.brdf_basis.surface_samples` takes them."""
+
+    f: FloatArray
+    """(P, M, 3), 1/sr, with noise."""
+    variance: FloatArray
+    light: FloatArray
+    """(P, M, 3), unit vectors."""
+    view: FloatArray
+    normals: FloatArray
+    """(P, 3)."""
+    r_d: FloatArray
+    """The true R_d, (P, 3)."""
+    surface: FloatArray
+    """The true surface term, (P, M), 1/sr."""
+    clean: FloatArray
+    """The samples without noise, (P, M, 3), 1/sr."""
+
+    def again(self, count: int, *, rng: np.random.Generator) -> Captured:
+        """Return the first points with other noise."""
+        part = {name: getattr(self, name)[:count] for name in self.__dataclass_fields__}
+        sigma = np.sqrt(part["variance"])
+        noise = sigma * rng.standard_normal(sigma.shape)
+        return Captured(**(part | {"f": part["clean"] + noise}))
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """Mixtures of the materials at points, and whose they are."""
+
+    name: str
+    weights: FloatArray
+    """(P, K), at least 0."""
+    label: NDArray[np.int64]
+    """Index into `labels` of each point."""
+    labels: tuple[str, ...]
+    """Conditions or people."""
+    noise: float
+    """How far two fits of one point with different noise lie apart, over root 2, relative to the
+    mixtures' BRDFs: what no basis should explain. NaN where it was not measured."""
+    lost: int
+    """Points without a fit."""
+
+
+def capture(
+    surface: SkinSurface,
+    position_mm: Float32Array,
+    where: NDArray[np.bool_],
+    count: int,
+    *,
+    samples: int = SAMPLES,
+    noise: float = NOISE,
+    rng: np.random.Generator,
+) -> Captured:
+    """Return samples of random points of a face.
+
+    Parameters
+    ----------
+    surface
+        How it reflects.
+    position_mm
+        Its texels, (N, N, 3), rig frame.
+    where
+        Texels to choose from, (N, N).
+    count
+        Number of points P.
+    samples
+        Pairs of light and view a point.
+    noise
+        See `NOISE`.
+    rng
+        Of everything random.
+
+    Raises
+    ------
+    DatasetError
+        No texel has as many pairs.
+
+    Notes
+    -----
+    Texels are drawn without replacement while there are enough of them.
+    """
+    rig = load_rig("dome")
+    lights = np.array([light.position_mm for light in rig.lights])
+    views = np.array([view.position_mm for view in rig.views])
+    texels = np.flatnonzero(where)
+    # A third more than needed: some lie too flat to lights or cameras.
+    few = max(count + count // 3, 64)
+    drawn = rng.choice(texels, few, replace=few > len(texels)) if len(texels) else texels
+    normal = surface.normal.reshape(-1, 3)[drawn].astype(np.float64)
+    place = position_mm.reshape(-1, 3)[drawn].astype(np.float64)
+    above_l, above_v = _above(lights, place, normal), _above(views, place, normal)
+    pairs = (above_l >= LEAST_COS_LIGHT).sum(1) * (above_v >= LEAST_COS_VIEW).sum(1)
+    able = np.flatnonzero(pairs >= samples)
+    if not len(able):
+        raise DatasetError(
+            f"samples: got {samples} a point, expected at most the {int(pairs.max(initial=0))} "
+            f"pairs of light and view that the best of {len(drawn)} points has"
+        )
+    chosen = able[:count] if len(able) >= count else rng.choice(able, count)
+    normal, place = normal[chosen], place[chosen]
+    valid = (above_v[chosen][:, :, None] >= LEAST_COS_VIEW) & (
+        above_l[chosen][:, None, :] >= LEAST_COS_LIGHT
+    )
+    order = np.argsort(np.where(valid, rng.random(valid.shape), 2.0).reshape(count, -1), axis=1)
+    view_index, light_index = np.divmod(order[:, :samples], len(lights))
+    to_light = _unit(lights[light_index] - place[:, None])
+    to_view = _unit(views[view_index] - place[:, None])
+    packed = np.repeat(
+        surface.packed().reshape(len(where) ** 2, -1)[drawn[chosen]], samples, axis=0
+    )
+    clean, specular = surface_brdf.evaluate(
+        packed,
+        np.repeat(normal, samples, axis=0),
+        to_light.reshape(-1, 3),
+        to_view.reshape(-1, 3),
+    )
+    f = clean.astype(np.float64).reshape(count, samples, 3)
+    mu = np.einsum("pmc,pc->pm", to_light, normal)[..., None]
+    sigma = noise * (f * mu + DARK_SHARE / np.pi) / mu
+    return Captured(
+        f=f + sigma * rng.standard_normal(f.shape),
+        variance=np.maximum(sigma, 1e-9) ** 2,
+        light=to_light,
+        view=to_view,
+        normals=normal,
+        r_d=surface.r_d.reshape(-1, 3)[drawn[chosen]].astype(np.float64),
+        surface=specular.astype(np.float64).reshape(count, samples),
+        clean=f,
+    )
+
+
+def fitted(captured: Captured, basis: brdf_tables.BrdfBasis) -> brdf_basis.BasisWeights:
+    """Fit the materials to what is left of samples after their estimated diffuse part."""
+    found = diffuse_albedo.estimate(
+        captured.f, captured.light, captured.view, captured.normals, eta=fresnel.ETA_SKIN,
+        variance=captured.variance,
+    )  # fmt: skip
+    given = brdf_basis.surface_samples(
+        captured.f, captured.light, captured.view, captured.normals, found.r_d,
+        eta=fresnel.ETA_SKIN, variance=captured.variance,
+    )  # fmt: skip
+    return brdf_basis.fit_weights(given, basis)
+
+
+def one_person(
+    points: int, *, member: Member | None = None, noise: float = NOISE, rng: np.random.Generator
+) -> Dataset:
+    """Return points of one face as it usually is.
+
+    Parameters
+    ----------
+    points
+        How many.
+    member
+        Whose; None: that of dataset A.
+    noise
+        See `NOISE`.
+    rng
+        Of everything random.
+    """
+    person = table_1()[PERSON] if member is None else member
+    return _gathered(
+        "one person", ("normal",), [points], lambda _: _skin(person, {}), noise=noise, rng=rng
+    )
+
+
+def dataset_a(
+    points: int,
+    *,
+    member: Member | None = None,
+    conditions: Sequence[str] = CONDITIONS,
+    noise: float = NOISE,
+    progress: Callable[[str], None] | None = None,
+    rng: np.random.Generator,
+) -> Dataset:
+    """Return points of one face under seven conditions, evenly spread over them.
+
+    Parameters
+    ----------
+    points
+        How many in all.
+    member
+        Whose; None: `PERSON` of table 1.
+    conditions
+        Of `rigsim.skin_conditions.CONDITIONS`, each of amount 1.
+    noise
+        See `NOISE`.
+    progress
+        Called with each condition's name.
+    rng
+        Of everything random.
+    """
+    if not conditions or points < len(conditions):
+        raise DatasetError(
+            f"points: got {points} for {len(conditions)} conditions, expected one each or more"
+        )
+    person = table_1()[PERSON] if member is None else member
+    share = np.diff(np.linspace(0, points, len(conditions) + 1).round().astype(int))
+    return _gathered(
+        "dataset A", tuple(conditions), share.tolist(),
+        lambda k: _skin(person, {conditions[k]: 1.0}), noise=noise, progress=progress, rng=rng,
+    )  # fmt: skip
+
+
+def dataset_b(
+    points: int,
+    *,
+    members: Sequence[Member] | None = None,
+    noise: float = NOISE,
+    progress: Callable[[str], None] | None = None,
+    rng: np.random.Generator,
+) -> Dataset:
+    """Return points of each member of a population.
+
+    Parameters
+    ----------
+    points
+        How many of each.
+    members
+        None: the 87 of `rigsim.population.table_1`.
+    noise
+        See `NOISE`.
+    progress
+        Called with each member's name.
+    rng
+        Of everything random.
+    """
+    people = table_1() if members is None else tuple(members)
+    if not people or points < 1:
+        raise DatasetError(f"points: got {points} of {len(people)} people, expected 1 of 1 or more")
+    return _gathered(
+        "dataset B", tuple(person.name for person in people), [points] * len(people),
+        lambda k: _skin(people[k], None), noise=noise, progress=progress, rng=rng,
+    )  # fmt: skip
+
+
+Skin = tuple[SkinSurface, Float32Array, NDArray[np.bool_]]
+
+
+def _skin(member: Member, conditions: dict[str, float] | None) -> Skin:
+    """Return surface, places and bare skin of a member, under its own conditions or others."""
+    rig = load_rig("dome")
+    camera, light = rig.views[0].spectral_sensitivity, rig.lights[0].illuminant
+    worn = dict(member.applied) if conditions is None else conditions
+    face = member.face(SIZE)
+    surface = conditioned_surface(face, camera, light, worn)
+    return surface, face.atlas.position_mm, face.atlas.covered & (face.hair < HAIR_LIMIT)
+
+
+def _gathered(
+    name: str,
+    labels: tuple[str, ...],
+    counts: Sequence[int],
+    skin: Callable[[int], Skin],
+    *,
+    noise: float,
+    rng: np.random.Generator,
+    progress: Callable[[str], None] | None = None,
+) -> Dataset:
+    basis = brdf_tables.default()
+    weights, label = [], []
+    twice: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    lost = 0
+    for k, count in enumerate(counts):
+        if progress is not None:
+            progress(f"{name}: {labels[k]}")
+        surface, place, where = skin(k)
+        for start in range(0, count, CHUNK):
+            seen = capture(surface, place, where, min(CHUNK, count - start), noise=noise, rng=rng)
+            fit = fitted(seen, basis)
+            good = fit.valid & (fit.weights @ basis.strength() > 0.0)
+            lost += int(np.count_nonzero(~good))
+            weights.append(fit.weights[good])
+            label.append(np.full(np.count_nonzero(good), k))
+            if start == 0:
+                few = min(REPEATED, len(good))
+                other = fitted(seen.again(few, rng=rng), basis)
+                both = good[:few] & other.valid
+                twice[0].append(fit.weights[:few][both])
+                twice[1].append(other.weights[both])
+    shares = np.concatenate(weights)
+    kept = brdf_space.usable(shares, basis)
+    again = [np.concatenate(part) for part in twice]
+    return Dataset(
+        name,
+        shares[kept],
+        np.concatenate(label)[kept],
+        labels,
+        brdf_space.repeatability(again[0], again[1], basis),
+        lost + int(np.count_nonzero(~kept)),
+    )
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def _above(places_mm: FloatArray, points_mm: FloatArray, normals: FloatArray) -> FloatArray:
+    """Return cosines to the normals of the ways from points to places, (points, places)."""
+    way = _unit(places_mm[None] - points_mm[:, None])
+    return np.einsum("pkc,pc->pk", way, normals)

@@ -1,0 +1,114 @@
+"""The two figures of the space of surface BRDFs: error against rank, and mean BRDFs on spheres."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.brdf_tables import BrdfBasis
+from reconstruction import brdf_basis
+from reconstruction.brdf_space import SpaceCurve
+
+FloatArray = NDArray[np.float64]
+
+LIGHTS: Final = (((-0.5, 0.5, 0.70710678), "light from the left"),
+                 ((0.85, 0.35, -0.39), "light from behind right"))  # fmt: skip
+"""The two directions that spheres are lit from."""
+SPHERE_PX: Final = 160
+GAMMA: Final = 2.2
+BRIGHTEST: Final = 99.0
+"""Percentile of all spheres' lit pixels that is shown as white."""
+
+
+def curves(found: Mapping[str, SpaceCurve]) -> bytes:
+    """Draw errors over the number of mixtures, each over that of its first rank.
+
+    Parameters
+    ----------
+    found
+        Name to curve.
+
+    Returns
+    -------
+    bytes
+        PNG. In-sample errors are joined by lines, those out of sample dashed; a ring marks the
+        plateau.
+    """
+    figure, axes = _figure(6.4, 4.0, 1, 1)
+    plot = axes[0, 0]
+    for name, curve in found.items():
+        scale = curve.error[0] if curve.error[0] > 0.0 else 1.0
+        (line,) = plot.plot(curve.ranks, curve.error / scale, "o-", ms=3, lw=1.2, label=name)
+        color = line.get_color()
+        plot.plot(curve.ranks, curve.held_out / scale, "--", lw=1.0, color=color)
+        rank = curve.plateau()
+        at = curve.error[curve.ranks.index(rank)] / scale
+        plot.plot([rank], [at], "o", ms=10, mfc="none", mec=color)
+        plot.annotate(str(rank), (rank, at), xytext=(0, 8), textcoords="offset points",
+                      color=color, fontsize=8, ha="center")  # fmt: skip
+    plot.set_xlabel("common mixtures")
+    plot.set_ylabel("relative error over that of one mixture")
+    plot.set_ylim(bottom=0.0)
+    plot.set_title("Error against number of mixtures (dashed: not used for them)", fontsize=10)
+    plot.legend(fontsize=8, frameon=False)
+    return _png(figure)
+
+
+def spheres(means: Mapping[str, FloatArray], basis: BrdfBasis) -> bytes:
+    """Draw mean BRDFs on spheres, lit from two directions.
+
+    Parameters
+    ----------
+    means
+        Label to shares of the materials, (K,).
+    basis
+        The K materials.
+
+    Returns
+    -------
+    bytes
+        PNG; all spheres share one exposure and a gamma of 2.2.
+    """
+    pictures = lit(means, basis)
+    shown = np.concatenate([p[p > 0.0] for row in pictures.values() for p in row])
+    white = float(np.percentile(shown, BRIGHTEST)) if len(shown) else 1.0
+    count = max(len(means), 1)
+    figure, axes = _figure(1.25 * count + 0.3, 3.0, len(LIGHTS), count)
+    for place in axes.flat:
+        place.axis("off")
+    for column, (name, row) in enumerate(pictures.items()):
+        for k, picture in enumerate(row):
+            level = np.clip(picture / white, 0.0, 1.0) ** (1.0 / GAMMA)
+            axes[k, column].imshow(level, cmap="gray", vmin=0.0, vmax=1.0)
+        axes[0, column].set_title(name, fontsize=8)
+    return _png(figure)
+
+
+def lit(means: Mapping[str, FloatArray], basis: BrdfBasis) -> dict[str, tuple[FloatArray, ...]]:
+    """Return each label's sphere under each of `LIGHTS`, (SPHERE_PX, SPHERE_PX), 1/sr."""
+    return {
+        name: tuple(
+            brdf_basis.lit_sphere(shares, basis, light_dir=way, size_px=SPHERE_PX)
+            for way, _ in LIGHTS
+        )
+        for name, shares in means.items()
+    }
+
+
+def _figure(width_in: float, height_in: float, rows: int, columns: int) -> tuple[Any, Any]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _png(figure: Any) -> bytes:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=140, metadata={"Software": None})
+    return stream.getvalue()
