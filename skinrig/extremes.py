@@ -69,6 +69,7 @@ class Result:
 def all_cases() -> tuple[Case, ...]:
     """Return every case, in the order of the light: transport, pictures, surface, motion."""
     from skinrig import (
+        extremes_interior,
         extremes_motion,
         extremes_pictures,
         extremes_reflectance,
@@ -79,7 +80,7 @@ def all_cases() -> tuple[Case, ...]:
 
     groups = (
         extremes_transport, extremes_rendering, extremes_pictures, extremes_surface,
-        extremes_reflectance, extremes_motion,
+        extremes_reflectance, extremes_interior, extremes_motion,
     )  # fmt: skip
     return tuple(case for group in groups for case in group.CASES)
 
