@@ -45,7 +45,7 @@ def fit_reflectance(
         console.say(f"left out: {what}: {why}")
     valid = float(found.model.valid.mean())
     console.say(f"{out}: reflectance model, {100 * valid:.0f} % of its texels valid")
-    console.say(f"next: skinrig render {out} --out pictures")
+    console.say(f"next: skinrig render {out} --light 1,1,2 --out picture")
     console.document(
         "skinrig.fit/1",
         {"model": "reflectance", "out": out, "assumed": list(found.assumed),
