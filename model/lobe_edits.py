@@ -29,6 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import nnls
+from threadpoolctl import threadpool_limits
 
 from model import nonnegative_kernels, reduced_spaces
 from model.trait_vectors import TraitError
@@ -134,10 +135,11 @@ def edit_weights(
     if not asked:
         return LobeEdit(given.astype(dtype), lobes, zero, zero, zero, {})
     vectors = {name: space.trait(name).vector for name in asked}
-    for name, vector in vectors.items():
-        some = np.flatnonzero(asked[name])
-        tried = some[:: -(-len(some) // TRIED)]
-        lobes = _with_lobe(t[tried], lobes, vector, asked[name][tried], space.metric)
+    with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
+        for name, vector in vectors.items():
+            some = np.flatnonzero(asked[name])
+            tried = some[:: -(-len(some) // TRIED)]
+            lobes = _with_lobe(t[tried], lobes, vector, asked[name][tried], space.metric)
     if len(lobes) > max(MOST_LOBES, t.shape[1]):
         raise TraitError(f"lobes: got {len(lobes)} with those of traits, expected {MOST_LOBES}")
     gram = reduced_spaces.times_metric(lobes, space.metric) @ lobes.T

@@ -11,6 +11,8 @@ import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,6 +28,7 @@ Precision = Literal["float64", "float32", "float16", "int8"]
 Source = Literal["simulated", "measured"]
 
 SCHEMA = "skinrig.traits/1"
+PACKAGED = "trait_space.npz"
 BLOCK = 256
 """Numbers that share one scale in 8 bits."""
 _LARGE = 1024  # samples at least so long are stored in fewer bits
@@ -114,6 +117,16 @@ class TraitLibrary:
     def save(self, path: str | Path, *, precision: Precision = "float32") -> None:
         """Write the file that `load` reads; ``path`` is used as it is."""
         Path(path).write_bytes(self.to_bytes(precision=precision))
+
+
+@cache
+def default() -> TraitLibrary:
+    """Return the packaged traits, learned from a simulated population.
+
+    `tools/make_trait_space.py` makes them; `parameters` says of whom, and how near they come to
+    what the simulator truly changed.
+    """
+    return from_bytes(resources.files("model").joinpath("data", PACKAGED).read_bytes())
 
 
 def load(path: str | Path) -> TraitLibrary:

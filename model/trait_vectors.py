@@ -15,7 +15,7 @@ they are those of Welch). Phipson and Smyth 2010, doi:10.2202/1544-6115.1585 (p-
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -99,6 +99,21 @@ class TraitVector:
     confidence: Confidence
     confounded: tuple[tuple[str, float], ...] = ()
     warnings: tuple[str, ...] = ()
+
+    def opposite(self, name: str) -> TraitVector:
+        """Return the trait of those without this binary one, such as "male" of "female"."""
+        if self.kind != "binary":
+            raise TraitError(f"trait: got {self.name!r}, a continuous one, which has no opposite")
+        return replace(
+            self,
+            name=name,
+            vector=-self.vector,
+            coordinates=-self.coordinates,
+            members=self.others,
+            others=self.members,
+            confounded=tuple((other, -r) for other, r in self.confounded),
+            warnings=tuple(w.replace(f"{self.name}:", f"{name}:", 1) for w in self.warnings),
+        )
 
     @property
     def warning(self) -> str:

@@ -19,11 +19,12 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
 
 from model import feasible_sets, reduced_spaces, trait_vectors
 from model.feasible_sets import FeasibleSet
-from model.reduced_spaces import SpaceKind
-from model.trait_vectors import Contrast, TraitError, TraitVector
+from model.reduced_spaces import Reduction, SpaceKind
+from model.trait_vectors import Contrast, Trait, TraitError, TraitVector
 
 FloatArray = NDArray[np.float64]
 Mode = Literal["linear", "convex"]
@@ -189,38 +190,14 @@ class TraitSpace:
             bad = int(np.count_nonzero(~inside.contains(x)))
             raise TraitError(f"samples: {bad} of {len(x)} are not in the set {inside}")
         rng = np.random.default_rng(seed)
-        if space == "pca":
-            reduced = reduced_spaces.principal(x, traits, components=components, metric=g, rng=rng)
-        else:
-            reduced = reduced_spaces.mixtures(x, basis, metric=g)
-        related = trait_vectors.correlations(traits)
-        found = {}
-        for k, trait in enumerate(traits):
-            beside = tuple(t for t in traits if t is not trait) if contrast == "regression" else ()
-            sure = trait_vectors.confidence(
-                trait, reduced.scores, whole=reduced.whole, beside=beside, rng=rng
-            )
-            left = trait_vectors.residuals(trait, x, beside=beside)
-            weights = trait_vectors.error_weights(trait, left[:, -1], 2 + len(beside))
-            others = [
-                (t.name, float(r))
-                for t, r in zip(traits, related[k], strict=True)
-                if t is not trait and abs(r) > trait_vectors.CONFOUNDED
-            ]
-            confounded = tuple(sorted(others, key=lambda other: -abs(other[1])))
-            along = trait.contrast @ reduced.coordinates
-            found[trait.name] = TraitVector(
-                name=trait.name,
-                kind=trait.kind,
-                vector=inside.tangent(along @ reduced.basis),
-                stderr=np.sqrt(weights @ left[:, :-1] ** 2),
-                coordinates=along,
-                members=trait.members,
-                others=len(x) - trait.members,
-                confidence=sure,
-                confounded=confounded,
-                warnings=trait_vectors.doubts(trait, sure, confounded),
-            )
+        with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
+            if space == "pca":
+                reduced = reduced_spaces.principal(
+                    x, traits, components=components, metric=g, rng=rng
+                )
+            else:
+                reduced = reduced_spaces.mixtures(x, basis, metric=g)
+            found = _vectors(x, traits, reduced, inside, contrast, rng)
         return cls(
             kind=space,
             center=reduced.center,
@@ -381,3 +358,43 @@ def cosine(a: ArrayLike, b: ArrayLike, metric: FloatArray | None = None) -> floa
         raise TraitError(f"directions: got shapes {x.shape}, {y.shape}, expected (d,) twice")
     size = float(reduced_spaces.lengths(x, metric) * reduced_spaces.lengths(y, metric))
     return float(x @ reduced_spaces.times_metric(y, metric)) / size if size > 0.0 else 0.0
+
+
+def _vectors(
+    x: FloatArray,
+    traits: tuple[Trait, ...],
+    reduced: Reduction,
+    inside: FeasibleSet,
+    contrast: Contrast,
+    rng: np.random.Generator,
+) -> dict[str, TraitVector]:
+    """Return the vectors of traits in a reduced space, with what they are worth."""
+    related = trait_vectors.correlations(traits)
+    found = {}
+    for k, trait in enumerate(traits):
+        beside = tuple(t for t in traits if t is not trait) if contrast == "regression" else ()
+        sure = trait_vectors.confidence(
+            trait, reduced.scores, whole=reduced.whole, beside=beside, rng=rng
+        )
+        left = trait_vectors.residuals(trait, x, beside=beside)
+        weights = trait_vectors.error_weights(trait, left[:, -1], 2 + len(beside))
+        others = [
+            (t.name, float(r))
+            for t, r in zip(traits, related[k], strict=True)
+            if t is not trait and abs(r) > trait_vectors.CONFOUNDED
+        ]
+        confounded = tuple(sorted(others, key=lambda other: -abs(other[1])))
+        along = trait.contrast @ reduced.coordinates
+        found[trait.name] = TraitVector(
+            name=trait.name,
+            kind=trait.kind,
+            vector=inside.tangent(along @ reduced.basis),
+            stderr=np.sqrt(weights @ left[:, :-1] ** 2),
+            coordinates=along,
+            members=trait.members,
+            others=len(x) - trait.members,
+            confidence=sure,
+            confounded=confounded,
+            warnings=trait_vectors.doubts(trait, sure, confounded),
+        )
+    return found
