@@ -5,98 +5,71 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from skinrig import (
-    bench_alignment,
-    bench_brdf,
-    bench_chromophores,
-    bench_dome_calibration,
-    bench_dome_render,
-    bench_efficiency,
-    bench_facial_color,
-    bench_fibre_readings,
-    bench_flash,
-    bench_gradient_calibration,
-    bench_gradient_normals,
-    bench_gradient_render,
-    bench_hdr,
-    bench_integration,
-    bench_kernels,
-    bench_light_order,
-    bench_microstructure,
-    bench_motion,
-    bench_perfusion,
-    bench_photometric,
-    bench_probe,
-    bench_reflectance,
-    bench_shared_melanin,
-    bench_skin_stretch,
-    bench_subsurface,
-    bench_subsurface_gather,
-    bench_surface,
-    bench_synthesis,
-    bench_texture,
-    bench_tissue,
-    bench_translucency,
-    bench_transport,
-    bench_wrinkles,
-)
 from skinrig.benchmark import StageBenchmark, to_document
 from skinrig.console import Console, plain
 
-STAGES: dict[str, Callable[..., StageBenchmark]] = {
-    "chromophores": bench_chromophores.inversion,
-    "render-flash": bench_flash.render,
-    "render-dome": bench_dome_render.render,
-    "render-gradient": bench_gradient_render.render,
-    "skin-stretch": bench_skin_stretch.stretched,
-    "layered-reflectance": bench_tissue.layered_reflectance,
-    "color-table": bench_tissue.table,
-    "expression-alignment": bench_alignment.aligned,
-    "efficiency": bench_efficiency.efficiency,
-    "misalignment": bench_alignment.misaligned,
-    "shared-melanin": bench_shared_melanin.inversion,
-    "facial-color": bench_facial_color.rig,
-    "diffuse-albedo": bench_brdf.albedo,
-    "brdf": bench_brdf.surface,
-    "reflectance": bench_reflectance.model,
-    "normals": bench_photometric.normals,
-    "gradient-normals": bench_gradient_normals.normals,
-    "hdr": bench_hdr.merging,
-    "lumitexels": bench_surface.lumitexels,
-    "texture-fill": bench_surface.filling,
-    "head-motion": bench_motion.motion,
-    "dome-geometry": bench_dome_calibration.geometry,
-    "dome-lights": bench_dome_calibration.lights,
-    "light-order": bench_light_order.light_order,
-    "sphere-lights": bench_gradient_calibration.sphere_lights,
-    "fibre-readings": bench_fibre_readings.fibre_readings,
-    "normal-integration": bench_integration.integration,
-    "normal-histogram": bench_kernels.histograms,
-    "kernel-fit": bench_kernels.search,
-    "displacement-synthesis": bench_synthesis.growth,
-    "texture-matching": bench_texture.matching,
-    "microstructure": bench_microstructure.truth,
-    "microstructure-passes": bench_microstructure.passes,
-    "perfusion-curves": bench_perfusion.curves,
-    "probe-session": bench_probe.session,
-    "subsurface-fit": bench_subsurface.tiers,
-    "subsurface-batch": bench_subsurface.batches,
-    "subsurface-gather": bench_subsurface_gather.gathering,
-    "anisotropy": bench_translucency.directions,
-    "translucency": bench_translucency.sites,
-    "photon-transport": bench_transport.photon_transport,
-    "wrinkles": bench_wrinkles.fitting,
-    "wrinkle-sum": bench_wrinkles.summing,
-    "wrinkle-storage": bench_wrinkles.storing,
-    "wrinkle-weights": bench_wrinkles.weighing,
+STAGES = {
+    "chromophores": "bench_chromophores.inversion",
+    "render-flash": "bench_flash.render",
+    "render-dome": "bench_dome_render.render",
+    "render-gradient": "bench_gradient_render.render",
+    "skin-stretch": "bench_skin_stretch.stretched",
+    "layered-reflectance": "bench_tissue.layered_reflectance",
+    "color-table": "bench_tissue.table",
+    "expression-alignment": "bench_alignment.aligned",
+    "efficiency": "bench_efficiency.efficiency",
+    "misalignment": "bench_alignment.misaligned",
+    "shared-melanin": "bench_shared_melanin.inversion",
+    "facial-color": "bench_facial_color.rig",
+    "diffuse-albedo": "bench_brdf.albedo",
+    "brdf": "bench_brdf.surface",
+    "reflectance": "bench_reflectance.model",
+    "normals": "bench_photometric.normals",
+    "gradient-normals": "bench_gradient_normals.normals",
+    "hdr": "bench_hdr.merging",
+    "lumitexels": "bench_surface.lumitexels",
+    "texture-fill": "bench_surface.filling",
+    "head-motion": "bench_motion.motion",
+    "dome-geometry": "bench_dome_calibration.geometry",
+    "dome-lights": "bench_dome_calibration.lights",
+    "light-order": "bench_light_order.light_order",
+    "sphere-lights": "bench_gradient_calibration.sphere_lights",
+    "fibre-readings": "bench_fibre_readings.fibre_readings",
+    "normal-integration": "bench_integration.integration",
+    "normal-histogram": "bench_kernels.histograms",
+    "kernel-fit": "bench_kernels.search",
+    "displacement-synthesis": "bench_synthesis.growth",
+    "texture-matching": "bench_texture.matching",
+    "microstructure": "bench_microstructure.truth",
+    "microstructure-passes": "bench_microstructure.passes",
+    "perfusion-curves": "bench_perfusion.curves",
+    "probe-session": "bench_probe.session",
+    "subsurface-fit": "bench_subsurface.tiers",
+    "subsurface-batch": "bench_subsurface.batches",
+    "subsurface-gather": "bench_subsurface_gather.gathering",
+    "anisotropy": "bench_translucency.directions",
+    "translucency": "bench_translucency.sites",
+    "photon-transport": "bench_transport.photon_transport",
+    "wrinkles": "bench_wrinkles.fitting",
+    "wrinkle-sum": "bench_wrinkles.summing",
+    "wrinkle-storage": "bench_wrinkles.storing",
+    "wrinkle-weights": "bench_wrinkles.weighing",
 }
+"""Module and function of each; a module is imported, and its kernels compiled, when it is run."""
 
 
 class BenchError(ValueError):
     """A stage that cannot be measured."""
+
+
+def _function(name: str) -> Callable[..., StageBenchmark]:
+    module, function = STAGES[name].split(".")
+    found: Callable[..., StageBenchmark] = getattr(import_module(f"skinrig.{module}"), function)
+    return found
 
 
 def run_stages(
@@ -139,7 +112,7 @@ def run_stages(
             left_out.append([name, f"the budget of {budget_s:g} s was used up"])
             continue
         console.progress(f"bench {name}")
-        done.append(STAGES[name](toy=toy))
+        done.append(_function(name)(toy=toy))
     document = to_document(done)
     document["toy"] = toy
     document["left_out"] = left_out
