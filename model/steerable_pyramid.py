@@ -242,6 +242,9 @@ def _by_rows(
     """Run a kernel over a level's rows, in threads; no two write the same row."""
     common = (level.rows, level.weight, level.fy, level.fx, filters.toward, factor, out)
     height = len(level.rows)
+    if height <= _CHUNK_ROWS:
+        kernel(source, *common, 0, height)
+        return
     jobs = [
         pool.submit(kernel, source, *common, begin, min(begin + _CHUNK_ROWS, height))
         for begin in range(0, height, _CHUNK_ROWS)

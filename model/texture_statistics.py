@@ -13,9 +13,10 @@ Weyrich et al. 2006, doi:10.1145/1141911.1141987, sections 10.2 and 11.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +31,8 @@ Floats = NDArray[np.float64]
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 Weights = tuple[Array, tuple[Array, ...]] | None
+T = TypeVar("T")
+_SMALL = 128 * 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -317,7 +320,7 @@ def _count(
         counts = None if weights is None else weight_of(weights, r, space.orientations)
         return bins[r].count(responses[r], counts)
 
-    return list(pool.map(one, range(len(bins))))
+    return _each(pool, one, range(len(bins)), large=responses[0].size > _SMALL)
 
 
 def _move(
@@ -334,7 +337,14 @@ def _move(
         if far[r]:
             bins[r].match(response, counted[r], wanted[r], out=response)
 
-    list(pool.map(one, range(1, len(bins)), pyramid))
+    _each(pool, one, range(1, len(bins)), pyramid, large=pyramid.high.size > _SMALL)
+
+
+def _each(
+    pool: ThreadPoolExecutor, one: Callable[..., T], *items: Iterable[Any], large: bool
+) -> list[T]:
+    """Do all items: in threads when images are large enough to be worth them."""
+    return list((pool.map if large else map)(one, *items))
 
 
 def _blended(original: Array, new: Array, blend: Array, mask: Mask) -> Array:

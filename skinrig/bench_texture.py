@@ -130,16 +130,7 @@ def matching(*, toy: bool) -> StageBenchmark:
     )  # fmt: skip
     for other in (32,) if toy else (128, 512):
         found.append(_point(other, {"levels": 7, "iterations": 5}, repeats=repeats))
-    limits: tuple[Limit, ...] = ()
-    left_out: tuple[tuple[str, str], ...] = ()
-    if not toy:
-        try:
-            limits = _full_size()
-        except ImportError as error:
-            left_out = (
-                (f"{TIMES_FASTER:g} x {PEER}",
-                 f"the peer is missing ({error}): pip install 'skinrig[peers]'"),
-            )  # fmt: skip
+    limits, left_out = ((), ()) if toy else against_peer()
     return StageBenchmark(
         "texture-matching",
         "mean distance of 93 histograms, spreads of the population",
@@ -205,11 +196,18 @@ def peer_responses(image: ArrayLike) -> list[Floats]:
     return [found["residual_highpass"], *bands, found["residual_lowpass"] / 4.0**levels]
 
 
-def _full_size() -> tuple[Limit, ...]:
-    """Match one channel of 1024 x 1024, by turns with the peer."""
+def against_peer(
+    side: int = FULL_SIDE,
+) -> tuple[tuple[Limit, ...], tuple[tuple[str, str], ...]]:
+    """Match one channel by turns with the peer; return limits, or what is left out and why."""
+    try:
+        peer_responses(np.zeros((512, 512)))
+    except ImportError as error:
+        why = f"the peer is missing ({error}); to measure it: pip install 'skinrig[peers]'"
+        return (), ((f"{TIMES_FASTER:g} x {PEER}", why),)
     rng = np.random.default_rng(0)
-    target = skin_texture(FULL_SIDE, spots=10.0, rng=rng)[..., 1].copy()
-    source = 0.9 * skin_texture(FULL_SIDE, spots=0.0, rng=rng)[..., 1]
+    target = skin_texture(side, spots=10.0, rng=rng)[..., 1].copy()
+    source = 0.9 * skin_texture(side, spots=0.0, rng=rng)[..., 1]
     space = TextureSpace.fit([target, source])
     vector = describe(target, space=space)
     theirs = peer_iterations(source, target, 1)
@@ -234,13 +232,14 @@ def _full_size() -> tuple[Limit, ...]:
         float(np.abs(a - b).max() / source.max())
         for a, b in zip(steerable_pyramid.analyze(source), peer_responses(source), strict=True)
     ]
-    what = f"an iteration at {FULL_SIDE} x {FULL_SIDE}, one channel"
-    return (
+    what = f"an iteration at {side} x {side}, one channel"
+    limits = (
         Limit(f"{what}: times as fast as {PEER}", float(wall), TIMES_FASTER, ">="),
         Limit(f"{what}: the same of processor time", float(busy), TIMES_FASTER, ">="),
         Limit("distance from the target over the peer's", off[0] / off[1], SAME_DISTANCE, "<="),
         Limit("responses less the peer's, of the image", max(apart), SAME_RESPONSES, "<="),
     )
+    return limits, ()
 
 
 def _spent(call: Callable[[], Any]) -> Floats:
