@@ -22,7 +22,8 @@ def edit(
         typer.Option(help="Amounts, joined by commas: lotion=0.6,tan=-1; 1 is all of a trait."),
     ] = None,
     space: Annotated[
-        Path | None, typer.Option(help="Traits that `skinrig fit traits` learned.")
+        Path | None,
+        typer.Option(help="Traits that `skinrig fit traits` learned; default: the package's."),
     ] = None,
     region: Annotated[
         str, typer.Option(help="Where: face, beard or no-beard; of spots also skin.")

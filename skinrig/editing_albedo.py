@@ -123,6 +123,9 @@ def edit_albedo(
     used = region & known
     if not used.any():
         raise AlbedoEditError("r_d: no valid texel lies in the region that is edited")
+    if space.kind == "quantiles":
+        # the same factor for any skin: bring one darker or lighter than all to where the bins are
+        image = image - (image[used].mean(axis=0) - space.texture.mean)
     start = _noisy(image, used, space, noise, rng)
     vector = texture_statistics.describe(start, space=space.texture, valid=known, region=used)
     target, texture, clipped = space.target(vector, amounts)

@@ -73,8 +73,8 @@ KINDS: Final[Mapping[str, SpotKind]] = MappingProxyType(
         "follicles": SpotKind(0.45, 0.2, 4.0, 0.6, 40.0, (0.2, 1.5)),
     }
 )
-"""Chosen sizes and numbers, in round figures: ephelides of 1 to 3 mm, common nevi of 2 to 6 mm, some
-tens of beard hairs a cm^2."""
+"""Chosen sizes and numbers, in round figures: ephelides of 1 to 3 mm, common nevi of 2 to 6 mm,
+some tens of beard hairs a cm^2."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any, Final
 
@@ -132,9 +133,12 @@ def load(path: Path | None) -> tuple[TraitLibrary, str]:
     TraitLibraryError
         When none comes with it.
     """
-    if path is None:
+    if path is not None:
+        return trait_storage.load(path), hashlib.sha256(path.read_bytes()).hexdigest()
+    packaged = resources.files("model").joinpath("data", trait_storage.PACKAGED)
+    if not packaged.is_file():
         raise TraitLibraryError(
             "traits: no library comes with this package; name one with --space FILE "
             "(`skinrig fit traits` learns one)"
         )
-    return trait_storage.load(path), hashlib.sha256(path.read_bytes()).hexdigest()
+    return trait_storage.default(), hashlib.sha256(packaged.read_bytes()).hexdigest()
