@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,6 +14,7 @@ from model import brdf_tables, skin_reflectance
 from model.brdf_tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
 from reconstruction.brdf_basis import SurfaceSamples
+from skinrig import bench_texture
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure
 from skinrig.photograph_errors import LIMIT, luminance
 
@@ -146,19 +148,24 @@ def model(*, toy: bool) -> StageBenchmark:
             error = float(np.median(surface))
             total = float(np.median(everything))
             knobs: dict[str, str | int | float | bool] = {
-                "rank": rank, "subject": subject, "points": len(surface), "samples": samples,
-                "all_light_error_percent": round(total, 3),
+                "part": "lobes", "rank": rank, "subject": subject, "points": len(surface),
+                "samples": samples, "all_light_error_percent": round(total, 3),
             }  # fmt: skip
             points.append(Point(knobs, timing, error, (low, high)))
             if rank == USUAL_RANK:
                 bands[subject] = error
                 usual.append(total)
+    texture = [
+        dataclasses.replace(point, knobs={"part": "texture", **point.knobs})
+        for point in bench_texture.points(toy=toy)
+    ]
     return StageBenchmark(
         "reflectance",
-        "error of the surface term under lights left out, of its sum, %; of texture statistics, %",
+        "error of the surface term under lights left out, % of its sum; of matched textures' "
+        "histograms, spreads of the population",
         "simulated faces: facets, oil and vellus hair, of which no lobe is made",
         0.0,
-        tuple(points),
+        (*points, *texture),
         (
             Limit(
                 f"median error of all light under lights left out, rank {USUAL_RANK}, worst skin",
