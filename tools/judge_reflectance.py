@@ -4,7 +4,7 @@
 
 Five simulated faces, lightest to darkest, whose light spreads in the skin and goes from skin to
 skin: captured with the dome's targets, calibrated, reconstructed without every twelfth of 48
-lights and one of 6 cameras, and rendered for what those show. What lies in OUT already is not made
+lights and one of 6 cameras, fitted, and rendered for 24 of the photographs held out. What lies in OUT already is not made
 again. 320 pixels across take some two minutes a face on two cores.
 """
 
@@ -18,12 +18,14 @@ from typing import Any
 
 from reconstruction import pipeline
 from skinrig.calibrating import calibrate
+from skinrig.fitting_reflectance import fit_reflectance
 from skinrig.rendering_evaluation import FULL, evaluate_folders
 from skinrig.simulation import simulate_session
 
 SUBJECTS = ("palest", "II", "III", "V", "darkest")
 WANT = ("normals", "normals_refined", "r_d", "basis_weight_0")
 HOLD_OUT = "lights=3,15,27,39,views=2"
+PHOTOGRAPHS = 24
 DOME: dict[str, Any] = {"lights": 48, "views": 6}
 
 
@@ -52,9 +54,10 @@ def main(arguments: list[str]) -> int:
             out / f"session-{subject}", want=WANT, out=out / f"appearance-{subject}",
             calibration=calibration, hold_out=HOLD_OUT, truth=f"truth-{subject}",
         )  # fmt: skip
+        fit_reflectance(out / f"appearance-{subject}", out=out / f"model-{subject}")
         record = evaluate_folders(
-            out / f"appearance-{subject}", out / f"session-{subject}", out / f"judged-{subject}",
-            calibration=calibration,
+            out / f"model-{subject}", out / f"session-{subject}", out / f"judged-{subject}",
+            calibration=calibration, count=PHOTOGRAPHS,
         )  # fmt: skip
         records.append(record)
         print(f"{subject}: {time.perf_counter() - begun:.0f} s", file=sys.stderr, flush=True)
