@@ -216,11 +216,9 @@ class _Points:
         def flat(image: Float32Array) -> Float32Array:
             return image.reshape(-1, image.shape[-1])[index]
 
-        uv = flat(buffers.uv)
-        return _Points(
-            flat(buffers.position_mm), flat(buffers.face_normal), flat(buffers.to_camera), uv,
-            laid.at(uv),
-        )  # fmt: skip
+        uv, position = flat(buffers.uv), flat(buffers.position_mm)
+        rows = laid.at(uv, position, flat(buffers.normal))
+        return _Points(position, flat(buffers.face_normal), flat(buffers.to_camera), uv, rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

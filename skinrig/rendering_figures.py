@@ -177,7 +177,7 @@ def draw_photograph(
     photo = photographs.photograph(shot).rgb.astype(np.float32)
     seen = _rendered(subject.laid, camera, [lamp], effort)
     exposure = effort.exposure or exposure_of(seen.radiance, seen.coverage)
-    left = np.where(seen.covered[..., None], photo - seen.diffuse, 0.0).astype(np.float32)
+    left = np.where(seen.coverage[..., None] > 0.5, photo - seen.diffuse, 0.0).astype(np.float32)
     return rendering_folder.write(
         out,
         images={
@@ -214,7 +214,7 @@ def component_panels(
     out = [] if photograph is None else [panel("(a) photograph", photograph)]
     out.append(panel("(b) light from inside", seen.diffuse))
     if photograph is not None:
-        skin = seen.covered[..., None]
+        skin = seen.coverage[..., None] > 0.5
         out.append(panel("(c) photograph less (b)", np.where(skin, photograph - seen.diffuse, 0.0)))
     out.append(panel("(d) model", seen.radiance))
     out.append(panel("(e) surface reflection", seen.surface))

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance
-from rigsim.atlas import Atlas, sample, spread, unwrap
+from rigsim.atlas import Atlas, spread, unwrap
 from rigsim.mesh import Float32Array, Mesh, MeshError, MeshFileError, build_mesh, load_mesh
+from skinrig.rendering_lookup_kernels import look_up
 
 BoolArray = NDArray[np.bool_]
 
@@ -27,6 +29,12 @@ FOREIGN_MM: Final = 40.0
 LEAST_SHARE: Final = 0.2
 """Least share of a mesh's texels that the maps must hold values for."""
 SPREAD: Final = 4
+AROUND: Final = 8
+"""Nearest texels that stand in where a point has none of its own."""
+SPARSE: Final = 8_000
+"""Texels, drawn at random, that stand in farther away: their mean is smooth."""
+LEAST_BLEND: Final = 0.01
+"""Least share of the four texels around a point that must be of its place."""
 
 
 class GeometryError(ValueError):
@@ -46,7 +54,7 @@ class Rows:
     translucency_mm: Float32Array
     """1/sigma_tr, shape (n, 3)."""
     measured: BoolArray
-    """Whether a valid texel was among those looked up; others hold what was filled in."""
+    """Whether a valid texel lies within a texel's width; others hold the nearest valid one's."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +81,11 @@ class FittedSurface:
     normals: Float32Array
     carried: bool
     _values: Float32Array
-    _valid: BoolArray
+    _known: BoolArray
+    """Texels with a surface and valid maps."""
+    _width_mm: Float32Array
+    _trees: list[tuple[cKDTree, NDArray[np.intp]]] = field(default_factory=list)
+    """Places of the known texels, and of some of them, once they are asked for."""
 
     @staticmethod
     def of(model: SkinReflectance, mesh: Mesh, *, rest: Mesh | None = None) -> FittedSurface:
@@ -130,9 +142,8 @@ class FittedSurface:
         )  # where nothing is known light must spread, too
         layers = [model.r_d, model.weights, normals, np.where(depth > 0.0, depth, usual)]
         values = np.concatenate([np.asarray(layer, np.float32) for layer in layers], axis=-1)
-        return FittedSurface(
-            model, mesh, atlas, normals, moved, np.nan_to_num(values), np.asarray(model.valid)
-        )
+        width = np.maximum(*atlas.texel_mm())
+        return FittedSurface(model, mesh, atlas, normals, moved, np.nan_to_num(values), both, width)
 
     def of_medium(self, sigma_tr_per_mm: ArrayLike) -> FittedSurface:
         """Return the same surface above a medium of one sigma_tr, three channels, 1/mm."""
@@ -153,24 +164,65 @@ class FittedSurface:
         own = dataclasses.replace(self.model, lobes=model.lobes, weights=model.weights)
         return dataclasses.replace(self, model=own, _values=values.astype(np.float32))
 
-    def at(self, uv: Float32Array) -> Rows:
-        """Look the maps up at texture coordinates, bilinearly, among valid texels where there are.
+    def at(self, uv: Float32Array, position_mm: Float32Array, normal: Float32Array) -> Rows:
+        """Look the maps up at points of the mesh.
+
+        Bilinearly among valid texels of the same place. Where there are none, what is known around
+        stands in, with the mesh's normal: a texture filled from its own neighbors would bring in
+        other parts of the face where charts are small.
 
         Parameters
         ----------
         uv
-            Shape (n, 2), (0, 0) is bottom left.
+            Texture coordinates, shape (n, 2), (0, 0) is bottom left.
+        position_mm
+            The points, shape (n, 3), frame of the mesh.
+        normal
+            The mesh's shading normals there, shape (n, 3).
         """
-        every = np.ones(len(uv), np.bool_)
-        weight = self._valid.astype(np.float32)
-        share = sample(weight, uv, every)
-        measured = share > 1e-3
-        known = sample(self._values * weight[..., None], uv, measured)
-        known /= np.where(measured, share, 1.0)[:, None]
-        rows = np.where(measured[:, None], known, sample(self._values, uv, ~measured))
+        point = np.ascontiguousarray(position_mm, np.float32)
+        rows = np.zeros((len(uv), self._values.shape[-1]), np.float32)
+        share = np.zeros(len(uv), np.float32)
+        look_up(
+            self._values, self._known, self.atlas.position_mm, self._width_mm,
+            np.ascontiguousarray(uv, np.float32), point, rows, share,
+        )  # fmt: skip
         lobes = self.model.weights.shape[-1]
+        measured = share > LEAST_BLEND
+        lost = np.flatnonzero(~measured)
+        if len(lost):
+            rows[lost], near = self._around(point[lost])
+            measured[lost] = near
+            far = lost[~near]
+            rows[far, 3 + lobes : 6 + lobes] = normal[far]
         r_d, weights, normals, translucency = np.split(rows, (3, 3 + lobes, 6 + lobes), axis=-1)
         return Rows(r_d, weights, unit(normals), translucency, measured)
+
+    def _around(self, point: Float32Array) -> tuple[Float32Array, BoolArray]:
+        """Return means of known texels around points, and where one is within its own width."""
+        if not self._trees:
+            every = np.flatnonzero(self._known)
+            some = np.sort(np.random.default_rng(0).permutation(every)[:SPARSE])
+            place = self.atlas.position_mm.reshape(-1, 3).astype(np.float64)
+            self._trees.extend((cKDTree(place[t]), t) for t in (every, some))
+        means, near = self._mean(*self._trees[0], point)
+        far = np.flatnonzero(~near)
+        if len(far):
+            means[far] = self._mean(*self._trees[1], point[far])[0]
+        return means, near
+
+    def _mean(
+        self, tree: cKDTree, texels: NDArray[np.intp], point: Float32Array
+    ) -> tuple[Float32Array, BoolArray]:
+        """Return means of the nearest texels by inverse squares, and where one is near."""
+        count = min(AROUND, len(texels))
+        distance, index = tree.query(point.astype(np.float64), k=range(1, count + 1))
+        found = texels[index]
+        weight = 1.0 / np.maximum(distance, 1e-3) ** 2
+        weight /= weight.sum(axis=1, keepdims=True)
+        values = self._values.reshape(-1, self._values.shape[-1])[found]
+        near = distance[:, 0] < self._width_mm.reshape(-1)[found[:, 0]]
+        return np.einsum("nk,nkc->nc", weight, values).astype(np.float32), near
 
 
 def carried_normals(normals: Float32Array, rest: Atlas, moved: Atlas) -> Float32Array:

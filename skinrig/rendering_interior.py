@@ -75,8 +75,9 @@ class Interior:
         )
         across, along = across / np.float32(atlas.size), along / np.float32(atlas.size)
         area = np.linalg.norm(np.cross(across.astype(np.float64), along), axis=-1)
+        held = laid.at(uv.astype(np.float32), position, atlas.normal[chosen])
         return Interior(
-            laid, position, across, along, laid.at(uv.astype(np.float32)).normals,
+            laid, position, across, along, held.normals,
             atlas.prim[chosen], SourceTree.of(position, area),
         )  # fmt: skip
 

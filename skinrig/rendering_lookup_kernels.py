@@ -1,0 +1,67 @@
+"""Look textures up among the texels that show the same place of a surface."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numba import njit, prange
+
+NEAR_TEXELS: Final = 2.0
+"""A texel counts for a point up to so many of its own widths away on the surface."""
+CHUNK: Final = 1 << 12
+
+
+@njit(parallel=True, cache=True)
+def look_up(values, known, place, width, uv, point, out, share):  # type: ignore[no-untyped-def]
+    """Blend the four texels around texture coordinates, without those of other places.
+
+    Charts lie close together in a texture: the texels around a point near a chart's rim, or in a
+    chart smaller than a texel, may show another part of the surface.
+
+    Parameters
+    ----------
+    values : float32 (H, W, C)
+        Row 0 is at v = 1.
+    known : bool (H, W)
+        Texels that hold something.
+    place : float32 (H, W, 3)
+        Surface point of each texel, mm.
+    width : float32 (H, W)
+        Longer side of the texel on the surface, mm.
+    uv : float32 (n, 2)
+        Texture coordinates.
+    point : float32 (n, 3)
+        Surface points, mm, in the frame of `place`.
+    out : float32 (n, C)
+        Blends; 0 where no texel counts.
+    share : float32 (n,)
+        Sum of the weights of those that count, 0 to 1.
+    """
+    rows, columns, channels = values.shape
+    for chunk in prange((uv.shape[0] + CHUNK - 1) // CHUNK):
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, uv.shape[0])):
+            x = min(max(uv[i, 0] * columns - 0.5, 0.0), columns - 1.0)
+            y = min(max((1.0 - uv[i, 1]) * rows - 0.5, 0.0), rows - 1.0)
+            column, row = min(int(x), columns - 2), min(int(y), rows - 2)
+            fx, fy = x - column, y - row
+            total = 0.0
+            for k in range(channels):
+                out[i, k] = 0.0
+            for corner in range(4):
+                r, c = row + corner // 2, column + corner % 2
+                if not known[r, c]:
+                    continue
+                weight = (fy if corner // 2 else 1.0 - fy) * (fx if corner % 2 else 1.0 - fx)
+                away = 0.0
+                for k in range(3):
+                    away += (place[r, c, k] - point[i, k]) ** 2
+                if weight <= 0.0 or away > (NEAR_TEXELS * width[r, c]) ** 2:
+                    continue
+                total += weight
+                for k in range(channels):
+                    out[i, k] += np.float32(weight) * values[r, c, k]
+            share[i] = total
+            if total > 0.0:
+                for k in range(channels):
+                    out[i, k] /= np.float32(total)
