@@ -4,8 +4,8 @@
 
 Five simulated faces, lightest to darkest, whose light spreads in the skin and goes from skin to
 skin: captured with the dome's targets, calibrated, reconstructed without every twelfth of 48
-lights and one of 6 cameras, fitted, and rendered for 24 of the photographs held out. What lies in OUT already is not made
-again. 320 pixels across take some two minutes a face on two cores.
+lights and one of 6 cameras, fitted, and rendered for 24 of the photographs held out. What lies in
+OUT already is not made again. 320 pixels across take some two minutes of processor time a face.
 """
 
 from __future__ import annotations
