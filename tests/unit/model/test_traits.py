@@ -394,3 +394,16 @@ def test_cosines_count_what_the_metric_counts(rng):
     assert cosine([1.0, 0.0], [0.0, 1.0]) == 0.0
     assert cosine([1.0, 0.0], [0.0, 1.0], g) == pytest.approx(1.0)
     assert cosine([1.0, 0.0], [0.0, 0.0]) == 0.0
+
+
+def test_the_opposite_of_a_trait_takes_it_away(rng):
+    samples, label, _ = population(rng)
+    both = TraitSpace.fit(samples, {"female": label, "male": ~label})
+    made = both.trait("female").opposite("male")
+    direct = both.trait("male")
+    np.testing.assert_allclose(made.vector, direct.vector, atol=1e-12)
+    np.testing.assert_allclose(made.stderr, direct.stderr, rtol=1e-12)
+    assert (made.members, made.others, made.name) == (direct.members, direct.others, "male")
+    aged = TraitSpace.fit(samples, {}, continuous={"age": rng.random(40)}).trait("age")
+    with pytest.raises(TraitError, match="no opposite"):
+        aged.opposite("young")
