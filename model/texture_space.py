@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model import steerable_pyramid
 from model.steerable_pyramid import LEVELS, ORIENTATIONS
+from model.texture_bins import OPPONENT, principal_axes, uneven_edges
 from model.texture_histograms import BINS
 from model.texture_masks import fill_smoothly, response_weights
 
@@ -35,9 +36,6 @@ Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 _QUANTILES = 2049
-_MARGIN = 0.05
-_OPPONENT = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0], [1.0, 1.0, -2.0]])
-_OPPONENT /= np.linalg.norm(_OPPONENT, axis=1, keepdims=True)
 
 
 class TextureError(ValueError):
@@ -191,7 +189,7 @@ class TextureSpace:
             edges[c] = grown
             top = 1.25 * np.sqrt(channels)
             edges[c, [0, -1]] = top * even if c == 0 else 1.5 * grown
-        axes = _OPPONENT if channels == 3 else np.eye(1)
+        axes = OPPONENT if channels == 3 else np.eye(1)
         return cls(np.zeros(channels), axes.copy(), edges, LEVELS, ORIENTATIONS, 0)
 
     @classmethod
@@ -256,7 +254,7 @@ class TextureSpace:
         mean = centers.mean(axis=0)
         spread = np.mean([c for _, c in moments], axis=0)
         spread = spread + (centers - mean).T @ (centers - mean) / count
-        axes = _principal_axes(spread, unit or 1.0)
+        axes = principal_axes(spread, unit or 1.0)
         plain = cls(
             mean, axes, np.tile(np.linspace(0.0, 1.0, BINS + 1),
                                 (len(mean), levels * orientations + 3, 1)),
@@ -270,7 +268,7 @@ class TextureSpace:
         edges = np.empty_like(plain.edges)
         for c in range(pooled.shape[1]):
             for r in range(pooled.shape[2]):
-                edges[c, r] = _uneven_edges(pooled[:, c, r], unit or 1.0)
+                edges[c, r] = uneven_edges(pooled[:, c, r], unit or 1.0)
         return cls(mean, axes, edges, levels, orientations, count)
 
     def save(self, path: str | Path) -> None:
@@ -318,19 +316,6 @@ def checked_image(image: ArrayLike, valid: ArrayLike | None) -> tuple[Array, Mas
     return values, mask
 
 
-def _principal_axes(covariance: Floats, unit: float) -> Floats:
-    """Return eigenvectors as rows by falling variance, well defined without variance too."""
-    C = len(covariance)
-    preferred = _OPPONENT if C == 3 else np.eye(C)
-    # orders directions without variance; about that of the rounding of float32
-    least = 1e-9 * np.trace(covariance) + 1e-13 * unit**2
-    ordered = covariance + least * preferred.T @ np.diag(np.arange(C, 0.0, -1.0)) @ preferred
-    axes = np.linalg.eigh(ordered)[1].T[::-1]
-    # of equal components the first decides the sign
-    largest = axes[np.arange(C), (np.abs(axes) - 1e-3 * np.arange(C)).argmax(axis=1)]
-    return np.ascontiguousarray(axes * np.sign(largest)[:, None])
-
-
 def _quantiles(
     space: TextureSpace, image: ArrayLike, valid: Mask | None, workers: int | None
 ) -> Array:
@@ -355,19 +340,3 @@ def weight_of(weights: tuple[Array, tuple[Array, ...]], response: int, orientati
     """Return the weights of the samples of a response out of those of all levels."""
     texels, samples = weights
     return texels if response == 0 else samples[max(response - 2, 0) // orientations]
-
-
-def _uneven_edges(quantiles: Array, unit: float) -> Floats:
-    """Return 257 edges over pooled quantiles (images, n): half even, half by occurrence."""
-    values = np.sort(quantiles, axis=None).astype(np.float64)
-    low, high = values[0], values[-1]
-    room = max(_MARGIN * (high - low), 0.5e-4 * unit)
-    low, high = low - room, high + room
-    at = np.concatenate([[low], values, [high]])
-    occurrence = np.concatenate([[0.0], (np.arange(values.size) + 0.5) / values.size, [1.0]])
-    share = 0.5 * (at - low) / (high - low) + 0.5 * occurrence
-    widths = np.diff(np.interp(np.linspace(0.0, 1.0, BINS + 1), share, at))
-    # a value that occurs very often holds several edges: keep them apart
-    widths = np.maximum(widths, 1e-12 * (high - low))
-    widths *= (high - low) / widths.sum()
-    return np.asarray(low + np.concatenate([[0.0], np.cumsum(widths)]))
