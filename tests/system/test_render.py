@@ -1,0 +1,199 @@
+"""`skinrig render` as a user calls it, on a small fitted face."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+
+from model import brdf_tables, store
+from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig.cli import main
+
+SIZE = 32
+STEPS = 24
+
+
+def mesh_text(moved=0.0):
+    at = np.linspace(0.0, 1.0, STEPS)
+    u, v = np.meshgrid(at, at)
+    x, y = 120.0 * (u - 0.5), 160.0 * (v - 0.5)
+    z = 50.0 * np.sqrt(np.maximum(1.0 - (x**2 + y**2) / 110.0**2, 0.0)) + moved * np.sin(6.0 * u)
+    lines = [f"v {a:.4f} {b:.4f} {c:.4f}" for a, b, c in zip(x.flat, y.flat, z.flat, strict=True)]
+    lines += [f"vt {a:.5f} {b:.5f}" for a, b in zip(u.flat, v.flat, strict=True)]
+    for r in range(STEPS - 1):
+        for c in range(STEPS - 1):
+            i = r * STEPS + c + 1
+            for a, b, d in ((i, i + 1, i + STEPS + 1), (i, i + STEPS + 1, i + STEPS)):
+                lines.append(f"f {a}/{a} {b}/{b} {d}/{d}")
+    return "\n".join(lines) + "\n"
+
+
+def basis_bytes():
+    lobes = brdf_tables.tabulate(
+        {
+            "broad": lambda light, view: np.full(light.shape[:-1], 0.05),
+            "narrow": lambda light, view: 0.2 * np.maximum(light[..., 2] + view[..., 2] - 1.0, 0.0),
+        }
+    )
+    out = io.BytesIO()
+    np.savez(
+        out, table=lobes.table[..., :2], light_radius_rad=0.0, mix=np.eye(2), materials=["a", "b"]
+    )
+    return out.getvalue()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a folder with a fitted face, one without lobes, and meshes."""
+    path = tmp_path_factory.mktemp("render")
+    at = (np.arange(SIZE) + 0.5) / SIZE
+    u, v = np.meshgrid(at, 1.0 - at)
+    x, y = 120.0 * (u - 0.5), 160.0 * (v - 0.5)
+    z = 50.0 * np.sqrt(np.maximum(1.0 - (x**2 + y**2) / 110.0**2, 0.0))
+    gradient = np.gradient(z, 160.0 / SIZE, 120.0 / SIZE)
+    normals = np.stack([-gradient[1], gradient[0], np.ones_like(z)], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    valid = np.ones((SIZE, SIZE), bool)
+    maps = {
+        "position": SkinMap(np.stack([x, y, z], -1), UNITS["position"], valid=valid),
+        "normals": SkinMap(normals, UNITS["normals"], valid=valid),
+        "r_d": SkinMap(
+            np.broadcast_to([0.6, 0.4, 0.3], (SIZE, SIZE, 3)), UNITS["r_d"], valid=valid
+        ),
+        "basis_weight_0": SkinMap(0.5 + 0.0 * x, "1", valid=valid),
+        "basis_weight_1": SkinMap(1.0 + x / 120.0, "1", valid=valid),
+    }
+    files = {"mesh.obj": mesh_text().encode(), "brdf_basis.npz": basis_bytes()}
+    store.write(path / "face", SkinAppearance(maps, "simulated", files=files))
+    fewer = {k: m for k, m in maps.items() if not k.startswith("basis")}
+    store.write(path / "matt", SkinAppearance(fewer, "simulated", files=files))
+    (path / "smile.obj").write_text(mesh_text(3.0))
+    (path / "bare.obj").write_text("v 0 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n")
+    store.write_exr(path / "sky.exr", np.ones((4, 8, 3), np.float32))
+    return path
+
+
+def run(folder, monkeypatch, *words):
+    monkeypatch.chdir(folder)
+    return main(["render", *words, "--size", "40"])
+
+
+def test_a_picture_its_components_and_one_document_are_written(folder, monkeypatch, capsys):
+    words = ("face", "--light", "1,0.5,2", "--components", "--out", "picture", "--json")
+    assert run(folder, monkeypatch, *words) == 0
+    out, err = capsys.readouterr()
+    document = json.loads(out)
+    assert document["schema"] == "skinrig.render/1"
+    assert document["lights"] == {"1,0.5,2": 1}
+    assert document["subsurface"] == "dipole"
+    assert document["lit_pixels"] > 100
+    assert any("population" in text for text in document["assumed"])
+    kept = json.loads((folder / "picture" / "render.json").read_text())
+    assert kept["files"] == document["files"]
+    radiance, diffuse, surface = (
+        store.read_exr(folder / "picture" / f"{name}.exr")
+        for name in ("radiance", "diffuse", "surface")
+    )
+    np.testing.assert_allclose(radiance, diffuse + surface, atol=1e-6)
+    assert radiance.shape == (40, 40, 3)
+    assert radiance[..., 0].max() > radiance[..., 2].max() > 0.0
+    assert "read face" in err
+    assert not list(folder.glob(".*.part"))
+
+
+def test_a_view_of_the_rig_an_environment_and_two_lights_shine_together(
+    folder, monkeypatch, capsys
+):
+    words = ("face", "--view", "C03", "--light", "L017*0.2", "--light", "at:200,0,500*0.3,0.2,0.1",
+             "--environment", "sky.exr", "--environment-lights", "6", "--subsurface", "local",
+             "--samples", "1", "--out", "lit", "--json")  # fmt: skip
+    assert run(folder, monkeypatch, *words) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["lights"]["environment"] == 6
+    assert document["view"]["name"] == "C03"
+    assert any("view C03" in text or "camera C03" in text for text in document["assumed"])
+
+
+def test_another_mesh_of_the_same_layout_carries_the_normals_along(folder, monkeypatch, capsys):
+    words = ("face", "--mesh", "smile.obj", "--light", "1,0,1", "--subsurface", "local", "--out",
+             "smile", "--json")  # fmt: skip
+    assert run(folder, monkeypatch, *words) == 0
+    assert json.loads(capsys.readouterr().out)["normals_carried_along"] is True
+
+
+def test_fewer_lobes_and_a_shadow_boundary_are_drawn(folder, monkeypatch, capsys):
+    common = ("--light", "1,0,2", "--subsurface", "local", "--json")
+    words = ("face", "--bases", "1,2", *common, "--out", "bases")
+    assert run(folder, monkeypatch, *words) == 0
+    rows = json.loads(capsys.readouterr().out)["bases"]
+    assert [row["lobes"] for row in rows] == [1, 2]
+    assert [row["refitted"] for row in rows] == [False, True]
+    assert rows[0]["surface_difference_from_2"] > rows[1]["surface_difference_from_2"] == 0.0
+    monkeypatch.setattr("skinrig.rendering_shadow.FACE_TEXELS", 128)
+    monkeypatch.setattr("skinrig.rendering_shadow.PATCH_TEXELS", 64)
+    words = ("face", "--shadow-boundary", "--samples", "1", "--out", "shadow", "--json")
+    assert run(folder, monkeypatch, *words) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert "labelled by sigma_tr" in document["labels"]
+    assert [row["sigma_tr_per_mm"] for row in document["boundaries"][:2]] == [
+        [0.3558, 0.7932, 1.5173], [0.9171, 1.5682, 1.6569],
+    ]  # fmt: skip
+    assert (folder / "shadow" / "shadow_boundary.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_translucency_that_is_asked_for_is_used(folder, monkeypatch, capsys):
+    found = []
+    for sigma in ("0.2,0.2,0.2", "5,5,5"):
+        words = (
+            "face",
+            "--light",
+            "3,0,1",
+            "--samples",
+            "1",
+            "--translucency",
+            sigma,
+            "--out",
+            "t",
+        )
+        assert run(folder, monkeypatch, *words) == 0
+        found.append(store.read_exr(folder / "t" / "radiance.exr"))
+    assert np.abs(found[0] - found[1]).max() > 0.02
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (["face", "--light", "L999"], 2, "L999"),
+        (["face"], 2, "--light: got none"),
+        (["face", "--light", "1,1,1", "--view", "0,0,-700"], 3, "behind the head"),
+        (["face", "--light", "1,1,1", "--view", "C99"], 2, "C99"),
+        (["face", "--light", "1,1,1", "--samples", "3"], 2, "--samples"),
+        (["face", "--light", "1,1,1", "--subsurface", "wax"], 2, "wax"),
+        (["face", "--light", "1,1,1", "--translucency", "1,2"], 2, "--translucency"),
+        (["face", "--light", "1,1,1", "--bases", "2,24"], 3, "--rank 24"),
+        (["face", "--light", "1,1,1", "--bases", "x"], 2, "--bases"),
+        (["face", "--light", "1,1,1", "--calibration", "none"], 2, "none"),
+        (["face", "--light", "1,1,1", "--mesh", "bare.obj"], 3, "no texture coordinates"),
+        (["face", "--light", "1,1,1", "--exposure", "0"], 2, "--exposure"),
+        (["matt", "--light", "1,1,1"], 3, "basis_weight_0"),
+        (["face", "face", "--light", "1,1,1"], 2, "--bases"),
+        (["nothing", "--light", "1,1,1"], 3, "nothing"),
+        (["face", "--environment", "none.exr"], 3, "none.exr"),
+        (["face", "--light", "1,1,1", "--rig", "tent"], 3, "tent"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_rendered_is_refused_with_one_clear_message(
+    words, code, says, folder, monkeypatch, capsys
+):
+    assert run(folder, monkeypatch, *words, "--out", "refused") == code
+    out, err = capsys.readouterr()
+    assert says in err
+    assert "Traceback" not in out + err
+    assert not (folder / "refused").exists()
+
+
+def test_a_folder_of_something_else_is_not_replaced(folder, monkeypatch, capsys):
+    assert run(folder, monkeypatch, "face", "--light", "1,1,1", "--out", "matt") == 3
+    assert "no rendering" in capsys.readouterr().err
+    assert (folder / "matt" / "appearance.json").exists()
