@@ -432,6 +432,7 @@ app.add_typer(import_app, name="import")
 cli_dynamic.fit_app.command("reflectance")(cli_reflectance.fit_reflectance)
 app.add_typer(cli_dynamic.fit_app, name="fit")
 app.add_typer(cli_dynamic.apply_app, name="apply")
+cli_analysing.analyse_app.command("albedo")(cli_editing.analyse_albedo)
 app.add_typer(cli_analysing.analyse_app, name="analyse")
 
 

@@ -153,6 +153,61 @@ def fit_traits(
     )  # fmt: skip
 
 
+def analyse_albedo(
+    out: Annotated[Path, typer.Option("--out", help="Folder to write.")],
+    appearances: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Fitted maps of the dome, a face each; none: simulated faces."),
+    ] = None,
+    labels: Annotated[
+        Path | None, typer.Option(help="Table name,TRAIT,... of 0 and 1, a line for each face.")
+    ] = None,
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(help="Folder with NAME.csv of each face; default: a simulation's own."),
+    ] = None,
+    people: Annotated[int, typer.Option(help="Simulated faces, of 87.")] = 87,
+    size: Annotated[
+        int | None, typer.Option(help="Pixels a side of the common map; default: as the textures.")
+    ] = None,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Average the color histograms of groups of faces, and tell the components they differ by.
+
+    Example: skinrig analyse albedo appearance-a appearance-b --labels labels.csv --out analysis
+    """
+    from skinrig import analysing_albedo
+
+    console = Console(json)
+    if appearances:
+        found = analysing_albedo.analyse_measured(
+            out, appearances, labels=labels, landmarks=landmarks, size=size,
+            progress=console.progress,
+        )  # fmt: skip
+    elif labels is not None or landmarks is not None:
+        raise UsageError("--labels, --landmarks: are of measured faces; name their folders")
+    else:
+        found = analysing_albedo.analyse_simulated(
+            out, people=people, seed=seed, progress=console.progress
+        )
+    told = found.document()
+    console.rows(
+        ("group", "faces", "R_d red", "green", "blue"),
+        [(group, told["groups"][group], *mean) for group, mean in told["mean_r_d"]["face"].items()],
+    )
+    for region, share in found.explained.items():
+        first = ", ".join(f"{100 * s:.0f} %" for s in share[:4])
+        console.say(
+            f"{region}: components explain {first}; "
+            f"{told['components_for_90_percent'][region]} make 90 %"
+        )
+    for what, why in found.left_out:
+        console.say(f"left out: {what}: {why}")
+    console.say(f"{out}: {', '.join(analysing_albedo.FILES)}")
+    console.document("skinrig.analyse-albedo/1", {"out": out, **told})
+
+
 def parse_amounts(option: str, text: str | None) -> dict[str, float]:
     """Return names and numbers of ``NAME=NUMBER,...``.
 

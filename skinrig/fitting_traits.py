@@ -119,11 +119,8 @@ def fit_traits(
         Naming what is missing or does not fit.
     """
     tell = progress or (lambda text: None)
-    if len(appearances) < 2:
-        raise TraitFitError(f"appearances: got {len(appearances)}, expected two or more faces")
-    faces = _read(appearances, landmarks)
+    faces = read_faces(appearances, landmarks)
     table = trait_labels.read(labels, [face.name for face in faces])
-    _require_landmarks(faces)
     frame = face_textures.common_frame(faces, size)
     tell(f"common map: {frame.size} pixels of {frame.pixel_mm:.2f} mm, {len(frame.names)} marks")
     samples = []
@@ -220,7 +217,16 @@ def summary(
     return rows, tuple(dict.fromkeys(said))
 
 
-def _read(appearances: Sequence[Path], landmarks: Path | None) -> list[Face]:
+def read_faces(appearances: Sequence[Path], landmarks: Path | None) -> list[Face]:
+    """Read appearances with their landmarks.
+
+    Raises
+    ------
+    TraitFitError
+        For fewer than two, names that are the same, or faces without landmarks, saying what to do.
+    """
+    if len(appearances) < 2:
+        raise TraitFitError(f"appearances: got {len(appearances)}, expected two or more faces")
     if landmarks is not None and not landmarks.is_dir():
         raise TraitFitError(f"landmarks: {landmarks} is no folder; expected one with NAME.csv each")
     faces: list[Face] = []
@@ -234,6 +240,7 @@ def _read(appearances: Sequence[Path], landmarks: Path | None) -> list[Face]:
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise TraitFitError(f"appearances: two are called {twice!r}; labels could not tell them")
+    _require_landmarks(faces)
     return faces
 
 

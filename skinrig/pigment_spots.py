@@ -49,7 +49,7 @@ class SpotKind:
     spread
         Standard deviation of the diameter's logarithm.
     melanin
-        Times the melanin of the skin around.
+        Volume fraction of the epidermis that it holds more than the skin around.
     edge
         Share of the radius over which a spot ends, in (0, 1].
     density_per_cm2
@@ -68,9 +68,9 @@ class SpotKind:
 
 KINDS: Final[Mapping[str, SpotKind]] = MappingProxyType(
     {
-        "freckles": SpotKind(2.2, 0.35, 2.2, 0.8, 2.0, (0.8, 6.0)),
-        "moles": SpotKind(3.5, 0.3, 8.0, 0.35, 0.03, (1.5, 10.0)),
-        "follicles": SpotKind(0.45, 0.2, 4.0, 0.6, 40.0, (0.2, 1.5)),
+        "freckles": SpotKind(2.2, 0.35, 0.02, 0.8, 2.0, (0.8, 6.0)),
+        "moles": SpotKind(3.5, 0.3, 0.12, 0.35, 0.03, (1.5, 10.0)),
+        "follicles": SpotKind(0.45, 0.2, 0.06, 0.6, 40.0, (0.2, 1.5)),
     }
 )
 """Chosen sizes and numbers, in round figures: ephelides of 1 to 3 mm, common nevi of 2 to 6 mm,
@@ -196,8 +196,8 @@ def _table() -> ColorTable:
     return color_table.build(CAMERA, ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
 
 
-def _transmitted(colors: Floats, times: float, amount: float, table: ColorTable) -> Floats:
-    """Return what `times` the melanin leaves of each channel of the median color, (3,)."""
+def _transmitted(colors: Floats, added: float, amount: float, table: ColorTable) -> Floats:
+    """Return what `added` melanin leaves of each channel of the median color, (3,)."""
     usable = colors[(colors > 0).all(axis=1)]
     if not len(usable):
         raise SpotError("r_d: is 0 all over the mask, there is no skin to color")
@@ -207,7 +207,7 @@ def _transmitted(colors: Floats, times: float, amount: float, table: ColorTable)
     i, j = np.unravel_index(int(np.argmin(apart)), apart.shape)
     c_m = table.c_m_max * (max(int(i), 1) / (size - 1)) ** 3
     c_hd = table.c_hd_max * (int(j) / (size - 1)) ** 3
-    more = max(min(c_m * (1.0 + amount * (times - 1.0)), MOST_MELANIN), c_m)
+    more = max(min(c_m + amount * added, MOST_MELANIN), c_m)
     ratio = table.lookup(more, c_hd) / table.lookup(c_m, c_hd)
     return np.minimum(np.asarray(ratio, np.float64), 1.0)
 

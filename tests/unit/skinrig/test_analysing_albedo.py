@@ -1,0 +1,54 @@
+"""Color histograms of groups and components of a population whose difference is known."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from skinrig import analysing_albedo
+from skinrig.cli import main
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory, dome_faces):
+    folder = tmp_path_factory.mktemp("albedo")
+    return folder, *dome_faces.population(folder, count=4)
+
+
+def test_groups_differ_in_their_histograms_as_they_were_made(lab, capsys):
+    folder, paths, labels = lab
+    out = folder / "analysis"
+    argv = ["analyse", "albedo", *map(str, paths), "--labels", str(labels), "--out", str(out)]
+    assert main([*argv, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["groups"] == {"all": 4, "tan": 2, "no tan": 2, "oily": 2, "no oily": 2}
+    ratio = np.log(np.array(told["mean_r_d"]["face"]["tan"]) / told["mean_r_d"]["face"]["no tan"])
+    np.testing.assert_allclose(ratio, -0.365 * np.array([1.0, 1.1, 1.2]), atol=0.06)
+    assert told["explained"]["face"][0] > 0.5
+    assert sum(told["explained"]["face"]) == pytest.approx(1.0)
+    with open(out / "histograms.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    share = {
+        group: sum(float(r["share"]) for r in rows if r["group"] == group
+                   and r["region"] == "face" and r["channel"] == "red")
+        for group in told["groups"]
+    }  # fmt: skip
+    np.testing.assert_allclose(list(share.values()), 1.0, rtol=1e-4)
+    assert {path.name for path in out.iterdir()} == set(analysing_albedo.FILES)
+    assert (out / "figure-16.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_labels_without_faces_are_refused(lab, capsys):
+    folder, _, labels = lab
+    argv = ["analyse", "albedo", "--labels", str(labels), "--out", str(folder / "none")]
+    assert main(argv) == 2
+    assert "name their folders" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_the_simulated_population_is_darker_where_it_is_said_to_be(tmp_path):
+    found = analysing_albedo.analyse_simulated(tmp_path / "out", people=6, size=96)
+    told = found.document()
+    assert told["groups"]["all"] == 6
+    assert found.explained["face"].size == 5
