@@ -44,7 +44,9 @@ class Information:
     tilt : ndarray of float64, shape (P, L, 2)
         l.t / l.n for two tangents.
     weight : ndarray of float64, shape (P, L)
-        Inverse variance of the logarithm of the sample; 0 where the light does not reach the point.
+        Inverse variance of the logarithm of the sample; 0 where the light tells nothing.
+    reaches : ndarray of bool, shape (P, L)
+        The light shows the point, be it too obliquely, or in a highlight, to tell of its normal.
     importance : ndarray of float64, shape (P,)
         How much a point counts, e.g. its area.
     systematic_rad : ndarray of float64, shape (P,)
@@ -53,6 +55,7 @@ class Information:
 
     tilt: Floats
     weight: Floats
+    reaches: Bools
     importance: Floats
     systematic_rad: Floats
 
@@ -60,7 +63,8 @@ class Information:
         """Check shapes and values."""
         points, lights = self.weight.shape if self.weight.ndim == 2 else (0, 0)
         for name, shape in (
-            ("tilt", (points, lights, 2)), ("importance", (points,)), ("systematic_rad", (points,)),
+            ("tilt", (points, lights, 2)), ("reaches", (points, lights)),
+            ("importance", (points,)), ("systematic_rad", (points,)),
         ):  # fmt: skip
             if getattr(self, name).shape != shape:
                 raise SelectionError(f"{name}: got {getattr(self, name).shape}, expected {shape}")
@@ -126,6 +130,7 @@ def information(
     to_light: ArrayLike,
     relative_variance: ArrayLike,
     *,
+    reaches: ArrayLike | None = None,
     importance: ArrayLike | None = None,
     systematic_rad: ArrayLike = 0.0,
 ) -> Information:
@@ -139,6 +144,8 @@ def information(
         Unit vectors from the points to the lights.
     relative_variance : array_like, shape (P, L)
         Variance of each sample over its square, > 0; infinite where there is none.
+    reaches : array_like of bool, shape (P, L), optional
+        Which lights show a point; those that tell of it by default.
     importance : array_like, shape (P,), optional
         How much a point counts; 1 by default.
     systematic_rad : array_like, shape (P,) or ()
@@ -167,6 +174,7 @@ def information(
     return Information(
         tilt,
         weight,
+        weight > 0 if reaches is None else np.asarray(reaches, np.bool_),
         np.ones(count) if importance is None else np.asarray(importance, np.float64),
         np.array(np.broadcast_to(np.asarray(systematic_rad, np.float64), (count,))),
     )
@@ -185,7 +193,7 @@ def predict(found: Information, lights: ArrayLike, *, least: int) -> Prediction:
     """
     chosen = np.asarray(list(lights), np.intp)  # type: ignore[arg-type]
     covariance = np.asarray(np.linalg.inv(_start(found, chosen)), np.float64)
-    reached = np.count_nonzero(found.weight[:, chosen] > 0, axis=1)
+    reached = np.count_nonzero(found.reaches[:, chosen], axis=1)
     return _judged(found, covariance, reached, least)
 
 
@@ -280,7 +288,7 @@ def _gains(found: Information, chosen: list[int], least: int) -> Floats:
     """
     at = np.asarray(chosen, np.intp)
     covariance = np.linalg.inv(_start(found, at))
-    reached = np.count_nonzero(found.weight[:, at] > 0, axis=1)
+    reached = np.count_nonzero(found.reaches[:, at], axis=1)
     g = np.concatenate([found.tilt, np.ones((*found.weight.shape, 1))], axis=-1)
     moved = np.einsum("pij,plj->pli", covariance, g)  # Sherman and Morrison 1950
     bend = np.einsum("pli,pli->pl", moved, g)
@@ -291,7 +299,7 @@ def _gains(found: Information, chosen: list[int], least: int) -> Floats:
     now = _loss(0.5 * trace + floor, reached, least, unknown)
     then = _loss(
         0.5 * (trace[:, None] - drop) + floor[:, None],
-        reached[:, None] + (found.weight > 0),
+        reached[:, None] + found.reaches,
         least,
         unknown,
     )

@@ -25,7 +25,7 @@ from reconstruction.scan_mesh import RefinedScan
 
 CHUNK_SAMPLES: Final = 3_000_000
 """Samples of a chunk; about 60 bytes each."""
-LEAST_LIGHTS: Final = 20
+LEAST_LIGHTS: Final = 10
 LEAST_VIEWS: Final = 2
 """A point lit or seen by fewer has no estimate."""
 LEAST_COS_LIGHT: Final = 0.15

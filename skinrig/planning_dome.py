@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 
 POINTS = 1500
 """Points of the face that the forecast looks at."""
-LIGHT_ERROR = 0.03
+LIGHT_ERROR = 0.015
 """Relative error that all cameras share of what one light shows: gloss outside the part that is
 left out, a light's intensity, a shadow's edge."""
 VALID_SHARE = 0.9
@@ -46,7 +46,11 @@ class Sight:
     to_light: Floats
     """(P, L, 3)."""
     variance: Floats
-    """(P, L, V): variance of a sample over its square; infinite where there is none."""
+    """(P, L, V): variance of a sample over its square; infinite where it tells nothing."""
+    lit: NDArray[np.bool_]
+    """(P, L): nothing stands between the point and the light."""
+    seen: NDArray[np.bool_]
+    """(P, V): nothing stands between the point and the camera."""
     area_mm2: Floats
     """(P,)."""
     systematic_rad: Floats
@@ -58,10 +62,10 @@ class Sight:
         seen = self.variance[..., list(views)]
         with np.errstate(divide="ignore"):
             noise = 1.0 / np.sum(1.0 / seen, axis=-1)
-        enough = np.any(np.isfinite(seen), axis=1).sum(-1) >= surface_estimates.LEAST_VIEWS
+        enough = self.seen[:, list(views)].sum(-1) >= surface_estimates.LEAST_VIEWS
         noise = np.where(enough[:, None], noise + LIGHT_ERROR**2, np.inf)
         return light_selection.information(
-            self.normals, self.to_light, noise,
+            self.normals, self.to_light, noise, reaches=self.lit & enough[:, None],
             importance=self.area_mm2, systematic_rad=self.systematic_rad,
         )  # fmt: skip
 
@@ -107,8 +111,8 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
     to_view, _, seen = _toward(caster, start, normal, views)
     cos_light = np.einsum("plk,pk->pl", to_light, normal)
     cos_view = np.einsum("pvk,pk->pv", to_view, normal)
-    lit &= cos_light > surface_estimates.LEAST_COS_LIGHT
-    seen &= cos_view > surface_estimates.LEAST_COS_VIEW
+    steep = cos_light > surface_estimates.LEAST_COS_LIGHT
+    facing = cos_view > surface_estimates.LEAST_COS_VIEW
     half = to_light[:, :, None] + to_view[:, None]
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
     matte = np.einsum("plvk,pk->plv", half, normal) < math.cos(surface_estimates.HIGHLIGHT_RAD)
@@ -117,7 +121,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
     rate = r_d[:, None] * white * cos_light / light_mm**2  # full scales per second
     chip = sensor_of(view)
     variance = _relative_variance(rate, chip.full_well_e, chip.read_noise_e)
-    there = lit[:, :, None] & seen[:, None] & matte
+    there = (lit & steep)[:, :, None] & (seen & facing)[:, None] & matte
     pixel = float(
         2.0 * np.median(np.linalg.norm(views, axis=-1)) * 1e-3 * view.pixel_um / view.focal_mm
     )  # mm on the subject, of a cell of the color filter
@@ -125,6 +129,8 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
         normal,
         to_light,
         np.where(there, variance[:, :, None], np.inf),
+        lit,
+        seen,
         np.ones(len(place)),
         np.hypot(
             surface_estimates.MISPLACED_PX * pixel * _bend(face, drawn, pixel),

@@ -124,7 +124,7 @@ def test_the_median_of_rayleigh_angles_is_that_of_draws():
 def test_bad_information_is_refused_by_name(broken):
     good = told(face(3), dome(4))
     fields = {name: getattr(good, name).copy() for name in
-              ("tilt", "weight", "importance", "systematic_rad")}  # fmt: skip
+              ("tilt", "weight", "reaches", "importance", "systematic_rad")}  # fmt: skip
     if broken == "negative":
         fields["importance"][0] = -1.0
     elif broken == "shape":
