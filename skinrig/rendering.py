@@ -20,6 +20,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from model.dipole_gather import TOLERANCE
 from model.skin_reflectance import SkinReflectance, lobe_brdf, transmitted
 from rigsim.mesh import Float32Array, Mesh, build_mesh
 from rigsim.render import Caster, GBuffer, trace
@@ -112,6 +113,7 @@ def render(
     blockers: Mesh | None = None,
     caster: Caster | None = None,
     interior: Interior | None = None,
+    tolerance: float = TOLERANCE,
     progress: Callable[[str], None] | None = None,
 ) -> Rendering:
     """Render a fitted model.
@@ -142,6 +144,8 @@ def render(
         Of the mesh, where there is one already.
     interior
         Of the model on the mesh, where there is one already; for "dipole".
+    tolerance
+        For "dipole": aimed-at error of light from inside, over the brightest that entered.
     progress
         Called with a line of text now and then.
 
@@ -167,7 +171,7 @@ def render(
     rays = Caster(laid.mesh) if caster is None else caster
     shadows = rays if blockers is None else Caster(joined(laid.mesh, blockers), choice=rays.choice)
     columns, height = camera.image_size
-    inside = _inside(laid, subsurface, lamps, shadows, shadow_samples, interior)
+    inside = _inside(laid, subsurface, lamps, shadows, shadow_samples, interior, tolerance)
     film = _Film(height, columns)
     seen = _Sighting()
     band = max(1, BAND_RAYS // (columns * subpixels**2))
@@ -308,6 +312,7 @@ def _inside(
     shadows: Caster,
     shadow_samples: int,
     interior: Interior | None,
+    tolerance: float,
 ) -> Callable[[_Points, FloatArray], FloatArray]:
     """Return what gives the light that comes from inside at points, of what enters there."""
     if subsurface == "none":
@@ -316,7 +321,9 @@ def _inside(
         return lambda points, entered: entered * points.rows.r_d
     below = Interior.of(laid) if interior is None else interior
     light = below.entered(lamps, shadows, shadow_samples)
-    return lambda points, entered: below.leaving(light, points.position_mm, points.rows, entered)
+    return lambda points, entered: below.leaving(
+        light, points.position_mm, points.rows, entered, tolerance=tolerance
+    )
 
 
 def _lamps(lights: Light | Sequence[Light]) -> list[Light]:
