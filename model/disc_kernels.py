@@ -386,14 +386,7 @@ def _tile(
             deviation[y, x0 + i] = np.sqrt(max(variance, 0.0))
 
 
-_SIGNATURES = [
-    f"void({kind}[:, ::1], uint8[:, ::1], boolean, int64[::1], int64[::1], int64, int64, int64, "
-    "int64, float64, float64[:, ::1], float64[:, ::1], int32[:, ::1])"
-    for kind in ("float32", "float64")
-]
-
-
-@njit(_SIGNATURES, cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, error_model="numpy")
 def disc_moments(
     h: Any, valid: Any, masked: Any, half: Any, high: Any, inner: Any, tall: Any, wide: Any,
     parts: Any, trusted: Any, mean: Any, deviation: Any, count: Any,

@@ -30,7 +30,6 @@ from scipy.ndimage import gaussian_filter
 
 from model.color_table import ColorTable
 from reconstruction import chromophore_posterior
-from reconstruction import shared_melanin_kernels as kernels
 from reconstruction.chromophore_posterior import FINEST
 from reconstruction.chromophore_start import LOWEST
 from reconstruction.chromophores import (
@@ -160,6 +159,8 @@ def weigh(
     >>> f"{found.melanin[0]:.3f}", f"{found.change[1, 0]:.3f}"
     ('0.020', '0.020')
     """
+    from reconstruction import shared_melanin_kernels as kernels  # compiled when imported
+
     colors = np.asarray(rgb, np.float32)
     if colors.ndim < 2 or colors.shape[-1] != 3 or not colors.shape[0]:
         raise ChromophoreError(f"rgb: expected shape (S, ..., 3), got {colors.shape}")
@@ -246,6 +247,8 @@ def _mean_color(
     own: NDArray[np.float64],
 ) -> tuple[Map, Map]:
     """Return the states' mean log color, as of skin with their mean blood, and its variance."""
+    from reconstruction import shared_melanin_kernels as kernels  # compiled when imported
+
     count = np.maximum(usable.sum(axis=0), 1)[:, None]
     keep = usable[..., None]
     plain = np.where(keep, log_rgb, 0.0).sum(axis=0) / count

@@ -21,14 +21,7 @@ def _turn(s0, s1, s2, s3, ux, uy, uz, g, strength, most):  # type: ignore[no-unt
             return s0, s1, s2, s3, vx, vy, vz
 
 
-@njit(
-    "void(float64[::1], float64, float64, float64[:,::1], float64[::1], float64, int64[::1],"
-    " int64[::1], float64, float64[:,:,::1], float64[::1], float64, float64, int64, uint64[::1],"
-    " float64[:,::1], float64[:,::1])",
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-)
+@njit(cache=True, nogil=True, error_model="numpy")
 def walk_anisotropic(  # type: ignore[no-untyped-def]
     medium, source_sine, fibre_sine, places, overlap, overlap_per_mm, starts, counts, bins_per_mm,
     rings, window, per_mm, deeper_per_mm, photons, seed, tally, visited,

@@ -86,12 +86,7 @@ def scatter(s0, s1, s2, s3, ux, uy, uz, g):  # type: ignore[no-untyped-def]
     return s0, s1, s2, s3, ux, uy, uz
 
 
-@njit(
-    "int64(float64[:,::1], float64[::1], int64, uint64[::1], float64[::1], float64[:,::1])",
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-)
+@njit(cache=True, nogil=True, error_model="numpy")
 def walk(table, ring_edges2, photons, seed, tally, events):  # type: ignore[no-untyped-def]
     """Trace photons that enter at the origin along +z and add their weights to `tally`.
 
