@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -130,6 +131,15 @@ def plain_picture(title: str, image: NDArray[np.uint8]) -> str:
     """Return a figure of an 8-bit image, (H, W) or (H, W, 3), shown as it is."""
     return (
         f'<figure><img alt="{escape(title)}" src="{png.data_uri(image)}">'
+        f"<figcaption>{escape(title)}</figcaption></figure>"
+    )
+
+
+def stored_picture(title: str, data: bytes) -> str:
+    """Return a figure of a PNG file's bytes, as they are."""
+    text = base64.b64encode(data).decode("ascii")
+    return (
+        f'<figure><img alt="{escape(title)}" src="data:image/png;base64,{text}">'
         f"<figcaption>{escape(title)}</figcaption></figure>"
     )
 

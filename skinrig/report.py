@@ -21,6 +21,7 @@ from skinrig import (
     figures,
     microrelief_section,
     page,
+    pictures_section,
     population_section,
     sequence_section,
     subsurface_section,
@@ -41,6 +42,8 @@ class Findings:
     truths: dict[str, Path] = field(default_factory=dict)
     calibrations: list[Path] = field(default_factory=list)
     sessions: list[Path] = field(default_factory=list)
+    pictures: list[Path] = field(default_factory=list)
+    """Folders of renderings and analyses."""
     documents: list[Path] = field(default_factory=list)
     """JSON documents of commands: benchmarks and the demo's own."""
 
@@ -60,7 +63,7 @@ def discover(paths: Sequence[Path]) -> Findings:
         below = [path, *sorted(path.iterdir())] if path.is_dir() else [path]
         for entry in below:
             _sort_in(entry, found)
-    if not (found.appearances or found.sessions or found.documents):
+    if not (found.appearances or found.sessions or found.documents or found.pictures):
         raise ReportError(
             f"{', '.join(map(str, paths))}: holds no session, appearance or benchmark; "
             "`skinrig demo` makes all of them"
@@ -80,6 +83,8 @@ def _sort_in(entry: Path, found: Findings) -> None:
         (found.truths if kind == "truth" else found.appearances)[entry.name] = entry
     elif (entry / "session.json").is_file():
         found.sessions.append(entry)
+    elif entry.is_dir() and pictures_section.folder_document(entry) is not None:
+        found.pictures.append(entry)
     elif entry.is_dir() and entry.name.startswith("calibration"):
         found.calibrations.append(entry)
 
@@ -106,6 +111,7 @@ def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
         truth_path = _truth_of(appearance, found)
         truth = store.read(truth_path) if truth_path else None
         sections.append(_appearance_section(name, appearance, truth, checks))
+    sections += [pictures_section.section(folder, checks) for folder in found.pictures]
     sections.append(population_section.section(appearances))
     documents = [json.loads(p.read_text(encoding="utf-8")) for p in found.documents]
     for document in documents:

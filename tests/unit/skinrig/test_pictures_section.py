@@ -1,0 +1,63 @@
+"""Folders of renderings and analyses in the report."""
+
+import json
+
+import numpy as np
+import pytest
+
+from skinrig import page, pictures_section, png
+from skinrig.report import ReportError, build
+
+
+def a_row(median):
+    return {"pairs": 2, "median": median, "p68": 0.05, "p95": 0.2, "bias": -0.01,
+            "total_error": 0.04, "ssim": 0.98, "noise": 0.01}  # fmt: skip
+
+
+def a_folder(path, **document):
+    path.mkdir()
+    (path / "render.json").write_text(json.dumps({"schema": "skinrig.render/1", **document}))
+    (path / "radiance.png").write_bytes(png.encode(np.zeros((4, 6, 3), np.uint8)))
+    return path
+
+
+def test_a_comparison_adds_its_limit_and_names_what_was_left_out(tmp_path):
+    folder = a_folder(
+        tmp_path / "pictures",
+        **{"full model": a_row(0.06), "by_kind": {"light": a_row(0.06)}, "limit": 0.05,
+           "ablation": {"no surface": a_row(0.11)}, "assumed": ["lights as drawn"],
+           "by_band": {"light": {"pixels": 10, "median": 0.06}}},
+    )  # fmt: skip
+    checks: list[page.Check] = []
+    body = pictures_section.section(folder, checks)
+    assert [check.passed for check in checks] == [False]
+    assert "no surface" in body
+    assert "light held out" in body
+    assert "lights as drawn" in body
+    assert body.count("data:image/png") == 1
+
+
+def test_a_report_finds_pictures_below_its_folder(tmp_path):
+    a_folder(tmp_path / "pictures", view={"name": "C03"}, lights={"L017": 1}, lobes=4)
+    html = build([tmp_path])
+    assert "Rendering: pictures" in html
+    assert "L017" in html
+
+
+def test_large_pictures_stay_in_their_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(pictures_section, "LARGEST_BYTES", 10)
+    folder = a_folder(tmp_path / "pictures", view={"name": "C03"}, lights={})
+    body = pictures_section.section(folder, [])
+    assert "Too large for here: radiance.png" in body
+    assert "data:image" not in body
+
+
+def test_other_documents_are_no_pictures(tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    (folder / "analysis.json").write_text(json.dumps({"schema": "somebody.else/1"}))
+    assert pictures_section.section(folder, []) == ""
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(ReportError, match="holds no"):
+        build([empty])
