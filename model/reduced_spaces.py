@@ -23,8 +23,10 @@ SpaceKind = Literal["pca", "nmf"]
 
 HALVINGS = 20
 """Random halvings of the people that choose the number of components."""
-GAIN = 0.002
-"""The fewest components are taken whose score is within this of the best one's, in cosine."""
+GAIN = 1.05
+"""Few components are taken when their score is more than this times that of all."""
+LEAST_SCORE = 0.5
+"""Scores below this tell too little to drop a component for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,9 +173,10 @@ def choose(scores: FloatArray, traits: Sequence[Trait], *, rng: np.random.Genera
     -----
     Both groups of a trait are halved at random. One half gives a vector in its own first k
     components, the other a plain difference of means. As that one errs independently, the cosine
-    between both is, but for a factor that does not depend on k, the cosine to the truth. The
-    fewest components win whose mean over traits and 20 halvings is within 0.002 of the best; when
-    that is all that half of the people have, all components stay.
+    between both is, but for a factor that does not depend on k, the cosine to the truth. The k
+    of the largest mean over traits and 20 halvings wins when it is better than all components by
+    more than a twentieth: dropping components helps where noise is spread over many and the trait
+    is not, and loses a trait that is smaller than what people differ in anyway.
     """
     n, rank = scores.shape
     used = [
@@ -206,8 +209,8 @@ def choose(scores: FloatArray, traits: Sequence[Trait], *, rng: np.random.Genera
             total[: len(score)] += score
             total[len(score) :] += score[-1]
     total /= len(used) * HALVINGS
-    best = int(np.argmax(total >= total.max() - GAIN)) + 1
-    return rank if best >= most else best
+    better = total.max() > max(GAIN * total[-1], LEAST_SCORE)
+    return int(np.argmax(total)) + 1 if better else rank
 
 
 def mixtures(

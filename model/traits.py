@@ -147,8 +147,8 @@ class TraitSpace:
         basis : array_like, shape (K, d)
             For "nmf": non-negative mixtures, as `reconstruction.brdf_basis.reduce` gives them.
         components : int, optional
-            For "pca"; by default chosen by how well vectors hold for other people, see
-            `model.reduced_spaces.choose`.
+            For "pca"; by default all, or fewer where their vectors hold better for other people,
+            see `model.reduced_spaces.choose`.
         metric : array_like, shape (d,) or (d, d), optional
             What differences count. For mixtures of materials give their products over directions
             (`brdf_products`): their shares alone are no measure of what is seen.

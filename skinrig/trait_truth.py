@@ -28,6 +28,7 @@ from rigsim.population import Member
 from skinrig.fitting_traits import AlbedoSample
 
 Floats = NDArray[np.float64]
+Points = NDArray[np.float32]
 Labels = dict[str, NDArray[np.bool_]]
 
 CAMERA: Final = "Nikon 5100 (NPL)"
@@ -76,51 +77,47 @@ def labels_of(members: Sequence[Member], names: Sequence[str]) -> Labels:
     return {name: np.array([name in person.labels for person in members]) for name in names}
 
 
-@dataclass(frozen=True, slots=True)
-class SurfaceSampling:
-    """How much of a face's surface is measured.
-
-    Attributes
-    ----------
-    points : int
-        Of the face, drawn at random.
-    pairs : int
-        Of light and view at each point.
-    noise : float
-        Standard deviation of a sample as a fraction of the radiance plus 2 % of white's.
-    """
-
-    points: int = 40
-    pairs: int = 240
-    noise: float = 0.02
+def surface_points(person: Member, count: int, *, rng: np.random.Generator) -> Points:
+    """Return what `count` random places of a face's bare skin reflect by, (count, 7 or 11)."""
+    surface = person.surface(SIZE, CAMERA, LIGHT)
+    packed = surface.packed()
+    length = np.linalg.norm(surface.normal, axis=-1)
+    bare = np.flatnonzero(((surface.bare > BARE) & (length > 0.5)).reshape(-1))
+    return packed.reshape(-1, packed.shape[-1])[rng.choice(bare, count)]
 
 
 def mean_mixture(
-    person: Member, basis: BrdfBasis, sampling: SurfaceSampling, *, rng: np.random.Generator
+    points: Points,
+    basis: BrdfBasis,
+    *,
+    pairs: int = 240,
+    noise: float = 0.02,
+    rng: np.random.Generator,
 ) -> Floats:
     """Fit materials to points of a face and return their mean mixture, (59,).
 
     Parameters
     ----------
-    person
-        With conditions.
+    points
+        See `surface_points`.
     basis
         The materials.
-    sampling
-        What is measured; R_d is estimated from the same samples.
+    pairs
+        Of light and view at each point; R_d is estimated from the same samples.
+    noise
+        Standard deviation of a sample as a fraction of the radiance plus 2 % of white's.
     rng
-        Draws points, directions and noise.
+        Draws directions and noise.
     """
-    packed = _points(person, sampling.points, rng)
-    shape = (sampling.points, sampling.pairs)
+    shape = (len(points), pairs)
     light, view = directions(shape, rng=rng), directions(shape, rng=rng)
-    up = np.tile([0.0, 0.0, 1.0], (sampling.points, 1))
+    up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     f = np.stack([
         surface_brdf.evaluate(one, n, to, at)[0]
-        for one, n, to, at in zip(packed, up, light, view, strict=True)
+        for one, n, to, at in zip(points, up, light, view, strict=True)
     ]).astype(np.float64)  # fmt: skip
     cosine = light[..., 2:]
-    sigma = sampling.noise * (f * cosine + 0.02 / np.pi) / cosine
+    sigma = noise * (f * cosine + 0.02 / np.pi) / cosine
     f += sigma * rng.standard_normal(f.shape)
     variance = sigma**2
     r_d = diffuse_albedo.estimate(f, light, view, up, eta=ETA, variance=variance).r_d
@@ -193,21 +190,12 @@ def lobe_change(
         stream = int(rng.integers(2**31))
         for person, sign in zip(pair, (-1.0, 1.0), strict=True):
             # the same stream draws the same points of both
-            packed = _points(person, points, np.random.default_rng(stream))
+            packed = surface_points(person, points, rng=np.random.default_rng(stream))
             floors = surface_brdf.surface_floor(packed) / np.pi
             for one, floor in zip(packed, floors, strict=True):
                 lobe = surface_brdf.evaluate(one, [0.0, 0.0, 1.0], light, view)[1]
                 total += sign * (lobe - floor * through) * light[:, 2]
     return LobeChange(light, view, total / (points * len(before)))
-
-
-def _points(person: Member, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return what `count` random places of bare skin reflect by, (count, 7 or 11)."""
-    surface = person.surface(SIZE, CAMERA, LIGHT)
-    packed = surface.packed()
-    length = np.linalg.norm(surface.normal, axis=-1)
-    bare = np.flatnonzero(((surface.bare > BARE) & (length > 0.5)).reshape(-1))
-    return packed.reshape(-1, packed.shape[-1])[rng.choice(bare, count)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

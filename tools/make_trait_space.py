@@ -1,6 +1,6 @@
 """Make model/data/trait_space.npz: trait spaces of a simulated population.
 
-Run from the repository root, ``python tools/make_trait_space.py`` (about 5 minutes of one core;
+Run from the repository root, ``python tools/make_trait_space.py`` (about 3 minutes of one core;
 see `main` for options).
 
 - People: the 87 of `rigsim.population.table_1`. A random half of them gets a tan (1.5 times the
@@ -9,7 +9,7 @@ see `main` for options).
 - Surface: materials fitted to 2 % noisy light from 40 points of each face in 240 pairs of light
   and view, R_d estimated from the same samples; mean mixtures; 8 common ones as in figure 15 of
   Weyrich et al.; traits are the conditions, sex and age.
-- Albedo: R_d at 384 texels with 1 % noise in a common map of 256 pixels; vectors of quantiles for
+- Albedo: R_d at 256 texels with 1 % noise in a common map of 192 pixels; vectors of quantiles for
   the face and its regions as `skinrig fit traits` makes them; traits are what shows in color.
 - "regression": what a trait adds beside all others, as everybody has several.
 - Truth: for some traits the same people are simulated twice, without and with, free of noise. The
@@ -22,7 +22,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,17 +34,20 @@ from reconstruction import brdf_basis, common_regions
 from rigsim.population import Member, shifted, table_1
 from rigsim.skin_conditions import CONDITIONS
 from skinrig import albedo_vectors, fitting_traits, trait_regions, trait_truth
+from skinrig.fitting_traits import AlbedoSample
 from skinrig.trait_labels import Labels
-from skinrig.trait_truth import CommonFaces, SurfaceSampling
+from skinrig.trait_truth import CommonFaces
 
 TAN = 1.5
 WORN = ("normal", *CONDITIONS)
 SEEN_ON_SURFACE = (*CONDITIONS[1:], "female")
 SEEN_IN_COLOR = ("tan", "beard", "freckles", "female", "asian", "cold", "hot", "makeup", "powder")
 OPPOSITES = {"female": "male", "asian": "caucasian"}
-RANK = 8
-COMPARED = 10
+RANK, POINTS = 8, 40
+COMPARED = 6
 """People who are simulated twice for the truth."""
+DIRECTIONS = 8
+"""Of the albedo's space that are stored."""
 LIMIT_BYTES = 1_500_000
 
 
@@ -53,14 +56,30 @@ def population(seed: int) -> tuple[Member, ...]:
     return trait_truth.assigned(people, WORN, rng=np.random.default_rng([seed, 2]))
 
 
-def surface_space(people: Sequence[Member], seed: int) -> TraitSpace:
+def mixtures(people: Sequence[Member], seed: int) -> np.ndarray:
     basis = brdf_tables.default()
-    means = np.array([
-        trait_truth.mean_mixture(
-            person, basis, SurfaceSampling(), rng=np.random.default_rng([seed, 3, k])
-        )
-        for k, person in enumerate(people)
-    ])  # fmt: skip
+    means = []
+    for k, person in enumerate(people):
+        rng = np.random.default_rng([seed, 3, k])
+        points = trait_truth.surface_points(person, POINTS, rng=rng)
+        means.append(trait_truth.mean_mixture(points, basis, rng=rng))
+    return np.array(means)
+
+
+def kept(work: Path | None, name: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+    """Return what an earlier run left in the work folder, or make it."""
+    path = None if work is None else work / f"{name}.npy"
+    if path is not None and path.is_file():
+        return np.load(path)
+    made = make()
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, made)
+    return made
+
+
+def surface_space(people: Sequence[Member], means: np.ndarray, seed: int) -> TraitSpace:
+    basis = brdf_tables.default()
     strength = basis.strength()
     return TraitSpace.fit(
         means,
@@ -75,8 +94,16 @@ def surface_space(people: Sequence[Member], seed: int) -> TraitSpace:
     )
 
 
-def with_opposites(space: TraitSpace) -> TraitSpace:
-    traits = dict(space.traits)
+def packaged(space: TraitSpace) -> TraitSpace:
+    """Leave out all but the first directions, which vectors do not need, and add opposites."""
+    traits = {
+        name: dataclasses.replace(trait, coordinates=trait.coordinates[:DIRECTIONS])
+        for name, trait in space.traits.items()
+    }
+    notes = {}
+    if len(space.basis) > DIRECTIONS:
+        notes["basis"] = f"the first {DIRECTIONS} of {len(space.basis)}; vectors are of all"
+    space = dataclasses.replace(space, basis=space.basis[:DIRECTIONS], notes=notes)
     for name, other in OPPOSITES.items():
         if name in traits:
             traits[other] = traits[name].opposite(other)
@@ -127,10 +154,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("model/data") / PACKAGED)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--size", type=int, default=384, help="texels a side of the faces")
-    parser.add_argument("--common", type=int, default=256, help="pixels a side of the common map")
+    parser.add_argument("--size", type=int, default=256, help="texels a side of the faces")
+    parser.add_argument("--common", type=int, default=192, help="pixels a side of the common map")
     parser.add_argument("--people", type=int, default=87, help="only so many, drawn at random")
-    parser.add_argument("--surface-only", action="store_true")
+    parser.add_argument("--work", type=Path, help="folder that keeps samples for another run")
     given = parser.parse_args()
     start = time.process_time()
 
@@ -140,19 +167,23 @@ def main() -> None:
     people = population(given.seed)
     order = np.random.default_rng([given.seed, 6]).permutation(len(people))[: given.people]
     people = tuple(people[i] for i in sorted(order))
-    surface = surface_space(people, given.seed)
+    means = kept(given.work, "surface", lambda: mixtures(people, given.seed))
+    surface = surface_space(people, means, given.seed)
     tell("surface learned")
     truth = {"surface": surface_truth(surface, people, given.seed)}
     tell(f"cosines to the truth: {truth['surface']}")
-    if given.surface_only:
-        return
     faces = CommonFaces.of(people, size=given.size, common=given.common)
-    samples = [
-        faces.albedo(
-            person, noise=trait_truth.ALBEDO_NOISE, rng=np.random.default_rng([given.seed, 7, k])
-        )
-        for k, person in enumerate(people)
-    ]
+
+    def maps() -> np.ndarray:
+        drawn = []
+        for k, person in enumerate(people):
+            rng = np.random.default_rng([given.seed, 7, k])
+            one = faces.albedo(person, noise=trait_truth.ALBEDO_NOISE, rng=rng)
+            drawn.append(np.concatenate([one.r_d, one.valid[..., None]], axis=-1))
+        return np.array(drawn, np.float32)
+
+    drawn = kept(given.work, "albedo", maps)
+    samples = [AlbedoSample(one[..., :3].copy(), one[..., 3] > 0) for one in drawn]
     tell("albedo maps drawn")
     names = tuple(person.name for person in people)
     ages = {"age": np.array([person.age_years for person in people])}
@@ -167,7 +198,7 @@ def main() -> None:
     truth["albedo"] = albedo_truth(spaces, faces, texture, people, given.seed)
     tell(f"cosines to the truth: {truth['albedo']}")
     library = TraitLibrary(
-        {name: with_opposites(space) for name, space in {**spaces, "surface": surface}.items()},
+        {name: packaged(space) for name, space in {**spaces, "surface": surface}.items()},
         "simulated",
         trait_regions.library_parameters(
             faces.frame, "quantiles", contrast="regression", seed=given.seed, people=len(people),
