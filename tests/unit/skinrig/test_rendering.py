@@ -201,15 +201,15 @@ def test_less_light_comes_back_than_arrives(shiny):
     """A white model with a full lobe in a white room shows less than white from any angle."""
     mesh = plane()
     model = model_on(mesh, shiny)
-    directions = np.random.default_rng(3).normal(size=(400, 3))
+    directions = np.random.default_rng(3).normal(size=(200, 3))
     directions[:, 2] = np.abs(directions[:, 2])
     # radiance 1 from everywhere: each of n directions has 2 pi / n of solid angle, over pi
-    room = [Light(name="room", direction=tuple(w), intensity=(2 / 400,) * 3) for w in directions]
-    for tilt in (0.0, 0.7, 1.2):
+    room = [Light(name="room", direction=tuple(w), intensity=(2 / 200,) * 3) for w in directions]
+    for tilt in (0.0, 1.2):
         place = 700.0 * np.array([np.sin(tilt), 0.0, np.cos(tilt)])
         camera = rendering_camera.looking_at(place, fov_deg=1.0, size_px=(3, 3))
         shown = middle(render(model, mesh, camera, room, subpixels=1).radiance)
-        assert 0.5 < shown.max() < 1.05  # 400 directions leave 5 % of noise
+        assert 0.5 < shown.max() < 1.05  # 200 directions leave 5 % of noise
 
 
 def rotation():
@@ -329,3 +329,40 @@ def test_an_appearance_without_a_mesh_is_refused():
 
     with pytest.raises(GeometryError, match="skinrig reconstruct"):
         own_mesh(SkinAppearance({}, "simulated"))
+
+
+def test_under_even_light_spreading_changes_nothing(matt):
+    mesh = plane()
+    model = model_on(mesh, matt, r_d=(0.6, 0.4, 0.2))
+    light = Light(name="front", direction=(0.2, 0.1, 1.0))
+    spread_out, local = (
+        render(model, mesh, front_camera(9), light, subsurface=way, subpixels=1)
+        for way in ("dipole", "local")
+    )
+    np.testing.assert_allclose(spread_out.radiance, local.radiance, rtol=0.01)
+
+
+@pytest.mark.parametrize("r_d", [0.0, 1e-6, 1.0 - 1e-9, 1.0, 1.5])
+@pytest.mark.parametrize("sigma_tr", [1e-3, 1.0, 1e3])
+def test_extreme_skin_gives_finite_pictures_in_proportion_to_its_albedo(matt, r_d, sigma_tr):
+    """R_d above 1 is an outlier: light stays where it entered, and nothing is clamped."""
+    mesh = plane()
+    model = model_on(mesh, matt, r_d=(r_d, 0.5, 0.1), size=16)
+    depth = np.full_like(model.translucency_mm, 1.0 / sigma_tr)
+    model = dataclasses.replace(model, translucency_mm=depth)
+    seen = render(
+        model, mesh, front_camera(5), Light(name="a", direction=(0, 0, 1)), subsurface="dipole",
+        subpixels=1,
+    )  # fmt: skip
+    passed = transmitted(1.0) ** 2
+    expected = np.array([r_d, 0.5, 0.1]) * passed
+    np.testing.assert_allclose(middle(seen.radiance), expected, rtol=0.01, atol=1e-9)
+
+
+def test_a_fully_specular_texel_shows_the_surface_alone(shiny):
+    mesh = plane()
+    model = model_on(mesh, shiny, r_d=(0.0, 0.0, 0.0), weight=1e4)
+    seen = render(model, mesh, front_camera(5), Light(name="a", direction=(0, 0, 1)))
+    assert np.isfinite(seen.radiance).all()
+    np.testing.assert_array_equal(seen.radiance, seen.surface)
+    assert np.all(seen.surface > 100.0)
