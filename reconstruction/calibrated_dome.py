@@ -50,6 +50,39 @@ class Dome:
         return DomeImage(image.rgb / response, image.variance / response**2, image.valid)
 
 
+def seen_from(dome: Dome, rotation: NDArray[np.float64], shift_mm: NDArray[np.float64]) -> Dome:
+    """Return the dome in the frame of a mesh that stands in it at ``rotation @ p + shift_mm``.
+
+    Parameters
+    ----------
+    dome
+        In the rig frame.
+    rotation
+        (3, 3), from the mesh's frame to the rig's.
+    shift_mm
+        (3,).
+    """
+
+    def table(lights: LightTable) -> LightTable:
+        return dataclasses.replace(
+            lights,
+            position_mm=(lights.position_mm - shift_mm) @ rotation,
+            axis=lights.axis @ rotation,
+        )
+
+    cameras = tuple(
+        dataclasses.replace(
+            camera,
+            rotation=camera.rotation @ rotation,
+            translation_mm=camera.translation_mm + camera.rotation @ shift_mm,
+        )
+        for camera in dome.cameras
+    )
+    return dataclasses.replace(
+        dome, cameras=cameras, table=table(dome.table), lights=table(dome.lights)
+    )
+
+
 def calibrated(evidence: Evidence, images: DomeImages) -> Dome:
     """Return the dome of a session's images; what no calibration says is taken as drawn.
 

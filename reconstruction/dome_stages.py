@@ -22,13 +22,13 @@ from reconstruction import (
     brdf_basis,
     photometric_stereo,
     scan_mesh,
-    scan_registration,
     stages,
 )
 from reconstruction import surface_estimates as estimates
-from reconstruction.calibrated_dome import Dome, apart, calibrated, rows
+from reconstruction.calibrated_dome import Dome, apart, calibrated
 from reconstruction.dome_images import DomeImages
 from reconstruction.dome_motion import Motion, follow_head
+from reconstruction.dome_registration import register
 from reconstruction.evidence import Evidence, EvidenceError
 from reconstruction.hold_out import HoldOutError
 from reconstruction.lumitexel_store import LumitexelStore
@@ -50,10 +50,6 @@ RANKS: Final = (1, 2, RANK, 2 * RANK, 24)
 BASIS_POINTS: Final = 5_000
 """Points, drawn at random, that the mixtures are found on."""
 SCAN: Final = "scan.ply"
-ALIGNING_LIGHTS: Final = 40
-"""Lights whose images say where the scan is."""
-SIGNAL: Final = 5.0
-"""Times its noise from which on a pixel shows something."""
 MEMORY_BYTES: Final = 2**30
 """Size of the table of samples from which on it lies in files and not in memory."""
 FACE_MM2: Final = 60_000.0
@@ -202,35 +198,7 @@ def _surface(evidence: Evidence, dome: Dome) -> RefinedScan:
     points = int(np.clip(FACE_MM2 / footprint**2, *POINT_LIMITS))
     mesh = session.attachment(SCAN) if evidence.scan is None else evidence.scan
     scan = scan_mesh.prepare(mesh, points=points)
-    chosen = _spread(dome.lights.position_mm, dome.lights.valid, ALIGNING_LIGHTS)
-    shares = []
-
-    def stacks(view: int) -> NDArray[np.float32]:
-        layers = []
-        for capture in chosen:
-            image = dome.image(view, capture)
-            gray = image.rgb.mean(axis=-1)
-            noise = np.sqrt(image.variance.sum(axis=-1)) / 3.0
-            seen = image.valid & (gray > SIGNAL * noise)
-            shares.append((np.mean(~image.valid), np.mean(seen)))
-            layers.append(np.where(image.valid, gray, np.nan))
-        return np.asarray(layers, np.float32)
-
-    try:
-        fit = scan_registration.align(
-            scan.coarse,
-            cameras=dome.cameras,
-            lights=rows(dome.lights, chosen, [dome.lights.names[k] for k in chosen]),
-            stacks=stacks,
-            binning=2,
-            rng=np.random.default_rng(0),
-        )
-    except scan_registration.RegistrationError as exc:
-        lost, seen = 100.0 * np.mean(shares, axis=0)
-        raise EvidenceError(
-            f"surface: the scan was not found in the images: {exc}; {lost:.1f} % of their pixels "
-            f"are saturated in every exposure, {seen:.1f} % are brighter than their noise"
-        ) from exc
+    fit = register(dome, scan.coarse)
     evidence.noted["registration"] = {
         "rotation": fit.rotation.tolist(),
         "translation_mm": fit.translation_mm.tolist(),
@@ -256,23 +224,6 @@ def _require(dome: Dome) -> None:
         )
     place = dome.lights.position_mm[dome.lights.valid]
     photometric_stereo.require_spread(place / np.linalg.norm(place, axis=1, keepdims=True))
-
-
-def _spread(position_mm: NDArray[np.float64], usable: NDArray[np.bool_], count: int) -> list[int]:
-    """Choose lights that light the face, each next one the farthest from those before."""
-    way = position_mm / np.linalg.norm(position_mm, axis=1, keepdims=True)
-    front = np.flatnonzero(usable & (way[:, 2] > -0.1))
-    if not len(front):
-        raise EvidenceError("lights: none that can be used stands before the face")
-    chosen = [int(front[np.argmax(way[front, 2])])]
-    nearest = way[front] @ way[chosen[0]]
-    while len(chosen) < min(count, len(front)):
-        best = int(front[np.argmin(nearest)])
-        if best in chosen:
-            break
-        chosen.append(best)
-        nearest = np.maximum(nearest, way[front] @ way[best])
-    return chosen
 
 
 def _texture(dome: Dome, surface: RefinedScan) -> Mapping[str, Any]:

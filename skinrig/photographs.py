@@ -11,12 +11,16 @@ import numpy as np
 
 from capture.session import Session
 from model.skin import SkinAppearance
-from reconstruction.calibrated_dome import Dome, calibrated
+from reconstruction.calibrated_dome import Dome, calibrated, seen_from
 from reconstruction.dome_images import DomeImages
+from reconstruction.dome_registration import register
 from reconstruction.evidence import Evidence
 from reconstruction.hold_out import HoldOut
+from reconstruction.mesh_repair import TriangleMesh
+from reconstruction.surface_estimates import LEAST_LIGHTS
 from skinrig.photograph_errors import Photograph
 from skinrig.rendering_camera import Camera, binned
+from skinrig.rendering_geometry import own_mesh
 from skinrig.rendering_lights import Light
 
 
@@ -49,7 +53,10 @@ class Photographs:
     shots: tuple[Shot, ...]
     assumed: tuple[str, ...]
     _dome: Dome
+    """In the frame of the maps."""
     _session: Session
+    _white_mm: tuple[float, ...]
+    """Distance of each light of the dome at which white is taken."""
 
     @staticmethod
     def of(
@@ -100,13 +107,15 @@ class Photographs:
         if not shots:
             raise PhotographsError(f"session {opened.id}: none of its lights is calibrated")
         assumed = list(evidence.assumed)
+        away = tuple(float(r) for r in np.linalg.norm(dome.table.position_mm, axis=1))
         if not same:
-            assumed.append("the head stands where it stood in the session that was fitted")
+            dome, told = _where_the_head_is(dome, appearance)
+            assumed.append(told)
         motion = appearance.parameters.get("motion", {})
         if isinstance(motion, dict) and motion.get("still") is False:
             moved = float(motion.get("displacement_mm_max", 0.0))
             assumed.append(f"the head held still; it moved by up to {moved:.1f} mm")
-        return Photographs(tuple(shots), tuple(assumed), dome, opened)
+        return Photographs(tuple(shots), tuple(assumed), dome, opened, away)
 
     @property
     def subject(self) -> str:
@@ -134,7 +143,10 @@ class Photographs:
         """Return the calibrated light of a photograph, of intensity 1 in all channels."""
         radius = self._session.rig.light(shot.light).radius_mm
         lamp = Light.of_table(self._dome.table, shot.light, radius_mm=radius)
-        return dataclasses.replace(lamp, intensity=(1.0, 1.0, 1.0))
+        row = self._dome.table.names.index(shot.light)
+        return dataclasses.replace(
+            lamp, intensity=(1.0, 1.0, 1.0), reference_mm=self._white_mm[row]
+        )
 
     def chosen(self, count: int | None) -> tuple[Shot, ...]:
         """Return so many of the shots, even over views and lights; None: all."""
@@ -143,8 +155,32 @@ class Photographs:
     def _white(self, light: str) -> np.ndarray:
         """Return what white at the rig's origin shows in the images' unit, shape (3,)."""
         row = self._dome.table.names.index(light)
-        away = np.linalg.norm(self._dome.table.position_mm[row])
-        return np.asarray(self._dome.table.intensity[row] / away**2, np.float64)
+        return np.asarray(self._dome.table.intensity[row] / self._white_mm[row] ** 2, np.float64)
+
+
+def _where_the_head_is(dome: Dome, appearance: SkinAppearance) -> tuple[Dome, str]:
+    """Return the dome about the head as it sat when it was fitted, and words for it.
+
+    Only where the head is comes from the photographs, from their shading, and nothing of its skin.
+    """
+    mesh = own_mesh(appearance)
+    welded, index = np.unique(mesh.vertices_mm.round(4), axis=0, return_inverse=True)
+    lights = int(np.count_nonzero(dome.lights.valid))
+    if lights < LEAST_LIGHTS:
+        return dome, (
+            "the head sits where it sat in the session that was fitted: "
+            f"{lights} lights are too few to find it, {LEAST_LIGHTS} would do"
+        )
+    fit = register(dome, TriangleMesh(welded.astype(np.float64), index.reshape(-1)[mesh.faces]))
+    turn_deg = np.degrees(np.arccos(np.clip((np.trace(fit.rotation) - 1) / 2, -1, 1)))
+    before = (fit.center_mm - fit.translation_mm) @ fit.rotation
+    moved_mm = np.linalg.norm(fit.center_mm - before)
+    off_mm, off_deg = np.linalg.norm(fit.stderr[3:]), np.degrees(np.linalg.norm(fit.stderr[:3]))
+    return seen_from(dome, fit.rotation, fit.translation_mm), (
+        f"the head sits {moved_mm:.2f} +- {off_mm:.2f} mm and {turn_deg:.2f} +- {off_deg:.2f} "
+        "degrees from where it sat in the session that was fitted, by the shading of these "
+        "photographs"
+    )
 
 
 def _held_out(appearance: SkinAppearance) -> HoldOut:

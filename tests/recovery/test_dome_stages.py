@@ -362,7 +362,7 @@ def _frames(folder):
 
 @pytest.mark.parametrize(
     ("hold_out", "named"),
-    [("lights=" + ",".join(map(str, range(25))), "leaves 15 of 40 lights"),
+    [("lights=" + ",".join(map(str, range(31))), "leaves 9 of 40 lights"),
      ("views=0,1,2", "leaves 1 of 4 views"), ("lights=L999", "L999")],
 )  # fmt: skip
 def test_holding_out_too_much_or_nothing_that_is_there_is_refused(found, hold_out, named):
