@@ -46,6 +46,7 @@ STAGES = {
     "kernel-fit": "bench_kernels.search",
     "displacement-synthesis": "bench_synthesis.growth",
     "texture-matching": "bench_texture.matching",
+    "editing": "bench_editing.editing",
     "microstructure": "bench_microstructure.truth",
     "microstructure-passes": "bench_microstructure.passes",
     "perfusion-curves": "bench_perfusion.curves",

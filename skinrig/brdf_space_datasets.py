@@ -330,12 +330,13 @@ def _gathered(
     shares = np.concatenate(weights)
     kept = brdf_space.usable(shares, basis)
     again = [np.concatenate(part) for part in twice]
+    held = brdf_space.usable(again[0], basis) & brdf_space.usable(again[1], basis)
     return Dataset(
         name,
         shares[kept],
         np.concatenate(label)[kept],
         labels,
-        brdf_space.repeatability(again[0], again[1], basis),
+        brdf_space.repeatability(again[0][held], again[1][held], basis),
         lost + int(np.count_nonzero(~kept)),
     )
 
