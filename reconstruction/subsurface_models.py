@@ -238,7 +238,7 @@ def _tabled(
     g_error: float,
 ) -> ProfileModel:
     """Lay the photon table out as log R + sigma_tr r over (sigma_s', root, g)."""
-    radius_mm = np.frombuffer(radius, np.float64)
+    radius_mm = np.frombuffer(radius, np.float64).copy()  # not read-only: one kernel for all
     held = photon_table.asymmetries()
     low, high = max(g - 3.0 * g_error, held[0]), min(g + 3.0 * g_error, held[-1])
     count = 4 if high - low > 1e-6 else 1

@@ -81,7 +81,8 @@ def specular_stokes(
         below the surface.
     """
     n, light, v = _directions(normal, to_light, to_camera)
-    rough = np.ascontiguousarray(np.broadcast_to(np.asarray(alpha, np.float32), len(n)))
+    # a copy: a view would be read-only, which is another type to the compiler
+    rough = np.array(np.broadcast_to(np.asarray(alpha, np.float32), len(n)))
     _check(eta, extinction)
     if len(rough) and not (ALPHA_RANGE[0] <= rough.min() and rough.max() <= ALPHA_RANGE[1]):
         raise ShadingError(
