@@ -33,7 +33,7 @@ LIGHT_ERROR = 0.015
 left out, a light's intensity, a shadow's edge."""
 VALID_SHARE = 0.9
 """Of the points that the whole dome gives an estimate, so many must keep one."""
-FORECAST_SPREAD = 0.2
+FORECAST_SPREAD = {"normals": 0.2, "r_d": 0.4}
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
 
 
@@ -295,7 +295,7 @@ def _choice(
 ) -> Choice:  # fmt: skip
     plan = dome_plan(kept) if plan is None else plan
     forecasts = tuple(
-        Forecast(name, unit, value, _interval(value), wants.get(name))
+        Forecast(name, unit, value, _interval(name, value), wants.get(name))
         for name, unit, value in (
             ("normals", "deg", math.degrees(prediction.median_rad)),
             ("r_d", "%", 100.0 * _r_d_error(prediction, look)),
@@ -326,8 +326,8 @@ def _choice(
     )  # fmt: skip
 
 
-def _interval(value: float) -> tuple[float, float]:
-    return value / (1.0 + FORECAST_SPREAD), value * (1.0 + FORECAST_SPREAD)
+def _interval(name: str, value: float) -> tuple[float, float]:
+    return value / (1.0 + FORECAST_SPREAD[name]), value * (1.0 + FORECAST_SPREAD[name])
 
 
 def _toward(
