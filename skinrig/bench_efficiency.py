@@ -85,6 +85,7 @@ def efficiency(*, toy: bool) -> StageBenchmark:
         tuple(limits),
         tuple(left_out),
         by_band=bands,
+        squared=True,
     )
 
 

@@ -13,7 +13,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from skinrig import resident_memory
+
 SCHEMA = "skinrig.bench/1"
+TRACED_S = 0.1
+"""Calls that are quicker are run once more for their memory, asked or not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +31,10 @@ class Timing:
     cold_s: float
     """The first call, with compilation and caches to fill, s."""
     peak_memory_mb: float
-    """Most memory held by Python and NumPy during a call, MB."""
+    """Most memory held during a call, MB; 0: not measured."""
+    memory_of: Literal["allocated", "resident"] = "allocated"
+    """Whether that is what Python and NumPy allocated, or how far the process's resident memory
+    rose."""
 
 
 def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool = True) -> Timing:
@@ -40,7 +47,9 @@ def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool = True) -
     repeats
         Warm calls, at least 1.
     memory
-        False skips the extra call that measures memory (then 0 MB is given).
+        False spares a call that takes long the extra one in which its allocations are traced:
+        then how far resident memory rose in a warm call is taken (0 MB on systems that do not
+        tell).
 
     Returns
     -------
@@ -57,24 +66,28 @@ def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool = True) -
     call()
     cold = time.perf_counter() - start
     seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - start)
-    peak = 0
-    if memory:
-        tracemalloc.start()
-        try:
+    with resident_memory.watched() as rise:
+        for _ in range(repeats):
+            start = time.perf_counter()
             call()
-            peak = tracemalloc.get_traced_memory()[1]
-        finally:
-            tracemalloc.stop()
+            seconds.append(time.perf_counter() - start)
+    traced = memory or min(seconds) < TRACED_S
     return Timing(
         seconds=float(np.median(seconds)),
         spread_s=(min(seconds), max(seconds)),
         cold_s=cold,
-        peak_memory_mb=peak / 1e6,
+        peak_memory_mb=_allocated_mb(call) if traced else rise.mb or 0.0,
+        memory_of="allocated" if traced else "resident",
     )
+
+
+def _allocated_mb(call: Callable[[], Any]) -> float:
+    tracemalloc.start()
+    try:
+        call()
+        return tracemalloc.get_traced_memory()[1] / 1e6
+    finally:
+        tracemalloc.stop()
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +103,26 @@ class Point:
     """68 % interval of ``error``."""
     cramer_rao_bound: float | None = None
     """Least error that any unbiased estimator could have, same unit; None: not known."""
+
+    def efficiency(self, *, squared: bool = False) -> tuple[float, float, float] | None:
+        """Return variance over the least variance, with its 68 % interval; None without a bound.
+
+        1 is perfect. Where the error is a median or a mean the bound is that of a normal error,
+        so that the ratio of squares holds too.
+
+        Parameters
+        ----------
+        squared
+            Whether error and bound are squares already.
+        """
+        if self.cramer_rao_bound is None or not self.cramer_rao_bound > 0.0:
+            return None
+        low, high = self.error_interval
+        value, low, high = (
+            (error / self.cramer_rao_bound) ** (1 if squared else 2)
+            for error in (self.error, max(low, 0.0), high)
+        )
+        return value, low, high
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +158,15 @@ class StageBenchmark:
     """What this run did not measure, and why."""
     by_band: Mapping[str, float] = field(default_factory=dict)
     """Error by melanin band, same unit."""
+    squared: bool = False
+    """Whether errors and bounds are squares (variances), not sizes."""
+
+    @property
+    def reference_error_means(self) -> str:
+        """What `reference_error` says."""
+        if self.reference_error == 0.0:
+            return "exact: the truth that the data were made of, or errors are defined by it"
+        return "how far the reference itself may be off, in the error's unit"
 
 
 def pareto_front(points: tuple[Point, ...]) -> tuple[int, ...]:
@@ -176,25 +218,32 @@ def to_document(stages: list[StageBenchmark]) -> dict[str, Any]:
     document: dict[str, Any] = {"schema": SCHEMA, "machine": machine(), "stages": {}}
     for stage in stages:
         front = pareto_front(stage.points)
+        bend = knee(stage.points)
+        efficiency: list[Any] = [p.efficiency(squared=stage.squared) for p in stage.points]
         document["stages"][stage.name] = {
             "error_name": stage.error_name,
             "reference": stage.reference,
             "reference_error": stage.reference_error,
+            "reference_error_means": stage.reference_error_means,
             "points": [
                 {
                     "knobs": dict(point.knobs),
                     "seconds": point.timing.seconds,
                     "seconds_spread": list(point.timing.spread_s),
                     "cold_seconds": point.timing.cold_s,
-                    "peak_memory_mb": point.timing.peak_memory_mb,
+                    "peak_memory_mb": point.timing.peak_memory_mb or None,
+                    "memory_of": point.timing.memory_of,
                     "error": point.error,
                     "error_interval": list(point.error_interval),
                     "cramer_rao_bound": point.cramer_rao_bound,
+                    "efficiency": efficiency[index] and efficiency[index][0],
+                    "efficiency_interval": efficiency[index] and list(efficiency[index][1:]),
                     "on_front": index in front,
+                    "knee": index == bend,
                 }
                 for index, point in enumerate(stage.points)
             ],
-            "knee": knee(stage.points),
+            "knee": bend,
             "limits": [
                 {
                     "name": limit.name,

@@ -1,5 +1,11 @@
-import pytest
+import itertools
 
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skinrig import resident_memory
 from skinrig.benchmark import (
     Limit,
     Point,
@@ -53,3 +59,62 @@ def test_a_missed_limit_fails_the_document(sense, got, passed):
     document = to_document([stage])
     assert document["passed"] is passed
     assert document["stages"]["s"]["points"][0]["on_front"] is True
+
+
+errors_and_seconds = st.lists(
+    st.tuples(
+        st.floats(1e-9, 1e9) | st.sampled_from([1.0, 2.0]),
+        st.floats(0.0, 1e9) | st.sampled_from([1.0, 2.0, float("nan"), float("inf")]),
+    ),
+    max_size=30,
+)
+
+
+@given(errors_and_seconds)
+def test_along_a_front_error_falls_as_seconds_rise(drawn):
+    points = tuple(point(*one) for one in drawn)
+    front = [points[k] for k in pareto_front(points)]
+    seconds = [p.timing.seconds for p in front]
+    errors = [p.error for p in front]
+    assert all(a < b for a, b in itertools.pairwise(seconds))
+    assert all(a > b for a, b in itertools.pairwise(errors))
+    for p in points:
+        if np.isfinite(p.error):
+            assert any(f.timing.seconds <= p.timing.seconds and f.error <= p.error for f in front)
+
+
+def test_efficiency_is_the_ratio_of_variances():
+    timing = Timing(1.0, (1.0, 1.0), 1.0, 0.0)
+    one = Point({}, timing, 3.0, (2.0, 4.0), 2.0)
+    assert one.efficiency() == (2.25, 1.0, 4.0)
+    assert one.efficiency(squared=True) == (1.5, 1.0, 2.0)
+    assert point(1, 1).efficiency() is None
+    document = to_document([StageBenchmark("s", "rms, %", "truth", 0.0, (one,))])
+    written = document["stages"]["s"]["points"][0]
+    assert (written["efficiency"], written["efficiency_interval"]) == (2.25, [1.0, 4.0])
+
+
+def test_a_reference_of_its_own_error_is_told_from_the_truth():
+    means = [
+        StageBenchmark("s", "rms", "r", error, (point(1, 1),)).reference_error_means
+        for error in (0.0, 0.1)
+    ]
+    assert means[0].startswith("exact")
+    assert not means[1].startswith("exact")
+
+
+def test_memory_of_slow_calls_is_what_the_process_grew_by(monkeypatch):
+    monkeypatch.setattr("skinrig.benchmark.TRACED_S", 0.0)
+    with resident_memory.watched() as seen:
+        pass
+    if seen.mb is None:
+        pytest.skip("this system does not count resident memory")
+    timing = measure(lambda: np.ones(10_000_000).sum(), repeats=1, memory=False)
+    assert timing.memory_of == "resident"
+    assert 60.0 < timing.peak_memory_mb < 160.0
+
+
+def test_memory_of_quick_calls_is_what_they_allocate():
+    timing = measure(lambda: np.ones(100_000).sum(), repeats=1, memory=False)
+    assert timing.memory_of == "allocated"
+    assert 0.8 <= timing.peak_memory_mb < 0.9
