@@ -22,6 +22,8 @@ FloatArray = NDArray[np.float64]
 
 POINTS: Final = 2
 """Points along each side of a piece that light is looked for at."""
+MANY_LIGHTS: Final = 8
+"""With so many lights one point is enough: their shadows' steps lie in different places."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,7 +92,8 @@ class Interior:
         faces = shadows.face_normals[self.prim]
         total = np.zeros((len(self.prim), 3))
         # several points of each piece, or shadows would end in steps
-        offsets = (np.arange(POINTS, dtype=np.float32) + np.float32(0.5)) / POINTS - 0.5
+        points = POINTS if len(lamps) < MANY_LIGHTS else 1
+        offsets = (np.arange(points, dtype=np.float32) + np.float32(0.5)) / points - 0.5
         for u in offsets:
             for v in offsets:
                 place = self.position_mm + u * self.across_mm + v * self.along_mm
@@ -98,7 +101,7 @@ class Interior:
                     light = entering(
                         lamp, place, faces, self.normals, shadows, samples, self.laid.model.eta
                     )[0]
-                    total += light / POINTS**2
+                    total += light / points**2
         return total
 
     def leaving(

@@ -24,6 +24,8 @@ FloatArray = NDArray[np.float64]
 
 ROUGHNESS: Final = np.linspace(0.12, 0.6, 9)
 """Nodes of the roughness."""
+LEAST_COSINE: Final = 0.02
+"""Tables hold what the surface does at 89 degrees for directions closer to the horizon, too."""
 FUZZ: Final = 1e-3
 """Optical depth of the table of vellus hair."""
 
@@ -101,9 +103,19 @@ def _lobe(
 ) -> FloatArray:
     packed = np.array([0.0, 0.0, 0.0, roughness, oil, fuzz, 1.0], np.float32)
     up = np.array([0.0, 0.0, 1.0], np.float32)
-    to_light, to_view = (np.ascontiguousarray(w.reshape(-1, 3), np.float32) for w in (light, view))
+    to_light, to_view = (_raised(w.reshape(-1, 3)) for w in (light, view))
     found = surface_brdf.evaluate(packed, up, to_light, to_view)[1]
     return np.asarray(found.reshape(light.shape[:-1]), np.float64)
+
+
+def _raised(directions: FloatArray) -> NDArray[np.float32]:
+    """Return directions above the horizon, where hair would glow without end."""
+    up = np.maximum(directions[:, 2:], LEAST_COSINE)
+    across = np.linalg.norm(directions[:, :2], axis=-1, keepdims=True)
+    scale = np.sqrt(1.0 - up**2) / np.maximum(across, 1e-9)
+    flat = np.where(across > np.sqrt(1.0 - LEAST_COSINE**2), directions[:, :2] * scale,
+                    directions[:, :2])  # fmt: skip
+    return np.ascontiguousarray(np.concatenate([flat, up], axis=-1), np.float32)
 
 
 def _hair(light: FloatArray, view: FloatArray) -> FloatArray:
