@@ -316,6 +316,13 @@ def test_meshes_are_read_with_their_texture_coordinates(tmp_path):
     text = "v 0 0 0\nv 9 0 0\nv 0 9 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
     (tmp_path / "a.obj").write_text(text)
     assert read_mesh(tmp_path / "a.obj").uv.max() == 1.0
+    ply = (
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+        "property float z\nproperty float s\nproperty float t\nelement face 1\n"
+        "property list uchar int vertex_indices\nend_header\n0 0 0 0 0\n9 0 0 1 0\n0 9 0 0 1\n"
+        "3 0 1 2\n"
+    )
+    assert parse_mesh(ply.encode(), "a.ply").uv.tolist() == [[0, 0], [1, 0], [0, 1]]
     with pytest.raises(ValueError, match="no texture coordinates"):
         parse_mesh(b"v 0 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n", "bare.obj")
     with pytest.raises(ValueError, match=r"expected \.obj"):
