@@ -16,6 +16,10 @@ makeup   pigment that covers 70 % of the diffuse color and evens it out, a satin
 powder   grains on 45 %, which scatter back; a matte white part below them; a fifth of the oil
 ======== ========================================================================================
 
+What grains scatter once goes every way, and eq. (6) takes the least of it for diffuse light: under
+powder the minimum lies some 13 % above R_d (`rigsim.surface_brdf.surface_floor`, the truth's map
+``r_d_floor``).
+
 All these amounts are chosen; what is known is their direction and order of size:
 
 - Sebum flows by 10 % less for each degree that the skin is colder (Cunliffe, Burton and Shuster

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import zipfile
@@ -241,29 +242,38 @@ def analyse_measured(
     found = [_measured(folder, materials, points_each, rng) for folder in folders]
     sets = [
         Dataset(name, shares, np.zeros(len(shares), np.int64), (name,), np.nan, lost)
-        for name, (shares, lost) in zip(names, found, strict=True)
+        for name, (shares, lost, _) in zip(names, found, strict=True)
     ]
+    lobes = [kept for _, _, kept in found]
     if len(sets) > 1:
         label = np.concatenate([np.full(len(s.weights), k) for k, s in enumerate(sets)])
         every = np.concatenate([s.weights for s in sets])
         lost = sum(s.lost for s in sets)
         sets.append(Dataset("all", every, label, tuple(names), np.nan, lost))
-    groups = None if table is None or len(sets) == 1 else dict(table.binary)
+    groups = None if table is None else dict(table.binary)
     done = tuple(
-        analyse(
-            data, materials, by_label=True, groups=groups if data.name == "all" else None,
-            method=method, rng=rng,
-        )
-        for data in sets
+        _up_to(analyse(data, materials, by_label=False, method=method, rng=rng,
+                       ranks=[rank for rank in brdf_space.RANKS if rank <= kept]), kept)
+        for data, kept in zip(sets, lobes, strict=False)
     )  # fmt: skip
+    for data in sets[len(lobes) :]:
+        done += (analyse(data, materials, by_label=True, groups=groups, method=method, rng=rng),)
     _write(out, done, materials, spheres=done[-1], method=method)
     return done
 
 
+def _up_to(one: Analysis, lobes: int) -> Analysis:
+    """Say of a face's own curve why it ends where the lobes that it was reconstructed with do."""
+    why = f"the face has {lobes} lobes; `skinrig reconstruct --rank 24` keeps more"
+    beyond = tuple((rank, why) for rank in brdf_space.RANKS if rank > lobes)
+    curve = dataclasses.replace(one.curve, left_out=(*one.curve.left_out, *beyond[:1]))
+    return dataclasses.replace(one, curve=curve)
+
+
 def _measured(
     folder: Path, materials: BrdfBasis, count: int, rng: np.random.Generator
-) -> tuple[FloatArray, int]:
-    """Return shares of the materials at random texels of a face, and how many cannot be used."""
+) -> tuple[FloatArray, int, int]:
+    """Return shares of the materials at random texels, how many are no use, and its lobes."""
     appearance = store.read(folder)
     weights: list[SkinMap] = []
     while (name := f"basis_weight_{len(weights)}") in appearance.maps:
@@ -294,7 +304,7 @@ def _measured(
     shares = np.stack([one.values.reshape(-1)[at] for one in weights], axis=-1).astype(np.float64)
     mixed = np.maximum(shares, 0.0) @ mix
     kept_rows = brdf_space.usable(mixed, materials)
-    return mixed[kept_rows], int(np.count_nonzero(~kept_rows))
+    return mixed[kept_rows], int(np.count_nonzero(~kept_rows)), len(weights)
 
 
 def _write(

@@ -87,7 +87,7 @@ def analyse_brdf(
     )  # fmt: skip
     for document in documents:
         for rank, why in document["left_out"]:
-            console.say(f"left out: {document['name']}, {rank} lobes: {why}")
+            console.say(f"left out: {document['name']}, {rank} lobes and more: {why}")
         if document["points_lost"]:
             console.say(f"{document['name']}: {document['points_lost']} points show no lobe")
     console.say(f"{out}: figure-14.png, figure-15.png, curves.csv, analysis.json")

@@ -155,6 +155,8 @@ def test_measured_faces_are_analysed_by_label(tmp_path, basis, capsys):
         # a face holds as many lobes as it was reconstructed with
         error = dict(zip(document["ranks"], document["error"], strict=True))
         assert error[3] < 0.1 * error[1]
+        assert max(error) == 3
+        assert "--rank 24" in document["left_out"][0][1]
     assert told["datasets"][3]["plateau"] > 3
     assert told["datasets"][3]["held_out"] == "people"
     for name in ("figure-14.png", "figure-15.png", "curves.csv", "analysis.json"):
