@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_closing, map_coordinates, maximum_filter
 
-from reconstruction import landmark_field, texture_fill
+from model.texture_masks import fill_smoothly
+from reconstruction import landmark_field
 from reconstruction.landmark_field import LandmarkField, LandmarkFieldError
 
 Floats = NDArray[np.float64]
@@ -274,9 +275,10 @@ class Chart:
         mean = total / np.maximum(weight, 1e-12)[..., None]
         known = weight > 0.0
         near = _closed(known)
-        filled = texture_fill.push_pull(mean, known.astype(np.float32))
-        values = filled.values if image.ndim == 3 else filled.values[..., 0]
-        return values, near & filled.valid
+        if not known.any():
+            return np.zeros_like(mean if image.ndim == 3 else mean[..., 0], np.float32), known
+        filled = fill_smoothly(mean, known).astype(np.float32)
+        return filled if image.ndim == 3 else filled[..., 0], near
 
     def read(self, common: ArrayLike) -> tuple[Image, Bools]:
         """Read a common map at the texels, linearly.
