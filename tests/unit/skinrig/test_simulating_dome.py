@@ -147,6 +147,10 @@ def test_a_faces_session_holds_a_scan_and_its_truth_lies_beside(tmp_path):
     assert truth.inputs["session"] == session.content_hash
     assert {"normals", "r_d", "position"} <= set(truth.maps)
     assert np.shape(truth.parameters["scan_to_dome"]) == (4, 4)
+    places = truth.maps["position"].values.reshape(-1, 3)
+    for name, point in truth.parameters["landmarks_mm"].items():
+        assert np.linalg.norm(places - point, axis=1).min() < 3.0, name
+    assert len(truth.parameters["landmarks_mm"]) >= 20
     assert len(session.frames("olat")) == 2 * 2 * 12
     bright = session.read(session.frames("olat", exposure=0)[0]).cfa
     dark = session.read(session.frames("dark", exposure=0)[0]).cfa
