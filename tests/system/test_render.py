@@ -8,7 +8,11 @@ import pytest
 
 from model import brdf_tables, store
 from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig import photographs, rendering_camera
 from skinrig.cli import main
+from skinrig.photograph_errors import Photograph
+from skinrig.photographs import Shot
+from skinrig.rendering_lights import Light
 
 SIZE = 32
 STEPS = 24
@@ -197,3 +201,40 @@ def test_a_folder_of_something_else_is_not_replaced(folder, monkeypatch, capsys)
     assert run(folder, monkeypatch, "face", "--light", "1,1,1", "--out", "matt") == 3
     assert "no rendering" in capsys.readouterr().err
     assert (folder / "matt" / "appearance.json").exists()
+
+
+class OnePhotograph:
+    """A session with one photograph that no fit has seen."""
+
+    assumed = ("the head held still",)
+    shots = (Shot("C03", "L017", "light"),)
+
+    def camera(self, shot):
+        return rendering_camera.looking_at((200, 0, 600), size_px=(40, 30), name=shot.view)
+
+    def light(self, shot):
+        return Light(name=shot.light, direction=(1.0, 0.0, 1.0))
+
+    def photograph(self, shot):
+        return Photograph(np.full((30, 40, 3), 0.7), np.ones((30, 40, 3)), np.ones((30, 40), bool))
+
+
+def test_a_photograph_is_taken_apart_beside_its_rendering(folder, monkeypatch, capsys):
+    monkeypatch.setattr(photographs.Photographs, "of", lambda *_, **__: OnePhotograph())
+    words = ("face", "--against", "session", "--components", "--subsurface", "local", "--json")
+    lit = ("--view", "C03", "--light", "L017", "--out", "apart")
+    assert run(folder, monkeypatch, *words, *lit) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["held_out"] == "light"
+    assert "the head held still" in document["assumed"]
+    left, diffuse, coverage = (
+        store.read_exr(folder / "apart" / f"{name}.exr")
+        for name in ("photograph_less_diffuse", "diffuse", "coverage")
+    )
+    skin = coverage > 0.5
+    assert skin.any()
+    np.testing.assert_allclose(left[skin], 0.7 - diffuse[skin], atol=1e-6)
+    assert np.all(left[~skin] == 0.0)
+    other = ("--view", "C03", "--light", "L020", "--out", "other")
+    assert run(folder, monkeypatch, *words, *other) == 2
+    assert "C03 L017" in capsys.readouterr().err
