@@ -5,6 +5,7 @@ reflection equation, with shot and read noise, and read from a session as any ot
 """
 
 import dataclasses
+import io
 from datetime import UTC, date, datetime
 
 import numpy as np
@@ -21,6 +22,7 @@ from capture.rig import load_rig
 from capture.session import Session, Subject
 from model import store
 from reconstruction import pipeline
+from reconstruction.evidence import EvidenceError
 from reconstruction.hold_out import HoldOutError
 from reconstruction.stages import StageError
 from skinrig.simulating_dome import small_dome
@@ -373,6 +375,38 @@ def test_holding_out_too_much_or_nothing_that_is_there_is_refused(found, hold_ou
             hold_out=hold_out,
         )  # fmt: skip
     assert not (folder / "never").exists()
+
+
+@pytest.mark.long
+def test_as_many_lobes_are_made_as_are_asked_for(found):
+    folder, _ = found
+    pipeline.reconstruct(
+        folder / "session-ellipsoid", want=("basis_weight_1",), out=folder / "two-lobes",
+        calibration=folder / "calibration", rank=2,
+    )  # fmt: skip
+    maps = store.read(folder / "two-lobes")
+    assert {name for name in maps.maps if name.startswith("basis_weight")} == {
+        "basis_weight_0", "basis_weight_1",
+    }  # fmt: skip
+    with np.load(io.BytesIO(maps.files["brdf_basis.npz"])) as stored:
+        assert stored["table"].shape[-1] == 2
+        assert stored["mix_by_rank"].shape == (stored["ranks"].sum(), len(stored["materials"]))
+        at = int(np.searchsorted(stored["ranks"], 2))
+        first = stored["ranks"][:at].sum()
+        np.testing.assert_array_equal(stored["mix_by_rank"][first : first + 2], stored["mix"])
+        assert stored["error_by_rank"][-1] < 0.5 * stored["error_by_rank"][0]
+
+
+@pytest.mark.parametrize(
+    ("rank", "want", "named"),
+    [(2, "basis_weight_2", "basis_weight_1"), (0, "normals", "1 or more")],
+)
+def test_lobes_beyond_those_asked_for_are_refused(found, rank, want, named):
+    folder, _ = found
+    with pytest.raises(EvidenceError, match=named):
+        pipeline.reconstruct(
+            folder / "session-ellipsoid", want=(want,), out=folder / "never", rank=rank
+        )
 
 
 def test_without_tracking_frames_the_record_says_that_nobody_followed_the_head(found):
