@@ -304,22 +304,22 @@ def confidence(
 
     Notes
     -----
-    Exchanges are exact for a difference of means; by regression they treat the part of the label
-    that the other traits do not explain as exchangeable.
+    Exchanges are exact for a difference of means. By regression, what is left of the samples when
+    the other traits have explained what they can is exchanged (Freedman and Lane 1983,
+    doi:10.1080/07350015.1983.10509354), else their effects would pass for noise.
     """
     n = len(scores)
     c = trait.contrast
     if whole is None:
         whole = scores
     vector, true = c @ scores, c @ whole
+    base = whole if not beside else residuals(beside[0], whole, beside=beside[1:])[:, :-1]
     length, far = float(np.linalg.norm(vector)), float(np.linalg.norm(true))
     beyond = 0
     for start in range(0, permutations, _CHUNK):
         many = min(_CHUNK, permutations - start)
         mixed = rng.permuted(np.broadcast_to(c, (many, n)), axis=1)
-        beyond += int(
-            np.count_nonzero(np.linalg.norm(mixed @ whole, axis=1) >= far * (1.0 - 1e-12))
-        )
+        beyond += int(np.count_nonzero(np.linalg.norm(mixed @ base, axis=1) >= far * (1.0 - 1e-12)))
     p = (1 + beyond) / (1 + permutations)
     left = residuals(trait, scores, beside=beside)
     off, leverage = left[:, :-1], left[:, -1]

@@ -163,8 +163,8 @@ def lobe_change(
     before: Sequence[Member],
     after: Sequence[Member],
     *,
-    points: int = 30,
-    pairs: int = 4000,
+    points: int = 60,
+    pairs: int = 1000,
     rng: np.random.Generator,
 ) -> LobeChange:
     """Return the mean change of the surface's light between the same people twice.
@@ -180,22 +180,38 @@ def lobe_change(
     rng
         Draws points and directions.
     """
+    return lobe_changes(before, {"": after}, points=points, pairs=pairs, rng=rng)[""]
+
+
+def lobe_changes(
+    before: Sequence[Member],
+    after: Mapping[str, Sequence[Member]],
+    *,
+    points: int = 60,
+    pairs: int = 1000,
+    rng: np.random.Generator,
+) -> dict[str, LobeChange]:
+    """Return the mean changes by several traits; see `lobe_change`."""
     light, view = directions((pairs,), rng=rng), directions((pairs,), rng=rng)
     through = np.array([
         surface_brdf.boundary_transmittance(one[2], other[2])
         for one, other in zip(light, view, strict=True)
     ])  # fmt: skip
-    total = np.zeros(pairs)
-    for pair in zip(before, after, strict=True):
-        stream = int(rng.integers(2**31))
-        for person, sign in zip(pair, (-1.0, 1.0), strict=True):
-            # the same stream draws the same points of both
+    streams = [int(n) for n in rng.integers(2**31, size=len(before))]
+
+    def mean(people: Sequence[Member]) -> Floats:
+        total = np.zeros(pairs)
+        for person, stream in zip(people, streams, strict=True):
+            # the same stream draws the same points of the same face again
             packed = surface_points(person, points, rng=np.random.default_rng(stream))
             floors = surface_brdf.surface_floor(packed) / np.pi
             for one, floor in zip(packed, floors, strict=True):
                 lobe = surface_brdf.evaluate(one, [0.0, 0.0, 1.0], light, view)[1]
-                total += sign * (lobe - floor * through) * light[:, 2]
-    return LobeChange(light, view, total / (points * len(before)))
+                total += (lobe - floor * through) * light[:, 2]
+        return total / (points * len(people))
+
+    bare = mean(before)
+    return {name: LobeChange(light, view, mean(people) - bare) for name, people in after.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

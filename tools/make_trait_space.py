@@ -44,7 +44,7 @@ SEEN_ON_SURFACE = (*CONDITIONS[1:], "female")
 SEEN_IN_COLOR = ("tan", "beard", "freckles", "female", "asian", "cold", "hot", "makeup", "powder")
 OPPOSITES = {"female": "male", "asian": "caucasian"}
 RANK, POINTS = 8, 40
-COMPARED = 6
+COMPARED = 8
 """People who are simulated twice for the truth."""
 DIRECTIONS = 8
 """Of the albedo's space that are stored."""
@@ -114,13 +114,14 @@ def surface_truth(space: TraitSpace, people: Sequence[Member], seed: int) -> dic
     basis = brdf_tables.default()
     some = [people[i] for i in np.random.default_rng([seed, 4]).permutation(len(people))[:COMPARED]]
     bare = [dataclasses.replace(person, applied=()) for person in some]
-    found = {}
-    for name in CONDITIONS[1:]:
-        worn = [dataclasses.replace(person, applied=((name, 1.0),)) for person in bare]
-        rng = np.random.default_rng([seed, 5])
-        change = trait_truth.lobe_change(bare, worn, points=12, pairs=2000, rng=rng)
-        found[name] = change.cosine(space.trait(name).vector, basis)
-    return found
+    worn = {
+        name: [dataclasses.replace(person, applied=((name, 1.0),)) for person in bare]
+        for name in CONDITIONS[1:]
+    }
+    changes = trait_truth.lobe_changes(bare, worn, rng=np.random.default_rng([seed, 5]))
+    return {
+        name: change.cosine(space.trait(name).vector, basis) for name, change in changes.items()
+    }
 
 
 def albedo_truth(

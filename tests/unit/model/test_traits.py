@@ -415,3 +415,14 @@ def test_components_stay_where_the_trait_is_smaller_than_what_people_differ_in(r
     assert len(space.basis) == 59
     few = TraitSpace.fit(samples, {"tan": label}, components=5)
     assert space.cosine("tan", trait) > few.cosine("tan", trait)
+
+
+def test_effects_of_other_traits_do_not_pass_for_noise_in_a_regression(rng):
+    samples, tan, _ = population(rng, people=60, with_trait=30, shift=0.4)
+    strong = rng.permutation(np.arange(60) < 20)
+    samples = samples + 15.0 * strong[:, None] * rng.normal(size=samples.shape[1])
+    labels = {"tan": tan, "strong": strong}
+    means = TraitSpace.fit(samples, labels).trait("tan").confidence
+    beside = TraitSpace.fit(samples, labels, contrast="regression").trait("tan").confidence
+    assert beside.p_value == 0.001
+    assert means.p_value > 0.01
