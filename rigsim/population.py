@@ -292,6 +292,25 @@ def table_1(*, seed: int = 0) -> tuple[Member, ...]:
     return tuple(members)
 
 
+def member(name: str) -> Member:
+    """Return a member of `table_1` by name, "P01" to "P87".
+
+    Raises
+    ------
+    PopulationError
+        There is none of that name.
+
+    Examples
+    --------
+    >>> member("P56").group
+    'caucasian female, lotion or makeup'
+    """
+    found = {person.name: person for person in table_1()}
+    if name not in found:
+        raise PopulationError(f"member: got {name!r}, expected P01 to P{len(found)}")
+    return found[name]
+
+
 def shifted(
     members: Sequence[Member],
     trait: str,
@@ -456,4 +475,4 @@ def _laid_out(head: int, size: int) -> tuple[Mesh, Atlas, Float32Array, Mapping[
     return mesh, atlas, points, face_regions.region_masks(points)
 
 
-__all__ = ["GROUPS", "HEADS", "Group", "Member", "PopulationError", "shifted", "table_1"]
+__all__ = ["GROUPS", "HEADS", "Group", "Member", "PopulationError", "member", "shifted", "table_1"]

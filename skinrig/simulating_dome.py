@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import io
-from typing import Any, cast, get_args
+import re
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 import numpy as np
 
@@ -18,6 +19,11 @@ from skinrig.light_safety import light_figures, light_lines
 from skinrig.reflection_evaluation import TEST_FILE, make_test
 from skinrig.simulation import Order, Simulated, SimulationError, drive, open_session, truth_folder
 
+if TYPE_CHECKING:
+    from rigsim.population import Member
+
+TEXELS = 512
+"""Along one side of a face's maps."""
 WIDTHS_PX = {"small": 320, "full": 1300}
 LIGHTS = {"small": 48, "full": None}
 VIEWS = {"small": 6, "full": None}
@@ -136,6 +142,20 @@ def _conditions(order: Order) -> dict[str, float]:
         return checked(order.conditions)
     except ConditionError as error:
         raise SimulationError(str(error)) from error
+
+
+def _member(order: Order) -> Member | None:
+    """Return the member of the simulated population that is asked for; None: a preset is."""
+    from rigsim.population import PopulationError, member
+
+    if order.target is not None or not re.fullmatch(r"P\d+", order.subject):
+        return None
+    if order.mesh is not None:
+        raise SimulationError(f"mesh: {order.subject} has a head already; leave it out")
+    try:
+        return member(order.subject)
+    except PopulationError as error:
+        raise SimulationError(f"subject: {error}") from error
 
 
 def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, bytes]:
@@ -289,12 +309,17 @@ def _scene(rig: Rig, order: Order) -> Any:
         return DomeScene(rig, make_target("dark"), dome=built, seed=order.seed)
     if order.target is not None:
         return target_scene(order.target, rig, seed=order.seed, dome=built)  # type: ignore[arg-type]
-    person = make_subject(order.subject, seed=order.seed, mesh=order.mesh)
+    conditions = dict(order.conditions)
+    if (one := _member(order)) is not None:
+        person = one.face(TEXELS)
+        conditions = dict(one.applied) | conditions
+    else:
+        person = make_subject(order.subject, seed=order.seed, size=TEXELS, mesh=order.mesh)
     motion = head_motion(order.seed) if order.move else None
     return DomeScene(
         rig, person, dome=built, motion=motion, state=order.states[0], movement=order.movement,
         seed=order.seed, subsurface=order.subsurface, interreflections=order.interreflections,
-        conditions=order.conditions,
+        conditions=conditions,
     )  # fmt: skip
 
 

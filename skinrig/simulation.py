@@ -141,6 +141,15 @@ class Order:
             if getattr(self, name) != value:
                 raise SimulationError(f"{name}: the {rig} rig knows nothing of it; leave it out")
 
+    def check_plan(self, rig: str) -> None:
+        """Raise where a plan was handed over that is another rig's, or a target's or sequence's."""
+        if self.plan is None:
+            return
+        if self.plan.rig != rig:
+            raise SimulationError(f"plan: got one of {self.plan.rig!r}, expected {rig!r}")
+        if self.target is not None or self.sequence is not None:
+            raise SimulationError("plan: is for a subject; targets and sequences have their own")
+
 
 def simulate_session(
     rig_name: str,
@@ -191,7 +200,8 @@ def simulate_session(
     seed
         Of the subject, the sensor and the boxes.
     subject
-        Preset of the face, by skin type; of the probe also
+        Preset of the face, by skin type; of the dome also a member of the simulated population, P01
+        to P87 (`rigsim.population.table_1`), with what it wears; of the probe also
         "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm.
     mesh
         A face mesh to wear the skin instead of the procedural head.
@@ -243,7 +253,8 @@ def simulate_session(
     conditions
         Conditions of the face in the dome with their amounts, see `rigsim.skin_conditions`.
     plan
-        Of the dome: what is captured of a face; its lights and cameras are those of targets, too.
+        What is captured of the subject instead of the rig's own plan; of the dome its lights and
+        cameras are those of targets, too.
 
     Raises
     ------
@@ -263,9 +274,8 @@ def simulate_session(
         plan=plan,
     )  # fmt: skip
     if rig_name != "dome":
-        order.refuse(
-            rig_name, subsurface=False, interreflections=False, conditions={}, plan=None
-        )  # fmt: skip
+        order.refuse(rig_name, subsurface=False, interreflections=False, conditions={})
+        order.check_plan(rig_name)
     if sequence is not None and rig_name != "flash":
         raise SimulationError(f"sequence: the {rig_name} rig knows nothing of it; leave it out")
     if sequence is None and relaxation_s is not None:

@@ -48,6 +48,8 @@ def test_the_promised_commands_are_there():
         (["simulate", "dome", "--out", "x", "--condition", "mud"], 3, "mud"),
         (["simulate", "dome", "--out", "x", "--condition", "hot=much"], 2, "hot=much"),
         (["simulate", "flash", "--out", "x", "--condition", "hot"], 3, "flash"),
+        (["simulate", "dome", "--out", "x", "--target", "white", "--condition", "hot"], 3, "hot"),
+        (["simulate", "dome", "--out", "x", "--subject", "P99"], 3, "P01 to P87"),
         (["simulate", "flash", "--out", "x", "--subject", "green"], 3, "green"),
         (["reconstruct", "nothing", "--want", "melanin", "--out", "x"], 3, "nothing"),
         (["calibrate", "sensor", "nothing"], 3, "nothing"),

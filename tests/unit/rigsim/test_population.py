@@ -131,3 +131,9 @@ def test_the_palest_and_the_darkest_member_can_be_drawn():
         skin, mask = person.r_d(64, CAMERA, LIGHT)
         assert np.isfinite(skin).all()
         assert 0.0 < skin[mask].min() <= skin[mask].max() < 1.0
+
+
+def test_members_are_found_by_name():
+    assert population.member("P87") == PEOPLE[-1]
+    with pytest.raises(PopulationError, match="P01 to P87"):
+        population.member("P88")
