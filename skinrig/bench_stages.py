@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from skinrig import bench_plan, bench_table
 from skinrig.benchmark import StageBenchmark, to_document
 from skinrig.console import Console, plain
+from skinrig.errors import EXTRA_MISSING, exit_code, sentence
 
 STAGES = {
     "chromophores": "bench_chromophores.inversion",
@@ -88,15 +91,22 @@ def run_stages(
     Parameters
     ----------
     names
-        Out of :data:`STAGES`; None runs all, as far as the budget goes.
+        Out of :data:`STAGES`, each at full size. None: all of them at their small size, and then
+        at full size those that fit into the budget, the quickest first.
     budget_s
-        A stage that would begin after so many seconds is left out, and named.
+        Seconds to spend. A stage that would begin after them is left out, and named.
     toy
-        Smallest sizes, and no limit is judged: for checking that the benchmark runs.
+        Small sizes only: for checking that the benchmark runs.
     out
         Folder for ``bench.json``; None writes nothing.
     console
         Where results and progress go.
+
+    Returns
+    -------
+    dict
+        ``skinrig.bench/1``. Each stage says its ``size``; limits are judged at full size alone, and
+        ``not_judged`` names the stages whose limits were not.
 
     Raises
     ------
@@ -107,45 +117,80 @@ def run_stages(
     for name in chosen:
         if name not in STAGES:
             raise BenchError(f"stage: got {name!r}, expected one of {', '.join(STAGES)}")
-    start = time.perf_counter()
-    done: list[StageBenchmark] = []
-    left_out = []
+    run = _Run(console, time.perf_counter() + budget_s, asked=bool(names))
+    small = toy or not names
     for name in chosen:
-        if time.perf_counter() - start > budget_s:
-            left_out.append([name, f"the budget of {budget_s:g} s was used up"])
-            continue
-        console.progress(f"bench {name}")
-        done.append(_function(name)(toy=toy))
-    document = to_document(done)
+        run.measure(name, "small" if small else "full")
+    if small and not toy:
+        run.enlarge()
+    document = run.document()
     document["toy"] = toy
-    document["left_out"] = left_out
-    if toy:
-        for stage in document["stages"].values():
-            stage["limits"] = []
-        document["passed"] = True
-    for stage in done:
-        console.rows(
-            (stage.name, "seconds", "cold s", "peak MB", stage.error_name, "Cramér-Rao"),
-            [
-                (
-                    " ".join(f"{k}={v}" for k, v in point.knobs.items()),
-                    point.timing.seconds, point.timing.cold_s, point.timing.peak_memory_mb,
-                    point.error, point.cramer_rao_bound or "",
-                )
-                for point in stage.points
-            ],
-        )  # fmt: skip
-        for limit in () if toy else stage.limits:
-            word = "kept" if limit.passed else "MISSED"
-            console.say(
-                f"{word}: {limit.name}: {limit.got:.4g} {limit.unit} "
-                f"({limit.sense} {limit.bound:g})"
-            )
-        for what, why in stage.left_out:
-            console.say(f"left out: {what}: {why}")
-        console.say()
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         text = json.dumps(plain(document), indent=1, sort_keys=True)
         (out / "bench.json").write_text(text + "\n", encoding="utf-8")
+    bench_table.show(document, console)
     return document
+
+
+Size = Literal["small", "full"]
+
+
+@dataclass(slots=True)
+class _Run:
+    """What was measured so far."""
+
+    console: Console
+    until_s: float
+    """When the budget ends, by `time.perf_counter`."""
+    asked: bool
+    """Whether stages were asked for by name: then what they need must be there."""
+    done: dict[str, StageBenchmark] = field(default_factory=dict)
+    size: dict[str, Size] = field(default_factory=dict)
+    compile_s: dict[str, float] = field(default_factory=dict)
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+
+    def measure(self, name: str, size: Size) -> float:
+        """Measure a stage, if there is time, and return the seconds that it took."""
+        began = time.perf_counter()
+        if began > self.until_s:
+            self.left_out.append((name, "the budget was used up"))
+            return 0.0
+        self.console.progress(f"bench {name}, {size} size")
+        try:
+            made = _function(name)(toy=size == "small")
+        except ImportError as error:
+            if self.asked or exit_code(error) != EXTRA_MISSING:
+                raise
+            self.left_out.append((name, sentence(error)))
+            return 0.0
+        # the first time that its kernels are called; later ones find them compiled
+        self.compile_s.setdefault(
+            name, sum(max(p.timing.cold_s - p.timing.seconds, 0.0) for p in made.points)
+        )
+        self.done[name], self.size[name] = made, size
+        return time.perf_counter() - began
+
+    def enlarge(self) -> None:
+        """Measure again at full size what fits into the rest of the budget."""
+        pace = bench_plan.Pace()
+        for name, told_s in bench_plan.quickest_first(self.done, bench_plan.FULL_S):
+            if not pace.fits(told_s, self.until_s - time.perf_counter()):
+                break
+            pace.add(told_s, self.measure(name, "full"))
+
+    def document(self) -> dict[str, Any]:
+        """Return the document of the run."""
+        document = to_document(list(self.done.values()))
+        document["left_out"] = [list(item) for item in self.left_out]
+        document["not_judged"] = [name for name, size in self.size.items() if size == "small"]
+        for name, made in self.done.items():
+            stage = document["stages"][made.name]
+            stage["size"] = self.size[name]
+            stage["compile_seconds"] = self.compile_s[name]
+            if self.size[name] == "small":
+                stage["limits"] = []
+        document["passed"] = all(
+            limit["passed"] for stage in document["stages"].values() for limit in stage["limits"]
+        )
+        return document

@@ -149,8 +149,8 @@ def simulate(
     subject: Annotated[
         str,
         typer.Option(
-            help="Preset, I to VI, palest or darkest; of the probe also "
-            "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G] or "
+            help="Preset, I to VI, palest or darkest; of the dome also P01 to P87 of the "
+            "simulated population; of the probe also homogeneous:SIGMA_A,SIGMA_S_PRIME[,G] or "
             "anisotropic:SIGMA_A,SIGMA_S_PRIME[,STRENGTH[,AXIS]], 1/mm and degrees."
         ),
     ] = "III",
@@ -635,17 +635,23 @@ def report(
 @app.command()
 def bench(
     stage: Annotated[list[str] | None, typer.Option(help="Stage; repeatable; default all.")] = None,
-    budget: Annotated[float, typer.Option(help="Seconds to spend, about.")] = 300.0,
+    budget: Annotated[float, typer.Option(help="Seconds to spend, about.")] = 600.0,
     toy: Annotated[bool, typer.Option("--toy", help="Smallest sizes, no limits judged.")] = False,
     extremes: Annotated[
         bool, typer.Option("--extremes", help="Try stiff and extreme cases instead.")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for bench.json, or extremes.json.")
+        Path | None,
+        typer.Option("--out", help="Folder for bench.json, a table and plots; or extremes.json."),
     ] = None,
     json: Json = False,
 ) -> None:
     """Measure error against run time; exit code 1 when a limit is missed.
+
+    Without --stage every stage is measured at its small size, and then, the quickest first, at full
+    size as long as the budget lasts. Limits are judged at full size alone.
+
+    Example: skinrig bench --json --out bench
 
     Example: skinrig bench --stage chromophores --json
 
@@ -657,9 +663,12 @@ def bench(
 
         document = run_extremes(stage or (), out=out, console=console)
     else:
+        from skinrig import bench_table
         from skinrig.bench_stages import run_stages
 
         document = run_stages(stage, budget_s=budget, toy=toy, out=out, console=console)
+        if out is not None:
+            bench_table.write(document, out)
     console.document(document.pop("schema"), document)
     if not document["passed"]:
         raise typer.Exit(errors.LIMIT_MISSED)

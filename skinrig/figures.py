@@ -53,8 +53,8 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     Returns
     -------
     str
-        SVG. Points on the Pareto front are joined and labelled, others are hollow; the
-        Cramer-Rao bound is dashed where it is known.
+        SVG. Points on the Pareto front are joined and labelled, others are hollow; the knee
+        has a ring, and the Cramer-Rao bound a dash where it is known.
     """
     figure, axes = _figure(5.2, 3.4)
     points = document["points"]
@@ -71,9 +71,12 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     axes.plot(
         seconds[on_front][order], error[on_front][order], "o-", color=_COLORS[0], label="front"
     )
+    bend = document.get("knee")
+    if bend is not None:
+        axes.plot(seconds[bend], error[bend], "o", mfc="none", mec=_COLORS[1], ms=13, label="knee")
     for index in np.flatnonzero(on_front):
         label = ", ".join(f"{k} {v}" for k, v in points[index]["knobs"].items())
-        label += "  (knee)" if index == document.get("knee") else ""
+        label += "  (knee)" if index == bend else ""
         words = axes.annotate(
             label,
             (seconds[index], error[index]),
@@ -87,13 +90,16 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
         known = np.isfinite(bounds)
         axes.plot(seconds[known], bounds[known], "_", color=_COLORS[1], ms=14, label="Cramér-Rao")
     if document.get("reference_error", 0) > 0:
-        axes.axhline(document["reference_error"], color="0.5", lw=0.8, ls=":")
+        axes.axhline(
+            document["reference_error"], color="0.5", lw=0.8, ls=":", label="reference's own"
+        )
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.margins(x=0.25, y=0.2)
     axes.set_xlabel("seconds, warm, median")
     axes.set_ylabel(document["error_name"])
-    axes.set_title(stage, fontsize=10)
+    small = document.get("size") == "small"
+    axes.set_title(f"{stage}, small size" if small else stage, fontsize=10)
     axes.legend(fontsize=7, frameon=False)
     return _svg(figure)
 

@@ -341,17 +341,38 @@ def _bench_section(document: Mapping[str, Any], checks: list[page.Check]) -> str
         rows += [
             (
                 name, ", ".join(f"{k} {v}" for k, v in point["knobs"].items()), point["seconds"],
-                point["cold_seconds"], point["peak_memory_mb"], point["error"],
+                point["cold_seconds"],
+                "" if point["peak_memory_mb"] is None else point["peak_memory_mb"],
+                point["error"],
                 "" if point["cramer_rao_bound"] is None else point["cramer_rao_bound"],
-                "front" if point["on_front"] else "",
+                "" if point.get("efficiency") is None else point["efficiency"],
+                "knee" if index == stage["knee"] else "front" if point["on_front"] else "",
             )
-            for point in stage["points"]
+            for index, point in enumerate(stage["points"])
         ]  # fmt: skip
     body += f"<div class=plots>{''.join(plots)}</div>"
     body += page.table(
-        ("stage", "setting", "seconds", "cold s", "peak MB", "error", "Cramér-Rao", ""), rows
+        ("stage", "setting", "seconds", "cold s", "peak MB", "error", "Cramér-Rao", "efficiency",
+         ""),
+        rows,
+    )  # fmt: skip
+    bands = [
+        (name, band, error, stage["error_name"])
+        for name, stage in document["stages"].items()
+        for band, error in stage["by_band"].items()
+    ]
+    if bands:
+        body += page.table(("stage", "skin", "error", "which is"), bands)
+    body += (
+        "<p class=note>Errors are in the unit on each plot's axis. Efficiency is variance over the "
+        "Cramér-Rao bound: 1 is perfect.</p>"
     )
-    return body + "<p class=note>Errors are in the unit on each plot's axis.</p>"
+    if document.get("not_judged"):
+        body += (
+            "<p class=note>Measured at small size, so that limits were not judged: "
+            f"{page.escape(', '.join(document['not_judged']))}.</p>"
+        )
+    return body
 
 
 def _document_section(document: Mapping[str, Any]) -> str:

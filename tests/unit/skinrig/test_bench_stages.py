@@ -1,0 +1,116 @@
+"""How a run spends its budget, on stages that take no time."""
+
+import csv
+from types import SimpleNamespace
+
+import pytest
+
+from skinrig import bench_plan, bench_stages, bench_table
+from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
+from skinrig.console import Console
+from skinrig.errors import MissingExtra
+
+NAMES = ("a", "b", "c")
+
+
+def stage(name, calls, seconds=0.0, error=None):
+    def made(*, toy):
+        clock.now += seconds * (0.01 if toy else 1.0)
+        calls.append((name, "small" if toy else "full"))
+        if error is not None:
+            raise error
+        points = tuple(
+            Point({"n": n}, Timing(n, (n, n), 3.0 * n, 1.0), 8 / n**2, (7 / n**2, 9 / n**2), 1 / n)
+            for n in (1.0, 2.0, 4.0, 8.0)
+        )
+        limits = (Limit("kept at full size", 2.0 if toy else 0.5, 1.0, "<="),)
+        return StageBenchmark(name, "rms, %", "truth", 0.0, points, limits)
+
+    return made
+
+
+clock = SimpleNamespace(now=0.0)
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    made = []
+    costs = {"a": 100.0, "b": 10.0, "c": 50.0}
+    functions = {name: stage(name, made, costs[name]) for name in NAMES}
+    clock.now = 0.0
+    monkeypatch.setattr(bench_stages.time, "perf_counter", lambda: clock.now)
+    monkeypatch.setattr(bench_stages, "STAGES", dict.fromkeys(NAMES, "x.y"))
+    monkeypatch.setattr(bench_stages, "_function", functions.__getitem__)
+    monkeypatch.setattr(bench_plan, "FULL_S", costs)
+    made.append(functions)
+    return made
+
+
+def run(budget_s, names=None, toy=False, out=None):
+    return bench_stages.run_stages(
+        names, budget_s=budget_s, toy=toy, out=out, console=Console(True)
+    )
+
+
+def test_every_stage_is_measured_small_and_then_the_quickest_at_full_size(calls, capsys):
+    document = run(150.0)
+    small = [(name, "small") for name in NAMES]
+    assert calls[1:] == [*small, ("b", "full"), ("c", "full")]
+    assert {n: s["size"] for n, s in document["stages"].items()} == {
+        "a": "small", "b": "full", "c": "full",
+    }  # fmt: skip
+    assert document["not_judged"] == ["a"]
+    assert document["stages"]["a"]["limits"] == []
+    assert document["passed"]
+    assert "limits not judged, since measured at small size: a;" in capsys.readouterr().err
+
+
+def test_a_budget_for_all_has_all_at_full_size_with_seconds_of_compiling_kept(calls, capsys):
+    document = run(400.0)
+    assert document["not_judged"] == []
+    assert document["stages"]["a"]["compile_seconds"] == pytest.approx(2.0 * (1 + 2 + 4 + 8))
+
+
+def test_a_slow_machine_is_noticed(calls, monkeypatch, capsys):
+    monkeypatch.setattr(bench_plan, "FULL_S", {"a": 40.0, "b": 1.0, "c": 12.0})
+    # c takes 50 s instead of 12: then a, told to take 40, would not end in time
+    assert run(150.0)["not_judged"] == ["a"]
+
+
+def test_a_stage_that_is_asked_for_has_its_full_size_at_once(calls, capsys):
+    document = run(1.0, ["a"])
+    assert calls[1:] == [("a", "full")]
+    assert document["stages"]["a"]["limits"][0]["passed"]
+
+
+def test_toys_are_judged_by_no_limit(calls, capsys):
+    document = run(600.0, toy=True)
+    assert calls[1:] == [(name, "small") for name in NAMES]
+    assert document["passed"]
+    assert document["not_judged"] == list(NAMES)
+
+
+def test_a_stage_whose_optional_part_is_missing_is_left_out_unless_asked_for(calls, capsys):
+    calls[0]["a"] = stage("a", calls, error=MissingExtra("this", "peers"))
+    document = run(600.0)
+    assert [name for name, _ in document["left_out"]] == ["a"]
+    assert list(document["stages"]) == ["b", "c"]
+    with pytest.raises(MissingExtra):
+        run(600.0, ["a"])
+
+
+def test_a_table_of_all_points_and_a_plot_a_stage_are_written(calls, tmp_path, capsys):
+    document = run(150.0, out=tmp_path)
+    bench_table.write(document, tmp_path)
+    with (tmp_path / "bench.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 4 * len(NAMES)
+    assert rows[0]["setting"] == "n=1.0"
+    assert float(rows[-1]["efficiency"]) == pytest.approx(1.0)
+    assert {p.name for p in tmp_path.glob("*.svg")} == {"a.svg", "b.svg", "c.svg"}
+    assert "small size" in (tmp_path / "a.svg").read_text()
+    assert "(knee)" in (tmp_path / "c.svg").read_text()
+
+
+def test_seconds_are_told_of_stages_that_there_are():
+    assert set(bench_plan.FULL_S) <= set(bench_stages.STAGES)
