@@ -245,7 +245,8 @@ def evaluate(
     if len(count) > 1:
         raise SurfaceError(f"points: got leading axes {count}, expected one")
     rows = count[0] if count else 1
-    full = [np.ascontiguousarray(np.broadcast_to(a, (rows, a.shape[-1]))) for a in arrays]
+    # copies: views are read-only, which is another type to the compiler
+    full = [np.array(np.broadcast_to(a, (rows, a.shape[-1])), order="C") for a in arrays]
     return _evaluate(*full)
 
 
