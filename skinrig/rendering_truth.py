@@ -18,6 +18,7 @@ from model.skin_reflectance import SkinReflectance
 from rigsim import surface_brdf
 from rigsim.atlas import spread
 from rigsim.scenes.dome import DomeScene
+from rigsim.subject import Subject
 from skinrig.rendering_lights import Light
 
 FloatArray = NDArray[np.float64]
@@ -55,17 +56,18 @@ def true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflecta
     Returns
     -------
     SkinReflectance
-        Valid on bare skin; its translucency is 1 mm and means nothing.
+        With brows and lashes; its translucency is 1 mm and means nothing.
     """
-    truth, surface = scene.truth_appearance(view), scene.surface(scene.rig.view(view))
+    if not isinstance(scene.subject, Subject):
+        raise TypeError(f"scene: got the target {scene.subject.name!r}, expected a face")
+    surface, atlas = scene.surface(scene.rig.view(view)), scene.subject.atlas
     at = (surface.roughness - ROUGHNESS[0]) / (ROUGHNESS[1] - ROUGHNESS[0])
     hat = np.maximum(1.0 - np.abs(at[..., None] - np.arange(len(ROUGHNESS))), 0.0)
-    oil = surface.oil[..., None]
+    oil, bare = surface.oil[..., None], surface.bare[..., None]
     shares = np.stack([hat * (1.0 - oil), hat * oil], axis=-1).reshape(*at.shape, -1)
-    layers = [truth.maps[name].values for name in ("r_d", "normals", "position")]
-    layers += [shares, surface.fuzz[..., None] / FUZZ]
-    valid = truth.maps["r_d"].valid
-    covered = np.ones(at.shape, np.bool_) if valid is None else valid
+    layers = [surface.r_d, surface.normal, atlas.position_mm]
+    layers += [bare * shares, bare * surface.fuzz[..., None] / FUZZ]
+    covered = atlas.covered
     values = np.concatenate(layers, axis=-1).astype(np.float32)
     size = at.shape[0] // binning
     count = covered.reshape(size, binning, size, binning).sum(axis=(1, 3))
