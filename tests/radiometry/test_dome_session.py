@@ -31,7 +31,7 @@ start = time.perf_counter()
 after_one = 0
 for k in range(lights):
     t_s = k / 12.0
-    for exposure_s in (0.048, 0.012):
+    for exposure_s in (0.048,) if moving else (0.048, 0.012):
         for view in rig.views:
             pulse = Pulse(k * (150 // lights), 1.0, t_s, t_s + exposure_s)
             scene.exposure(view.name, pops=[pulse], exposure_s=exposure_s, seed=k)
@@ -43,12 +43,13 @@ print(json.dumps({"after_one": after_one, "peak": peak, "seconds": time.perf_cou
 
 
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(("kind", "lights"), [("still", 3), ("moving", 1)])
+@pytest.mark.parametrize(("kind", "lights"), [("still", 2), ("moving", 1)])
 def test_sixteen_full_views_stream_within_four_gigabytes(kind, lights):
     """All that lasts is there after the first light of all cameras; later lights add nothing.
 
-    So a session of 150 lights and two exposures peaks where one of three lights does: below 4 GB,
-    and after the first light by no more than 5 % (freed memory that is not given back).
+    So a session of 150 lights and two exposures peaks where one of two lights does: below 4 GB,
+    and after the first light by no more than 5 % (freed memory that is not given back). One light
+    and exposure of a moving face shows what motion adds.
     """
     run = subprocess.run(
         [sys.executable, "-c", SESSION, str(lights), kind],
