@@ -243,7 +243,7 @@ def parse_spots(text: str | None) -> tuple[Any, ...]:
     >>> [(s.kind, s.amount, s.density_per_cm2) for s in parse_spots("freckles=1:3,moles=-1")]
     [('freckles', 1.0, 3.0), ('moles', -1.0, None)]
     """
-    from skinrig.editing import SpotOrder
+    from skinrig.editing_spots import SpotOrder
 
     out = []
     for word in filter(None, (w.strip() for w in (text or "").split(","))):

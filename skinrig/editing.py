@@ -11,26 +11,24 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from model.trait_storage import TraitLibrary
 from model.trait_vectors import DOUBTFUL_P, TraitVector
-from reconstruction import common_parameterization, common_regions, texture_fill
-from reconstruction.common_parameterization import Chart, CommonFrame
+from reconstruction import common_regions
 from skinrig import (
-    albedo_vectors,
     edit_masks,
     editing_albedo,
+    editing_spots,
     editing_surface,
     face_textures,
     pigment_spots,
-    spot_removal,
     surface_mixtures,
     trait_regions,
 )
 from skinrig.editing_albedo import AlbedoEdit
+from skinrig.editing_spots import SpotOrder
 from skinrig.face_textures import Face
 from skinrig.surface_mixtures import SurfaceMixtures
 from skinrig.trait_regions import LibraryParts
@@ -45,34 +43,6 @@ STALE: Final = {"lobe_residual": "is of the lobes before the edit"}
 
 class EditError(ValueError):
     """An edit that cannot be made as asked."""
-
-
-@dataclass(frozen=True, slots=True)
-class SpotOrder:
-    """Spots to add or to remove.
-
-    Attributes
-    ----------
-    kind
-        One of `pigment_spots.KINDS`.
-    amount
-        Above 0 adds spots with so much pigment, below 0 removes that share of those there are.
-    density_per_cm2
-        Of added ones; None: as usual.
-    """
-
-    kind: str
-    amount: float
-    density_per_cm2: float | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse another kind, and more than all spots removed."""
-        if self.kind not in pigment_spots.KINDS:
-            raise EditError(
-                f"spots: got {self.kind!r}, expected one of {', '.join(pigment_spots.KINDS)}"
-            )
-        if not np.isfinite(self.amount) or self.amount < -1.0:
-            raise EditError(f"spots: got {self.kind}={self.amount}, expected at least -1")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -358,7 +328,7 @@ def _edit_albedo(
     values, held = found.apply(source.values, mask)
     back = one(values, {name: -amount for name, amount in amounts.items()}, 1)
     again, _ = back.apply(values, mask)
-    work.maps["r_d"] = _with_values(source, values)
+    work.maps["r_d"] = editing_spots.with_values(source, values)
     good = face_textures.valid_of(source) & (values != source.values).any(axis=-1)
     work.record["albedo"] = {
         "traits": dict(amounts),
@@ -422,7 +392,7 @@ def _edit_spots(
     face = work.face
     if "r_d" not in work.maps:
         raise EditError(f"{face.path}: has no map r_d, which spots are drawn into")
-    frame = spot_frame(face)
+    frame = editing_spots.spot_frame(face)
     chart = face.chart(frame)
     skin = edit_masks.on_texture("skin" if order.region == "face" else order.region, frame, chart)
     # a picture says itself where spots may be; without one they keep off eyes, brows and lips
@@ -433,12 +403,12 @@ def _edit_spots(
         source = work.maps["r_d"]
         rng = np.random.default_rng([order.seed, 2, number])
         if spot.amount > 0:
-            values, one = _added(face, source, spot, share, rng)
-            work.maps["r_d"] = _with_values(source, values)
+            values, one = editing_spots.added(face, source, spot, share, rng)
+            work.maps["r_d"] = editing_spots.with_values(source, values)
         else:
-            values, one = _removed(source, spot, share, chart, frame)
+            values, one = editing_spots.removed(source, spot, share, chart, frame)
             good = face_textures.valid_of(source) if source.valid is not None else None
-            moved = _with_values(source, values)
+            moved = editing_spots.with_values(source, values)
             if moved.stderr is not None:  # what is filled in is known no better than it changed
                 off = np.abs(values - source.values)
                 moved = dataclasses.replace(moved, stderr=np.hypot(moved.stderr, off))
@@ -452,68 +422,6 @@ def _edit_spots(
             )
     _say_unmarked(work, order)
     work.record["spots_done"] = told
-
-
-def spot_frame(face: Face) -> CommonFrame:
-    """Return a map of the whole face without seams, about as fine as its texture."""
-    if face.landmarks:
-        return face_textures.common_frame([face])
-    cylinder = common_parameterization.find_cylinder(face.position, face.surface)
-    places = cylinder.unroll(face.position[face.surface])
-    around = common_parameterization.frame_around((), np.empty((0, 2)), [places], size=64)
-    size = face_textures.size_for(around.side_mm, face.texel_mm())
-    return dataclasses.replace(around, size=size)
-
-
-def _added(
-    face: Face, source: SkinMap, spot: SpotOrder, share: Image, rng: np.random.Generator
-) -> tuple[Image, dict[str, Any]]:
-    drawn = pigment_spots.draw(
-        spot.kind, source.values, face.position, face.surface, share, amount=spot.amount,
-        density_per_cm2=spot.density_per_cm2, rng=rng,
-    )  # fmt: skip
-    gain = _bled(drawn.gain, face.surface, share)
-    values = np.where(gain == 1.0, source.values, source.values * gain)
-    return values, {
-        "drawn": len(drawn.center_mm),
-        "transmitted": drawn.transmitted.tolist(),
-        "camera": pigment_spots.CAMERA,
-        "illuminant": pigment_spots.ILLUMINANT,
-    }
-
-
-def _removed(
-    source: SkinMap, spot: SpotOrder, share: Image, chart: Chart, frame: CommonFrame
-) -> tuple[Image, dict[str, Any]]:
-    found = spot_removal.find(
-        source.values, face_textures.valid_of(source), chart, pixel_mm=frame.pixel_mm,
-        range_mm=pigment_spots.KINDS[spot.kind].range_mm,
-    )  # fmt: skip
-    part = (np.float32(-spot.amount) * share * found.share)[..., None]
-    wanted = source.values * (1 - part) + found.fill * part
-    ratio = np.where(part == 0.0, 1.0, wanted / np.maximum(source.values, albedo_vectors.LEAST))
-    gain = _bled(ratio.astype(np.float32), chart.on_surface, share)
-    values = np.where(part == 0.0, source.values * gain, wanted)
-    values = np.where(gain == 1.0, source.values, values)
-    return values.astype(np.float32), {"found": found.spots}
-
-
-def _bled(gain: Image, surface: Bools, share: Image) -> Image:
-    """Carry factors two texels beyond the rims of a texture's islands, where lookups reach."""
-    rim = ndimage.binary_dilation(surface, iterations=2) & ~surface & (share > 0)
-    if not rim.any():
-        return gain
-    filled = texture_fill.push_pull(np.log(gain), surface.astype(np.float32), mask=surface | rim)
-    return np.where(rim[..., None], np.exp(filled.values), gain).astype(np.float32)
-
-
-def _with_values(source: SkinMap, values: Image) -> SkinMap:
-    """Return a map with other values, its standard error scaled as they are."""
-    error = source.stderr
-    if error is not None:
-        ratio = np.abs(values) / np.maximum(np.abs(source.values), np.float32(1e-12))
-        error = np.where(values == source.values, error, error * ratio)
-    return dataclasses.replace(source, values=values, stderr=error)
 
 
 def _say_unmarked(work: _Work, order: Order) -> None:

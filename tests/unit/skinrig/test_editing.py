@@ -12,7 +12,8 @@ from model.skin_reflectance import lobes_of
 from model.trait_storage import load
 from skinrig import editing, face_textures, png
 from skinrig.cli import main
-from skinrig.editing import EditError, Order, SpotOrder
+from skinrig.editing import EditError, Order
+from skinrig.editing_spots import SpotOrder
 
 
 @pytest.fixture(scope="module")
