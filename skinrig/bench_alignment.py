@@ -196,7 +196,7 @@ def aligned(*, toy: bool) -> StageBenchmark:
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
     seen = moved_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
     still = moved_face(face, np.zeros_like(away), state="exercise", noise=0.005, rng=rng)
-    settings: list[tuple[int, int]] = [(24, 0), (24, 2)]
+    settings: list[tuple[int, int]] = [(8, 0), (24, 0), (48, 0), (24, 2)]
     if not toy:
         settings = [(8, 0), (8, 2), (24, 0), (24, 1), (24, 2), (24, 4), (48, 0), (48, 2),
                     (0, 0), (0, 2)]  # fmt: skip

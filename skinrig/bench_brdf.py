@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -14,7 +15,7 @@ from model import brdf_tables, microfacet
 from model.brdf_tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
 from skinrig import brdf_truth
-from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure
+from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure, once
 
 FloatArray = NDArray[np.float64]
 
@@ -128,16 +129,8 @@ def surface(*, toy: bool) -> StageBenchmark:
             timing = measure(lambda on=mixed: run(on=on), repeats=1, memory=False)  # type: ignore[misc]
             lobe = _lobes(run("cbrt", on=mixed).weights, mixed, p)
             points.append(point("NMF, refitted", timing, lobe, rank=rank))
-        start = time.perf_counter()
-        lobe = _ggx(p, given)
-        seconds = time.perf_counter() - start
-        points.append(point("GGX", Timing(seconds, (seconds, seconds), seconds, 0.0), lobe))
-        start = time.perf_counter()
-        lobe = _rooted(p, given, basis)
-        seconds = time.perf_counter() - start
-        points.append(
-            point("roots of elements", Timing(seconds, (seconds, seconds), seconds, 0.0), lobe)
-        )
+        points.append(point("GGX", *once(partial(_ggx, p, given))))
+        points.append(point("roots of elements", *once(partial(_rooted, p, given, basis))))
     faster, excess = _beside_scipy(basis, toy=toy)
     limits = (
         Limit("median error of all light under lights left out", error, HELD_OUT_ERROR, "<=", "%"),

@@ -12,6 +12,7 @@ from model import color_table, metrics
 from model.tissue_optics import ANISOTROPY_SKIN
 from reconstruction import chromophores
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure
+from skinrig.evaluation import BANDS
 
 Floats = NDArray[np.float64]
 
@@ -71,8 +72,28 @@ def inversion(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         limits,
-        by_band={},
+        by_band=_by_band(table, 500 if toy else 20_000, rng),
     )
+
+
+def _by_band(
+    table: color_table.ColorTable, count: int, rng: np.random.Generator
+) -> dict[str, float]:
+    """Return the median error of melanin in percent, shading free, from light skin to dark."""
+    errors = {}
+    for low, high in BANDS:
+        c_m = rng.uniform(low, min(high, table.c_m_max), count)
+        c_hd = rng.uniform(0.02, 0.08, count)
+        color = table.lookup(c_m, c_hd)
+        noisy = color * (1 + NOISE * rng.standard_normal(color.shape))
+        found = chromophores.invert(
+            noisy.astype(np.float32)[None], table,
+            variance=(NOISE * color[None]).astype(np.float32) ** 2,
+        )  # fmt: skip
+        off = 100 * np.abs(found.melanin[0] / c_m - 1)[found.valid[0]]
+        if off.size:
+            errors[f"C_m {low:g}–{high:g}"] = float(np.median(off))
+    return errors
 
 
 def _scipy_seconds(rgb: NDArray[np.floating], table: color_table.ColorTable) -> float:

@@ -53,7 +53,7 @@ def fibre_readings(*, toy: bool) -> StageBenchmark:
     away: FloatArray = np.zeros(0)
     relative: FloatArray = np.zeros(0)
     bound: FloatArray = np.ones(1)
-    for count in (1, 23) if toy else COUNTS:
+    for count in (1, 3, 8, 23) if toy else COUNTS:
         chosen = _spread(len(bench.times), count)
 
         def call(chosen: Sequence[int] = chosen, draw: int = 0) -> FibreReadings:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 
@@ -11,7 +10,7 @@ from capture.plan.flicker import FlickerReport, flicker_of_rows
 from capture.plan.light_order import ORDERS, best_order
 from capture.plan.rows import LedRow
 from capture.rig import LedLimits, Rig, load_rig
-from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
+from skinrig.benchmark import Limit, Point, StageBenchmark, once
 
 DWELL_S = 1.0 / 12.0
 LESS_FLICKER = 5.0
@@ -28,13 +27,10 @@ def light_order(*, toy: bool) -> StageBenchmark:
     orders: dict[str, Callable[[Rig], list[int]]] = dict(ORDERS)
     orders["chosen"] = partial(best_order, dwell_s=DWELL_S)
     for name, order in orders.items():
-        start_s = time.perf_counter()
-        shown = order(rig)
-        seconds = time.perf_counter() - start_s
+        timing, shown = once(partial(order, rig))
         for gaps in (False, True) if name == "spiral" else (False,):
             found[name, gaps] = _flicker(rig, shown, gaps=gaps)
             error = 100.0 * found[name, gaps].rms
-            timing = Timing(seconds, (seconds, seconds), seconds, 0.0)
             knobs = {
                 "order": name,
                 "gaps": "dark" if gaps else "none",

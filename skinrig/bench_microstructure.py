@@ -443,7 +443,7 @@ def passes(*, toy: bool) -> StageBenchmark:
         tried = [(0.0, 0.0), *((v, 0.0) for v in values), *((0.0, v) for v in values)]
     points, errors = [], {}
     draws = 1 if toy else 3
-    samplings: tuple[Sampling, ...] = ("cubic",) if toy else ("cubic", "linear")
+    samplings: tuple[Sampling, ...] = ("cubic", "linear")
     for sigma_px in (2.0,) if toy else (1.5, 3.0):
         for sampling in samplings:
             for turn, growth in tried if sampling == "cubic" else tried[::5]:

@@ -55,7 +55,7 @@ def inversion(*, toy: bool) -> StageBenchmark:
         )  # fmt: skip
 
     points = [_point({"way": "each alone", "states": 2}, alone, lambda: alone() - truth, mask)]
-    settings: list[tuple[int, float | None]] = [(2, None), (2, 3.0)]
+    settings: list[tuple[int, float | None]] = [(2, None), (3, None), (2, 3.0)]
     if not toy:
         settings = [(2, None), (4, None), (7, None), (7, 3.0), (7, 8.0)]
     for count, window in settings:

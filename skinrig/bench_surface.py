@@ -39,7 +39,7 @@ def lumitexels(*, toy: bool) -> StageBenchmark:
     seen = [_seen(camera) for camera in cameras]
     points = []
     rate = peak = 0.0
-    counts = (500,) if toy else (2_000, 10_000, 40_000)
+    counts = (250, 500) if toy else (2_000, 10_000, 40_000)
     for count, kind in [(n, k) for n in counts for k in ("memory", "disk")]:
         where = sphere.vertices[:count]
         surface = Surface(where, where / RADIUS_MM)
@@ -111,7 +111,7 @@ def filling(*, toy: bool) -> StageBenchmark:
         axis=-1,
     ).astype(np.float32)
     points = []
-    for share in (0.05, 0.25, 0.75):
+    for share in (0.05, 0.15, 0.35, 0.75):
         weight = (rng.random((side, side)) < share).astype(np.float32)
         weight[side // 3 : side // 3 + side // 16, side // 3 : side // 2] = 0.0
         timing = measure(

@@ -120,7 +120,7 @@ def growth(*, toy: bool) -> StageBenchmark:
     truth = slope_histogram(patches)
     halves = [slope_histogram(patches[part::2]) for part in (0, 1)]
     knobs = (
-        ((24, 8, 4), (40, 16, 4))
+        ((24, 8, 4), (32, 12, 4), (40, 16, 4))
         if toy
         else ((64, 32, 16), (96, 32, 16), (128, 64, 16), (192, 64, 1), (192, 64, 16),
               (192, 64, 64), (256, 64, 16), (256, 128, 16))

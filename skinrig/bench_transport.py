@@ -102,7 +102,7 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
     radii = np.array(probe.radius_mm)
     stack = LayerStack((Layer(inf, RED[0], RED[1] / (1.0 - G), G, ETA),))
     points = []
-    for photons in (2000,) if toy else (5000, 20_000, 80_000, 320_000):
+    for photons in (1000, 2000) if toy else (5000, 20_000, 80_000, 320_000):
 
         def next_event(photons: int = photons) -> Any:
             return fibre_profile(
@@ -113,7 +113,7 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
         run = next_event()
         relative = 100.0 * run.stderr / run.reflectance_per_mm2
         points.append(_point({"score": "next event", "photons": photons}, timing, relative))
-    for photons in (2000,) if toy else (80_000, 320_000):
+    for photons in (1000, 2000) if toy else (80_000, 320_000):
 
         def in_the_cone(photons: int = photons) -> Floats:
             return _in_the_cone(radii, photons)

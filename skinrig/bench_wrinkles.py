@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +15,7 @@ from model import metrics, wrinkle_differences, wrinkle_storage, wrinkles
 from model import texture_resampling as resampling
 from model.wrinkles import JIMENEZ2011, Layer
 from reconstruction import wrinkle_fit, wrinkle_texels, wrinkle_weights
-from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure
+from skinrig.benchmark import Limit, Point, StageBenchmark, measure, once
 
 Floats = NDArray[np.float64]
 
@@ -153,7 +154,7 @@ def fitting(*, toy: bool) -> StageBenchmark:
     side = 64 if toy else 512
     neutral, states = furrowed_face(side, rng=np.random.default_rng(0))
     points = []
-    sizes = ((64, 16), (16, 16)) if toy else (
+    sizes = ((64, 16), (32, 16), (16, 16), (32, 8)) if toy else (
         (512, 64), (256, 64), (128, 64), (64, 64), (256, 256), (256, 16)
     )  # fmt: skip
     for map_side, mask_side in sizes:
@@ -164,13 +165,8 @@ def fitting(*, toy: bool) -> StageBenchmark:
                 neutral, states, masks, size=(map_side, map_side), clamp="signed"
             )
 
-        begin = time.perf_counter()
-        found = run()
-        cold_s = time.perf_counter() - begin
-        begin = time.perf_counter()
-        run()
-        warm_s = time.perf_counter() - begin
-        timing = Timing(warm_s, (warm_s, warm_s), cold_s, 0.0)
+        cold, found = once(run)
+        timing = dataclasses.replace(once(run)[0], cold_s=cold.seconds)
         model = found.model()
         error, interval = _mean_error(model, states)
         size = wrinkle_storage.footprint((map_side, map_side), (mask_side, mask_side))
@@ -320,7 +316,7 @@ def weighing(*, toy: bool) -> StageBenchmark:
     draws = 4 if toy else 12
     true = np.array([0.3, 0.8, 0.4, 0.7, 0.25, 0.5, 0.6, 0.2])
     points, ratios = [], []
-    for side in (64,) if toy else (128, 256):
+    for side in (64, 96) if toy else (128, 256):
         base = 0.1 * rng.standard_normal((side, side, 2))
         wrinkle = gaussian_filter(rng.standard_normal((64, 64, 2)), (1.5, 1.5, 0))
         layer = Layer(0.5 * wrinkle / np.abs(wrinkle).max(), zone_masks(32))

@@ -9,11 +9,13 @@ import time
 import tracemalloc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from skinrig import resident_memory
+
+Made = TypeVar("Made")
 
 SCHEMA = "skinrig.bench/1"
 TRACED_S = 0.1
@@ -79,6 +81,27 @@ def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool = True) -
         peak_memory_mb=_allocated_mb(call) if traced else rise.mb or 0.0,
         memory_of="allocated" if traced else "resident",
     )
+
+
+def once(call: Callable[[], Made]) -> tuple[Timing, Made]:
+    """Make something a single time, for a call too long to repeat: cold and warm are one.
+
+    Returns
+    -------
+    timing : Timing
+    made
+        What the call returned.
+
+    Examples
+    --------
+    >>> once(lambda: sum(range(100)))[1]
+    4950
+    """
+    with resident_memory.watched() as rise:
+        start = time.perf_counter()
+        made = call()
+        seconds = time.perf_counter() - start
+    return Timing(seconds, (seconds, seconds), seconds, rise.mb or 0.0, "resident"), made
 
 
 def _allocated_mb(call: Callable[[], Any]) -> float:
