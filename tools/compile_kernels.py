@@ -48,7 +48,7 @@ def _compile(module: str, name: str, signature: str) -> bool:
         return False
     try:
         kernel.compile(given)
-    except (NumbaError, TypeError):
+    except (NumbaError, TypeError, RuntimeError):  # the last of kernels with types of their own
         return False
     return True
 

@@ -39,6 +39,7 @@ def test_a_kernel_that_does_not_fit_is_counted_and_left_to_its_first_call(tool):
         ("rigsim.atlas", "no_such", good),
         ("rigsim.atlas", "sample", good),  # no kernel
         ("rigsim.head", "_distance", text),
+        ("model.photon_kernels", "evaluate", good),  # has types of its own, and takes no other
         ("rigsim.head", "_distance", "(Array(float64"),
         ("rigsim.head", "_distance", "__import__('os')"),
     ]:
