@@ -44,7 +44,7 @@ def geometry(*, toy: bool) -> StageBenchmark:
     rig = load_rig("dome").subset(views=views).resized(324 if toy else 650)
     dome = build(rig, seed=SEED, tolerances=Tolerances(distortion=0.2))
     scene = target_scene("charuco", rig, seed=SEED, dome=dome)
-    counts = (6, 8) if toy else (6, 8, 10, 12)
+    counts = (5, 6, 7, 8) if toy else (6, 8, 10, 12)
     sightings: dict[tuple[str, int], Sighting] = {}
     for pose in range(counts[-1]):
         scene.show(pose)
@@ -97,7 +97,7 @@ def lights(*, toy: bool) -> StageBenchmark:
     cameras = {view.name: CameraPose.nominal(view) for view in dome.rig.views}
     spheres: dict[int, mirror_sphere.SpherePlace] = {}
     seen: list[mirror_lights.Highlights] = []
-    most = 2 if toy else 4
+    most = 4
     for number in range(most):
         scene.show(number)
         _add_sphere(scene, rig, cameras, number, spheres, seen)

@@ -134,7 +134,7 @@ def motion(*, toy: bool) -> StageBenchmark:
     by_size: dict[str, float] = {}
     for drift_mm in (1.0,) if toy else (0.3, 1.0, 3.0):
         seen = simulate(width_px=width, views=views, drift_mm=drift_mm, times_s=times)
-        for tracks in (60, 200) if toy else (30, 100, 300):
+        for tracks in (30, 60, 120, 200) if toy else (30, 100, 300):
             points.append(_point(seen, drift_mm, tracks, toy=toy))
         by_size[f"moved by {seen.moved_mm().mean():.2g} mm"] = points[-1].error
     return StageBenchmark(
