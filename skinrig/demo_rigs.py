@@ -30,7 +30,12 @@ FLASH_WANT = (
 DOME_SUBJECT = "III"
 DOME_WANT = (
     "half_vector_normals", "normals", "normals_refined", "r_d", "lobe_residual", "samples",
+    "basis_weight_0", "basis_weight_1", "basis_weight_2", "basis_weight_3",
 )  # fmt: skip
+DOME_HELD_OUT = "lights=0,24"
+"""Lights, by number, whose photographs no fit sees: renderings are compared with them."""
+DOME_COMPARED = 3
+"""How many of their photographs are compared."""
 DOME_WIDTH_PX = 320
 """Pixels across each of the dome's cameras, unless said otherwise."""
 
@@ -131,9 +136,26 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
         appearance = out / f"appearance-dome-{DOME_SUBJECT}"
         pipeline.reconstruct(
             capture.session, want=DOME_WANT, out=appearance, calibration=calibration,
-            truth=capture.truth.name if capture.truth else "",
+            truth=capture.truth.name if capture.truth else "", hold_out=DOME_HELD_OUT,
         )  # fmt: skip
         found.errors += _surface_rows(appearance, capture.truth)
+    with share("dome: render photographs that no fit has seen"):
+        from skinrig.rendering_evaluation import FULL, evaluate_folders
+
+        compared = evaluate_folders(
+            appearance, capture.session, out / f"pictures-dome-{DOME_SUBJECT}",
+            calibration=calibration, count=DOME_COMPARED, seed=seed,
+        )  # fmt: skip
+    found.tables.append(
+        {
+            "title": "Luminance of photographs that no fit has seen, on lit pixels",
+            "head": ["model", "median error %", "all skin %"],
+            "rows": [
+                [name, 100 * row["median"], 100 * row["total_error"]]
+                for name, row in ((FULL, compared[FULL]), *compared["ablation"].items())
+            ],
+        }
+    )
     found.tables.append(
         {
             "title": "Light of the dome's capture",
