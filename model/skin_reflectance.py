@@ -168,7 +168,7 @@ def assemble(
             "makes them"
         )
     used = ["position", "r_d", found, *names]
-    maps = [_map(dome, name) for name in used]
+    maps = [_normals(dome) if name == found else _map(dome, name) for name in used]
     shape = maps[0].values.shape[:2]
     valid = np.ones(shape, bool)
     for name, one in zip(used, maps, strict=True):
@@ -366,6 +366,21 @@ def _map(appearance: SkinAppearance, name: str) -> SkinMap:
             f"maps: got no {name!r}; `skinrig reconstruct --want {name}` makes it"
         )
     return appearance.maps[name]
+
+
+def _normals(appearance: SkinAppearance) -> SkinMap:
+    """Return the better normals, and the others where those could not be had."""
+    there = [appearance.maps[name] for name in NORMALS if name in appearance.maps]
+    if len(there) == 1 or there[0].values.shape != there[1].values.shape:
+        return there[0]
+    best, other = there
+    good = _valid(best)
+    return SkinMap(
+        np.where(good[..., None], best.values, other.values),
+        best.unit,
+        valid=good | _valid(other),
+        description=best.description,
+    )
 
 
 def _valid(one: SkinMap) -> NDArray[np.bool_]:
