@@ -1,6 +1,7 @@
 """The points that the reflectance benchmark judges lobes by."""
 
 import numpy as np
+import pytest
 
 from skinrig import bench_reflectance
 
@@ -17,6 +18,7 @@ def test_points_of_the_benchmark_lie_above_their_horizon_and_keep_lights_apart(r
     assert (p.total.min(axis=-1) > p.surface * (1 - 1e-5))[p.seen].all()
 
 
+@pytest.mark.long
 def test_more_lobes_predict_lights_that_were_left_out_better():
     stage = bench_reflectance.model(toy=True)
     by_rank = {p.knobs["rank"]: p.error for p in stage.points if p.knobs["part"] == "lobes"}
