@@ -1,6 +1,7 @@
 import dataclasses
 import io
 import json
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -128,3 +129,35 @@ def test_spaces_are_found_by_their_traits(library):
     assert list(library.having("tan")) == ["albedo"]
     with pytest.raises(TraitError, match="got 'sweat', expected one of age, lotion, rare, tan"):
         library.having("sweat")
+
+
+def test_the_packaged_traits_are_simulated_and_say_how_near_the_truth_they_come():
+    library = trait_storage.default()
+    assert library.source == "simulated"
+    worn = {"cold", "hot", "sweat", "lotion", "makeup", "powder"}
+    assert worn <= set(library.spaces["surface"].traits)
+    assert {"tan", "beard", "freckles", "age", "male", "asian"} <= set(
+        library.spaces["albedo"].traits
+    )
+    told = library.parameters["cosine_to_truth"]
+    assert worn <= set(told["surface"])
+    assert told["surface"]["lotion"] > 0.95
+    assert min(told["albedo"][name] for name in ("tan", "beard", "hot", "cold", "makeup")) > 0.9
+    size = len(resources.files("model").joinpath("data", trait_storage.PACKAGED).read_bytes())
+    assert size <= 1_500_000
+    for space in library.spaces.values():
+        assert max(space.storage_error.values()) < 0.03
+
+
+def test_packaged_lotion_makes_skin_sharper_and_comes_off_again():
+    space = trait_storage.default().spaces["surface"]
+    bare = space.center - 0.5 * space.trait("lotion").vector
+    bare = space.feasible.project(bare, space.metric)
+    oiled = space.outcome(bare, {"lotion": 0.6})
+    sharp = np.array([n in ("ggx 0.14 eta 1.4", "ggx 0.18 eta 1.4") for n in space.names])
+    kin = space.metric[sharp].sum(axis=0)
+    assert oiled.sample @ kin > 1.05 * (bare @ kin)
+    back = space.edit(oiled.sample, {"lotion": -0.6})
+    gap = np.sqrt((back - bare) @ space.metric @ (back - bare))
+    assert gap <= oiled.return_bound + 1e-9
+    assert oiled.share < 0.1
