@@ -45,15 +45,18 @@ def session(*, toy: bool) -> StageBenchmark:
             rows += _invert(folder, last)
         timing = measure(lambda: _invert(folder, last, "again"), repeats=1, memory=False)
     by_method = {row.method: row for row in evaluation.by_method(rows)}
-    points = [
-        Point(
-            {"method": method, "media": len({row.name for row in rows})},
-            timing, 100 * by_method[method].median,
-            _interval([abs(row.relative) for row in rows if row.method == method and row.valid]),
-        )
-        for method in METHODS
-        if method in by_method
-    ]  # fmt: skip
+    points = []
+    for method in (name for name in METHODS if name in by_method):
+        valid = [row for row in rows if row.method == method and row.valid]
+        for channel in ("all", *sorted({row.channel for row in valid})):
+            sizes = [abs(row.relative) for row in valid if channel in ("all", row.channel)]
+            points.append(
+                Point(
+                    {"method": method, "channel": channel,
+                     "media": len({row.name for row in rows})},
+                    timing, 100 * float(np.median(sizes)), _interval(sizes),
+                )
+            )  # fmt: skip
     return StageBenchmark(
         "probe-session",
         "median error of sigma_tr, %",

@@ -1,5 +1,6 @@
 """Each benchmark once at toy size: it runs, and its document holds what the schema promises."""
 
+import itertools
 import json
 
 import pytest
@@ -14,11 +15,17 @@ def test_a_stage_gives_points_with_errors_and_intervals(stage, tmp_path, capsys)
     written = json.loads((tmp_path / "bench.json").read_text())
     assert written == plain(document)
     points = written["stages"][stage]["points"]
-    assert len(points) >= 2
-    assert any(point["on_front"] for point in points)
+    # small sizes have the fewest: a run within any budget shows so many
+    assert len(points) >= 4
+    front = sorted((p["seconds"], p["error"]) for p in points if p["on_front"])
+    assert front
+    assert all(a[0] < b[0] and a[1] > b[1] for a, b in itertools.pairwise(front))
+    assert written["stages"][stage]["reference"]
+    assert written["stages"][stage]["reference_error"] >= 0.0
     for point in points:
         low, high = point["error_interval"]
         assert point["seconds"] > 0
+        assert (point["efficiency"] is None) == (not point["cramer_rao_bound"])
         assert low <= point["error"] <= high or point["error"] == pytest.approx(high, rel=0.5)
 
 
