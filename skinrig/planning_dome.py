@@ -8,8 +8,7 @@ reconstruction itself states: samples misplaced by part of a pixel, and relief t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,123 +20,16 @@ from capture.plan.dome import EXPOSURES_S, dome_plan
 from capture.plan.rows import lights_of
 from capture.rig import Rig
 from reconstruction import light_selection, surface_estimates
-from reconstruction.light_selection import Information, Prediction
+from reconstruction.light_selection import Prediction
+from skinrig.dome_sight import Sight, sight
 from skinrig.planning import Choice, Forecast, PlanningError, light_of
 
 Floats = NDArray[np.float64]
 
-POINTS = 1500
-"""Points of the face that the forecast looks at."""
-LIGHT_ERROR = 0.015
-"""Relative error that all cameras share of what one light shows: gloss outside the part that is
-left out, a light's intensity, a shadow's edge."""
 VALID_SHARE = 0.9
 """Of the points that the whole dome gives an estimate, so many must keep one."""
 FORECAST_SPREAD = {"normals": 0.2, "r_d": 0.4}
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sight:
-    """What the dome's lights and cameras reach of a face."""
-
-    normals: Floats
-    """(P, 3)."""
-    to_light: Floats
-    """(P, L, 3)."""
-    variance: Floats
-    """(P, L, V): variance of a sample over its square; infinite where it tells nothing."""
-    lit: NDArray[np.bool_]
-    """(P, L): nothing stands between the point and the light."""
-    seen: NDArray[np.bool_]
-    """(P, V): nothing stands between the point and the camera."""
-    area_mm2: Floats
-    """(P,)."""
-    systematic_rad: Floats
-    """(P,)."""
-    pixel_mm: float
-
-    def information(self, views: Sequence[int]) -> Information:
-        """Return what each light tells of each point through some of the cameras."""
-        seen = self.variance[..., list(views)]
-        with np.errstate(divide="ignore"):
-            noise = 1.0 / np.sum(1.0 / seen, axis=-1)
-        enough = self.seen[:, list(views)].sum(-1) >= surface_estimates.LEAST_VIEWS
-        noise = np.where(enough[:, None], noise + LIGHT_ERROR**2, np.inf)
-        return light_selection.information(
-            self.normals, self.to_light, noise, reaches=self.lit & enough[:, None],
-            importance=self.area_mm2, systematic_rad=self.systematic_rad,
-        )  # fmt: skip
-
-
-def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -> Sight:
-    """Look at a simulated face from the dome.
-
-    Parameters
-    ----------
-    rig
-        The dome as drawn.
-    subject
-        Preset of the face, see `rigsim.subject.PRESETS`.
-    seed
-        Of the face and of the points.
-    points
-        How many to look at; `POINTS` by default.
-    """
-    from rigsim.led_light import white_intensity
-    from rigsim.render import OFFSET_MM, Caster
-    from rigsim.sensor import sensor_of
-    from rigsim.subject import make_subject
-    from rigsim.surface_brdf import skin_surface
-
-    points = POINTS if points is None else points
-    face = make_subject(subject, seed=seed, size=256)
-    texels = np.flatnonzero(face.atlas.covered & (face.hair < 0.5))
-    along_u, along_v = face.atlas.texel_mm()
-    area = (along_u * along_v).reshape(-1)[texels]
-    rng = np.random.default_rng([seed, 17])
-    drawn = texels[rng.choice(len(texels), points, p=area / area.sum())]  # evenly over the skin
-    place = face.atlas.position_mm.reshape(-1, 3)[drawn].astype(np.float64)
-    normal = face.atlas.normal.reshape(-1, 3)[drawn].astype(np.float64)
-    view = rig.views[0]
-    surface = skin_surface(face, view.spectral_sensitivity, rig.lights[0].illuminant)
-    r_d = surface.r_d.reshape(-1, 3)[drawn].astype(np.float64).mean(axis=-1)
-
-    caster = Caster(face.mesh)
-    start = place + OFFSET_MM * normal
-    lights = np.array([light.position_mm for light in rig.lights], np.float64)
-    views = np.array([one.position_mm for one in rig.views], np.float64)
-    to_light, light_mm, lit = _toward(caster, start, normal, lights)
-    to_view, _, seen = _toward(caster, start, normal, views)
-    cos_light = np.einsum("plk,pk->pl", to_light, normal)
-    cos_view = np.einsum("pvk,pk->pv", to_view, normal)
-    steep = cos_light > surface_estimates.LEAST_COS_LIGHT
-    facing = cos_view > surface_estimates.LEAST_COS_VIEW
-    half = to_light[:, :, None] + to_view[:, None]
-    half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    matte = np.einsum("plvk,pk->plv", half, normal) < math.cos(surface_estimates.HIGHLIGHT_RAD)
-
-    white = np.array([white_intensity(light, view).mean() for light in rig.lights])
-    rate = r_d[:, None] * white * cos_light / light_mm**2  # full scales per second
-    chip = sensor_of(view)
-    variance = _relative_variance(rate, chip.full_well_e, chip.read_noise_e)
-    there = (lit & steep)[:, :, None] & (seen & facing)[:, None] & matte
-    pixel = float(
-        2.0 * np.median(np.linalg.norm(views, axis=-1)) * 1e-3 * view.pixel_um / view.focal_mm
-    )  # mm on the subject, of a cell of the color filter
-    return Sight(
-        normal,
-        to_light,
-        np.where(there, variance[:, :, None], np.inf),
-        lit,
-        seen,
-        np.ones(len(place)),
-        np.hypot(
-            surface_estimates.MISPLACED_PX * pixel * _bend(face, drawn, pixel),
-            surface_estimates.UNRESOLVED_RAD,
-        ),
-        pixel,
-    )
 
 
 def choose(
@@ -328,49 +220,6 @@ def _choice(
 
 def _interval(name: str, value: float) -> tuple[float, float]:
     return value / (1.0 + FORECAST_SPREAD[name]), value * (1.0 + FORECAST_SPREAD[name])
-
-
-def _toward(
-    caster: Any, start: Floats, normal: Floats, places_mm: Floats
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Return unit vectors, distances and free sight from points to places."""
-    away = places_mm[None] - start[:, None]
-    length = np.linalg.norm(away, axis=-1)
-    way = away / length[..., None]
-    front = np.einsum("pqk,pk->pq", way, normal) > 0
-    free = np.zeros(front.shape, np.bool_)
-    point, place = np.nonzero(front)
-    free[point, place] = ~caster.blocked(
-        start[point], way[point, place], 0.999 * length[point, place]
-    )
-    return way, length, free
-
-
-def _relative_variance(rate: Floats, full_well_e: float, read_noise_e: float) -> Floats:
-    """Return the variance of merged brackets over the square of the light."""
-    told = np.zeros(rate.shape)
-    for seconds in EXPOSURES_S:
-        electrons = np.maximum(rate, 0.0) * seconds * full_well_e
-        kept = (electrons > 0) & (electrons < 0.95 * full_well_e)
-        told += np.where(kept, electrons**2 / (electrons + read_noise_e**2), 0.0)
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.where(told > 0, 1.0 / told, np.inf))
-
-
-def _bend(face: Any, drawn: NDArray[np.intp], pixel_mm: float) -> Floats:
-    """Return how fast the face's normals turn at texels, rad/mm, over edges as in the scan."""
-    mesh = face.mesh
-    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
-    turn = np.linalg.norm(mesh.normals[edges[:, 0]] - mesh.normals[edges[:, 1]], axis=1)
-    apart = np.linalg.norm(mesh.vertices_mm[edges[:, 0]] - mesh.vertices_mm[edges[:, 1]], axis=1)
-    squared = np.square(turn / np.maximum(apart, 0.25 * pixel_mm))
-    total, count = np.zeros(len(mesh.vertices_mm)), np.zeros(len(mesh.vertices_mm))
-    for side in (0, 1):
-        np.add.at(total, edges[:, side], squared)
-        np.add.at(count, edges[:, side], 1.0)
-    bend = np.sqrt(total / np.maximum(count, 1.0))
-    corner = mesh.faces[face.atlas.prim.reshape(-1)[drawn]]
-    return np.asarray(bend[corner].mean(axis=1))
 
 
 def _r_d_error(prediction: Prediction, look: Sight) -> float:

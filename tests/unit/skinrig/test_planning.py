@@ -7,7 +7,7 @@ import pytest
 
 from capture.plan import Plan
 from capture.rig import load_rig
-from skinrig import planning, planning_dome
+from skinrig import dome_sight, planning
 from skinrig.cli import main
 
 
@@ -39,7 +39,7 @@ def rig():
 
 @pytest.fixture(scope="module")
 def look(rig):
-    return planning_dome.sight(rig, "III", points=300)
+    return dome_sight.sight(rig, "III", points=300)
 
 
 def test_lights_from_behind_reach_no_point_that_looks_ahead(rig, look):
@@ -52,14 +52,14 @@ def test_lights_from_behind_reach_no_point_that_looks_ahead(rig, look):
 
 
 def test_darker_skin_and_fewer_cameras_tell_less(rig, look):
-    dark = planning_dome.sight(rig, "VI", points=300)
+    dark = dome_sight.sight(rig, "VI", points=300)
     every = look.information(range(16)).weight.sum()
     assert dark.information(range(16)).weight.sum() < every
     assert look.information(range(4)).weight.sum() < every
 
 
 def test_a_plan_keeps_what_it_promises_and_says_what_it_leaves_out(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(planning_dome, "POINTS", 300)
+    monkeypatch.setattr(dome_sight, "POINTS", 300)
     file = tmp_path / "plan.json"
     code = main(["plan", "dome", "--want", "normals<=1.5deg", "--width", "320", "--out", str(file),
                  "--json"])  # fmt: skip
@@ -82,7 +82,7 @@ def test_a_plan_keeps_what_it_promises_and_says_what_it_leaves_out(tmp_path, cap
 
 
 def test_what_is_out_of_reach_says_why(capsys, monkeypatch):
-    monkeypatch.setattr(planning_dome, "POINTS", 200)
+    monkeypatch.setattr(dome_sight, "POINTS", 200)
     assert main(["plan", "dome", "--want", "normals<=0.05deg", "--width", "320",
                  "--most-lights", "25"]) == 1  # fmt: skip
     said = capsys.readouterr().out
