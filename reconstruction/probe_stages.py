@@ -220,8 +220,8 @@ def _profile_document(profiles: Sequence[Profile]) -> dict[str, Any]:
 
 
 def _subsurface(profiles: Sequence[Profile], probe: Probe) -> Mapping[str, Any]:
-    fits = {method: _fitted(profiles, probe, method) for method in METHODS}
-    sites = _sites(fits[METHODS[0]])
+    fits = {method: fit_profiles(profiles, probe, method) for method in METHODS}
+    sites = site_values(fits[METHODS[0]])
     document = {
         "schema": "skinrig.subsurface/1",
         "unit": "1/mm",
@@ -248,7 +248,9 @@ def _subsurface(profiles: Sequence[Profile], probe: Probe) -> Mapping[str, Any]:
     }
 
 
-def _fitted(profiles: Sequence[Profile], probe: Probe, method: Any) -> list[ProfileFit]:
+def fit_profiles(
+    profiles: Sequence[Profile], probe: Probe, method: Any = METHODS[0]
+) -> list[ProfileFit]:
     """Fit all profiles and channels, also with each common error at its uncertainty."""
     first = profiles[0].reflectance
     causes = len(first.common_per_mm2)
@@ -307,7 +309,7 @@ def _one(fit: SubsurfaceFit, index: tuple[int, ...]) -> SubsurfaceFit:
     return dataclasses.replace(fit, **{name: getattr(fit, name)[index] for name in names})
 
 
-def _sites(fits: Sequence[ProfileFit]) -> list[SiteValue]:
+def site_values(fits: Sequence[ProfileFit]) -> list[SiteValue]:
     """Average the placements of each site; what they share is not averaged away.
 
     Placements differ by more than their fits know of, as contact does: where their scatter is

@@ -15,23 +15,26 @@ Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON docum
 
 
 def plan(
-    rig: Annotated[str, typer.Argument(help="Name of a rig: dome.")],
+    rig: Annotated[str, typer.Argument(help="Name of a rig: dome, flash, gradient or probe.")],
     want: Annotated[
         str,
         typer.Option(
-            help="Medians over the face that must be reached, such as normals<=1deg,r_d<=3%; "
-            "empty: what the whole rig, or --forecast, will give."
+            help="Medians that must be reached: dome normals<=1deg,r_d<=3%; flash melanin<=12%,"
+            "hemoglobin<=25%; gradient normals<=2deg; probe sigma_tr<=3%. Empty: what the whole "
+            "rig, or --forecast, will give."
         ),
     ] = "",
     subject: Annotated[
-        str, typer.Option(help="Preset of the face that is forecast, I to VI.")
+        str, typer.Option(help="Preset of the skin that is forecast, I to VI.")
     ] = "III",
     width: Annotated[
         int | None, typer.Option(help="Pixels across the cameras; default: the rig's own.")
     ] = None,
-    most_lights: Annotated[int | None, typer.Option(help="No more lights than these.")] = None,
+    most_lights: Annotated[
+        int | None, typer.Option(help="No more lights of the dome than these.")
+    ] = None,
     valid_share: Annotated[
-        float, typer.Option(help="Of the skin that the whole rig reaches, so much must stay.")
+        float, typer.Option(help="Of what the whole rig gives an estimate, so much must keep it.")
     ] = 0.9,
     forecast: Annotated[
         Path | None, typer.Option(help="A plan, JSON: say what it will give instead.")
@@ -47,6 +50,8 @@ def plan(
     """Choose the smallest plan that reaches an error, and say what it leaves out.
 
     Example: skinrig plan dome --want "normals<=1deg,r_d<=3%" --out plan.json
+
+    Example: skinrig plan flash --want "melanin<=12%,hemoglobin<=25%" --subject II
 
     Example: skinrig plan dome --forecast plan.json
     """

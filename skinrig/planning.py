@@ -8,11 +8,16 @@ and knobs that it may turn; this module reads what is wanted and says what came 
 from __future__ import annotations
 
 import difflib
+import importlib
+import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from capture.plan import Plan
 from capture.rig import Rig, load_rig
@@ -187,8 +192,10 @@ def choose(
         The simulated face that is forecast.
     width_px
         Pixels across the cameras; None: the rig's own.
-    most_lights, valid_share
+    most_lights
         See `skinrig.planning_dome.choose`.
+    valid_share
+        Of what the whole rig gives an estimate, so much must keep one.
     forecast
         A plan, JSON, of which only the forecast is asked for.
 
@@ -198,19 +205,28 @@ def choose(
         For what cannot be read or planned.
     """
     wants = read_wants(want, rig_name)
-    if rig_name != "dome":
-        raise PlanningError(f"rig: got {rig_name!r}, but plans are chosen for the dome only")
-    from skinrig import planning_dome
-
+    own = _planner(rig_name)
     rig = load_rig(rig_name)
-    rig = rig if width_px is None else rig.resized(width_px)
+    if width_px is not None:
+        if rig_name == "probe":
+            raise PlanningError("--width: the probe's spots lie on its camera as it is; leave it")
+        # the gradient sphere keeps its pixels' size and gives up field, as its simulation does
+        rig = rig.cropped(width_px) if rig_name == "gradient" else rig.resized(width_px)
+    if most_lights is not None and rig_name != "dome":
+        raise PlanningError(f"--most-lights: is for the dome, not the {rig_name} rig")
     if forecast is not None:
         from skinrig.acquisition import read_plan
 
-        return planning_dome.foresee(rig, read_plan(forecast), wants, subject=subject, seed=seed)
-    return planning_dome.choose(
-        rig, wants, subject=subject, seed=seed, valid_share=valid_share, most_lights=most_lights
+        plan = read_plan(forecast)
+        if plan.rig != rig.name:
+            raise PlanningError(f"{forecast}: got a plan of {plan.rig!r}, expected {rig.name!r}")
+        found: Choice = own.foresee(rig, plan, wants, subject=subject, seed=seed)
+        return found
+    options: dict[str, Any] = {"most_lights": most_lights} if rig_name == "dome" else {}
+    chosen: Choice = own.choose(
+        rig, wants, subject=subject, seed=seed, valid_share=valid_share, **options
     )
+    return chosen
 
 
 def confirmed(
@@ -229,9 +245,52 @@ def confirmed(
     progress
         Is told each step.
     """
-    from skinrig import planning_dome
+    rows: list[dict[str, Any]] = _planner(choice.rig.name).confirm(
+        choice, out, subject=subject, seed=seed, progress=progress
+    )
+    return rows
 
-    return planning_dome.confirm(choice, out, subject=subject, seed=seed, progress=progress)
+
+def _planner(rig_name: str) -> Any:
+    """Return the module that plans for a rig: its `choose`, `foresee` and `confirm`."""
+    return importlib.import_module(f"skinrig.planning_{rig_name}")
+
+
+def interval_of(value: float, spread: float) -> tuple[float, float]:
+    """Return the interval of a forecast that is off by a relative spread.
+
+    Examples
+    --------
+    >>> interval_of(1.2, 0.2)
+    (1.0, 1.44)
+    """
+    return value / (1.0 + spread), value * (1.0 + spread)
+
+
+def median_of_normals(scale: ArrayLike) -> float:
+    """Return the median magnitude of a mixture of normal errors; infinite for none.
+
+    Parameters
+    ----------
+    scale : array_like
+        Their standard deviations, each as often as another.
+
+    Examples
+    --------
+    >>> round(median_of_normals([1.0, 1.0]), 4)
+    0.6745
+    """
+    from scipy.special import erf
+
+    s = np.maximum(np.asarray(scale, np.float64).reshape(-1), 1e-300)
+    if not s.size:
+        return math.inf
+    low, high = 0.0, 2.0 * float(s.max())
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        below = float(np.mean(erf(middle / (math.sqrt(2.0) * s))))
+        low, high = (middle, high) if below < 0.5 else (low, middle)
+    return 0.5 * (low + high)
 
 
 def lines(choice: Choice) -> list[str]:

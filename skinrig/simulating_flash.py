@@ -44,10 +44,12 @@ def simulate_flash(order: Order) -> Simulated:
         "rig": "flash", "width_px": width, "subject": order.subject, "target": target or "",
         "mesh": str(order.mesh or ""), "states": list(states), "repeats": order.repeats,
         "movement": order.movement,
+        **({} if order.plan is None else {"plan": order.plan.to_json()}),
     }  # fmt: skip
     # what cannot be built must fail before a folder is made
     scenes = _scenes(rig, order)
-    session = open_session(order, _plan(rig, target, states, order.repeats), rig, asked)
+    plan = order.plan or _plan(rig, target, states, order.repeats)
+    session = open_session(order, plan, rig, asked)
 
     def prompt(world: Any, state: str) -> None:
         world.scene = scenes[state]

@@ -58,6 +58,7 @@ def simulate_gradient(order: Order) -> Simulated:
         "target": order.target or "", "site": order.site or SITE,
         "angles": ",".join(f"{angle:g}" for angle in order.angles or ANGLES_DEG[order.size] or ()),
         "steps": "" if order.steps is None else f"{order.steps[0]}..{order.steps[1]}",
+        **({} if order.plan is None else {"plan": order.plan.to_json()}),
     }  # fmt: skip
     scene = make_scene(
         rig, order.target, site=order.site, preset=order.subject, seed=order.seed, plan=plan
@@ -93,6 +94,8 @@ def plan_of(rig: Rig, order: Order) -> Plan:
     """Return the plan of what is to be simulated."""
     if order.target is not None:
         return gradient_calibration_plan(rig, cast(GradientTarget, order.target))
+    if order.plan is not None:
+        return order.plan
     angles = ANGLES_DEG[order.size] if order.angles is None else order.angles
     return gradient_plan(rig, angles=angles, steps=order.steps)
 

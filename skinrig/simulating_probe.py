@@ -52,6 +52,7 @@ def simulate_probe(order: Order) -> Simulated:
         "target": order.target or "", "sites": ",".join(order.sites or SITES),
         "repeats": order.repeats, "angles": directions_of(order.angles),
         "all_brackets": order.all_brackets,
+        **({} if order.plan is None else {"plan": order.plan.to_json()}),
     }  # fmt: skip
     scene = make_scene(rig, order.target, subject=order.subject, seed=order.seed, size=order.size)
     if order.target is None:
@@ -107,6 +108,8 @@ def plan_of(rig: Rig, order: Order) -> Plan:
     """Return the plan of what is to be simulated."""
     if order.target is not None:
         return probe_calibration_plan(rig, cast(ProbeTarget, order.target), repeats=order.repeats)
+    if order.plan is not None:
+        return order.plan
     return probe_plan(
         rig, sites=order.sites or SITES, repeats=order.repeats, angles=directions_of(order.angles)
     )

@@ -1,0 +1,115 @@
+"""The flash rig's choice of frames, light and darks, on a small simulated face."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from capture.plan import Plan, flash_plan
+from capture.rig import load_rig
+from skinrig import planning, planning_flash
+from skinrig.cli import main
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return load_rig("flash")
+
+
+@pytest.fixture(scope="module")
+def look(rig):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planning_flash, "TEXTURE_PX", 128)
+        return planning_flash.sight(rig, "III", width_px=96)
+
+
+@pytest.fixture
+def small(monkeypatch, look):
+    monkeypatch.setattr(planning_flash, "sight", lambda *args, **kwargs: look)
+
+
+def test_more_light_frames_and_darks_leave_less_error_down_to_that_of_the_model(look):
+    def median(**settings):
+        return planning_flash.predict(look, **settings).median("melanin")
+
+    dim = median(repeats=1, power=0.0625, darks=1)
+    assert median(repeats=1, power=0.0625, darks=4) < dim
+    assert median(repeats=4, power=0.0625, darks=1) < dim
+    assert median(repeats=1, power=1.0, darks=1) < dim
+    still = replace(look, gain=0.0, floor=0.0)
+    floor = planning_flash.predict(still, repeats=1, power=1.0, darks=0).median("melanin")
+    assert floor < median(repeats=16, power=1.0, darks=4) < 1.2 * floor
+
+
+def test_four_frames_halve_what_noise_alone_leaves(look):
+    still = replace(look, gain=0.0, floor=0.0)
+
+    def noise(repeats):
+        every = {"power": 1.0, "darks": 0, "repeats": repeats}
+        whole = planning_flash.predict(look, **every)
+        rest = planning_flash.predict(still, **every)
+        both = whole.valid["melanin"] & rest.valid["melanin"]
+        return np.sqrt(whole.sigma["melanin"][both] ** 2 - rest.sigma["melanin"][both] ** 2)
+
+    # noise and model error share their bound, so that a sum of squares holds only about
+    assert np.median(noise(1) / noise(4)) == pytest.approx(2.0, rel=0.05)
+
+
+def test_the_plan_leaves_out_what_the_errors_wanted_do_not_need(small, tmp_path, capsys):
+    file = tmp_path / "plan.json"
+    want = "melanin<=8%,hemoglobin<=20%"
+    assert main(["plan", "flash", "--want", want, "--out", str(file), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    plan = Plan.from_json(file.read_text())
+    assert {step.index["polarizer"] for step in plan.steps} == {"crossed"}
+    assert document["knobs"]["power"] < 1.0
+    assert document["saved_seconds"] > 20.0
+    assert all(one["median"] <= one["wanted"] for one in document["forecasts"])
+    # half the light would not have been enough
+    look = planning_flash.sight(None, "III")
+    power = document["knobs"]["power"] / 2
+    dimmer = planning_flash.predict(look, repeats=1, power=power, darks=0)
+    assert dimmer.median("melanin") > 0.08 or dimmer.median("hemoglobin") > 0.2
+    assert main(["plan", "flash", "--forecast", str(file), "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    for one, other in zip(document["forecasts"], again["forecasts"], strict=True):
+        assert other["median"] == pytest.approx(one["median"], rel=1e-9)
+
+
+def test_where_the_model_error_alone_is_too_large_more_frames_are_not_asked_for(small, capsys):
+    assert main(["plan", "flash", "--want", "melanin<=1%"]) == 1
+    said = capsys.readouterr().out
+    assert "more frames will not help" in said
+    assert "NOT REACHED" in said
+
+
+def test_a_plan_without_crossed_frames_or_of_another_rig_is_refused(rig, small, tmp_path, capsys):
+    whole = flash_plan(rig)
+    bare = replace(
+        whole, steps=tuple(s for s in whole.steps if s.index.get("polarizer") != "crossed")
+    )
+    with pytest.raises(planning.PlanningError, match="no crossed frame"):
+        planning_flash.foresee(rig, bare, {})
+    file = tmp_path / "plan.json"
+    file.write_text(json.dumps(whole.to_json()))
+    assert main(["plan", "gradient", "--forecast", str(file)]) == 3
+    assert "expected 'gradient'" in capsys.readouterr().err
+    assert main(["plan", "flash", "--most-lights", "3"]) == 3
+
+
+@pytest.mark.long
+def test_chromophores_are_reconstructed_from_crossed_frames_alone(rig, tmp_path):
+    from model import store
+    from reconstruction import pipeline
+    from skinrig.simulation import simulate_session
+
+    plan = planning_flash.crossed_plan(rig, repeats=1, power=1.0, darks=0)
+    simulate_session("flash", tmp_path / "session-face", subject="II", width_px=64, plan=plan)
+    pipeline.reconstruct(
+        tmp_path / "session-face", want=("melanin", "shading"), out=tmp_path / "appearance"
+    )
+    made = store.read(tmp_path / "appearance")
+    assert "melanin" in made.maps
+    # melanin itself is masked without a white tile; that its fit ran is what is asked
+    assert made.maps["shading"].valid.mean() > 0.1

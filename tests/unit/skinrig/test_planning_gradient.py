@@ -1,0 +1,111 @@
+"""The gradient sphere's choice of patterns and exposures, on a small patch of simulated skin."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from capture.plan import Plan
+from capture.plan.gradient import gradient_plan
+from capture.plan.steps import PATTERNS
+from capture.rig import load_rig
+from skinrig import planning, planning_gradient
+from skinrig.cli import main
+from skinrig.planning_gradient import SETS, Setting
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return load_rig("gradient")
+
+
+@pytest.fixture(scope="module")
+def look(rig):
+    return planning_gradient.sight(rig, "III", side_px=40)
+
+
+@pytest.fixture
+def small(monkeypatch, look):
+    monkeypatch.setattr(planning_gradient, "sight", lambda *args, **kwargs: look)
+    monkeypatch.setattr(planning_gradient, "EXPOSURES", (0.25, 1.0))
+
+
+@pytest.mark.long
+def test_complements_and_longer_exposures_lower_the_error(look):
+    def median(patterns, exposure_s):
+        return planning_gradient.predict(look, Setting(patterns, exposure_s, 2)).median_rad
+
+    least = median(SETS[0], 0.009)
+    assert median(SETS[0], 0.018) < least
+    assert median(SETS[1], 0.009) < least
+
+
+def test_the_quickest_scan_that_reaches_the_error_is_taken(small, tmp_path, capsys):
+    file = tmp_path / "plan.json"
+    assert main(["plan", "gradient", "--want", "normals<=2.5deg", "--out", str(file),
+                 "--json"]) == 0  # fmt: skip
+    document = json.loads(capsys.readouterr().out)
+    plan = Plan.from_json(file.read_text())
+    assert document["reached"]
+    assert {step.index["pattern"] for step in plan.steps} < set(PATTERNS)
+    assert any("complement" in why or "told without" in why for _, why in document["left_out"])
+    # what was tried before, and is quicker, did not reach it
+    *before, last = document["path"]
+    assert last["normals_deg"] <= 2.5
+    assert all(one["normals_deg"] > 2.5 and one["seconds"] <= last["seconds"] for one in before)
+    assert main(["plan", "gradient", "--forecast", str(file), "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["forecasts"][0]["median"] == pytest.approx(last["normals_deg"], rel=1e-9)
+
+
+def test_what_no_scan_reaches_says_why(small, capsys, monkeypatch):
+    monkeypatch.setattr(planning_gradient, "SETS", SETS[:1])
+    monkeypatch.setattr(planning_gradient, "EXPOSURES", (1.0,))
+    assert main(["plan", "gradient", "--want", "normals<=0.1deg"]) == 1
+    said = capsys.readouterr().out
+    assert "the best scan leaves" in said
+    assert "the lens shows" in said
+
+
+def test_exposures_that_saturate_or_ask_too_much_of_an_led_are_no_candidates(rig, look):
+    bright = replace(look, rates={key: 1000.0 * rate for key, rate in look.rates.items()})
+    assert not list(planning_gradient.candidates(rig, bright))
+    seconds = [plan.estimated_s(rig) for _, plan in planning_gradient.candidates(rig, look)]
+    assert seconds == sorted(seconds)
+    assert len(seconds) > 10
+
+
+def test_patterns_that_do_not_tell_a_gradient_are_refused(rig):
+    plan = gradient_plan(rig, angles=[0], steps=(0, 0), patterns=("full", "x", "y"))
+    with pytest.raises(planning.PlanningError, match="z or -z"):
+        planning_gradient.setting_of(plan)
+
+
+@pytest.mark.long
+def test_normals_are_reconstructed_from_four_patterns_as_well_as_is_forecast(rig, tmp_path):
+    from reconstruction.gradient_normals import estimate_roughness, from_patterns
+
+    look = planning_gradient.sight(rig, "III", seed=3, side_px=96)
+    setting = Setting(SETS[0], 0.018, 0)
+    found = planning_gradient.predict(look, setting)
+    rng = np.random.default_rng(1)
+    gain, floor = look.chip.noise_profile(setting.exposure_s)
+    values, variance = {}, {}
+    for key in look.rates:
+        if key[0] in setting.patterns:
+            light = setting.exposure_s * look.rates[key].astype(float)
+            variance[key] = gain * np.maximum(light, 0) + floor
+            values[key] = light + np.sqrt(variance[key]) * rng.standard_normal(light.shape)
+    alpha = estimate_roughness(
+        values, lights=look.told["lights"], view=look.told["view"], variance=variance, smooth_px=1.0
+    )
+    made = from_patterns(values, variance=variance, wiener=True, alpha=alpha, **look.told)
+    inner = (slice(6, -6),) * 2
+    cosine = np.sum(made.normals[inner] * look.seen[inner], axis=-1)
+    error = np.arccos(np.clip(cosine, -1.0, 1.0))[made.valid[inner]]
+    # the stated spread of forecasts
+    ratio = float(np.median(error)) / found.median_rad
+    spread = planning_gradient.FORECAST_SPREAD
+    assert 1.0 / (1.0 + spread) < ratio < 1.0 + spread, math.degrees(found.median_rad)

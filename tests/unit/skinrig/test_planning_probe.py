@@ -1,0 +1,108 @@
+"""The fibre probe's choice of exposures, placements and sites, on a simulated medium."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from capture.plan import Plan
+from capture.plan.probe import exposure_series_s, probe_plan
+from capture.rig import load_rig
+from skinrig import planning, planning_probe
+from skinrig.cli import main
+from skinrig.planning_probe import Setting
+
+SITES = ("forehead", "cheek")
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return load_rig("probe")
+
+
+@pytest.fixture(scope="module")
+def look(rig):
+    return planning_probe.sight(rig, "homogeneous:0.05,1.2", sites=SITES)
+
+
+@pytest.fixture
+def small(monkeypatch, look):
+    monkeypatch.setattr(planning_probe, "sight", lambda *args, **kwargs: look)
+    monkeypatch.setattr(planning_probe, "SERIES", (3, 6))
+    monkeypatch.setattr(planning_probe, "LONGEST", (0.5, 4.0))
+
+
+def test_longer_exposures_and_placements_lower_the_error_down_to_the_common_one(look):
+    def sigma(*exposures_s, repeats=1, darks=2):
+        found = planning_probe.predict(look, Setting(SITES, exposures_s, repeats, darks))
+        assert (found.sigma >= found.common).all()
+        return np.median(found.sigma)
+
+    short = sigma(0.00115, 0.01)
+    assert sigma(0.00115, 0.01, 0.1) < short
+    assert sigma(0.00115, 0.01, repeats=4) < short
+    assert sigma(0.00115, 0.01, darks=1) > short
+
+
+def test_variance_of_a_reading_follows_its_photons_and_saturation(look):
+    series = exposure_series_s()
+    skin = look.reflectance[0]
+    assert np.isfinite(planning_probe._variance(look, skin, series, 2, 1.0)).all()
+    # shorter than the shortest exposure would be needed for so much light
+    assert np.isinf(planning_probe._variance(look, 1e3 * skin, series, 2, 1.0)).any()
+    dim, four = (
+        np.sqrt(planning_probe._variance(look, share * skin, series[:6], 2, 1.0)) / share
+        for share in (0.01, 0.04)
+    )
+    # four times the light: twice as precise by photons, four times by read noise
+    assert (dim / four > 1.99).all()
+    assert (dim / four < 4.01).all()
+
+
+def test_the_quickest_plan_that_reaches_the_error_leaves_out_exposures(small, tmp_path, capsys):
+    file = tmp_path / "plan.json"
+    assert main(["plan", "probe", "--want", "sigma_tr<=4%", "--out", str(file), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    plan = Plan.from_json(file.read_text())
+    assert document["reached"]
+    assert document["saved_seconds"] > 60.0
+    assert any("exposures" in what for what, _ in document["left_out"])
+    assert document["path"][-1]["seconds"] <= plan.estimated_s(load_rig("probe")) + 1e-6
+    assert main(["plan", "probe", "--forecast", str(file), "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["forecasts"][0]["median"] == pytest.approx(document["forecasts"][0]["median"])
+
+
+def test_what_the_certificate_forbids_says_that_more_exposures_will_not_help(small, capsys):
+    assert main(["plan", "probe", "--want", "sigma_tr<=0.001%"]) == 1
+    said = capsys.readouterr().out
+    assert "will not help" in said
+    assert "certificate" in said
+
+
+def test_a_site_is_left_out_only_where_the_others_tell_it_well_enough(look):
+    setting = Setting(SITES, exposure_series_s(), 1, 2)
+    plan = probe_plan(load_rig("probe"), sites=SITES)
+
+    def least(limit):
+        def good(found):
+            left = found.sigma[~found.measured]
+            return not left.size or float(np.median(left)) <= limit
+
+        return planning_probe.without_sites(look, setting, plan, good)
+
+    kept, whole = least(1e-3)
+    assert kept.sites == SITES
+    assert len(whole.steps) == len(plan.steps)
+    kept, fewer = least(10.0)
+    assert len(kept.sites) == 1
+    assert planning_probe.setting_of(fewer).sites == kept.sites
+
+
+def test_plans_without_skin_or_darks_are_refused(rig):
+    plan = probe_plan(rig, sites=SITES)
+    for kind, word in (("fibres", "no series on skin"), ("dark", "without light")):
+        some = replace(plan, steps=tuple(s for s in plan.steps if s.kind != kind))
+        with pytest.raises(planning.PlanningError, match=word):
+            planning_probe.setting_of(some)
