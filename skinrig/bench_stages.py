@@ -50,6 +50,7 @@ STAGES = {
     "displacement-synthesis": "bench_synthesis.growth",
     "texture-matching": "bench_texture.matching",
     "editing": "bench_editing.editing",
+    "traits": "bench_traits.traits",
     "microstructure": "bench_microstructure.truth",
     "microstructure-passes": "bench_microstructure.passes",
     "perfusion-curves": "bench_perfusion.curves",
