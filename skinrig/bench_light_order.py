@@ -10,7 +10,7 @@ from capture.plan.flicker import FlickerReport, flicker_of_rows
 from capture.plan.light_order import ORDERS, best_order
 from capture.plan.rows import LedRow
 from capture.rig import LedLimits, Rig, load_rig
-from skinrig.benchmark import Limit, Point, StageBenchmark, once
+from skinrig.benchmark import Limit, Point, StageBenchmark, measure
 
 DWELL_S = 1.0 / 12.0
 LESS_FLICKER = 5.0
@@ -27,7 +27,7 @@ def light_order(*, toy: bool) -> StageBenchmark:
     orders: dict[str, Callable[[Rig], list[int]]] = dict(ORDERS)
     orders["chosen"] = partial(best_order, dwell_s=DWELL_S)
     for name, order in orders.items():
-        timing, shown = once(partial(order, rig))
+        timing, shown = measure(partial(order, rig), repeats=1), order(rig)
         for gaps in (False, True) if name == "spiral" else (False,):
             found[name, gaps] = _flicker(rig, shown, gaps=gaps)
             error = 100.0 * found[name, gaps].rms

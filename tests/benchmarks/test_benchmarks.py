@@ -8,8 +8,13 @@ import pytest
 from skinrig.bench_stages import STAGES, BenchError, run_stages
 from skinrig.console import Console, plain
 
+# simulated sessions, surveys and faces: over 5 s of processor time even when small
+HEAVY = {"editing", "gradient-normals", "probe-session", "render-gradient", "sphere-lights"}
 
-@pytest.mark.parametrize("stage", STAGES)
+
+@pytest.mark.parametrize(
+    "stage", [pytest.param(s, marks=pytest.mark.long if s in HEAVY else ()) for s in STAGES]
+)
 def test_a_stage_gives_points_with_errors_and_intervals(stage, tmp_path, capsys):
     document = run_stages([stage], budget_s=60.0, toy=True, out=tmp_path, console=Console(True))
     written = json.loads((tmp_path / "bench.json").read_text())
