@@ -66,7 +66,8 @@ def test_wrong_normals_light_or_lobes_show_in_the_picture(scene, model):
 def test_a_face_that_smiles_is_rendered_with_its_neutral_normals_carried_along(scene, model):
     """The simulator moves mesh and relief by code of its own; blood and wrinkles change a little.
 
-    Expected: nine in ten lit pixels within 2 %; with normals left as they were, three times as far or more.
+    Expected: nine in ten lit pixels within 2 %; with normals left as they were, three times as far
+    or more.
     """
     view, light = "C07", LIGHTS[1]
     smiling = scene.subject.posed("happiness")
