@@ -9,7 +9,10 @@ from skinrig.bench_stages import STAGES, BenchError, run_stages
 from skinrig.console import Console, plain
 
 # simulated sessions, surveys and faces: over 5 s of processor time even when small
-HEAVY = {"editing", "gradient-normals", "probe-session", "render-gradient", "sphere-lights"}
+HEAVY = {
+    "dome-geometry", "editing", "gradient-normals", "probe-session", "render-gradient",
+    "sphere-lights", "traits",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
