@@ -63,17 +63,20 @@ def quickest_first(names: Iterable[str], seconds: Mapping[str, float]) -> list[t
 
 
 FULL_S: Final[dict[str, float]] = {
-    "light-order": 2, "diffuse-albedo": 4, "wrinkle-weights": 4, "hdr": 6, "misalignment": 8,
-    "perfusion-curves": 8, "render-flash": 8, "fibre-readings": 8, "anisotropy": 8,
-    "normal-histogram": 10, "translucency": 12, "subsurface-fit": 12, "subsurface-batch": 12,
-    "layered-reflectance": 12, "efficiency": 15, "lumitexels": 15, "wrinkle-storage": 15,
-    "texture-fill": 15, "wrinkle-sum": 15, "color-table": 20, "chromophores": 20,
-    "facial-color": 20, "microstructure-passes": 20, "wrinkles": 25, "shared-melanin": 25,
-    "head-motion": 25, "probe-session": 25, "reflectance": 30, "render-dome": 30, "brdf": 30,
-    "brdf-space": 40, "dome-lights": 40, "render-gradient": 40, "texture-matching": 40,
-    "gradient-normals": 40, "normals": 45, "expression-alignment": 60, "dome-geometry": 60,
-    "skin-stretch": 60, "sphere-lights": 60, "normal-integration": 60, "subsurface-gather": 60,
-    "render-model": 60, "editing": 60, "photon-transport": 90, "microstructure": 90,
-    "displacement-synthesis": 120, "kernel-fit": 250,
+    "light-order": 1, "wrinkle-weights": 3, "anisotropy": 4, "translucency": 6,
+    "normal-histogram": 7, "fibre-readings": 8, "diffuse-albedo": 8, "subsurface-batch": 10,
+    "efficiency": 12, "hdr": 15, "misalignment": 22, "subsurface-fit": 23, "perfusion-curves": 29,
+    "layered-reflectance": 39, "render-flash": 44,
+    "lumitexels": 25, "wrinkle-storage": 25, "texture-fill": 25, "wrinkle-sum": 25,
+    "color-table": 30, "chromophores": 30, "facial-color": 40, "microstructure-passes": 40,
+    "wrinkles": 40, "head-motion": 40, "probe-session": 50, "shared-melanin": 60,
+    "reflectance": 60, "render-dome": 60, "brdf": 60, "brdf-space": 60, "dome-lights": 60,
+    "render-gradient": 60, "texture-matching": 60, "gradient-normals": 60, "normals": 90,
+    "expression-alignment": 90, "dome-geometry": 90, "normal-integration": 90,
+    "subsurface-gather": 90, "editing": 90, "traits": 90, "photon-transport": 120,
+    "sphere-lights": 120, "render-model": 120, "skin-stretch": 150, "microstructure": 150,
+    "displacement-synthesis": 200, "kernel-fit": 300,
 }  # fmt: skip
-"""About how many seconds each takes at full size on two cores that do nothing else."""
+"""At most about how many seconds each takes at full size on two cores that do nothing else: of the
+first fifteen their processor seconds, of the others a careful guess. A guess that is too low makes
+a run outlast its budget, one that is too high leaves a stage at its small size."""

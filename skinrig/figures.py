@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -62,6 +63,10 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     error = np.array([p["error"] for p in points], float)
     low = np.array([p["error_interval"][0] for p in points], float)
     high = np.array([p["error_interval"][1] for p in points], float)
+    exact = ~(error > 0.0)
+    if exact.any() and not exact.all():  # a log axis has no place for 0: below the others
+        error = np.where(exact, error[~exact].min() / 10.0, error)
+        low, high = np.where(exact, error, low), np.where(exact, error, high)
     bars = np.maximum(np.stack([error - low, high - error]), 0.0)
     bars[0] = np.minimum(bars[0], 0.999 * error)  # a log axis has no room for zero
     on_front = np.array([p["on_front"] for p in points], bool)
@@ -73,15 +78,19 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     )
     bend = document.get("knee")
     if bend is not None:
-        axes.plot(seconds[bend], error[bend], "o", mfc="none", mec=_COLORS[1], ms=13, label="knee")
+        axes.plot(seconds[bend], error[bend], "o", mfc="none", mec=_COLORS[1], ms=11, label="knee")
     for index in np.flatnonzero(on_front):
         label = ", ".join(f"{k} {v}" for k, v in points[index]["knobs"].items())
         label += "  (knee)" if index == bend else ""
+        label += "  (error 0)" if exact[index] else ""
+        # names of points on the right run to the left, into the plot
+        right = np.log(seconds[index]) > np.log([seconds.min(), seconds.max()]).mean()
         words = axes.annotate(
             label,
             (seconds[index], error[index]),
-            xytext=(5, 5),
+            xytext=(-5 if right else 5, 5),
             textcoords="offset points",
+            ha="right" if right else "left",
             fontsize=7,
         )
         words.set_in_layout(False)  # a long label must not squeeze the axes away
@@ -96,8 +105,9 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.margins(x=0.25, y=0.2)
+    axes.tick_params(axis="x", which="minor", labelsize=6, labelrotation=60)
     axes.set_xlabel("seconds, warm, median")
-    axes.set_ylabel(document["error_name"])
+    axes.set_ylabel("\n".join(textwrap.wrap(document["error_name"], 36)))
     small = document.get("size") == "small"
     axes.set_title(f"{stage}, small size" if small else stage, fontsize=10)
     axes.legend(fontsize=7, frameon=False)
