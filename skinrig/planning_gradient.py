@@ -394,8 +394,11 @@ def _choice(
         rig, plan, (forecast,), plan.estimated_s(rig), full.estimated_s(rig),
         {
             "patterns": list(setting.patterns), "polarizers": ["parallel", "crossed"],
-            "states": sorted(str(name) for name in states), "exposure_s": setting.exposure_s,
-            "dwell_s": next(float(s.settings["dwell_s"]) for s in plan.steps if state_of(s)),
+            "states": sorted(str(name) for name in states),
+            "exposure_s": round(setting.exposure_s, 6),
+            "dwell_s": next(
+                round(float(s.settings["dwell_s"]), 6) for s in plan.steps if state_of(s)
+            ),
             "darks": setting.darks, "level": setting.level, "valid_share": found.valid_share,
         },
         tuple(left_out), path, reasons, light_of(plan, rig),

@@ -167,8 +167,11 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
     )  # fmt: skip
 
 
-def predict(look: Sight, setting: Setting, *, noise: bool = True) -> Prediction:
+def predict(look: Sight, setting: Setting) -> Prediction:
     """Return the errors that a plan leaves.
+
+    Placements lower what the readings' noise leaves, and neither the misfit of layers nor what the
+    calibration leaves open.
 
     Parameters
     ----------
@@ -176,9 +179,31 @@ def predict(look: Sight, setting: Setting, *, noise: bool = True) -> Prediction:
         See `sight`.
     setting
         Sites, exposures, placements and darks.
-    noise
-        Whether the readings have any; without, what no exposure removes is left.
     """
+    shape = (len(look.sites), 3)
+    sigma, bias, common = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)
+    still, found = np.full(shape, np.inf), np.ones(shape)
+    valid = np.zeros(shape, np.bool_)
+    measured = np.zeros(len(look.sites), np.bool_)
+    places = [k for k, site in enumerate(look.sites) if site in setting.sites]
+    with_noise, without = (_fits(look, setting, places, noise=noise) for noise in (True, False))
+    for k, fit, quiet in zip(places, with_noise, without, strict=True):
+        measured[k] = True
+        valid[k] = fit.fit.valid
+        found[k] = fit.fit.sigma_tr_per_mm
+        common[k] = np.sqrt((fit.log_common**2).sum(axis=0))
+        stays = np.minimum(quiet.log_stderr, fit.log_stderr)
+        noise = (fit.log_stderr**2 - stays**2) / setting.repeats
+        still[k] = np.hypot(stays, common[k])
+        sigma[k] = np.sqrt(still[k] ** 2 + noise)
+        bias[k] = found[k] / look.truth[k] - 1.0
+    rest = _between(look, found, sigma, valid & measured[:, None])
+    sigma[~measured] = rest[~measured]
+    return Prediction(look.sites, sigma, bias, common, np.hypot(bias, still), valid, measured)
+
+
+def _fits(look: Sight, setting: Setting, places: Sequence[int], *, noise: bool) -> Sequence[Any]:
+    """Return the fits of each site's profile as a plan would read it, or without its noise."""
     from capture.calibration.fibre import FibreReflectance
     from reconstruction.probe_images import Measurement
     from reconstruction.probe_stages import Profile, fit_profiles
@@ -187,36 +212,20 @@ def predict(look: Sight, setting: Setting, *, noise: bool = True) -> Prediction:
     radius = np.array(look.probe.radius_mm)
     # gains are known from a series of all exposures on the phantom
     gain = _variance(look, look.phantom, exposure_series_s(), 4, 1.0) / look.phantom**2
-    places = [site for site in look.sites if site in setting.sites]
     profiles = []
-    for site in places:
-        value = look.reflectance[look.sites.index(site)]
+    for k in places:
+        value = look.reflectance[k]
         own = _variance(look, value, setting.exposures_s, setting.darks, setting.level)
         valid = np.isfinite(own)
         variance = np.where(valid, own, 0.0) if noise else np.zeros_like(own)
-        variance = variance + gain * value**2
         reflectance = FibreReflectance(
-            names, radius, value, variance, value * look.common, valid, ~valid
+            names, radius, value, variance + gain * value**2, value * look.common, valid, ~valid
         )
-        head = Measurement(Placement(site, 0.0, 0), len(setting.exposures_s), 1.0, math.nan, 5.0)
+        head = Measurement(
+            Placement(look.sites[k], 0.0, 0), len(setting.exposures_s), 1.0, math.nan, 5.0
+        )
         profiles.append(Profile(head, reflectance))
-    fits = fit_profiles(profiles, look.probe)
-    shape = (len(look.sites), 3)
-    sigma, bias, common = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)
-    valid_fit = np.zeros(shape, np.bool_)
-    measured = np.zeros(len(look.sites), np.bool_)
-    found = np.ones(shape)
-    for site, fit in zip(places, fits, strict=True):
-        k = look.sites.index(site)
-        measured[k] = True
-        valid_fit[k] = fit.fit.valid
-        found[k] = fit.fit.sigma_tr_per_mm
-        common[k] = np.sqrt((fit.log_common**2).sum(axis=0))
-        sigma[k] = np.sqrt(fit.log_stderr**2 / setting.repeats + common[k] ** 2)
-        bias[k] = found[k] / look.truth[k] - 1.0
-    rest = _between(look, found, sigma, valid_fit & measured[:, None])
-    sigma[~measured] = rest[~measured]
-    return Prediction(look.sites, sigma, bias, common, np.hypot(bias, common), valid_fit, measured)
+    return fit_profiles(profiles, look.probe) if profiles else []
 
 
 def choose(
@@ -515,11 +524,7 @@ def _choice(
 
 def _why(look: Sight, whole: Prediction, target: float) -> str:
     """Say why no plan reaches what is wanted."""
-    exposures = exposure_series_s()
-    still = predict(
-        look, Setting(look.sites, exposures, 1, 2), noise=False
-    ).misfit  # fmt: skip
-    stays = 100.0 * median_of_normals(still)
+    stays = 100.0 * median_of_normals(whole.misfit)
     certificate = 100.0 * median_of_normals(whole.common)
     return (
         f"sigma_tr: the rig's own series leave {100.0 * whole.median:.2g} %; without any noise "
