@@ -13,6 +13,8 @@ from typing import Final
 
 SPARE: Final = 1.25
 """A stage begins if so many times what it should take is left."""
+RESERVE_S: Final = 20.0
+"""What tables and plots take at the end."""
 SETTLED_S: Final = 10.0
 """Seconds of full sizes after which the pace of this machine counts as known."""
 UNKNOWN_S: Final = 120.0
@@ -67,7 +69,7 @@ FULL_S: Final[dict[str, float]] = {
     "normal-histogram": 7, "fibre-readings": 8, "diffuse-albedo": 8, "subsurface-batch": 10,
     "efficiency": 12, "hdr": 15, "misalignment": 22, "subsurface-fit": 23, "perfusion-curves": 29,
     "layered-reflectance": 39, "render-flash": 44,
-    "lumitexels": 25, "wrinkle-storage": 25, "texture-fill": 25, "wrinkle-sum": 25,
+    "lumitexels": 33, "wrinkle-storage": 3, "texture-fill": 39, "wrinkle-sum": 16,
     "color-table": 30, "chromophores": 30, "facial-color": 40, "microstructure-passes": 40,
     "wrinkles": 40, "head-motion": 40, "probe-session": 50, "shared-melanin": 60,
     "reflectance": 60, "render-dome": 60, "brdf": 60, "brdf-space": 60, "dome-lights": 60,
@@ -78,5 +80,5 @@ FULL_S: Final[dict[str, float]] = {
     "displacement-synthesis": 200, "kernel-fit": 300,
 }  # fmt: skip
 """At most about how many seconds each takes at full size on two cores that do nothing else: of the
-first fifteen their processor seconds, of the others a careful guess. A guess that is too low makes
+first nineteen their processor seconds, of the others a careful guess. A guess that is too low makes
 a run outlast its budget, one that is too high leaves a stage at its small size."""

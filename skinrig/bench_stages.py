@@ -176,7 +176,8 @@ class _Run:
         """Measure again at full size what fits into the rest of the budget."""
         pace = bench_plan.Pace()
         for name, told_s in bench_plan.quickest_first(self.done, bench_plan.FULL_S):
-            if not pace.fits(told_s, self.until_s - time.perf_counter()):
+            left_s = self.until_s - bench_plan.RESERVE_S - time.perf_counter()
+            if not pace.fits(told_s, left_s):
                 break
             pace.add(told_s, self.measure(name, "full"))
 
