@@ -77,6 +77,8 @@ def maps_of(rank: int = RANK) -> tuple[str, ...]:
     )  # fmt: skip
 
 
+REFINEMENTS = 2
+"""Turns of fitting normals by the lobes, and the lobes at the normals."""
 WEIGHTS = weight_names()
 MAPS = maps_of()
 """Maps that can be made of a dome session, unless another rank is asked for."""
@@ -152,17 +154,19 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
         stage("albedo", ("lumitexels", "point_normals", "texture"), ("point_r_d", "r_d"),
               lambda lumitexels, point_normals, texture: _albedo(
                   dome, lumitexels, point_normals, texture), unscaled),
-        stage("lobes", ("lumitexels", "point_normals", "point_r_d", "texture"),
-              ("basis", "weights", *weights_made, "lobe_residual", BASIS_FILE),
-              lambda lumitexels, point_normals, point_r_d, texture: _lobes(
-                  evidence, lumitexels, point_normals, point_r_d, texture), ranks=list(RANKS)),
+        stage("lobes", ("lumitexels", "point_normals", "point_r_d"),
+              ("basis", "weights", "basis_file"),
+              lambda lumitexels, point_normals, point_r_d: _lobes(
+                  evidence, lumitexels, point_normals, point_r_d), ranks=list(RANKS)),
         stage("refined normals",
               ("surface", "lumitexels", "point_normals", "point_r_d", "basis", "weights",
-               "texture"),
-              ("normals_refined",),
-              lambda surface, lumitexels, point_normals, point_r_d, basis, weights, texture:
-              _refined(dome, surface, lumitexels, point_normals, point_r_d, basis, weights,
-                       texture)),
+               "basis_file", "texture"),
+              ("normals_refined", *weights_made, "lobe_residual", BASIS_FILE),
+              lambda surface, lumitexels, point_normals, point_r_d, basis, weights, basis_file,
+              texture: {
+                  BASIS_FILE: basis_file,
+                  **_refined(dome, surface, lumitexels, point_normals, point_r_d, basis, weights,
+                             texture)}),
     ]  # fmt: skip
 
 
@@ -330,7 +334,6 @@ def _lobes(
     lumitexels: Samples,
     point_normals: PointValues,
     point_r_d: PointValues,
-    texture: SurfaceTexture,
 ) -> Mapping[str, Any]:
     folder = evidence.basis
     materials = brdf_tables.default() if folder is None else brdf_tables.load(folder)
@@ -372,20 +375,10 @@ def _lobes(
         ),
         progress=partial(evidence.tell, "lobes"),
     )  # fmt: skip
-    maps = {
-        name: texture.map(
-            found.values[:, k], found.stderr[:, k], found.valid, "1", "share of a common mixture"
-        )
-        for k, name in enumerate(weight_names(rank))
-    }
-    maps["lobe_residual"] = texture.map(
-        found.values[:, rank], None, found.valid, "1/sr", "weighted RMS of samples - model"
-    )
     return {
         "basis": basis,
         "weights": found.values[:, :rank],
-        **maps,
-        BASIS_FILE: _basis_bytes(materials, rank, mixes),
+        "basis_file": _basis_bytes(materials, rank, mixes),
     }
 
 
@@ -437,12 +430,44 @@ def _refined(
     weights: NDArray[np.float64],
     texture: SurfaceTexture,
 ) -> Mapping[str, SkinMap]:
-    found = lumitexels.collect(
+    started = lumitexels.collect(
         lambda part, samples: estimates.normals_from_remainder(
             samples, estimates.part_of(point_normals, part), estimates.part_of(point_r_d, part),
             weights[part], basis,
         ),
-        progress=partial(dome.tell, "refined normals"),
+        progress=partial(dome.tell, "normals by what lobes leave"),
     )  # fmt: skip
+    known = point_normals.valid & point_r_d.valid
+    inside = PointValues(
+        np.where(started.valid[:, None], started.values, point_normals.values),
+        np.where(started.valid[:, None], started.stderr, point_normals.stderr),
+        known,
+    )
+    found, rank = inside, weights.shape[1]
+    for turn in range(REFINEMENTS):
+        normals, shares = found, weights
+        found = lumitexels.collect(
+            lambda part, samples, n=normals, w=shares: estimates.normals_from_all_light(  # type: ignore[misc]
+                samples, estimates.part_of(inside, part), estimates.part_of(point_r_d, part),
+                w[part], basis, now=n.values[part],
+            ),
+            progress=partial(dome.tell, f"normals by all light, {turn + 1} of {REFINEMENTS}"),
+        )  # fmt: skip
+        fitted = lumitexels.collect(
+            lambda part, samples, n=found: estimates.lobe_weights(  # type: ignore[misc]
+                samples, estimates.part_of(n, part), estimates.part_of(point_r_d, part), basis
+            ),
+            progress=partial(dome.tell, f"lobes, {turn + 1} of {REFINEMENTS}"),
+        )
+        weights = fitted.values[:, :rank]
+    maps = {
+        name: texture.map(
+            fitted.values[:, k], fitted.stderr[:, k], fitted.valid, "1", "share of a common mixture"
+        )
+        for k, name in enumerate(weight_names(rank))
+    }
+    maps["lobe_residual"] = texture.map(
+        fitted.values[:, rank], None, fitted.valid, "1/sr", "weighted RMS of samples - model"
+    )
     found = estimates.with_misplacement(found, surface, dome.pixel_mm)
-    return {"normals_refined": texture.normals(found, "by the fitted lobes, world frame")}
+    return {"normals_refined": texture.normals(found, "by the whole model, world frame"), **maps}

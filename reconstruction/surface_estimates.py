@@ -17,6 +17,7 @@ from reconstruction import (
     diffuse_albedo,
     half_vector_normals,
     mixture_kernels,
+    model_normals,
     photometric_stereo,
 )
 from reconstruction.lumitexel_store import LumitexelStore
@@ -38,6 +39,8 @@ PEAK_RAD: Final = np.radians(25.0)
 """The same where the lobes are known and taken off: only their peaks are left out."""
 LOBE_ERROR: Final = 0.1
 """Relative error of a fitted lobe, for the weight of samples in it."""
+LOBE_TILT_RAD: Final = np.radians(0.5)
+"""Standard error, in each direction, of normals by highlights: lobes are known no better."""
 MISPLACED_PX: Final = 0.27
 """Standard deviation of where a sample is on the surface, over the size of a pixel."""
 UNRESOLVED_RAD: Final = np.radians(0.27)
@@ -309,6 +312,49 @@ def normals_from_remainder(
     )
     good = good & found.valid
     return _of_normals(found.values, found.stderr[:, 0], good)
+
+
+def normals_from_all_light(
+    samples: Lumitexels,
+    normals: PointValues,
+    r_d: PointValues,
+    weights: Double,
+    basis: BrdfBasis,
+    *,
+    now: Double | None = None,
+) -> PointValues:
+    """Return normals that hold what highlights say, where light from inside says too little.
+
+    Points whose standard error is below `LOBE_TILT_RAD` stay as they are. Those above it are moved
+    to where the whole model fits best, and lie between the two by the weights of their errors.
+
+    Parameters
+    ----------
+    samples, r_d, weights, basis
+        As in `normals_from_remainder`.
+    normals
+        By the light from inside alone.
+    now
+        Normals to begin from, (P, 3); `normals` by default.
+    """
+    rows = np.flatnonzero(normals.valid & r_d.valid & (normals.stderr[:, 0] > LOBE_TILT_RAD))
+    if not len(rows):
+        return normals
+    start = normals.values if now is None else now
+    found = model_normals.estimate(
+        rows_of(samples, rows), start[rows], np.ones(len(rows), np.bool_),
+        r_d.values[rows].mean(axis=-1), weights[rows], basis, lobe_error=LOBE_ERROR,
+        least_cos_light=LEAST_COS_LIGHT, least_cos_view=LEAST_COS_VIEW,
+    )  # fmt: skip
+    ours = np.square(np.hypot(found.stderr_rad, LOBE_TILT_RAD))
+    theirs = np.square(normals.stderr[rows, 0])
+    share = np.where(found.valid, theirs / (theirs + ours), 0.0)[:, None]
+    between = share * found.normals + (1.0 - share) * normals.values[rows]
+    values, stderr = normals.values.copy(), normals.stderr.copy()
+    values[rows] = between / np.linalg.norm(between, axis=-1, keepdims=True)
+    stderr[rows] = np.where(share > 0, np.sqrt(ours * theirs / (ours + theirs))[:, None],
+                            stderr[rows])  # fmt: skip
+    return PointValues(values, stderr, normals.valid)
 
 
 def sample_counts(part: slice, samples: Lumitexels) -> PointValues:
