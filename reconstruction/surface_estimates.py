@@ -39,7 +39,7 @@ PEAK_RAD: Final = np.radians(25.0)
 """The same where the lobes are known and taken off: only their peaks are left out."""
 LOBE_ERROR: Final = 0.1
 """Relative error of a fitted lobe, for the weight of samples in it."""
-LOBE_TILT_RAD: Final = np.radians(0.5)
+LOBE_TILT_RAD: Final = np.radians(0.3)
 """Standard error, in each direction, of normals by highlights: lobes are known no better."""
 MISPLACED_PX: Final = 0.27
 """Standard deviation of where a sample is on the surface, over the size of a pixel."""

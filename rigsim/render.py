@@ -582,25 +582,46 @@ def thread_count() -> int:
     return max(1, min(cores, 16))
 
 
+SLACK: Final = 64
+
+
+def with_slack(values: NDArray[np.generic]) -> NDArray[Any]:
+    """Return a copy of a row of numbers whose memory goes on beyond its end.
+
+    The renderer works on NumPy's memory itself, in whole vectors of up to 16 numbers, and Embree
+    reads 16 bytes at a mesh's last corner: at the end of a page of memory either would read what
+    is not the process's, and end it.
+
+    Examples
+    --------
+    >>> row = with_slack(np.arange(5, dtype=np.float32))
+    >>> row.tolist(), row.base.size - row.size
+    ([0.0, 1.0, 2.0, 3.0, 4.0], 64)
+    """
+    held = np.zeros(values.size + SLACK, values.dtype)
+    held[: values.size] = values.reshape(-1)
+    return held[: values.size]
+
+
 class _MitsubaTracer:
     def __init__(self, mesh: Mesh, choice: VariantChoice) -> None:
         self._choice = choice
         mi = load(choice)
         shape = mi.Mesh("mesh", len(mesh.vertices_mm), len(mesh.faces))
         parameters = mi.traverse(shape)
-        parameters["vertex_positions"] = np.ravel(mesh.vertices_mm)
-        parameters["faces"] = np.ravel(mesh.faces).astype(np.uint32)
+        parameters["vertex_positions"] = with_slack(np.ravel(mesh.vertices_mm))
+        parameters["faces"] = with_slack(np.ravel(mesh.faces).astype(np.uint32))
         parameters.update()
         self.scene: Any = mi.load_dict({"type": "scene", "mesh": shape})
 
     def _ray(
         self, mi: Any, origins: Float32Array, directions: Float32Array, length: Any = None
     ) -> Any:
-        start = mi.Point3f(*(np.ascontiguousarray(origins[:, k]) for k in range(3)))
-        way = mi.Vector3f(*(np.ascontiguousarray(directions[:, k]) for k in range(3)))
+        start = mi.Point3f(*(with_slack(origins[:, k]) for k in range(3)))
+        way = mi.Vector3f(*(with_slack(directions[:, k]) for k in range(3)))
         ray = mi.Ray3f(start, way)
         if length is not None:
-            ray.maxt = mi.Float(length)
+            ray.maxt = mi.Float(with_slack(length))
         return ray
 
     def first_hit(

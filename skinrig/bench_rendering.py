@@ -57,12 +57,12 @@ def model(*, toy: bool) -> StageBenchmark:
         )  # fmt: skip
 
     for subpixels in rays:
-        timing = measure(lambda k=subpixels: shown(laid[1], subpixels=k), repeats=2)  # type: ignore[misc]
+        timing = measure(lambda k=subpixels: shown(laid[1], subpixels=k), repeats=2, memory=None)  # type: ignore[misc]
         seen = shown(laid[1], subpixels=subpixels)
         error = _relative(seen.radiance, true)
         points.append(_point({"vary": "rays", "rays": subpixels**2}, timing, error))
     for binning in binnings[1:]:
-        timing = measure(lambda k=binning: shown(laid[k]), repeats=2)  # type: ignore[misc]
+        timing = measure(lambda k=binning: shown(laid[k]), repeats=2, memory=None)  # type: ignore[misc]
         error = _relative(shown(laid[binning]).radiance, true)
         points.append(_point({"vary": "texture", "texels": size // binning}, timing, error))
     skin = laid[1].of_medium(SIGMA_TR)
@@ -71,7 +71,7 @@ def model(*, toy: bool) -> StageBenchmark:
     for tolerance in (0.1, 0.01) if toy else (3.0, 1.0, 0.3, 0.1, 0.01):
         timing = measure(
             lambda t=tolerance: shown(skin, "dipole", interior, 1, t),  # type: ignore[misc]
-            repeats=1, memory=False,
+            repeats=1, memory=None,
         )  # fmt: skip
         error = _relative(shown(skin, "dipole", interior, 1, tolerance).diffuse, best)
         points.append(_point({"vary": "spreading", "tolerance": tolerance}, timing, error))

@@ -109,7 +109,7 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
                 stack, radii_mm=radii, photons=photons, rng=np.random.default_rng(1), threads=CORES
             )
 
-        timing = measure(next_event, repeats=1, memory=toy)
+        timing = measure(next_event, repeats=1, memory=None)
         run = next_event()
         relative = 100.0 * run.stderr / run.reflectance_per_mm2
         points.append(_point({"score": "next event", "photons": photons}, timing, relative))
@@ -118,7 +118,7 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
         def in_the_cone(photons: int = photons) -> Floats:
             return _in_the_cone(radii, photons)
 
-        timing = measure(in_the_cone, repeats=1, memory=False)
+        timing = measure(in_the_cone, repeats=1, memory=None)
         relative = in_the_cone()
         points.append(_point({"score": "leaves in the cone", "photons": photons}, timing, relative))
     medium = LayerStack((Layer(inf, SPEED_MEDIUM[0], *SPEED_MEDIUM[1:]),))
@@ -129,7 +129,7 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
             return transport(medium, photons=photons, rng=np.random.default_rng(2), engine=engine)
 
         try:
-            timing = measure(all_angles, repeats=1, memory=False)
+            timing = measure(all_angles, repeats=1, memory=None)
         except ValueError:  # no LLVM on this machine
             continue
         total = all_angles()

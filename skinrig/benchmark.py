@@ -39,7 +39,7 @@ class Timing:
     rose."""
 
 
-def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool = True) -> Timing:
+def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool | None = True) -> Timing:
     """Time ``call``: once cold, ``repeats`` times warm, and once more for its memory.
 
     Parameters
@@ -51,7 +51,8 @@ def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool = True) -
     memory
         False spares a call that takes long the extra one in which its allocations are traced:
         then how far resident memory rose in a warm call is taken (0 MB on systems that do not
-        tell).
+        tell). None never traces: for calls into the renderer, whose own threads free what Python
+        allocated, which tracing does not survive (one process in ten or so ends).
 
     Returns
     -------
@@ -73,7 +74,7 @@ def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool = True) -
             start = time.perf_counter()
             call()
             seconds.append(time.perf_counter() - start)
-    traced = memory or min(seconds) < TRACED_S
+    traced = memory is not None and (memory or min(seconds) < TRACED_S)
     return Timing(
         seconds=float(np.median(seconds)),
         spread_s=(min(seconds), max(seconds)),

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigsim.mesh import Float32Array
-from rigsim.render import Caster, load
+from rigsim.render import Caster, load, with_slack
 from rigsim.scenes.olat import (
     BARE,
     DISC_POINTS,
@@ -58,7 +58,7 @@ class VectorLight:
         # Normal and surface as ten half words, or fourteen: a dome holds sixteen views.
         halves = np.concatenate([hits.normal.view(np.uint16), hits.surface], axis=1)
         words = np.ascontiguousarray(halves).view(np.uint32)
-        self._words = [mi.UInt32(np.ascontiguousarray(words[:, k])) for k in range(words.shape[1])]
+        self._words = [mi.UInt32(with_slack(words[:, k])) for k in range(words.shape[1])]
         self._across, self._along = (mi.Float(points) for points in disc_points(DISC_POINTS))
 
     def light_up(
@@ -162,7 +162,7 @@ class VectorLight:
 
 
 def _columns(rows: Float32Array) -> list[Float32Array]:
-    return [np.ascontiguousarray(rows[:, k], np.float32) for k in range(rows.shape[1])]
+    return [with_slack(np.asarray(rows[:, k], np.float32)) for k in range(rows.shape[1])]
 
 
 def _grains(nl: Any, nv: Any, lh: Any) -> Any:
