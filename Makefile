@@ -1,8 +1,8 @@
 .DEFAULT_GOAL := help
 SKINRIG := .venv/bin/skinrig
 PYTEST := .venv/bin/python -m pytest
-# a process for each core, four at most: kernels use several threads as well
-WORKERS := -n auto --maxprocesses 4 --dist loadfile
+# a process for each core, four at most: kernels use several threads as well; one that ends ends all
+WORKERS := -n auto --maxprocesses 4 --dist loadfile --max-worker-restart 0
 
 .PHONY: help setup demo test test-long lint bench clean
 

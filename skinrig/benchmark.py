@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import time
@@ -196,6 +197,8 @@ class StageBenchmark:
 def pareto_front(points: tuple[Point, ...]) -> tuple[int, ...]:
     """Return the indices of points that no other beats in both seconds and error.
 
+    A point whose error is not finite is on no front.
+
     Examples
     --------
     >>> pareto_front(())
@@ -203,9 +206,8 @@ def pareto_front(points: tuple[Point, ...]) -> tuple[int, ...]:
     """
     front = []
     best = np.inf
-    for index in sorted(
-        range(len(points)), key=lambda i: (points[i].timing.seconds, points[i].error)
-    ):
+    told = [i for i, point in enumerate(points) if math.isfinite(point.error)]
+    for index in sorted(told, key=lambda i: (points[i].timing.seconds, points[i].error)):
         if points[index].error < best:
             best = points[index].error
             front.append(index)
