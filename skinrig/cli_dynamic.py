@@ -29,7 +29,7 @@ Extrapolate = Annotated[
     str, typer.Option(help="Beyond the table's stretch range: hold its ends, or formula.")
 ]
 
-fit_app = typer.Typer(help="Fit models of a moving face to captured data.", no_args_is_help=True)
+fit_app = typer.Typer(help="Fit models to captured data.", no_args_is_help=True)
 apply_app = typer.Typer(help="Evaluate fitted models of a moving face.", no_args_is_help=True)
 
 
