@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,10 +14,29 @@ from skinrig import (
     cli_analysing,
     cli_dynamic,
     cli_editing,
+    cli_importing,
     cli_planning,
     cli_reflectance,
     cli_rendering,
     errors,
+)
+from skinrig.cli_options import (
+    AllBrackets,
+    Angles,
+    Captures,
+    Consent,
+    ConsentExpires,
+    Duration,
+    Json,
+    Out,
+    PromptPeriod,
+    Repeats,
+    Seed,
+    Sequence,
+    ShotPeriod,
+    Site,
+    Sites,
+    Steps,
 )
 from skinrig.console import Console
 
@@ -31,62 +49,6 @@ app = typer.Typer(
     add_completion=True,
     rich_markup_mode=None,
 )
-
-Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
-Seed = Annotated[int, typer.Option(help="Seed of everything that is drawn.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder to write.")]
-Site = Annotated[
-    str | None,
-    typer.Option(help="Where the gradient rig's skin is from: forehead (default), cheek or chin."),
-]
-Sites = Annotated[
-    str | None,
-    typer.Option(help="Where the probe is placed, joined by commas: forehead,cheek,chin."),
-]
-Repeats = Annotated[
-    int, typer.Option(help="Placements of the probe a site and angle; pairs a state of the flash.")
-]
-AllBrackets = Annotated[
-    bool, typer.Option("--all-brackets", help="The probe's exposures that can show no more, too.")
-]
-Angles = Annotated[
-    str | None,
-    typer.Option(
-        help="Angles of the caliper, degrees, joined by commas: 0,90; of the probe how many "
-        "directions of its head: 16."
-    ),
-]
-Sequence = Annotated[
-    str | None,
-    typer.Option(
-        help="Of the flash rig, a sequence in time: an expression made and dropped by a sound, "
-        "such as smile, or exercise or alcohol, followed after the event."
-    ),
-]
-PromptPeriod = Annotated[
-    str | None, typer.Option(help="Of a sequence: seconds from sound to sound; default 5.")
-]
-ShotPeriod = Annotated[
-    str | None,
-    typer.Option(help="Of a sequence: seconds from shot to shot; default 5.5, of alcohol 300."),
-]
-Captures = Annotated[
-    int | None,
-    typer.Option(help="Shots of a sequence by sounds; default: each phase, a tenth twice."),
-]
-Duration = Annotated[
-    str | None,
-    typer.Option(help="Seconds an event is followed; default 60 for exercise, 3600 for alcohol."),
-]
-Steps = Annotated[str | None, typer.Option(help="First and last position of the caliper: -2..3.")]
-Consent = Annotated[
-    list[str] | None,
-    typer.Option("--consent", help="Use that the subject agreed to; repeatable, or by commas."),
-]
-ConsentExpires = Annotated[
-    datetime | None,
-    typer.Option("--consent-expires", formats=["%Y-%m-%d"], help="Last day of the consent."),
-]
 
 
 def _version(shown: bool) -> None:
@@ -423,138 +385,16 @@ def calibrate(
     )  # fmt: skip
 
 
-import_app = typer.Typer(help="Bring in what other devices made.", no_args_is_help=True)
 app.command()(cli_planning.plan)
 app.command()(cli_rendering.render)
 app.command()(cli_editing.edit)
 cli_dynamic.fit_app.command("traits")(cli_editing.fit_traits)
-app.add_typer(import_app, name="import")
+app.add_typer(cli_importing.import_app, name="import")
 cli_dynamic.fit_app.command("reflectance")(cli_reflectance.fit_reflectance)
 app.add_typer(cli_dynamic.fit_app, name="fit")
 app.add_typer(cli_dynamic.apply_app, name="apply")
 cli_analysing.analyse_app.command("albedo")(cli_editing.analyse_albedo)
 app.add_typer(cli_analysing.analyse_app, name="analyse")
-
-
-@import_app.command("photos")
-def import_photos(
-    directory: Annotated[Path, typer.Argument(help="Folder of photographs, or one file.")],
-    out: Out,
-    rig: Annotated[
-        str | None, typer.Option(help="Rig whose camera took them, so that its calibrations hold.")
-    ] = None,
-    subject: Annotated[str, typer.Option(help="Pseudonym of the subject.")] = "unnamed",
-    consent: Consent = None,
-    consent_expires: ConsentExpires = None,
-    json: Json = False,
-) -> None:
-    """Turn RAW, TIFF, EXR, PNG or JPEG photographs into a session.
-
-    Example: skinrig import photos portraits --out session-portraits
-    """
-    from capture.importers import import_photos as bring_in
-    from capture.rig import load_rig
-    from skinrig.consent import subject_of
-
-    console = Console(json)
-    person = subject_of(subject, consent, consent_expires)
-    done = bring_in(directory, out=out, rig=None if rig is None else load_rig(rig), subject=person)
-    for text in done.assumed:
-        console.say(f"assumed: {text}")
-    for name in done.ignored:
-        console.say(f"ignored: {name}")
-    console.say(f"{done.path}: {done.frames} photographs, states {', '.join(done.states)}")
-    state = "" if "neutral" in done.states else f" --state {done.states[0]}"
-    console.say(
-        f"next: skinrig reconstruct {out} --want melanin,hemoglobin --out appearance{state}"
-    )
-    console.document(
-        "skinrig.import/1",
-        {
-            "path": done.path,
-            "frames": done.frames,
-            "assumed": done.assumed,
-            "states": done.states,
-            "ignored": done.ignored,
-        },
-    )
-
-
-@import_app.command("mesh")
-def import_mesh(
-    file: Annotated[Path, typer.Argument(help="Scanned mesh: .obj or .ply.")],
-    session: Annotated[Path, typer.Option(help="Session that gets the mesh.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", help="New folder for a copy, where it is closed.")
-    ] = None,
-    unit: Annotated[str, typer.Option(help="Unit of the file: mm, cm, m or inch.")] = "mm",
-    json: Json = False,
-) -> None:
-    """Attach a scanned mesh to a session.
-
-    Example: skinrig import mesh scan.obj --unit m --session session
-    """
-    from capture.importers.meshes import import_mesh as bring_in
-
-    console = Console(json)
-    done = bring_in(file, session=session, out=out, unit=unit)
-    size = " x ".join(f"{side:.0f}" for side in done.extent_mm)
-    console.say(
-        f"{done.path}: {done.vertices} vertices, {done.faces} triangles, {size} mm, "
-        f"{'with' if done.has_uv else 'without'} texture coordinates"
-    )
-    after = f"reconstruct {done.path} --want normals --out appearance"
-    console.say(f"next: skinrig {after if done.reopened else f'verify {done.path}'}")
-    console.document(
-        "skinrig.import/1",
-        {"path": done.path, "vertices": done.vertices, "faces": done.faces,
-         "has_uv": done.has_uv, "extent_mm": done.extent_mm, "reopened": done.reopened},
-    )  # fmt: skip
-
-
-@import_app.command("lp")
-def import_lp(
-    directory: Annotated[Path, typer.Argument(help="Folder of pictures, one a light.")],
-    out: Out,
-    lights: Annotated[
-        Path | None, typer.Option(help=".lp, list of directions, or folder of a chrome ball.")
-    ] = None,
-    mask: Annotated[Path | None, typer.Option(help="Picture that is bright at the object.")] = None,
-    encoding: Annotated[
-        str, typer.Option(help="How 8-bit and PNG values code light: auto, sRGB or linear.")
-    ] = "auto",
-    mm_per_px: Annotated[
-        float | None,
-        typer.Option(help="Size of a pixel; then the list's rows are positions in mm."),
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Turn pictures of one object under many lights, with their light list, into a session.
-
-    Example: skinrig import lp rti-folder --out session-rti
-    """
-    from capture.importers import import_light_list
-
-    console = Console(json)
-    done = import_light_list(
-        directory, out=out, lights=lights, mask=mask,
-        encoding=encoding, mm_per_px=mm_per_px,  # type: ignore[arg-type]
-    )  # fmt: skip
-    for text in done.assumed:
-        console.say(f"assumed: {text}")
-    console.say(f"{done.path}: {done.frames} pictures, lights of {done.lights}")
-    console.say(f"next: skinrig reconstruct {out} --want normals,albedo --out appearance")
-    console.document(
-        "skinrig.import/1",
-        {
-            "path": done.path,
-            "frames": done.frames,
-            "lights": done.lights,
-            "encoding": done.encoding,
-            "mask": done.mask,
-            "assumed": done.assumed,
-        },
-    )
 
 
 @app.command()

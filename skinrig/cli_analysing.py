@@ -7,7 +7,7 @@ from typing import Annotated, Literal, cast
 
 import typer
 
-from skinrig.cli_dynamic import Json, Out
+from skinrig.cli_options import Json, Out
 from skinrig.console import Console
 from skinrig.errors import UsageError
 

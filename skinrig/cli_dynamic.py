@@ -8,10 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
+from skinrig.cli_options import Json, Out
 from skinrig.console import Console
 
-Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 Weights = Annotated[
     str, typer.Option(help="States and their weights: smile=0.7,anger=0.3; they sum to one.")
 ]

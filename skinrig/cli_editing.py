@@ -7,11 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
+from skinrig.cli_options import Json, Seed
 from skinrig.console import Console
 from skinrig.errors import UsageError
-
-Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
-Seed = Annotated[int, typer.Option(help="Seed of everything that is drawn.")]
 
 
 def edit(

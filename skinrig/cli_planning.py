@@ -9,9 +9,8 @@ from typing import Annotated
 import typer
 
 from skinrig import errors
+from skinrig.cli_options import Json
 from skinrig.console import Console
-
-Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
 
 
 def plan(

@@ -7,9 +7,10 @@ from typing import Annotated, Any, get_args
 
 import typer
 
+from skinrig import errors
+from skinrig.cli_options import Json
 from skinrig.console import Console
 
-Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
 Views = Annotated[
     str, typer.Option(help="View of the rig, such as C03, or the camera's place in mm: 0,0,700.")
 ]
@@ -144,6 +145,8 @@ def render(
             count=photographs, ablation=ablation, seed=seed, progress=console.progress,
         )  # fmt: skip
         rendering_evaluation.tell(console, found)
+        if not found["passed"]:
+            raise typer.Exit(errors.LIMIT_MISSED)
         return
     if shadow_boundary:
         subject = figures.Subject.of(appearance[0], mesh=mesh)

@@ -43,16 +43,33 @@ def test_a_comparison_without_an_assertion_would_be_found():
     assert bare_comparisons("np.allclose(a, b)\nassert np.allclose(a, b)") == [1]
 
 
-def none_defaults_without_none(source):
-    found = []
-    tree = ast.parse(source)
-    aliases = [
+def aliases_with_none(tree):
+    """The names a module gives to types that admit None, at its top level."""
+    return {
         target.id
         for node in tree.body
         if isinstance(node, ast.Assign) and "None" in ast.unparse(node.value)
         for target in node.targets
         if isinstance(target, ast.Name)
-    ]
+    }
+
+
+def imported_aliases_with_none(tree):
+    """Those it imports from modules of ours, under the names it uses."""
+    found = set()
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES:
+            path = ROOT.joinpath(*node.module.split(".")).with_suffix(".py")
+            if path.exists():
+                there = aliases_with_none(ast.parse(path.read_text()))
+                found |= {a.asname or a.name for a in node.names if a.name in there}
+    return found
+
+
+def none_defaults_without_none(source):
+    found = []
+    tree = ast.parse(source)
+    aliases = sorted(aliases_with_none(tree) | imported_aliases_with_none(tree))
     allowed = re.compile("|".join([r"None", r"Any", r"object", *(rf"\b{a}\b" for a in aliases)]))
     for node in ast.walk(tree):
         if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
@@ -84,6 +101,10 @@ def test_a_default_of_none_shows_in_the_annotation():
 
 def test_a_hidden_none_would_be_found():
     assert none_defaults_without_none("def f(a: int = None, b: int | None = None): ...") == ["f.a"]
+    imports = "from skinrig.cli_options import Json, Site\n"
+    assert none_defaults_without_none(imports + "def f(a: Json = None, b: Site = None): ...") == [
+        "f.a"
+    ]
 
 
 @pytest.mark.parametrize("package", ["capture", "reconstruction", "rigsim", "model"])

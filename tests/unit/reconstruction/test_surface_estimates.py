@@ -238,6 +238,41 @@ def test_lobes_taken_off_the_samples_leave_normals_that_highlights_do_not_bend()
     assert np.median(angle_deg(none, truth)) > 1.5 * np.median(angle_deg(found, truth))
 
 
+def glossy(truth, one, share):
+    """Dark samples under one lobe, and the lobe's shares."""
+    from reconstruction import brdf_basis
+
+    samples = make(truth, r_d=[0.02] * 3)
+    weights = np.full((len(truth), 1), share / one.strength()[0])
+    lobes = brdf_basis.evaluate(
+        weights[:, None], one, samples.light_dir, samples.view_dir, truth[:, None]
+    )
+    f = samples.f + np.asarray(lobes, np.float32)[..., None]
+    return dataclasses.replace(samples, f=np.where(samples.valid[..., None], f, 0.0)), weights
+
+
+def test_highlights_move_only_normals_that_light_from_inside_leaves_in_doubt():
+    truth = cap(40)
+    basis = brdf_tables.default()
+    one = basis.mixed(np.eye(basis.size)[[basis.names.index("beckmann 0.3")]])
+    samples, weights = glossy(truth, one, 0.2)
+    start = known(turned(truth, np.radians(1.5)))
+    stderr = np.full((40, 3), np.radians(2.0))
+    stderr[::2] = np.radians(0.1)
+    start = dataclasses.replace(start, stderr=stderr)
+    r_d = dataclasses.replace(albedo_of(truth), values=np.full((40, 3), 0.02))
+    found = estimates.normals_from_all_light(samples, start, r_d, weights, one)
+    np.testing.assert_array_equal(found.values[::2], start.values[::2])
+    np.testing.assert_array_equal(found.stderr[::2], start.stderr[::2])
+    assert np.median(angle_deg(found, truth)[1::2]) < 0.3 * 1.5
+    # two looks at one normal tell more than either, and no more than lobes are known
+    assert (found.stderr[1::2] < start.stderr[1::2]).all()
+    assert (found.stderr[1::2] > 0.9 * estimates.LOBE_TILT_RAD).all()
+    # the same without the lobe: highlights then pull where nothing is
+    bare = estimates.normals_from_all_light(samples, start, r_d, 0.0 * weights, one)
+    assert np.median(angle_deg(bare, truth)[1::2]) > 2 * np.median(angle_deg(found, truth)[1::2])
+
+
 @pytest.mark.parametrize(
     ("lights", "views", "enough"), [(10, 2, True), (9, 2, False), (10, 1, False), (60, 4, True)]
 )
