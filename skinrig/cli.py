@@ -14,10 +14,12 @@ from skinrig import (
     cli_analysing,
     cli_dynamic,
     cli_editing,
+    cli_export,
     cli_importing,
     cli_planning,
     cli_reflectance,
     cli_rendering,
+    cli_report,
     errors,
 )
 from skinrig.cli_options import (
@@ -388,6 +390,8 @@ def calibrate(
 app.command()(cli_planning.plan)
 app.command()(cli_rendering.render)
 app.command()(cli_editing.edit)
+app.command()(cli_report.report)
+app.command()(cli_export.export)
 cli_dynamic.fit_app.command("traits")(cli_editing.fit_traits)
 app.add_typer(cli_importing.import_app, name="import")
 cli_dynamic.fit_app.command("reflectance")(cli_reflectance.fit_reflectance)
@@ -451,25 +455,6 @@ def reconstruct(
         {"path": out, "ran": done.ran, "reused": done.reused, "left_out": done.left_out,
          "assumed": done.assumed},
     )  # fmt: skip
-
-
-@app.command()
-def report(
-    paths: Annotated[list[Path], typer.Argument(help="Folders that skinrig wrote.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The page.")] = Path("report.html"),
-    json: Json = False,
-) -> None:
-    """Write one self-contained HTML page about what lies at PATHS.
-
-    Example: skinrig report demo -o report.html
-    """
-    from skinrig.report import build
-
-    console = Console(json)
-    page = build(paths)
-    out.write_text(page, encoding="utf-8")
-    console.say(f"{out}: {len(page) / 1e6:.2f} MB; open it in a browser")
-    console.document("skinrig.report/1", {"path": out, "bytes": len(page)})
 
 
 @app.command()
@@ -541,46 +526,6 @@ def verify(
     )  # fmt: skip
     if not found.ok:
         raise typer.Exit(errors.BAD_INPUT)
-
-
-@app.command()
-def export(
-    source: Annotated[
-        Path, typer.Argument(help="SESSION/ folder; APPEARANCE/ of a dome for merl and rgl.")
-    ],
-    to: Annotated[str, typer.Option(help="mhl, frames, event-model; merl, rgl.")],
-    out: Out,
-    use: Annotated[
-        str | None, typer.Option(help="What a session is for; the consent must cover it.")
-    ] = None,
-    at: Annotated[
-        str | None, typer.Option(help="Place on the skin, U,V in 0 to 1: its BRDF too (merl, rgl).")
-    ] = None,
-    radius: Annotated[float, typer.Option(help="Average around the place, mm.")] = 0.0,
-    without_diffuse: Annotated[
-        bool, typer.Option("--without-diffuse", help="The place's surface alone.")
-    ] = False,
-    json: Json = False,
-) -> None:
-    """Hand a session on, within the subject's consent, or the BRDFs of an appearance.
-
-    All files are listed in an ASC MHL manifest.
-
-    Example: skinrig export session --to frames --use research --out delivery
-    """
-    from skinrig import export as hand_on
-    from skinrig.brdf_export import SUFFIX, place_of
-
-    console = Console(json)
-    if to in SUFFIX:
-        place = place_of(at, radius_mm=radius, diffuse=not without_diffuse)
-        done = hand_on.export_brdfs(source, out, to=to, place=place)
-    else:
-        done = hand_on.export(source, out, to=to, use=hand_on.named(use))
-    console.say(f"{done.path}: {done.files} files, listed in {done.manifest}")
-    console.document(
-        "skinrig.export/1", {"path": done.path, "files": done.files, "manifest": done.manifest}
-    )
 
 
 @app.command()
