@@ -4,13 +4,14 @@ PYTEST := .venv/bin/python -m pytest
 # a process for each core, four at most: kernels use several threads as well; one that ends ends all
 WORKERS := -n auto --maxprocesses 4 --dist loadfile --max-worker-restart 0
 
-.PHONY: help setup demo test test-long lint bench clean
+.PHONY: help setup browser demo test test-long lint bench clean
 
 help:
 	@echo "make demo       simulate, capture, calibrate, reconstruct, report (leaves ./demo)"
 	@echo "make test       every test but the long ones"
 	@echo "make test-long  the long ones"
 	@echo "make lint       ruff, mypy and the import contracts"
+	@echo "make browser    Chromium and what else the tests in a browser need (else they skip)"
 	@echo "make bench      error against run time of each stage"
 	@echo "each sets up what it needs in .venv first"
 
@@ -18,6 +19,9 @@ setup: .venv/.ready
 
 .venv/.ready: pyproject.toml constraints.txt tools/setup_environment.sh
 	@tools/setup_environment.sh
+
+browser: .venv/.ready
+	@tools/setup_browser.sh
 
 demo: .venv/.ready
 	@$(SKINRIG) demo --out demo
@@ -38,4 +42,4 @@ bench: .venv/.ready
 	@$(SKINRIG) bench
 
 clean:
-	rm -rf .venv demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis node_modules
