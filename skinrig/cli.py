@@ -46,7 +46,7 @@ app = typer.Typer(
     name="skinrig",
     help="Capture, calibrate and reconstruct skin appearance, with rigs that can be simulated.",
     epilog="Begin with: skinrig demo",
-    no_args_is_help=True,
+    invoke_without_command=True,
     pretty_exceptions_enable=False,
     add_completion=True,
     rich_markup_mode=None,
@@ -63,6 +63,7 @@ def _version(shown: bool) -> None:
 
 @app.callback()
 def _root(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which one.")
     ] = False,
@@ -73,6 +74,12 @@ def _root(
         level=logging.INFO if verbose else logging.WARNING,
         format="%(levelname)s %(name)s: %(message)s",
     )
+    if context.invoked_subcommand is None:
+        from importlib.metadata import version as version_of
+
+        from skinrig.next_steps import welcome
+
+        typer.echo(welcome(Path(), version_of("skinrig")))
 
 
 @app.command()
@@ -199,6 +206,7 @@ def simulate(
         sequence_of,
     )
     from skinrig.consent import subject_of
+    from skinrig.next_steps import after_session
     from skinrig.simulation import USES, pseudonym, simulate_session
 
     console = Console(json)
@@ -217,36 +225,8 @@ def simulate(
     console.say(
         f"{done.session}: {done.frames} frames" + (f", truth in {done.truth}" if done.truth else "")
     )
-    console.say(f"next: {_next_step(rig, out, target if sequence is None else 'sequence')}")
+    console.say(f"next: {after_session(rig, out, target if sequence is None else 'sequence')}")
     console.document("skinrig.simulate/1", done.document())
-
-
-def _next_step(rig: str, session: Path, target: str | None) -> str:
-    kinds = {"white": "white", "flat": "sensor", "dark": "sensor", "chart": "color",
-             "malus": "polarization"}  # fmt: skip
-    if rig == "dome":
-        kinds = {"charuco": "geometry", "mirror": "lights", "white": "lights"}
-    if rig == "gradient":
-        kinds = {"ball": "lights", "flat": "sensor", "dark": "sensor"}
-    if rig == "probe":
-        kinds = {"phantom": "fibre"}
-    if target == "sequence":
-        return f"skinrig reconstruct {session} --want perfusion_curves --out appearance"
-    if target is None:
-        if rig == "probe":
-            want = "profiles,subsurface,translucency --calibration calibration"
-            return f"skinrig reconstruct {session} --want {want} --out appearance"
-        if rig == "gradient":
-            want = "normals,height,histograms,kernels --calibration calibration"
-            return f"skinrig reconstruct {session} --want {want} --out appearance"
-        want = "normals,r_d --calibration calibration" if rig == "dome" else "melanin,hemoglobin"
-        return f"skinrig reconstruct {session} --want {want} --out appearance"
-    if target not in kinds:
-        return f"skinrig verify {session}"
-    pair = kinds[target] == "lights" and rig == "dome"
-    named = f"SESSION-MIRROR {session}" if pair else f"{session}"
-    named = f"{session} SESSION-WHITE" if target == "mirror" else named  # one calibration of both
-    return f"skinrig calibrate {kinds[target]} {named} --out calibration"
 
 
 @app.command()

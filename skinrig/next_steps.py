@@ -1,0 +1,240 @@
+"""What to do next: after a session was captured, and with what lies in a folder.
+
+Folders are told apart by their documents alone, and no map is read, so that a plain ``skinrig``
+answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+CALIBRATIONS: Final[Mapping[str, Mapping[str, str]]] = {
+    "flash": {"white": "white", "flat": "sensor", "dark": "sensor", "chart": "color",
+              "malus": "polarization"},
+    "dome": {"charuco": "geometry", "mirror": "lights", "white": "lights"},
+    "gradient": {"ball": "lights", "flat": "sensor", "dark": "sensor"},
+    "probe": {"phantom": "fibre"},
+}  # fmt: skip
+"""The calibration that each target of a rig makes."""
+WANTS: Final[Mapping[str, str]] = {
+    "flash": "melanin,hemoglobin",
+    "dome": "normals,r_d",
+    "gradient": "normals,height,histograms,kernels",
+    "probe": "profiles,subsurface,translucency",
+    "photographs": "melanin,hemoglobin",
+}
+"""What is usually wanted of a session of skin."""
+UNCALIBRATED: Final = ("flash", "photographs")
+"""Rigs whose maps need no calibration; without one something is assumed, and said."""
+PHOTOGRAPHS: Final = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".tif",
+                      ".tiff", ".jpg", ".jpeg")  # fmt: skip
+DEMO: Final = "demo"
+MOST: Final = 4
+"""Next steps that are named at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A command and what it is for."""
+
+    command: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What lies in a folder, each sorted by name."""
+
+    sessions: Mapping[Path, Mapping[str, Any]] = field(default_factory=dict)
+    """With their session.json."""
+    appearances: Mapping[Path, Mapping[str, Any]] = field(default_factory=dict)
+    """With their appearance.json, truths left out."""
+    truths: tuple[Path, ...] = ()
+    calibrations: tuple[Path, ...] = ()
+    reports: tuple[Path, ...] = ()
+    photographs: int = 0
+
+    def summary(self) -> str:
+        """Return what is here in one line; empty where nothing of skinrig's is."""
+        counts = [
+            (len(self.sessions), "session"), (len(self.calibrations), "calibration"),
+            (len(self.appearances), "appearance"), (len(self.reports), "report"),
+            (self.photographs, "photograph"),
+        ]  # fmt: skip
+        return ", ".join(f"{n} {noun}{'s' if n > 1 else ''}" for n, noun in counts if n)
+
+
+def after_session(
+    rig: str, session: str | Path, target: str | None, *, calibration: str | Path = "calibration"
+) -> str:
+    """Return the command that a session is for, most likely.
+
+    Parameters
+    ----------
+    rig
+        flash, dome, gradient or probe; another name is taken for photographs.
+    session
+        Its folder.
+    target
+        The calibration target that it shows, "sequence" for one in time, None for skin.
+    calibration
+        Folder of calibrations that the command names.
+
+    Examples
+    --------
+    >>> after_session("flash", "session-flash", None)
+    'skinrig reconstruct session-flash --want melanin,hemoglobin --out appearance'
+    >>> after_session("probe", "session-phantom", "phantom")
+    'skinrig calibrate fibre session-phantom --out calibration'
+    """
+    if target == "sequence":
+        return f"skinrig reconstruct {session} --want perfusion_curves --out appearance"
+    if not target:
+        needs = "" if rig not in WANTS or rig in UNCALIBRATED else f" --calibration {calibration}"
+        want = WANTS.get(rig, WANTS["photographs"])
+        return f"skinrig reconstruct {session} --want {want}{needs} --out appearance"
+    kind = CALIBRATIONS.get(rig, {}).get(target)
+    if kind is None:
+        return f"skinrig verify {session}"
+    named = f"{session}"
+    if rig == "dome" and kind == "lights":  # one calibration of both
+        named = f"{session} SESSION-WHITE" if target == "mirror" else f"SESSION-MIRROR {session}"
+    return f"skinrig calibrate {kind} {named} --out {calibration}"
+
+
+def look(folder: Path) -> Surroundings:
+    """Find what skinrig wrote into a folder, and photographs.
+
+    Parameters
+    ----------
+    folder
+        One that exists; the folders in it are looked into, not below. What cannot be read or is
+        damaged is passed over: the commands that use it say what is wrong.
+    """
+    sessions, appearances, truths, calibrations = {}, {}, [], []
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError:
+        return Surroundings()
+    for entry in entries:
+        if (document := _document(entry / "session.json")) is not None:
+            sessions[entry] = document
+        elif (document := _document(entry / "appearance.json")) is not None:
+            if document.get("parameters", {}).get("kind") == "truth":
+                truths.append(entry)
+            else:
+                appearances[entry] = document
+        elif entry.name.startswith("calibration") and entry.is_dir():
+            calibrations.append(entry)
+    reports = [e for e in entries if e.suffix == ".html" and e.is_file()]
+    photographs = sum(e.suffix.lower() in PHOTOGRAPHS for e in entries)
+    return Surroundings(
+        sessions, appearances, tuple(truths), tuple(calibrations), tuple(reports), photographs
+    )
+
+
+def suggest(found: Surroundings, folder: Path) -> tuple[Step, ...]:
+    """Return what to do next with what lies in a folder, the nearest first.
+
+    Parameters
+    ----------
+    found
+        By `look`.
+    folder
+        As it is to be named in commands.
+    """
+    steps: list[Step] = []
+    if found.reports:
+        steps.append(Step(f"open {found.reports[0]}", "in a browser: maps, errors, checks"))
+    elif found.appearances:
+        steps.append(Step(f"skinrig report {folder}", "one page of all that lies here"))
+    used = {d.get("parameters", {}).get("session") for d in found.appearances.values()}
+    fresh = [(p, d) for p, d in found.sessions.items() if p.name not in used and not _target(d)]
+    if fresh:
+        path, document = fresh[0]
+        rig = document.get("rig", {}).get("name", "")
+        where = next((c for c in found.calibrations if rig in c.name), None)
+        where = where or next(iter(found.calibrations), Path("calibration"))
+        steps.append(
+            Step(after_session(rig, path, None, calibration=where), "maps with standard errors")
+        )
+    if found.appearances:
+        best = _most_whole(found.appearances)
+        steps.append(Step(f"skinrig view {best}", "a page that shows the skin moving, under light"))
+        steps.append(Step(f"skinrig export {best} --to maps --out export", "for other programs"))
+    if found.photographs and not found.sessions:
+        steps.append(
+            Step(f"skinrig import photos {folder} --out session", "photographs become a session")
+        )
+    if not steps:
+        steps = [
+            Step("skinrig demo", "all four rigs, simulated, in under three minutes"),
+            Step("skinrig simulate flash --out session", "one virtual rig, by the real drivers"),
+            Step("skinrig import photos DIR --out session", "photographs of your own"),
+            Step("skinrig doctor", "what is installed, and how to mend what is not"),
+        ]
+    return tuple(steps[:MOST])
+
+
+def welcome(folder: Path, version: str) -> str:
+    """Return what a plain ``skinrig`` prints.
+
+    Parameters
+    ----------
+    folder
+        Where it was typed, as commands are to name it; else the demo's folder in it.
+    version
+        Of skinrig.
+    """
+    found = look(folder)
+    if not found.summary() and look(folder / DEMO).summary():
+        folder = folder / DEMO
+        found = look(folder)
+    steps = suggest(found, folder)
+    width = max(len(step.command) for step in steps)
+    summary = found.summary()
+    lines = [f"skinrig {version}: skin appearance, captured, calibrated, reconstructed", ""]
+    if summary:
+        lines += [f"In {folder}: {summary}" if folder.name else f"Here: {summary}", ""]
+    lines.append("Next:")
+    for step in steps:
+        lines.append(f"  {step.command.ljust(width)}  {step.why}".rstrip())
+    return "\n".join(
+        [*lines, "", "All commands: skinrig --help; one of them: skinrig report --help"]
+    )
+
+
+def _document(path: Path) -> dict[str, Any] | None:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _target(session: Mapping[str, Any]) -> str:
+    """Return the calibration target of a session, as far as its documents say one."""
+    named = session.get("extra", {}).get("simulation", {}).get("target")
+    if named:
+        return str(named)
+    kinds = {step.get("kind") for step in session.get("plan", {}).get("steps", ())}
+    targets = CALIBRATIONS.get(session.get("rig", {}).get("name", ""), {})
+    return next((target for target in targets if target in kinds - {"dark"}), "")
+
+
+def _most_whole(appearances: Mapping[Path, Mapping[str, Any]]) -> Path:
+    """Return the appearance that shows most in the viewer: a whole face before a patch."""
+
+    def rank(path: Path) -> tuple[int, int]:
+        document = appearances[path]
+        files: Sequence[str] = tuple(document.get("files", {}))
+        kind = document.get("parameters", {}).get("kind")
+        return (2 if "mesh.obj" in files else 1 if kind == "dynamic" else 0), len(
+            document.get("maps", {})
+        )
+
+    return max(appearances, key=rank)

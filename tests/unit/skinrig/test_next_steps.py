@@ -1,0 +1,102 @@
+"""What a plain ``skinrig`` tells people to do next, from what lies in a folder."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from skinrig.cli import main
+from skinrig.next_steps import CALIBRATIONS, after_session, look, suggest, welcome
+
+
+def session(path, rig="flash", kinds=("dark", "subject"), target=""):
+    path.mkdir()
+    document = {"rig": {"name": rig}, "plan": {"steps": [{"kind": kind} for kind in kinds]},
+                "extra": {"simulation": {"target": target}} if target else {}}  # fmt: skip
+    (path / "session.json").write_text(json.dumps(document))
+
+
+def appearance(path, session="", kind="appearance", files=()):
+    path.mkdir()
+    document = {"parameters": {"kind": kind, "session": session}, "maps": {"melanin": {}},
+                "files": dict.fromkeys(files, "")}  # fmt: skip
+    (path / "appearance.json").write_text(json.dumps(document))
+
+
+def commands(folder=Path()):
+    return [step.command for step in suggest(look(folder), folder)]
+
+
+@pytest.fixture(autouse=True)
+def _inside(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def test_an_empty_folder_begins_with_the_demo():
+    assert commands()[0] == "skinrig demo"
+
+
+def test_photographs_are_imported():
+    Path("anna.NEF").touch()
+    assert commands()[0].startswith("skinrig import photos .")
+
+
+def test_a_session_of_skin_is_reconstructed_with_its_own_calibration():
+    session(Path("session-a"), "dome", ("dark", "olat"))
+    Path("calibration-dome").mkdir()
+    Path("calibration-flash").mkdir()
+    assert commands()[0] == (
+        "skinrig reconstruct session-a --want normals,r_d --calibration calibration-dome "
+        "--out appearance"
+    )
+
+
+def test_a_target_is_not_reconstructed_as_if_it_were_skin():
+    session(Path("session-white"), "dome", ("dark", "white"))
+    session(Path("session-tile"), "flash", target="white")
+    assert not any("reconstruct" in command for command in commands())
+
+
+def test_what_has_maps_already_is_looked_at():
+    session(Path("session-a"))
+    appearance(Path("appearance"), "session-a")
+    assert [command.split()[1] for command in commands()] == ["report", "view", "export"]
+
+
+def test_a_whole_face_is_viewed_before_a_patch_and_never_a_truth():
+    appearance(Path("truth-a"), kind="truth", files=("mesh.obj",))
+    appearance(Path("a-patch"))
+    appearance(Path("b-face"), files=("mesh.obj",))
+    assert "skinrig view b-face" in commands()
+
+
+def test_a_demo_below_is_found():
+    Path("demo").mkdir()
+    session(Path("demo/session-a"))
+    Path("demo/report.html").touch()
+    text = welcome(Path(), "1")
+    assert "In demo: 1 session, 1 report" in text
+    assert f"open {Path('demo/report.html')}" in text
+
+
+def test_damaged_documents_do_not_stop_it():
+    Path("session-a").mkdir()
+    Path("session-a/session.json").write_bytes(b"\xff{")
+    Path("appearance").mkdir()
+    Path("appearance/appearance.json").write_text("[1]")
+    assert commands()[0] == "skinrig demo"
+
+
+@pytest.mark.parametrize(
+    ("rig", "target"), [(rig, target) for rig, kinds in CALIBRATIONS.items() for target in kinds]
+)
+def test_each_target_leads_to_a_calibration_that_exists(rig, target, capsys):
+    words = after_session(rig, "session", target).split()
+    assert words[:2] == ["skinrig", "calibrate"]
+    assert main([*words[1:3], "missing"]) == 3
+    assert "missing" in capsys.readouterr().err
+
+
+def test_nothing_typed_prints_the_next_steps(capsys):
+    assert main([]) == 0
+    assert "skinrig demo" in capsys.readouterr().out
