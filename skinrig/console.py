@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 
 def plain(value: Any) -> Any:
-    """Return ``value`` as something that JSON can hold; NaN and infinities become None."""
+    """Return ``value`` as something that JSON can hold; NaN and infinities become None.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> plain({"error": float("nan"), "sizes": (1, 2), "folder": Path("out")})
+    {'error': None, 'sizes': [1, 2], 'folder': 'out'}
+    """
+    if value is None or isinstance(value, (str, int)):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
     if isinstance(value, (list, tuple, set, frozenset)):
         return [plain(item) for item in value]
-    if isinstance(value, (np.floating, float)):
-        return float(value) if np.isfinite(value) else None
-    if isinstance(value, np.integer):
-        return int(value)
-    if isinstance(value, np.bool_):
-        return bool(value)
-    if value is None or isinstance(value, (str, int, bool)):
-        return value
+    # arrays and their scalars know it; NumPy itself would cost every command a tenth of a second
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
     return str(value)
 
 

@@ -1,0 +1,95 @@
+"""What starting costs: which libraries a command loads before it is asked for work, and how long.
+
+Each question is asked of a fresh process, since this one has loaded everything already.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+COMMAND = Path(sys.executable).with_name("skinrig")
+
+RENDERERS = ("mitsuba", "drjit")
+HEAVY = (
+    *RENDERERS, "cv2", "matplotlib", "scipy", "numba", "skimage", "sklearn", "colour",
+    "OpenEXR", "embreex", "trimesh",
+)  # fmt: skip
+QUICK_S = 0.3
+RUNS = 5
+"""The quickest of so many starts is judged: what else runs on the machine only adds to one."""
+
+
+def loaded_by(code, candidates=HEAVY):
+    """Return which of the libraries a fresh process has loaded after ``code``."""
+    tell = (
+        f"{code}\nimport sys, json\n"
+        f"sys.stderr.write(json.dumps([m for m in {candidates!r} if m in sys.modules]))"
+    )
+    run = subprocess.run([sys.executable, "-c", tell], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    return json.loads(run.stderr.splitlines()[-1])
+
+
+def packages(top):
+    return [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        for path in sorted((ROOT / top).rglob("*.py"))
+    ]
+
+
+@pytest.mark.parametrize("module", ["capture", "model", "reconstruction", "rigsim", "skinrig"])
+def test_a_package_alone_loads_nothing_heavy(module):
+    assert loaded_by(f"import {module}") == []
+
+
+def test_capture_and_its_devices_load_neither_renderer_nor_vision_nor_science():
+    """A capture computer drives a rig without the libraries that calibrate and reconstruct."""
+    every = [
+        name for name in packages("capture")
+        if "calibration" not in name and name != "capture.hdr"
+    ]  # fmt: skip
+    assert len(every) > 50
+    assert loaded_by("import " + ", ".join(every)) == []
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--version"], ["--help"], ["simulate", "--help"], ["reconstruct", "--help"],
+     ["fit", "--help"], ["render", "--help"], ["bench", "--help"]],
+    ids=" ".join,
+)  # fmt: skip
+def test_asking_for_help_loads_no_numerics_at_all(arguments):
+    code = f"from skinrig.cli import main\nassert main({arguments!r}) == 0"
+    assert loaded_by(code, (*HEAVY, "numpy", "capture", "model")) == []
+
+
+def test_a_heavy_import_would_be_found():
+    assert loaded_by("import skinrig.cli, scipy.ndimage") == ["scipy"]
+
+
+def best_start_s(arguments, environment=None):
+    best = float("inf")
+    for _ in range(RUNS):
+        begin = time.perf_counter()
+        run = subprocess.run(
+            [COMMAND, *arguments], cwd=ROOT, capture_output=True, text=True,
+            env={**os.environ, **(environment or {})},
+        )  # fmt: skip
+        best = min(best, time.perf_counter() - begin)
+        assert run.returncode == 0, run.stderr
+    return best
+
+
+@pytest.mark.skipif(not COMMAND.exists(), reason="the command is not installed beside Python")
+def test_the_version_is_told_in_under_a_third_of_a_second():
+    """Rationale: people and shells ask often. Expected: 0.13 s quiet. Tolerance: the requirement.
+
+    NumPy alone takes as long again, so that a single careless import at the top shows.
+    """
+    assert best_start_s(["--version"]) < QUICK_S
