@@ -4,10 +4,9 @@ Each question is asked of a fresh process, since this one has loaded everything 
 """
 
 import json
-import os
+import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -73,23 +72,30 @@ def test_a_heavy_import_would_be_found():
     assert loaded_by("import skinrig.cli, scipy.ndimage") == ["scipy"]
 
 
-def best_start_s(arguments, environment=None):
-    best = float("inf")
+def least_start_s(arguments):
+    """Return the least processor time of some starts, s; waiting for a busy machine is not ours."""
+    spent = []
     for _ in range(RUNS):
-        begin = time.perf_counter()
-        run = subprocess.run(
-            [COMMAND, *arguments], cwd=ROOT, capture_output=True, text=True,
-            env={**os.environ, **(environment or {})},
-        )  # fmt: skip
-        best = min(best, time.perf_counter() - begin)
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        run = subprocess.run([COMMAND, *arguments], cwd=ROOT, capture_output=True, text=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
         assert run.returncode == 0, run.stderr
-    return best
+        spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return min(spent)
 
 
 @pytest.mark.skipif(not COMMAND.exists(), reason="the command is not installed beside Python")
 def test_the_version_is_told_in_under_a_third_of_a_second():
-    """Rationale: people and shells ask often. Expected: 0.13 s quiet. Tolerance: the requirement.
+    """Rationale: people and shells ask often. Expected: 0.13 s on a quiet core. Tolerance: the
+    requirement.
 
-    NumPy alone takes as long again, so that a single careless import at the top shows.
+    Starting with NumPy takes 0.25 s or more, and with SciPy or a renderer a second.
     """
-    assert best_start_s(["--version"]) < QUICK_S
+    assert least_start_s(["--version"]) < QUICK_S
+
+
+@pytest.mark.skipif(not COMMAND.exists(), reason="the command is not installed beside Python")
+def test_a_slow_start_would_be_found(tmp_path, monkeypatch):
+    (tmp_path / "sitecustomize.py").write_text("import scipy.ndimage, scipy.sparse, scipy.signal\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    assert least_start_s(["--version"]) > QUICK_S
