@@ -22,6 +22,7 @@ from skinrig import (
     cli_report,
     errors,
 )
+from skinrig.cli_help import Commands
 from skinrig.cli_options import (
     AllBrackets,
     Angles,
@@ -44,6 +45,7 @@ from skinrig.console import Console
 
 app = typer.Typer(
     name="skinrig",
+    cls=Commands,
     help="Capture, calibrate and reconstruct skin appearance, with rigs that can be simulated.",
     epilog="Begin with: skinrig demo",
     invoke_without_command=True,

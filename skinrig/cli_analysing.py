@@ -7,6 +7,7 @@ from typing import Annotated, Literal, cast
 
 import typer
 
+from skinrig.cli_help import Subcommands
 from skinrig.cli_options import Json, Out
 from skinrig.console import Console
 from skinrig.errors import UsageError
@@ -15,7 +16,7 @@ Labels = Annotated[
     Path | None, typer.Option(help="Table name,TRAIT,... of 0 and 1, a line for each face.")
 ]
 
-analyse_app = typer.Typer(help="Analyse faces together.", no_args_is_help=True)
+analyse_app = typer.Typer(cls=Subcommands, help="Analyse faces together.", no_args_is_help=True)
 
 
 @analyse_app.callback()

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from skinrig.cli_help import Subcommands
 from skinrig.cli_options import Json, Out
 from skinrig.console import Console
 
@@ -28,8 +29,10 @@ Extrapolate = Annotated[
     str, typer.Option(help="Beyond the table's stretch range: hold its ends, or formula.")
 ]
 
-fit_app = typer.Typer(help="Fit models to captured data.", no_args_is_help=True)
-apply_app = typer.Typer(help="Evaluate fitted models of a moving face.", no_args_is_help=True)
+fit_app = typer.Typer(cls=Subcommands, help="Fit models to captured data.", no_args_is_help=True)
+apply_app = typer.Typer(
+    cls=Subcommands, help="Evaluate fitted models of a moving face.", no_args_is_help=True
+)
 
 
 @fit_app.command("facial-color")

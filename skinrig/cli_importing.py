@@ -7,10 +7,13 @@ from typing import Annotated
 
 import typer
 
+from skinrig.cli_help import Subcommands
 from skinrig.cli_options import Consent, ConsentExpires, Json, Out
 from skinrig.console import Console
 
-import_app = typer.Typer(help="Bring in what other devices made.", no_args_is_help=True)
+import_app = typer.Typer(
+    cls=Subcommands, help="Bring in what other devices made.", no_args_is_help=True
+)
 
 
 @import_app.command("photos")

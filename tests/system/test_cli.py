@@ -8,23 +8,39 @@ import pytest
 
 from skinrig.cli import app, main
 
-GROUPS = {"import": "photos", "fit": "facial-color", "apply": "expression", "analyse": "brdf"}
-"""Groups of commands, with one of each."""
-COMMANDS = sorted(
-    [
-        command.name or command.callback.__name__.replace("_", "-")
-        for command in app.registered_commands
-    ]
-    + list(GROUPS)
-)
+
+def registered(typer_app, before=()):
+    """Each command's words, those in groups too."""
+    for command in typer_app.registered_commands:
+        yield (*before, command.name or command.callback.__name__.replace("_", "-"))
+    for group in typer_app.registered_groups:
+        yield from registered(group.typer_instance, (*before, group.name))
+
+
+WORDS = sorted(registered(app))
+COMMANDS = sorted({words[0] for words in WORDS})
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_explains_itself_with_an_example(command, capsys):
-    argv = [command, *([GROUPS[command]] if command in GROUPS else []), "--help"]
-    assert main(argv) == 0
-    assert f"Example: skinrig {command}" in capsys.readouterr().out
+@pytest.mark.parametrize("words", WORDS, ids=" ".join)
+def test_every_command_explains_itself_with_an_example(words, capsys):
+    assert main([*words, "--help"]) == 0
+    assert f"Example: skinrig {' '.join(words)}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("group", [[], ["fit"], ["apply"], ["analyse"], ["import"]], ids=" ".join)
+def test_help_lists_each_command_with_its_whole_summary(group, capsys):
+    assert main([*group, "--help"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "..." not in printed.replace("[ARGS]...", "")
+    for words in WORDS:
+        if list(words[: len(group)]) == group:
+            assert f" {words[len(group)]} " in printed
+
+
+def test_commands_stand_under_the_heading_of_what_they_are_for(capsys):
+    assert main(["--help"]) == 0
+    assert "More:" not in capsys.readouterr().out
 
 
 def test_the_promised_commands_are_there():

@@ -1,0 +1,58 @@
+"""How ``skinrig --help`` lists commands: by what people come for, each with its whole summary."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import click
+from typer.core import TyperGroup
+
+SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
+    ("Begin", ("demo", "doctor")),
+    ("Capture, on a rig or its simulation",
+     ("plan", "simulate", "capture", "serve", "calibrate", "import", "verify")),
+    ("From captures to models", ("reconstruct", "fit", "apply", "edit", "analyse")),
+    ("Look, and hand on", ("report", "view", "render", "export")),
+    ("Measure", ("bench",)),
+)  # fmt: skip
+OTHER: Final = "More"
+
+
+class Commands(TyperGroup):
+    """A group that lists its commands under the headings of `SECTIONS`, nothing cut off."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the headings and the commands below them."""
+        for title, rows in self._sections(ctx):
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
+    def _sections(self, ctx: click.Context) -> Iterator[tuple[str, list[tuple[str, str]]]]:
+        left = {
+            name: command
+            for name in self.list_commands(ctx)
+            if (command := self.get_command(ctx, name)) is not None and not command.hidden
+        }
+        for title, names in SECTIONS:
+            rows = [(name, summary(left.pop(name))) for name in names if name in left]
+            if rows:
+                yield title, rows
+        if left:
+            yield OTHER, [(name, summary(command)) for name, command in left.items()]
+
+
+class Subcommands(TyperGroup):
+    """A group within the group: one list, nothing cut off."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands with their whole summaries."""
+        found = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, summary(one)) for name, one in found if one is not None])
+
+
+def summary(command: click.Command) -> str:
+    """Return the first paragraph of a command's help on one line, without its full stop."""
+    text = (command.short_help or command.help or "").split("\n\n")[0]
+    return " ".join(text.split()).rstrip(".")
