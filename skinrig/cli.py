@@ -12,6 +12,7 @@ import typer
 
 from skinrig import (
     cli_analysing,
+    cli_completion,
     cli_dynamic,
     cli_editing,
     cli_export,
@@ -34,6 +35,7 @@ from skinrig.cli_options import (
     Out,
     PromptPeriod,
     Repeats,
+    Rig,
     Seed,
     Sequence,
     ShotPeriod,
@@ -88,7 +90,11 @@ def _root(
 def demo(
     out: Out = Path("demo"),
     rigs: Annotated[
-        str, typer.Option(help="Rigs, joined by commas: flash, dome, gradient, probe; default all.")
+        str,
+        typer.Option(
+            help="Rigs, joined by commas: flash, dome, gradient, probe; default all.",
+            autocompletion=cli_completion.several_rigs,
+        ),
     ] = "flash,dome,gradient,probe",
     seed: Seed = 0,
     json: Json = False,
@@ -105,9 +111,12 @@ def demo(
 
 @app.command()
 def simulate(
-    rig: Annotated[str, typer.Argument(help="Name of a rig: flash, dome, gradient or probe.")],
+    rig: Rig,
     out: Out,
-    size: Annotated[str, typer.Option(help="Of the pictures: small or full.")] = "small",
+    size: Annotated[
+        str,
+        typer.Option(help="Of the pictures: small or full.", autocompletion=cli_completion.sizes),
+    ] = "small",
     width: Annotated[
         int | None, typer.Option(help="Pixels across, instead of the size; even but for gradient.")
     ] = None,
@@ -124,7 +133,8 @@ def simulate(
         typer.Option(
             help="Preset, I to VI, palest or darkest; of the dome also P01 to P87 of the "
             "simulated population; of the probe also homogeneous:SIGMA_A,SIGMA_S_PRIME[,G] or "
-            "anisotropic:SIGMA_A,SIGMA_S_PRIME[,STRENGTH[,AXIS]], 1/mm and degrees."
+            "anisotropic:SIGMA_A,SIGMA_S_PRIME[,STRENGTH[,AXIS]], 1/mm and degrees.",
+            autocompletion=cli_completion.subjects,
         ),
     ] = "III",
     mesh: Annotated[Path | None, typer.Option(help="Face mesh, .npz or .obj.")] = None,
@@ -132,7 +142,8 @@ def simulate(
         str | None,
         typer.Option(
             help="A target instead of a face: white, dark; of the flash rig chart, flat, malus; "
-            "of the dome charuco, mirror; of the gradient rig ball, flat; of the probe phantom."
+            "of the dome charuco, mirror; of the gradient rig ball, flat; of the probe phantom.",
+            autocompletion=cli_completion.targets,
         ),
     ] = None,
     site: Site = None,
@@ -144,7 +155,8 @@ def simulate(
     state: Annotated[
         list[str] | None,
         typer.Option(
-            help="State of the face, such as smile or exercise; repeatable for the flash rig."
+            help="State of the face, such as smile or exercise; repeatable for the flash rig.",
+            autocompletion=cli_completion.states,
         ),
     ] = None,
     movement: Annotated[
@@ -171,7 +183,8 @@ def simulate(
         list[str] | None,
         typer.Option(
             help="Condition of the face in the dome, NAME or NAME=AMOUNT up to 1: cold, hot, "
-            "sweat, lotion, makeup, powder; repeatable."
+            "sweat, lotion, makeup, powder; repeatable.",
+            autocompletion=cli_completion.conditions,
         ),
     ] = None,
     plan: Annotated[
@@ -233,7 +246,10 @@ def simulate(
 
 @app.command()
 def capture(
-    rig: Annotated[str, typer.Argument(help="Name of a rig, or its TOML file.")],
+    rig: Annotated[
+        str,
+        typer.Argument(help="Name of a rig, or its TOML file.", autocompletion=cli_completion.rigs),
+    ],
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the session.")] = None,
     port: Annotated[list[str] | None, typer.Option(help="Box: NAME=URL; repeatable.")] = None,
     camera: Annotated[list[str] | None, typer.Option(help="Camera: VIEW=URL; repeatable.")] = None,
@@ -301,7 +317,7 @@ def capture(
 
 @app.command()
 def serve(
-    rig: Annotated[str, typer.Argument(help="Name of a rig: flash, dome, gradient or probe.")],
+    rig: Rig,
     pty: Annotated[bool, typer.Option("--pty", help="Boxes on a pseudo terminal.")] = False,
     tcp: Annotated[str, typer.Option(help="Address for boxes and cameras.")] = "127.0.0.1:0",
     anywhere: Annotated[
@@ -330,7 +346,8 @@ def calibrate(
         str,
         typer.Argument(
             help="Of the flash rig sensor, color, polarization, white; of the dome geometry, "
-            "lights; of the gradient sphere sensor, lights, polarization; of the probe fibre."
+            "lights; of the gradient sphere sensor, lights, polarization; of the probe fibre.",
+            autocompletion=cli_completion.calibrations,
         ),
     ],
     sessions: Annotated[list[Path], typer.Argument(help="Sessions of the target.")],
@@ -387,7 +404,11 @@ app.add_typer(cli_analysing.analyse_app, name="analyse")
 def reconstruct(
     session: Annotated[Path, typer.Argument(help="SESSION/ folder.")],
     want: Annotated[
-        str, typer.Option(help="Maps, separated by commas; a wrong name lists those there are.")
+        str,
+        typer.Option(
+            help="Maps, separated by commas; a wrong name lists those there are.",
+            autocompletion=cli_completion.wants,
+        ),
     ],
     out: Out,
     calibration: Annotated[Path | None, typer.Option(help="CALIBRATION/ folder.")] = None,
@@ -441,7 +462,10 @@ def reconstruct(
 
 @app.command()
 def bench(
-    stage: Annotated[list[str] | None, typer.Option(help="Stage; repeatable; default all.")] = None,
+    stage: Annotated[
+        list[str] | None,
+        typer.Option(help="Stage; repeatable; default all.", autocompletion=cli_completion.stages),
+    ] = None,
     budget: Annotated[float, typer.Option(help="Seconds to spend, about.")] = 600.0,
     toy: Annotated[bool, typer.Option("--toy", help="Smallest sizes, no limits judged.")] = False,
     extremes: Annotated[

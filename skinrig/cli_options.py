@@ -8,6 +8,14 @@ from typing import Annotated
 
 import typer
 
+from skinrig import cli_completion
+
+Rig = Annotated[
+    str,
+    typer.Argument(
+        help="Name of a rig: flash, dome, gradient or probe.", autocompletion=cli_completion.rigs
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything that is drawn.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder to write.")]

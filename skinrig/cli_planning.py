@@ -9,12 +9,12 @@ from typing import Annotated
 import typer
 
 from skinrig import errors
-from skinrig.cli_options import Json
+from skinrig.cli_options import Json, Rig
 from skinrig.console import Console
 
 
 def plan(
-    rig: Annotated[str, typer.Argument(help="Name of a rig: dome, flash, gradient or probe.")],
+    rig: Rig,
     want: Annotated[
         str,
         typer.Option(

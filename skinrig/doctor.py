@@ -28,7 +28,7 @@ _REQUIRED = {
     "skimage": "scikit-image", "sklearn": "scikit-learn", "mitsuba": "mitsuba",
     "matplotlib": "matplotlib",
 }  # fmt: skip
-_EXTRAS = {"distributed": "cluster", "pxr": "usd", "gphoto2": "gphoto", "harvesters": "genicam",
+_EXTRAS = {"distributed": "cluster", "pxr": "usd", "gphoto2": "gphoto", "harvesters": "genicam", "playwright": "browser",
            "skfem": "fem"}  # fmt: skip
 
 

@@ -1,0 +1,58 @@
+"""What the shell offers at Tab, as the shell asks for it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from skinrig import cli_completion
+
+
+def offered(words):
+    typed = f"skinrig {words}"
+    run = subprocess.run(
+        [Path(sys.executable).with_name("skinrig")],
+        env={
+            "_SKINRIG_COMPLETE": "complete_bash", "COMP_WORDS": typed,
+            "COMP_CWORD": str(len(typed.split(" ")) - 1), "PATH": "",
+        },
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    return run.stdout.split()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("simulate d", ["dome"]),
+        ("calibrate ge", ["geometry"]),
+        ("demo --rigs flash,p", ["flash,probe"]),
+        ("reconstruct session --want normals,r", ["normals,r_d"]),
+        ("rep", ["report"]),
+    ],
+)
+def test_tab_completes_names(words, expected):
+    assert offered(words) == expected
+
+
+@pytest.mark.parametrize(
+    ("complete", "typed", "one"),
+    [
+        (cli_completion.targets, "ch", "charuco"),
+        (cli_completion.subjects, "dark", "darkest"),
+        (cli_completion.states, "sm", "smile"),
+        (cli_completion.conditions, "lo", "lotion"),
+        (cli_completion.stages, "chrom", "chromophores"),
+        (cli_completion.sizes, "f", "full"),
+    ],
+)
+def test_what_is_offered_begins_with_what_is_typed(complete, typed, one):
+    found = complete(typed)
+    assert one in found
+    assert all(name.startswith(typed) for name in found)
+    assert complete("zz") == []
+
+
+def test_a_name_is_not_offered_twice_in_a_list():
+    assert "flash,flash" not in cli_completion.several_rigs("flash,")
