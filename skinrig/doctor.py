@@ -28,8 +28,8 @@ _REQUIRED = {
     "skimage": "scikit-image", "sklearn": "scikit-learn", "mitsuba": "mitsuba",
     "matplotlib": "matplotlib",
 }  # fmt: skip
-_EXTRAS = {"distributed": "cluster", "pxr": "usd", "gphoto2": "gphoto", "harvesters": "genicam", "playwright": "browser",
-           "skfem": "fem"}  # fmt: skip
+_EXTRAS = {"distributed": "cluster", "pxr": "usd", "gphoto2": "gphoto", "harvesters": "genicam",
+           "playwright": "browser", "skfem": "fem"}  # fmt: skip
 
 
 def examine(*, probe_renderer: bool = True) -> list[Finding]:
