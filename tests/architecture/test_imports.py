@@ -72,10 +72,10 @@ def test_a_heavy_import_would_be_found():
     assert loaded_by("import skinrig.cli, scipy.ndimage") == ["scipy"]
 
 
-def least_start_s(arguments):
+def least_start_s(arguments, runs=RUNS):
     """Return the least processor time of some starts, s; waiting for a busy machine is not ours."""
     spent = []
-    for _ in range(RUNS):
+    for _ in range(runs):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         run = subprocess.run([COMMAND, *arguments], cwd=ROOT, capture_output=True, text=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -96,6 +96,6 @@ def test_the_version_is_told_in_under_a_third_of_a_second():
 
 @pytest.mark.skipif(not COMMAND.exists(), reason="the command is not installed beside Python")
 def test_a_slow_start_would_be_found(tmp_path, monkeypatch):
-    (tmp_path / "sitecustomize.py").write_text("import scipy.ndimage, scipy.sparse, scipy.signal\n")
+    (tmp_path / "sitecustomize.py").write_text("import scipy.ndimage, pydantic\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    assert least_start_s(["--version"]) > QUICK_S
+    assert least_start_s(["--version"], 1) > QUICK_S
