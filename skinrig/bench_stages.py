@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from skinrig import bench_plan, bench_table
-from skinrig.benchmark import StageBenchmark, to_document
+from skinrig.bench_document import to_document
+from skinrig.benchmark import StageBenchmark
 from skinrig.console import Console, plain
 from skinrig.errors import EXTRA_MISSING, exit_code, sentence
 
@@ -106,7 +107,7 @@ def run_stages(
     Returns
     -------
     dict
-        ``skinrig.bench/1``. Each stage says its ``size``; limits are judged at full size alone, and
+        ``skinrig.bench/2``. Each stage says its ``size``; limits are judged at full size alone, and
         ``not_judged`` names the stages whose limits were not.
 
     Raises
@@ -129,7 +130,7 @@ def run_stages(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         text = json.dumps(plain(document), indent=1, sort_keys=True)
-        (out / "bench.json").write_text(text + "\n", encoding="utf-8")
+        bench_table.write_whole(out / "bench.json", text + "\n")
     bench_table.show(document, console)
     return document
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+import io
+import os
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,9 @@ _COLUMNS = (
     "seconds", "cold_seconds", "peak_memory_mb", "error", "cramer_rao_bound", "efficiency",
 )  # fmt: skip
 
+BAND_COLUMNS = ("stage", "skin", "error", "low", "high", "Cramér-Rao", "of light", "which is")
+"""Of the table of errors by band: the last but one is the error over that of the lightest band."""
+
 
 def show(document: Mapping[str, Any], console: Console) -> None:
     """Print each stage's points and limits, then one line a stage and what was not judged.
@@ -20,7 +25,7 @@ def show(document: Mapping[str, Any], console: Console) -> None:
     Parameters
     ----------
     document
-        ``skinrig.bench/1``, as `skinrig.bench_stages.run_stages` makes it.
+        ``skinrig.bench/2``, as `skinrig.bench_stages.run_stages` makes it.
     console
         Where it is printed.
     """
@@ -43,9 +48,22 @@ def show(document: Mapping[str, Any], console: Console) -> None:
             console.say(f"left out: {what}: {why}")
         console.say()
     console.rows(
-        ("stage", "size", "points", "least error", "knee", "knee s", "best efficiency", "limits"),
+        (
+            "stage",
+            "size",
+            "points",
+            "fronts",
+            "least error",
+            "knee",
+            "knee s",
+            "best efficiency",
+            "limits",
+        ),
         [_line(name, stage) for name, stage in document["stages"].items()],
     )
+    if found := bands(document):
+        console.say()
+        console.rows(BAND_COLUMNS, found)
     for name, why in document["left_out"]:
         console.say(f"left out: {name}: {why}")
     if document["not_judged"]:
@@ -55,35 +73,63 @@ def show(document: Mapping[str, Any], console: Console) -> None:
         )
 
 
+def bands(document: Mapping[str, Any]) -> list[tuple[object, ...]]:
+    """Return the rows of :data:`BAND_COLUMNS`: errors of each stage from light skin to dark."""
+    rows: list[tuple[object, ...]] = []
+    for name, stage in document["stages"].items():
+        first = stage["by_band"][0]["error"] if stage["by_band"] else None
+        for one in stage["by_band"]:
+            low, high = one["error_interval"] or (None, None)
+            of_light = one["error"] / first if first else None
+            rows.append(
+                (name, one["band"], one["error"], _cell(low), _cell(high),
+                 _cell(one["cramer_rao_bound"]), _cell(of_light), stage["error_name"])
+            )  # fmt: skip
+    return rows
+
+
 def write(document: Mapping[str, Any], out: Path) -> None:
-    """Write one table of all points, ``bench.csv``, and a plot ``NAME.svg`` for each stage.
+    """Write one table of all points, ``bench.csv``, one by band, and a plot a stage.
 
     Parameters
     ----------
     document
-        ``skinrig.bench/1``.
+        ``skinrig.bench/2``.
     out
-        Folder; made if it is missing.
+        Folder; made if it is missing. It gets ``bench.csv``, ``bench-bands.csv``, ``NAME.svg``.
     """
     from skinrig import figures
 
     out.mkdir(parents=True, exist_ok=True)
-    with (out / "bench.csv").open("w", encoding="utf-8", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(
-            ("stage", "size", "setting", "error is", *_COLUMNS, "low", "high", "front", "knee")
-        )
-        for name, stage in document["stages"].items():
-            for point in stage["points"]:
-                table.writerow(
-                    (name, stage["size"], knobs(point), stage["error_name"],
-                     *(point[key] for key in _COLUMNS), *point["error_interval"],
-                     point["on_front"], point["knee"])
-                )  # fmt: skip
+    rows = [
+        (name, stage["size"], knobs(point), stage["error_name"],
+         *(point[key] for key in _COLUMNS), *point["error_interval"],
+         point["on_front"], point["knee"])
+        for name, stage in document["stages"].items()
+        for point in stage["points"]
+    ]  # fmt: skip
+    head = ("stage", "size", "setting", "error is", *_COLUMNS, "low", "high", "front", "knee")
+    write_whole(out / "bench.csv", _csv(head, rows))
+    write_whole(out / "bench-bands.csv", _csv(BAND_COLUMNS, bands(document)))
     for name, stage in document["stages"].items():
         if stage["points"]:
             plot = figures.error_against_seconds(name, stage)
-            (out / f"{name}.svg").write_text(plot + "\n", encoding="utf-8")
+            write_whole(out / f"{name}.svg", plot + "\n")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file that is there whole or not at all."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8", newline="")
+    os.replace(part, path)
+
+
+def _csv(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(head)
+    table.writerows(rows)
+    return text.getvalue()
 
 
 def knobs(point: Mapping[str, Any]) -> str:
@@ -109,13 +155,15 @@ def _place(point: Mapping[str, Any]) -> str:
 
 def _line(name: str, stage: Mapping[str, Any]) -> tuple[object, ...]:
     points = stage["points"]
-    bend = next((point for point in points if point["knee"]), None)
+    knees = [point for point in points if point["knee"]]
+    bend = knees[0] if len(knees) == 1 else None
     known = [point["efficiency"] for point in points if point["efficiency"] is not None]
     missed = sum(not limit["passed"] for limit in stage["limits"])
     verdict = f"{missed} MISSED" if missed else f"{len(stage['limits'])} kept"
+    many = f"{len(knees)}, one a condition" if len(knees) > 1 else ""
     return (
-        name, stage["size"], len(points),
+        name, stage["size"], len(points), len(stage["fronts"]),
         min((float(point["error"]) for point in points), default=""),
-        knobs(bend) if bend else "", bend["seconds"] if bend else "",
+        knobs(bend) if bend else many, bend["seconds"] if bend else "",
         min(known) if known else "", verdict if stage["size"] == "full" else "not judged",
     )  # fmt: skip

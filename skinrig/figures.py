@@ -49,16 +49,17 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     stage
         Name, for the title.
     document
-        The stage's entry in a ``skinrig.bench/1`` document.
+        The stage's entry in a ``skinrig.bench/2`` document.
 
     Returns
     -------
     str
-        SVG. Points on the Pareto front are joined and labelled, others are hollow; the knee
-        has a ring, and the Cramer-Rao bound a dash where it is known.
+        SVG. The Pareto front of each condition is joined, in a color of its own, and its points
+        are labelled with their effort; others are hollow. Knees have a ring, and the Cramer-Rao
+        bound a dash where it is known.
     """
     figure, axes = _figure(5.2, 3.4)
-    points = document["points"]
+    points, fronts = document["points"], document["fronts"]
     seconds = np.array([p["seconds"] for p in points], float)
     error = np.array([p["error"] for p in points], float)
     low = np.array([p["error_interval"][0] for p in points], float)
@@ -69,35 +70,42 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
         low, high = np.where(exact, error, low), np.where(exact, error, high)
     bars = np.maximum(np.stack([error - low, high - error]), 0.0)
     bars[0] = np.minimum(bars[0], 0.999 * error)  # a log axis has no room for zero
-    on_front = np.array([p["on_front"] for p in points], bool)
-    axes.errorbar(seconds, error, yerr=bars, fmt="none", ecolor=_COLORS[0], elinewidth=1)
-    axes.plot(seconds[~on_front], error[~on_front], "o", mfc="none", mec=_COLORS[0], label="beaten")
-    order = np.argsort(seconds[on_front])
-    axes.plot(
-        seconds[on_front][order], error[on_front][order], "o-", color=_COLORS[0], label="front"
-    )
-    bend = document.get("knee")
-    if bend is not None:
-        axes.plot(seconds[bend], error[bend], "o", mfc="none", mec=_COLORS[1], ms=11, label="knee")
-    for index in np.flatnonzero(on_front):
-        label = ", ".join(f"{k} {v}" for k, v in points[index]["knobs"].items())
-        label += "  (knee)" if index == bend else ""
-        label += "  (error 0)" if exact[index] else ""
-        # names of points on the right run to the left, into the plot
-        right = np.log(seconds[index]) > np.log([seconds.min(), seconds.max()]).mean()
-        words = axes.annotate(
-            label,
-            (seconds[index], error[index]),
-            xytext=(-5 if right else 5, 5),
-            textcoords="offset points",
-            ha="right" if right else "left",
-            fontsize=7,
+    middle = np.log([seconds.min(), seconds.max()]).mean()
+    named = len(fronts) <= MOST_NAMED
+    for number, front in enumerate(fronts):
+        color = _COLORS[number % len(_COLORS)]
+        own = np.array([_shares(p, front["condition"]) for p in points])
+        best = np.array(front["points"], int)
+        beaten = np.setdiff1d(np.flatnonzero(own), best)
+        axes.errorbar(
+            seconds[own], error[own], yerr=bars[:, own], fmt="none", ecolor=color, elinewidth=1
         )
-        words.set_in_layout(False)  # a long label must not squeeze the axes away
+        axes.plot(seconds[beaten], error[beaten], "o", mfc="none", mec=color, ms=4)
+        what = _words(front["condition"]) or "front"
+        axes.plot(
+            seconds[best], error[best], "o-", color=color, ms=4, label=what if named else None
+        )
+        bend = front["knee"]
+        if bend is not None:
+            axes.plot(seconds[bend], error[bend], "o", mfc="none", mec="0.5", ms=11)
+        for index in best if named or len(best) > 1 else ():
+            effort = {
+                k: v for k, v in points[index]["knobs"].items() if k not in front["condition"]
+            }
+            label = _words(effort)
+            label += "  (knee)" if index == bend else ""
+            label += "  (error 0)" if exact[index] else ""
+            # names of points on the right run to the left, into the plot
+            right = np.log(seconds[index]) > middle
+            words = axes.annotate(
+                label, (seconds[index], error[index]), xytext=(-5 if right else 5, 5),
+                textcoords="offset points", ha="right" if right else "left", fontsize=6,
+            )  # fmt: skip
+            words.set_in_layout(False)  # a long label must not squeeze the axes away
     bounds = np.array([p.get("cramer_rao_bound") or np.nan for p in points], float)
     if np.isfinite(bounds).any():
         known = np.isfinite(bounds)
-        axes.plot(seconds[known], bounds[known], "_", color=_COLORS[1], ms=14, label="Cramér-Rao")
+        axes.plot(seconds[known], bounds[known], "_", color="0.4", ms=14, label="Cramér-Rao")
     if document.get("reference_error", 0) > 0:
         axes.axhline(
             document["reference_error"], color="0.5", lw=0.8, ls=":", label="reference's own"
@@ -110,8 +118,21 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     axes.set_ylabel("\n".join(textwrap.wrap(document["error_name"], 36)))
     small = document.get("size") == "small"
     axes.set_title(f"{stage}, small size" if small else stage, fontsize=10)
-    axes.legend(fontsize=7, frameon=False)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=6, frameon=False)
     return _svg(figure)
+
+
+MOST_NAMED = 6
+"""Fronts that a plot has room to name; of more, only those of several points are labelled."""
+
+
+def _shares(point: Mapping[str, Any], condition: Mapping[str, Any]) -> bool:
+    return all(point["knobs"].get(name) == value for name, value in condition.items())
+
+
+def _words(knobs: Mapping[str, Any]) -> str:
+    return ", ".join(f"{k} {v}" for k, v in knobs.items() if v is not None)
 
 
 def bars(

@@ -15,6 +15,7 @@ from model import store
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.flash_stages import NOISE_STDERR
 from skinrig import (
+    bench_table,
     dynamic_section,
     evaluation,
     extremes_section,
@@ -115,7 +116,7 @@ def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
     sections.append(population_section.section(appearances))
     documents = [json.loads(p.read_text(encoding="utf-8")) for p in found.documents]
     for document in documents:
-        if document["schema"] == "skinrig.bench/1":
+        if document["schema"] == "skinrig.bench/2":
             sections.append(_bench_section(document, checks))
         elif document["schema"] == extremes_section.SCHEMA:
             sections.append(extremes_section.section(document, checks))
@@ -346,9 +347,9 @@ def _bench_section(document: Mapping[str, Any], checks: list[page.Check]) -> str
                 point["error"],
                 "" if point["cramer_rao_bound"] is None else point["cramer_rao_bound"],
                 "" if point.get("efficiency") is None else point["efficiency"],
-                "knee" if index == stage["knee"] else "front" if point["on_front"] else "",
+                "knee" if point["knee"] else "front" if point["on_front"] else "",
             )
-            for index, point in enumerate(stage["points"])
+            for point in stage["points"]
         ]  # fmt: skip
     body += f"<div class=plots>{''.join(plots)}</div>"
     body += page.table(
@@ -356,13 +357,9 @@ def _bench_section(document: Mapping[str, Any], checks: list[page.Check]) -> str
          ""),
         rows,
     )  # fmt: skip
-    bands = [
-        (name, band, error, stage["error_name"])
-        for name, stage in document["stages"].items()
-        for band, error in stage["by_band"].items()
-    ]
+    bands = bench_table.bands(document)
     if bands:
-        body += page.table(("stage", "skin", "error", "which is"), bands)
+        body += page.table(bench_table.BAND_COLUMNS, bands)
     body += (
         "<p class=note>Errors are in the unit on each plot's axis. Efficiency is variance over the "
         "Cramér-Rao bound: 1 is perfect.</p>"

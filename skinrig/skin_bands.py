@@ -1,8 +1,10 @@
-"""Skin color in bands: the individual typology angle of white-balanced reflectance."""
+"""Skin in bands: by the individual typology angle of its reflectance, and by its melanin."""
 
 from __future__ import annotations
 
-from typing import Final
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,3 +61,70 @@ def bands_of(angle_deg: ArrayLike) -> NDArray[np.str_]:
     """
     angle = np.asarray(angle_deg, np.float64)
     return np.array(BANDS)[np.searchsorted(-np.array(EDGES_DEG), -angle)]
+
+
+@dataclass(frozen=True, slots=True)
+class MelaninBand:
+    """A third of all skin by its melanin, with a typical person who stands for it."""
+
+    preset: str
+    """Of `rigsim.pigment.MELANIN_PRESETS`: the simulated person."""
+    melanin: float
+    """Volume fraction of that person's epidermis."""
+    melanin_range: tuple[float, float]
+    """Volume fractions of the band."""
+    sigma_a_per_mm: float
+    """Absorption that a fibre probe sees in red light, 1/mm: dark skin absorbs more."""
+    sigma_s_prime_per_mm: float
+    """Reduced scattering there, 1/mm."""
+    hemoglobin: float = 0.05
+    """Volume fraction of that person's dermis."""
+
+    def reflectance(self) -> NDArray[np.float64]:
+        """Return the diffuse albedo of the typical person, (3,), linear sRGB under D65.
+
+        By the layered model of `model.tissue_optics`.
+        """
+        return _reflectance(self.melanin, self.hemoglobin)
+
+    def told(self) -> dict[str, Any]:
+        """Return what a document says of the band."""
+        return {
+            "melanin": list(self.melanin_range),
+            "typical_melanin": self.melanin,
+            "typical_preset": self.preset,
+            "typical_typology_angle_deg": round(float(typology_angle_deg(self.reflectance())), 1),
+        }
+
+
+MELANIN_BANDS: Final = {
+    "light": MelaninBand("II", 0.014, (0.0, 0.02), 0.02, 1.4),
+    "medium": MelaninBand("IV", 0.047, (0.02, 0.07), 0.08, 1.2),
+    "dark": MelaninBand("VI", 0.17, (0.07, 0.51), 0.3, 1.0),
+}
+"""From light to dark, in the units of `rigsim.pigment` (an epidermis of 0.25 mm)."""
+
+
+@cache
+def _reflectance(melanin: float, hemoglobin: float) -> NDArray[np.float64]:
+    from model import spectra, tissue_optics
+
+    spectrum = tissue_optics.two_layer_reflectance(
+        spectra.WAVELENGTH_NM, np.array([melanin]), np.array([hemoglobin])
+    )
+    found = np.asarray(spectra.band_average(spectrum, spectra.LINEAR_SRGB, "D65")[0], np.float64)
+    found.setflags(write=False)
+    return found
+
+
+def melanin_band(melanin: ArrayLike) -> NDArray[np.str_]:
+    """Return the names of the bands that volume fractions of melanin lie in.
+
+    Examples
+    --------
+    >>> melanin_band([0.005, 0.02, 0.3]).tolist()
+    ['light', 'medium', 'dark']
+    """
+    edges = [band.melanin_range[0] for band in MELANIN_BANDS.values()][1:]
+    values = np.asarray(melanin, np.float64)
+    return np.array(list(MELANIN_BANDS))[np.searchsorted(edges, values, side="right")]

@@ -5,21 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skinrig import resident_memory
-from skinrig.benchmark import (
-    Limit,
-    Point,
-    StageBenchmark,
-    Timing,
-    knee,
-    measure,
-    pareto_front,
-    to_document,
-)
+from skinrig import bench_table, resident_memory
+from skinrig.bench_document import knee, pareto_front, to_document
+from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure
 
 
 def point(seconds, error):
-    return Point({"n": 1}, Timing(seconds, (seconds, seconds), seconds, 0.0), error, (error, error))
+    return Point({"n": 1}, Timing(seconds, (seconds, seconds), seconds, 1.0), error, (error, error))
 
 
 def test_the_front_holds_what_nothing_beats_in_both():
@@ -118,3 +110,42 @@ def test_memory_of_quick_calls_is_what_they_allocate():
     timing = measure(lambda: np.ones(100_000).sum(), repeats=1, memory=False)
     assert timing.memory_of == "allocated"
     assert 0.8 <= timing.peak_memory_mb < 0.9
+
+
+def test_each_condition_has_a_front_and_a_knee_of_its_own():
+    timing = {s: Timing(s, (s, s), s, 1.0) for s in (1.0, 2.0, 4.0)}
+    points = [
+        Point({"noise": noise, "steps": s}, timing[s], error, (error, error))
+        for noise, errors in (("low", (8.0, 1.0, 0.5)), ("high", (80.0, 10.0, 10.0)))
+        for s, error in zip(timing, errors, strict=True)
+    ]
+    alone = StageBenchmark("s", "rms", "r", 0.0, tuple(points), condition=("noise",))
+    told = to_document([alone])["stages"]["s"]
+    assert told["fronts"] == [
+        {"condition": {"noise": "low"}, "points": [0, 1, 2], "knee": 1},
+        {"condition": {"noise": "high"}, "points": [3, 4], "knee": None},
+    ]
+    assert [p["on_front"] for p in told["points"]] == [True] * 5 + [False]
+    # in one front for all, what is measured with much noise would look like too little effort
+    mixed = to_document([StageBenchmark("s", "rms", "r", 0.0, tuple(points))])["stages"]["s"]
+    assert [p["on_front"] for p in mixed["points"]] == [True] * 3 + [False] * 3
+
+
+def test_a_document_says_how_much_larger_errors_are_on_dark_skin():
+    stage = StageBenchmark(
+        "s", "rms, %", "truth", 0.0, (point(1, 1),),
+        by_band={"light": BandError(2.0, (1.0, 4.0)), "dark": BandError(6.0, (4.0, 8.0), 3.0)},
+    )  # fmt: skip
+    told = to_document([stage])["stages"]["s"]
+    assert [one["band"] for one in told["by_band"]] == ["light", "dark"]
+    assert told["darkest_over_lightest"] == {"ratio": 3.0, "interval": [1.0, 8.0]}
+    assert [row[1:7] for row in bench_table.bands({"stages": {"s": told}})] == [
+        ("light", 2.0, 1.0, 4.0, "", 1.0), ("dark", 6.0, 4.0, 8.0, 3.0, 3.0),
+    ]  # fmt: skip
+
+
+def test_memory_that_was_not_measured_has_its_reason():
+    timing = Timing(1.0, (1.0, 1.0), 1.0, None, no_memory="extrapolated")
+    stage = StageBenchmark("s", "rms", "r", 0.0, (Point({}, timing, 1.0, (1.0, 1.0)),))
+    told = to_document([stage])["stages"]["s"]["points"][0]
+    assert (told["peak_memory_mb"], told["no_memory"]) == (None, "extrapolated")

@@ -6,7 +6,8 @@ import pytest
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig import report
-from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, to_document
+from skinrig.bench_document import to_document
+from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
 
 
 @pytest.fixture

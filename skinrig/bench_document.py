@@ -1,0 +1,189 @@
+"""The one JSON schema of all benchmarks: fronts, knees, bands."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from skinrig import skin_bands
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark
+
+SCHEMA: Final = "skinrig.bench/2"
+
+
+def pareto_front(points: tuple[Point, ...]) -> tuple[int, ...]:
+    """Return the indices of points that no other beats in both seconds and error.
+
+    A point whose error is not finite is on no front.
+
+    Examples
+    --------
+    >>> pareto_front(())
+    ()
+    """
+    front = []
+    best = np.inf
+    told = [i for i, point in enumerate(points) if math.isfinite(point.error)]
+    for index in sorted(told, key=lambda i: (points[i].timing.seconds, points[i].error)):
+        if points[index].error < best:
+            best = points[index].error
+            front.append(index)
+    return tuple(front)
+
+
+def knee(points: tuple[Point, ...]) -> int | None:
+    """Return the front point after which more seconds buy least, or None below 3 points.
+
+    The point of the front that lies farthest below the straight line between its ends, on
+    log-log axes.
+    """
+    front = pareto_front(points)
+    if len(front) < 3:
+        return None
+    log_s = np.log([max(points[i].timing.seconds, 1e-9) for i in front])
+    log_e = np.log([max(points[i].error, 1e-300) for i in front])
+    line = log_e[0] + (log_s - log_s[0]) * (log_e[-1] - log_e[0]) / (log_s[-1] - log_s[0])
+    return front[int(np.argmax(line - log_e))]
+
+
+def fronts(stage: StageBenchmark) -> list[dict[str, Any]]:
+    """Return the front and the knee of each condition that a stage measures.
+
+    Returns
+    -------
+    list of dict
+        ``condition``: knobs with the values that all its points share; ``points``: numbers of the
+        points on its front, the quickest first; ``knee``: number of one of them, or None.
+    """
+    groups: dict[tuple[Any, ...], list[int]] = {}
+    for number, point in enumerate(stage.points):
+        key = tuple(point.knobs.get(name) for name in stage.condition)
+        groups.setdefault(key, []).append(number)
+    found = []
+    for key, numbers in groups.items():
+        some = tuple(stage.points[n] for n in numbers)
+        bend = knee(some)
+        found.append(
+            {
+                "condition": dict(zip(stage.condition, key, strict=True)),
+                "points": [numbers[k] for k in pareto_front(some)],
+                "knee": None if bend is None else numbers[bend],
+            }
+        )
+    return found
+
+
+def machine() -> dict[str, Any]:
+    """Say what ran the benchmark, without naming the machine."""
+    return {
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "architecture": platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0,
+    }
+
+
+def to_document(stages: Iterable[StageBenchmark]) -> dict[str, Any]:
+    """Return the JSON document of a run."""
+    stages = list(stages)
+    document: dict[str, Any] = {
+        "schema": SCHEMA,
+        "machine": machine(),
+        "skin_bands": {name: band.told() for name, band in skin_bands.MELANIN_BANDS.items()},
+        "stages": {stage.name: _stage(stage) for stage in stages},
+    }
+    document["passed"] = all(limit.passed for stage in stages for limit in stage.limits)
+    json.dumps(document, allow_nan=True)  # a value that is no JSON fails here, not at a reader
+    return document
+
+
+def _stage(stage: StageBenchmark) -> dict[str, Any]:
+    found = fronts(stage)
+    on_front = {number for front in found for number in front["points"]}
+    knees = {front["knee"] for front in found}
+    return {
+        "error_name": stage.error_name,
+        "reference": stage.reference,
+        "reference_error": stage.reference_error,
+        "reference_error_means": stage.reference_error_means,
+        "interval_of": stage.interval_of,
+        "points": [
+            {
+                **_point(point, squared=stage.squared),
+                "on_front": number in on_front,
+                "knee": number in knees,
+            }
+            for number, point in enumerate(stage.points)
+        ],
+        "fronts": found,
+        "limits": [_limit(limit) for limit in stage.limits],
+        "left_out": [list(item) for item in stage.left_out],
+        "by_band": [_band(name, error) for name, error in stage.by_band.items()],
+        "darkest_over_lightest": _dark_over_light(stage.by_band),
+        "no_bands": stage.no_bands or None,
+    }
+
+
+def _point(point: Point, *, squared: bool) -> dict[str, Any]:
+    efficiency = point.efficiency(squared=squared)
+    memory = point.timing.peak_memory_mb
+    return {
+        "knobs": dict(point.knobs),
+        "also": dict(point.also),
+        "seconds": point.timing.seconds,
+        "seconds_spread": list(point.timing.spread_s),
+        "cold_seconds": point.timing.cold_s,
+        "peak_memory_mb": memory,
+        "memory_of": point.timing.memory_of if memory is not None else None,
+        "no_memory": None if memory is not None else point.timing.no_memory,
+        "error": point.error,
+        "error_interval": list(point.error_interval),
+        "cramer_rao_bound": point.cramer_rao_bound,
+        "efficiency": efficiency and efficiency[0],
+        "efficiency_interval": efficiency and list(efficiency[1:]),
+    }
+
+
+def _limit(limit: Limit) -> dict[str, Any]:
+    return {
+        "name": limit.name,
+        "got": limit.got,
+        "bound": limit.bound,
+        "sense": limit.sense,
+        "unit": limit.unit,
+        "passed": limit.passed,
+    }
+
+
+def _band(name: str, told: BandError | float) -> dict[str, Any]:
+    if not isinstance(told, BandError):
+        return {"band": name, "error": told, "error_interval": None, "cramer_rao_bound": None}
+    return {
+        "band": name,
+        "error": told.error,
+        "error_interval": list(told.error_interval),
+        "cramer_rao_bound": told.cramer_rao_bound,
+    }
+
+
+def _dark_over_light(by_band: Mapping[str, BandError | float]) -> dict[str, Any] | None:
+    """Return the last band's error over the first's, with the ends that both intervals allow."""
+    told = [one for one in by_band.values() if isinstance(one, BandError)]
+    if len(told) < 2 or not told[0].error > 0.0:
+        return None
+    (light_low, light_high), (dark_low, dark_high) = (
+        told[0].error_interval, told[-1].error_interval,
+    )  # fmt: skip
+    return {
+        "ratio": told[-1].error / told[0].error,
+        "interval": [
+            max(dark_low, 0.0) / light_high,
+            dark_high / light_low if light_low > 0.0 else math.inf,
+        ],
+    }
