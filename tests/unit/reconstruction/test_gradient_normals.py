@@ -361,6 +361,19 @@ def test_leakage_by_direction_is_corrected():
     assert error_deg(wrong, normals).mean() > 0.2
 
 
+def test_films_mounted_across_turn_no_normal_when_calibrated():
+    """Three of the lights reflect more crossed than parallel: their films are 50 degrees off."""
+    lights, normals = sphere(), relief(32)
+    leak = np.zeros(len(lights))
+    facing = np.argsort(-lights[:, 2])[:3]
+    leak[facing] = np.tan(np.radians(50.0)) ** 2
+    images = pictures(normals, lights, leak=leak)
+    aware = from_patterns(images, lights=SphereLights(lights, leakage=leak), alpha=0.2)
+    unaware = from_patterns(images, lights=SphereLights(lights), alpha=0.2)
+    assert error_deg(aware, normals).mean() < 0.05
+    assert error_deg(unaware, normals).mean() > 0.2
+
+
 def test_an_analyser_ten_degrees_off_costs_signal_and_turns_no_normal(rng, caplog):
     """Signal falls to cos 20 degrees, with the diffuse light's own polarization turned as well."""
     lights, normals = sphere(), relief(32)
