@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from skinrig import bench_table, resident_memory
 from skinrig.bench_document import knee, pareto_front, to_document
-from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, Timing, measure
 
 
 def point(seconds, error):
