@@ -1,0 +1,24 @@
+"""From what is known of a face to a scene: every asset builder adds its part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from skinrig.viewer import facial_color_assets, scattering_assets, surface_assets
+from skinrig.viewer.scene import Assets, SceneSource, ViewerScene
+
+BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
+    facial_color_assets.assets,
+    scattering_assets.assets,
+    surface_assets.assets,
+)
+"""In the order in which their parts are listed; they do not see each other's."""
+
+
+def assemble(source: SceneSource, *, provenance: dict[str, Any] | None = None) -> ViewerScene:
+    """Return the scene of a source."""
+    scene = ViewerScene(mesh=source.mesh, provenance=provenance or {})
+    for build in BUILDERS:
+        scene = scene.with_assets(build(source))
+    return scene

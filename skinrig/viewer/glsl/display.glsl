@@ -1,0 +1,32 @@
+//@chunk tone
+vec3 srgb(vec3 linear) {
+  vec3 c = clamp(linear, 0.0, 1.0);
+  return mix(12.92 * c, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c));
+}
+vec3 filmic(vec3 x) {
+  vec3 a = max(x - 0.004, 0.0);
+  return (a * (6.2 * a + 0.5)) / (a * (6.2 * a + 1.7) + 0.06);
+}
+//@chunk display_fragment
+in vec2 v_uv;
+layout(location = 0) out vec4 o_display;
+void main() {
+  vec4 radiance = texel_radiance(ivec2(gl_FragCoord.xy));
+  vec3 exposed = p_exposure * radiance.rgb;
+  vec3 shown = p_filmic > 0.5 ? filmic(exposed) : srgb(exposed);
+  o_display = vec4(mix(p_background, shown, radiance.a), 1.0);
+}
+//@chunk show_fragment
+uniform sampler2D u_first;
+uniform sampler2D u_second;
+uniform float u_split;
+uniform float u_low;
+uniform float u_high;
+uniform float u_channels;
+in vec2 v_uv;
+layout(location = 0) out vec4 o_color;
+void main() {
+  vec4 value = v_uv.x < u_split ? texture(u_first, v_uv) : texture(u_second, v_uv);
+  vec3 shown = u_channels > 2.5 ? value.rgb : u_channels > 1.5 ? vec3(value.rg, 0.0) : value.rrr;
+  o_color = vec4((shown - u_low) / (u_high - u_low), 1.0);
+}

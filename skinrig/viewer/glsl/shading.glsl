@@ -1,0 +1,86 @@
+//@chunk surface_point
+// What is known of the surface under a pixel; functions of V.surface.adjust may change it.
+struct SurfacePoint {
+  vec2 uv;
+  vec3 position;
+  vec3 tangent;         // orthonormal frame of the smooth surface
+  vec3 bitangent;
+  vec3 normal;
+  vec2 slope;           // relief: change of height per length along tangent and bitangent
+  mat3 diffuseNormals;  // columns: of red, green, blue
+  vec3 specularNormal;
+  float roughness;      // Beckmann m
+  float intensity;      // of the specular reflection
+  vec3 toLight;
+  vec3 toEye;
+};
+vec3 tilted(SurfacePoint s, vec2 slope) {
+  return normalize(s.normal - slope.x * s.tangent - slope.y * s.bitangent);
+}
+//@chunk static_relief
+vec2 staticSlope(vec2 uv) {
+#ifdef HAS_relief_slopes
+  return p_relief * sample_relief_slopes(uv).rg;
+#else
+  return vec2(0.0);
+#endif
+}
+//@chunk kelemen_specular
+// Kelemen and Szirmay-Kalos 2001 with Beckmann's distribution and Schlick's Fresnel term.
+float kelemenSpecular(SurfacePoint s, vec3 n) {
+  float light = dot(n, s.toLight);
+  if (light <= 0.0) return 0.0;
+  vec3 whole = s.toLight + s.toEye;
+  vec3 h = normalize(whole);
+  float c2 = max(dot(n, h), 1e-3);
+  c2 *= c2;
+  float m2 = s.roughness * s.roughness;
+  float density = exp((c2 - 1.0) / (c2 * m2)) / (PI * m2 * c2 * c2);
+  float base = 1.0 - dot(s.toEye, h);
+  float fresnel = p_f0 + (1.0 - p_f0) * base * base * base * base * base;
+  return max(density * fresnel / dot(whole, whole), 0.0);
+}
+//@chunk surface_fragment
+uniform vec3 u_eye;
+uniform vec3 u_to_light;
+in float v_depth;
+layout(location = 0) out vec4 o_irradiance;
+layout(location = 1) out vec4 o_albedo;
+layout(location = 2) out vec4 o_specular;
+void main() {
+  SurfacePoint s;
+  s.uv = v_uv;
+  s.position = v_position;
+  s.normal = normalize(v_normal);
+  s.tangent = normalize(v_tangent - dot(v_tangent, s.normal) * s.normal);
+  s.bitangent = cross(s.normal, s.tangent);
+  if (dot(s.bitangent, v_bitangent) < 0.0) s.bitangent = -s.bitangent;
+  s.toLight = u_to_light;
+  s.toEye = normalize(u_eye - v_position);
+  s.slope = surfaceSlope(v_uv);
+  vec3 n = tilted(s, s.slope);
+  s.diffuseNormals = mat3(n, n, n);
+  s.specularNormal = n;
+  s.roughness = p_roughness;
+  s.intensity = p_specular_intensity;
+#ifdef HAS_surface_maps
+  vec4 maps = sample_surface_maps(v_uv);
+  s.roughness *= maps.r;
+  s.intensity *= maps.g;
+#endif
+  adjustSurface(s);
+  vec3 cosines = clamp(s.toLight * s.diffuseNormals, 0.0, 1.0);
+  vec3 irradiance = p_light_intensity * cosines + p_ambient * (0.6 + 0.4 * s.normal.y);
+  o_irradiance = vec4(irradiance, v_depth);
+  o_albedo = vec4(skinAlbedo(v_uv), 1.0);
+  float facing = clamp(dot(s.specularNormal, s.toLight), 0.0, 1.0);
+  o_specular = vec4(PI * p_light_intensity * facing * s.intensity * surfaceSpecular(s), 1.0);
+}
+//@chunk inspect_fragment
+layout(location = 0) out vec4 o_inspect;
+layout(location = 1) out vec4 o_normal;
+in float v_depth;
+void main() {
+  o_inspect = vec4(v_uv, melaninFraction(v_uv), blendHemoglobin(v_uv));
+  o_normal = vec4(normalize(v_normal), v_depth);
+}

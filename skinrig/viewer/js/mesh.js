@@ -1,0 +1,141 @@
+// The mesh: blend shapes on the processor, normals and tangents of the moved surface, drawing.
+Object.assign(V.defaults, {weights: {}, heads: 1});
+
+V.weightsKey = p => JSON.stringify(Object.entries(p.weights).filter(([, w]) => w !== 0).sort());
+
+V.uploadMesh = () => {
+  const gl = V.gl;
+  const faces = V.scene.mesh.faces;
+  V.faceType = faces instanceof Uint16Array ? gl.UNSIGNED_SHORT : gl.UNSIGNED_INT;
+  V.staticBuffers = {uv: gl.createBuffer(), rest: gl.createBuffer(), faces: gl.createBuffer()};
+  gl.bindVertexArray(null);
+  gl.bindBuffer(gl.ARRAY_BUFFER, V.staticBuffers.uv);
+  gl.bufferData(gl.ARRAY_BUFFER, V.scene.mesh.uv, gl.STATIC_DRAW);
+  gl.bindBuffer(gl.ARRAY_BUFFER, V.staticBuffers.rest);
+  gl.bufferData(gl.ARRAY_BUFFER, V.scene.mesh.positions, gl.STATIC_DRAW);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, V.staticBuffers.faces);
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
+  V.restAngles = V.vertexNormals(V.scene.mesh.positions);
+};
+
+// Positions under the weights; float64 sums so that the order of shapes does not matter.
+V.morph = weights => {
+  const rest = V.scene.mesh.positions;
+  const sum = Float64Array.from(rest);
+  for (const [name, weight] of Object.entries(weights)) {
+    const deltas = V.scene.mesh.shapes[name];
+    if (!deltas || weight === 0) continue;
+    for (let i = 0; i < sum.length; i++) sum[i] += weight * deltas[i];
+  }
+  return Float32Array.from(sum);
+};
+
+// Normals weighted by the angle of each face; vertices at one place share a normal.
+V.vertexNormals = positions => {
+  const {faces, weld} = V.scene.mesh;
+  const sum = new Float64Array(positions.length);
+  const e = new Float64Array(9);
+  for (let f = 0; f < faces.length; f += 3) {
+    for (let k = 0; k < 3; k++) {
+      const a = 3 * faces[f + k];
+      const b = 3 * faces[f + (k + 1) % 3];
+      let length = 0;
+      for (let c = 0; c < 3; c++) {
+        e[3 * k + c] = positions[b + c] - positions[a + c];
+        length += e[3 * k + c] ** 2;
+      }
+      length = Math.sqrt(length) || 1e-30;
+      for (let c = 0; c < 3; c++) e[3 * k + c] /= length;
+    }
+    let nx = e[1] * e[5] - e[2] * e[4];
+    let ny = e[2] * e[3] - e[0] * e[5];
+    let nz = e[0] * e[4] - e[1] * e[3];
+    const size = Math.hypot(nx, ny, nz);
+    if (!(size > 1e-12)) continue;
+    nx /= size; ny /= size; nz /= size;
+    for (let k = 0; k < 3; k++) {
+      const p = 3 * ((k + 2) % 3);
+      const cos = -(e[3 * k] * e[p] + e[3 * k + 1] * e[p + 1] + e[3 * k + 2] * e[p + 2]);
+      const angle = Math.acos(Math.min(1, Math.max(-1, cos)));
+      const at = 3 * weld[faces[f + k]];
+      sum[at] += angle * nx; sum[at + 1] += angle * ny; sum[at + 2] += angle * nz;
+    }
+  }
+  const out = new Float32Array(positions.length);
+  for (let v = 0; v < weld.length; v++) {
+    const at = 3 * weld[v];
+    const size = Math.hypot(sum[at], sum[at + 1], sum[at + 2]) || 1;
+    for (let c = 0; c < 3; c++) out[3 * v + c] = sum[at + c] / size;
+  }
+  return out;
+};
+
+// Change of the point along u and along v, mean of the faces by their area in the texture.
+V.vertexTangents = positions => {
+  const {faces, uv} = V.scene.mesh;
+  const along = [new Float32Array(positions.length), new Float32Array(positions.length)];
+  const area = new Float32Array(uv.length / 2);
+  for (let f = 0; f < faces.length; f += 3) {
+    const [a, b, c] = [faces[f], faces[f + 1], faces[f + 2]];
+    const u1 = uv[2 * b] - uv[2 * a];
+    const v1 = uv[2 * b + 1] - uv[2 * a + 1];
+    const u2 = uv[2 * c] - uv[2 * a];
+    const v2 = uv[2 * c + 1] - uv[2 * a + 1];
+    const det = u1 * v2 - u2 * v1;
+    const sign = Math.sign(det);
+    for (const v of [a, b, c]) area[v] += Math.abs(det);
+    for (let k = 0; k < 3; k++) {
+      const p1 = positions[3 * b + k] - positions[3 * a + k];
+      const p2 = positions[3 * c + k] - positions[3 * a + k];
+      const du = sign * (p1 * v2 - p2 * v1);
+      const dv = sign * (p2 * u1 - p1 * u2);
+      for (const v of [a, b, c]) { along[0][3 * v + k] += du; along[1][3 * v + k] += dv; }
+    }
+  }
+  for (let v = 0; v < area.length; v++) {
+    const scale = area[v] > 0 ? 1 / area[v] : 0;
+    for (let k = 0; k < 3; k++) { along[0][3 * v + k] *= scale; along[1][3 * v + k] *= scale; }
+  }
+  return along;
+};
+
+// The moved mesh of a side, computed where its weights changed.
+V.movedMesh = (side, p) => {
+  const key = V.weightsKey(p);
+  if (side.mesh?.key === key) return side.mesh;
+  const gl = V.gl;
+  const mesh = side.mesh ?? {
+    vao: gl.createVertexArray(),
+    buffers: ["position", "normal", "tangent", "bitangent"].map(() => gl.createBuffer()),
+  };
+  const positions = V.morph(p.weights);
+  const turned = V.vertexNormals(positions);
+  const normals = Float32Array.from(V.scene.mesh.normals, (n, i) => n + turned[i] - V.restAngles[i]);
+  for (let i = 0; i < normals.length; i += 3) {
+    const size = Math.hypot(normals[i], normals[i + 1], normals[i + 2]) || 1;
+    for (let c = 0; c < 3; c++) normals[i + c] /= size;
+  }
+  const [tangent, bitangent] = V.vertexTangents(positions);
+  gl.bindVertexArray(mesh.vao);
+  const names = ["a_position", "a_normal", "a_tangent", "a_bitangent"];
+  [positions, normals, tangent, bitangent].forEach((data, i) => {
+    gl.bindBuffer(gl.ARRAY_BUFFER, mesh.buffers[i]);
+    gl.bufferData(gl.ARRAY_BUFFER, data, gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(V.ATTRIBUTES[names[i]]);
+    gl.vertexAttribPointer(V.ATTRIBUTES[names[i]], 3, gl.FLOAT, false, 0, 0);
+  });
+  for (const [name, buffer, width] of [["a_uv", "uv", 2], ["a_rest", "rest", 3]]) {
+    gl.bindBuffer(gl.ARRAY_BUFFER, V.staticBuffers[buffer]);
+    gl.enableVertexAttribArray(V.ATTRIBUTES[name]);
+    gl.vertexAttribPointer(V.ATTRIBUTES[name], width, gl.FLOAT, false, 0, 0);
+  }
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, V.staticBuffers.faces);
+  side.mesh = {...mesh, key, positions, normals, tangent, bitangent};
+  return side.mesh;
+};
+
+V.drawMesh = (side, p) => {
+  const mesh = V.movedMesh(side, p);
+  V.gl.bindVertexArray(mesh.vao);
+  V.gl.drawElements(V.gl.TRIANGLES, V.scene.mesh.faces.length, V.faceType, 0);
+};

@@ -1,0 +1,87 @@
+// The shaded surface: irradiance, albedo and specular reflection in buffers of their own.
+Object.assign(V.defaults, {
+  roughness: 1, specular_intensity: 1, relief: 1, f0: 0.028, specular_model: "analytic",
+});
+
+// What other scripts add to the surface:
+//   chunks     GLSL pieces that hold the functions named below
+//   defines    preprocessor values
+//   slopes     names of `vec2 f(vec2 uv)`: slopes of relief, summed
+//   adjust     names of `void f(inout SurfacePoint s)`, called in order
+//   specular   by value of p.specular_model: name of `vec3 f(SurfacePoint s)`, 1/sr
+//   after      passes whose buffers they read; key(p): what else they depend on
+V.surface = {
+  chunks: ["static_relief"], defines: {}, slopes: ["staticSlope"], adjust: [],
+  specular: {analytic: "analyticSpecular"}, after: ["hemoglobin_rig"], keys: [],
+};
+
+V.surfaceDefines = () => ({PI: "3.14159265358979", ...V.colorDefines(), ...V.surface.defines});
+
+// The functions that join what was added.
+V.surfaceJoin = p => {
+  const name = "surface_join_" + p.specular_model;
+  V.glsl[name] = [
+    "vec2 surfaceSlope(vec2 uv) { return " +
+      ["vec2(0.0)", ...V.surface.slopes.map(f => `${f}(uv)`)].join(" + ") + "; }",
+    `void adjustSurface(inout SurfacePoint s) { ${V.surface.adjust.map(f => `${f}(s);`).join(" ")} }`,
+    "vec3 analyticSpecular(SurfacePoint s) { return vec3(kelemenSpecular(s, s.specularNormal)); }",
+    `vec3 surfaceSpecular(SurfacePoint s) { return ${V.surface.specular[p.specular_model]}(s); }`,
+  ].join("\n");
+  return name;
+};
+
+// Places of several heads: side by side, each a little behind.
+V.headShifts = p => Array.from({length: p.heads}, (_, i) => {
+  const at = i - 0.5 * (p.heads - 1);
+  return [185 * at, 0, -40 * Math.abs(at)];
+});
+
+V.drawHeads = (ctx, program, uniforms) => {
+  for (const shift of V.headShifts(ctx.p)) {
+    const camera = V.camera(ctx.p, ctx.size, shift);
+    ctx.mesh(program, {u_view: camera.view, u_projection: camera.projection, u_eye: camera.eye,
+      ...uniforms});
+  }
+};
+
+V.meshKey = p => [V.weightsKey(p), V.cameraKey(p), p.heads].join();
+V.screen = () => [V.canvas.width, V.canvas.height];
+
+V.start.push(() => {
+  V.passes.push({
+    name: "surface",
+    get after() { return V.surface.after; },
+    depth: true,
+    key: p => [V.meshKey(p), V.colorKey(p), p.light_azimuth_deg, p.light_elevation_deg,
+      p.light_intensity, p.ambient, p.roughness, p.specular_intensity, p.relief, p.f0,
+      p.specular_model, ...V.surface.keys.map(f => f(p))].join(),
+    targets: () => ({
+      irradiance: {format: "RGBA32F", size: V.screen(), space: "screen", filter: "nearest"},
+      albedo: {format: "RGBA16F", size: V.screen(), space: "screen"},
+      specular: {format: "RGBA16F", size: V.screen(), space: "screen"},
+    }),
+    draw: ctx => {
+      ctx.clear(0, 0, 0, 0);
+      const program = V.program(["mesh_attributes", "mesh_vertex"], ["surface_varyings",
+        "surface_point", "skin_color", "kelemen_specular", ...V.surface.chunks,
+        V.surfaceJoin(ctx.p), "surface_fragment"], V.surfaceDefines());
+      V.drawHeads(ctx, program,
+        {u_to_light: V.direction(ctx.p.light_azimuth_deg, ctx.p.light_elevation_deg)});
+    },
+    cost: () => ({taps: 8 * V.screen()[0] * V.screen()[1], bytes: 32 * V.screen()[0] * V.screen()[1]}),
+  });
+  V.passes.push({
+    name: "inspect", after: ["hemoglobin_rig"], depth: true, demanded: true,
+    key: p => [V.meshKey(p), V.colorKey(p)].join(),
+    targets: () => ({
+      inspect: {format: "RGBA32F", size: V.screen(), space: "screen", filter: "nearest"},
+      normal: {format: "RGBA32F", size: V.screen(), space: "screen", filter: "nearest"},
+    }),
+    draw: ctx => {
+      ctx.clear(0, 0, 0, 0);
+      V.drawHeads(ctx, V.program(["mesh_attributes", "mesh_vertex"],
+        ["surface_varyings", "skin_color", "inspect_fragment"], V.colorDefines()));
+    },
+    cost: () => ({taps: 6 * V.screen()[0] * V.screen()[1], bytes: 32 * V.screen()[0] * V.screen()[1]}),
+  });
+});

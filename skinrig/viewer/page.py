@@ -1,0 +1,117 @@
+"""Pack a scene, our shaders and our script into ONE HTML page that asks the network for nothing."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from importlib import resources
+from importlib.resources.abc import Traversable
+from typing import Final
+
+from skinrig.viewer.packing import Packed, pack
+from skinrig.viewer.scene import ViewerScene
+
+SCRIPTS: Final = (
+    "graph.js",
+    "gl.js",
+    "load.js",
+    "mesh.js",
+    "camera.js",
+    "color.js",
+    "shading.js",
+    "scattering.js",
+    "display.js",
+    "main.js",
+)
+"""Scripts in the order in which they run, all in one function; `main.js` comes last."""
+
+_CHUNK = re.compile(r"^//@chunk (\w+)[ \t]*$", re.MULTILINE)
+
+
+class PageError(ValueError):
+    """A part of the page that is missing or named twice."""
+
+
+def chunks() -> dict[str, str]:
+    """Return the pieces of GLSL by name.
+
+    Raises
+    ------
+    PageError
+        Two pieces have one name.
+    """
+    found: dict[str, str] = {}
+    for entry in sorted(_files("glsl", ".glsl"), key=lambda one: one.name):
+        parts = _CHUNK.split(entry.read_text(encoding="utf-8"))
+        for name, text in zip(parts[1::2], parts[2::2], strict=True):
+            if name in found:
+                raise PageError(f"glsl/{entry.name}: chunk {name!r} is there twice")
+            found[name] = text.strip("\n") + "\n"
+    return found
+
+
+def script() -> str:
+    """Return all scripts as one strict function that shares an object ``V``."""
+    here = resources.files("skinrig.viewer").joinpath("js")
+    body = "\n".join(here.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
+    glsl = json.dumps(chunks(), sort_keys=True)
+    return f'(() => {{\n"use strict";\nconst V = {{glsl: {glsl}}};\n{body}\n}})();\n'
+
+
+def build(scene: ViewerScene, *, connect: bool = False) -> str:
+    """Return the page of a scene.
+
+    Parameters
+    ----------
+    scene
+        What it shows.
+    connect
+        Whether it may ask the server it came from for more (tiles); a page in a file may not.
+
+    Returns
+    -------
+    str
+        HTML, the same for the same scene.
+    """
+    return render(pack(scene), connect=connect)
+
+
+def render(packed: Packed, *, connect: bool = False) -> str:
+    """Return the page of a packed scene."""
+    here = resources.files("skinrig.viewer")
+    page = here.joinpath("page.html").read_text(encoding="utf-8")
+    style = here.joinpath("page.css").read_text(encoding="utf-8")
+    code = script().replace("</", "<\\/")
+    policy = "; ".join(
+        [
+            "default-src 'none'",
+            f"script-src '{_hash(code)}'",
+            f"style-src '{_hash(style)}'",
+            "img-src data: blob:",
+            f"connect-src {chr(39)}{'self' if connect else 'none'}{chr(39)}",
+            "base-uri 'none'",
+            "form-action 'none'",
+        ]
+    )
+    parts = {
+        "POLICY": policy,
+        "STYLE": style,
+        "HEADER": packed.header_bytes().decode("utf-8").replace("</", "<\\/"),
+        "PAYLOAD": base64.b64encode(packed.payload).decode("ascii"),
+        "SCRIPT": code,
+    }
+    for name in parts:
+        if page.count("{{" + name + "}}") != 1:
+            raise PageError(f"page.html: expected {{{{{name}}}}} once")
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], page)
+
+
+def _hash(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode()
+
+
+def _files(folder: str, ending: str) -> list[Traversable]:
+    here = resources.files("skinrig.viewer").joinpath(folder)
+    return [entry for entry in here.iterdir() if entry.name.endswith(ending)]

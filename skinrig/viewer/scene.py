@@ -1,0 +1,205 @@
+"""What the viewer shows: a mesh that moves, textures, tables, parameters and what is left out.
+
+A scene is plain data. Its sources (`skinrig.viewer.procedural`, `skinrig.viewer.from_appearance`)
+say what is known of a face; asset builders turn that into textures, tables and parameters; the
+packer (`skinrig.viewer.packing`) makes it small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from model.skin import SkinAppearance
+    from rigsim.subject import Subject
+
+Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+Storage = Literal["u8", "u16", "f16", "f32"]
+Filter = Literal["linear", "mipmap", "nearest"]
+Kind = Literal["procedural", "mesh", "dynamic", "dome", "model"]
+
+LARGEST_TEXTURE: Final = 4096
+"""Texels a side that any WebGL2 device of the last ten years takes."""
+
+
+class SceneError(ValueError):
+    """A scene that contradicts itself, or nothing that could be shown."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Texture:
+    """One texture of the page.
+
+    Attributes
+    ----------
+    values : ndarray of float32
+        Shape (H, W, C), C from 1 to 4, row 0 at the top (v = 1); or (L, H, W, C) for layers.
+    storage
+        How the page holds it: "u8" and "u16" are spread linearly over the range of each layer and
+        channel; "f16" and "f32" as they are.
+    filter
+        Between texels.
+    """
+
+    values: Float32
+    storage: Storage = "u8"
+    filter: Filter = "linear"
+
+    def __post_init__(self) -> None:
+        """Check shape, numbers and names."""
+        shape = self.values.shape
+        if self.values.ndim not in (3, 4) or not 1 <= shape[-1] <= 4 or 0 in shape:
+            raise SceneError(
+                f"texture: got shape {shape}, expected (H, W, C) or (L, H, W, C) with C from 1 to 4"
+            )
+        if max(shape[-3:-1]) > LARGEST_TEXTURE:
+            raise SceneError(
+                f"texture: got {shape}, expected at most {LARGEST_TEXTURE} texels a side; "
+                "choose a smaller --size"
+            )
+        if self.values.dtype != np.float32 or not np.isfinite(self.values).all():
+            raise SceneError(f"texture: got {self.values.dtype} or NaN, expected finite float32")
+        if self.storage not in get_args(Storage) or self.filter not in get_args(Filter):
+            raise SceneError(f"texture: got {self.storage!r}, {self.filter!r}: unknown")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewerMesh:
+    """A triangle mesh with texture coordinates and any number of blend shapes.
+
+    Attributes
+    ----------
+    positions : ndarray of float32, shape (V, 3)
+        At rest, mm, +z towards the viewer.
+    normals : ndarray of float32, shape (V, 3)
+        Unit shading normals at rest.
+    uv : ndarray of float32, shape (V, 2)
+        (0, 0) is bottom left of the texture.
+    faces : ndarray of int32, shape (F, 3)
+        Counter-clockwise seen from outside.
+    shapes : mapping of str to ndarray of float32, shape (V, 3)
+        Movement at weight 1, mm.
+    """
+
+    positions: Float32
+    normals: Float32
+    uv: Float32
+    faces: Int32
+    shapes: Mapping[str, Float32] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check shapes and indices."""
+        count = len(self.positions)
+        for name, array, width in (
+            ("positions", self.positions, 3),
+            ("normals", self.normals, 3),
+            ("uv", self.uv, 2),
+            *((f"shape {name!r}", deltas, 3) for name, deltas in self.shapes.items()),
+        ):
+            if array.shape != (count, width) or not np.isfinite(array).all():
+                raise SceneError(
+                    f"mesh: {name}: got shape {array.shape}, expected finite ({count}, {width})"
+                )
+        if not len(self.faces) or self.faces.min() < 0 or self.faces.max() >= count:
+            raise SceneError(f"mesh: faces: expected triangles of vertices 0 to {count - 1}")
+
+
+class Assets(TypedDict, total=False):
+    """What an asset builder adds to a scene; every key may be missing."""
+
+    textures: Mapping[str, Texture]
+    tables: Mapping[str, Float32]
+    params: Mapping[str, Any]
+    presets: Mapping[str, Mapping[str, Any]]
+    facts: Mapping[str, Any]
+    left_out: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneSource:
+    """What is known of a face before assets are built from it.
+
+    Attributes
+    ----------
+    kind
+        Where it comes from.
+    mesh
+        Its geometry.
+    size
+        Texels a side of the large textures.
+    seed
+        Of everything that is drawn, where something is.
+    subject
+        The simulated person, where the face or its textures are simulated.
+    appearances
+        Fitted folders by kind: "dynamic" (facial color, wrinkles, microstructure), "dome", "model".
+    paths
+        Those folders.
+    """
+
+    kind: Kind
+    mesh: ViewerMesh
+    size: int
+    seed: int = 0
+    subject: Subject | None = None
+    appearances: Mapping[str, SkinAppearance] = field(default_factory=dict)
+    paths: Mapping[str, Path] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewerScene:
+    """All that goes into a page.
+
+    Attributes
+    ----------
+    mesh
+        Geometry and blend shapes.
+    textures, tables
+        By name; a table is a float32 array of any shape, (rows, columns, channels) where the page
+        samples it: row 0 first, not flipped.
+    params
+        Parameters the page starts with; JSON values.
+    presets
+        Parameters that a preset sets, by name.
+    facts
+        Stated errors and figures that the page shows; JSON values.
+    provenance
+        Where the scene comes from.
+    left_out
+        (what, why) of each feature that the page lacks.
+    """
+
+    mesh: ViewerMesh
+    textures: Mapping[str, Texture] = field(default_factory=dict)
+    tables: Mapping[str, Float32] = field(default_factory=dict)
+    params: Mapping[str, Any] = field(default_factory=dict)
+    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    left_out: tuple[tuple[str, str], ...] = ()
+
+    def with_assets(self, assets: Assets) -> ViewerScene:
+        """Return the scene with more in it.
+
+        Raises
+        ------
+        SceneError
+            Two builders name a texture, table, parameter, preset or fact alike.
+        """
+        merged: dict[str, Any] = {}
+        for key in ("textures", "tables", "params", "presets", "facts"):
+            old: Mapping[str, Any] = getattr(self, key)
+            new: Mapping[str, Any] = assets.get(key, {})  # type: ignore[assignment]
+            double = sorted(set(old) & set(new))
+            if double:
+                raise SceneError(f"{key}: {double[0]!r} comes from two builders")
+            merged[key] = MappingProxyType({**old, **new})
+        return replace(self, **merged, left_out=(*self.left_out, *assets.get("left_out", ())))

@@ -1,0 +1,14 @@
+"""The page opens, draws a face, asks nobody for anything."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def test_a_page_draws_a_face_without_errors_or_requests(viewer):
+    picture = viewer.read("display")
+    assert picture.shape == (256, 256, 4)
+    assert viewer.read("albedo")[..., 3].mean() > 0.2
+    assert picture[..., :3].std() > 0.05
+    assert np.isfinite(viewer.read("radiance")).all()
+    assert viewer.problems == []
