@@ -8,29 +8,44 @@ void main() {
   o_source = vec4(light * pow(texel_albedo(at).rgb, vec3(u_pre)), 1.0);
 }
 //@chunk scatter_fragment
-// One direction of one Gaussian; a tap counts by its distance in space, so that light does not
-// leak across depths.
+// One direction of one Gaussian, as model.screen_scattering defines it: taps are as far apart as
+// the slant of the surface makes them on the screen, and count by their distance in space.
 uniform sampler2D u_source;
-uniform vec2 u_step;      // texture coordinates of one pixel along the direction
+uniform ivec2 u_axis;     // one pixel along the direction
 uniform float u_sigma_mm;
 uniform float u_pixels;   // pixels of 1 mm at a depth of 1 mm
-in vec2 v_uv;
 layout(location = 0) out vec4 o_scattered;
+float depthAt(ivec2 at) {
+  ivec2 size = textureSize(u_source, 0);
+  return texel_irradiance(clamp(at, ivec2(0), size - 1)).a;
+}
 void main() {
-  float depth = texel_irradiance(ivec2(gl_FragCoord.xy)).a;
-  vec4 middle = texture(u_source, v_uv);
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  float depth = depthAt(at);
   if (depth <= 0.0) { o_scattered = vec4(0.0); return; }
-  float sigma = u_sigma_mm * u_pixels / depth;
-  vec3 sum = middle.rgb;
+  float before = depthAt(at - u_axis);
+  float after = depthAt(at + u_axis);
+  float slant = SLANT_LIMIT * depth;
+  if (before > 0.0) slant = min(slant, abs(depth - before));
+  if (after > 0.0) slant = min(slant, abs(after - depth));
+  if (before <= 0.0 && after <= 0.0) slant = 0.0;
+  float pixel_mm = depth / u_pixels;
+  float sigma_mm = u_sigma_mm * texel_specular(at).a;
+  float sigma = sigma_mm / sqrt(pixel_mm * pixel_mm + min(slant * slant, SLANT_LIMIT * SLANT_LIMIT
+    * pixel_mm * pixel_mm));
+  vec3 sum = texelFetch(u_source, at, 0).rgb;
   float weight = 1.0;
+  vec2 texel = 1.0 / vec2(textureSize(u_source, 0));
+  vec2 middle = vec2(at) + 0.5;
   for (int i = 1; i <= TAPS; i++) {
-    float t = 3.0 * float(i) / float(TAPS);
+    float t = REACH * float(i) / float(TAPS);
     for (int side = -1; side <= 1; side += 2) {
-      vec2 at = v_uv + float(side) * t * sigma * u_step;
-      float there = buffer_irradiance(at).a;
-      float away = (there - depth) / u_sigma_mm;
-      float w = there > 0.0 ? exp(-0.5 * (t * t + away * away)) : 0.0;
-      sum += w * texture(u_source, at).rgb;
+      vec2 there = middle + float(side) * t * sigma * vec2(u_axis);
+      float other = depthAt(ivec2(floor(there)));
+      float flat_mm = t * sigma * pixel_mm;
+      float away = (flat_mm * flat_mm + (other - depth) * (other - depth)) / (sigma_mm * sigma_mm);
+      float w = other > 0.0 ? exp(-0.5 * away) : 0.0;
+      sum += w * texture(u_source, there * texel).rgb;
       weight += w;
     }
   }
@@ -38,7 +53,7 @@ void main() {
 }
 //@chunk radiance_fragment
 uniform float u_post;
-in vec2 v_uv;
+uniform vec3 u_weights[GAUSSIANS];
 layout(location = 0) out vec4 o_radiance;
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);

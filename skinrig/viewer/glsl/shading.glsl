@@ -74,7 +74,8 @@ void main() {
   o_irradiance = vec4(irradiance, v_depth);
   o_albedo = vec4(skinAlbedo(v_uv), 1.0);
   float facing = clamp(dot(s.specularNormal, s.toLight), 0.0, 1.0);
-  o_specular = vec4(PI * p_light_intensity * facing * s.intensity * surfaceSpecular(s), 1.0);
+  o_specular = vec4(PI * p_light_intensity * facing * s.intensity * surfaceSpecular(s),
+    surfaceWidth(v_uv));
 }
 //@chunk inspect_fragment
 layout(location = 0) out vec4 o_inspect;

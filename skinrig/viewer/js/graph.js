@@ -25,6 +25,10 @@
 // A pass is drawn again only where its key, its size, or a pass before it changed; that is counted
 // in V.statistics. Outputs of the fragment shader are numbered as the targets are listed.
 //
+// The surface (V.surface in shading.js) and the scattering profile (V.profiles, V.profileName in
+// scattering.js) are joints where other scripts add slopes, normals, specular models, widths.
+// V.start functions may add passes and set joints; V.merged, V.set and V.readNow are in main.js.
+//
 // In GLSL these names are declared by the program builder where they are used:
 //   p_name                  parameter (number or boolean: float; array of 2 to 4: vec)
 //   sample_name(vec2 uv)    scene texture, in its own unit (layers: sample_name(vec3(uv, layer)))
@@ -101,10 +105,16 @@ V.enabled = (pass, p) => !pass.enabled || pass.enabled(p);
 // Names of the passes that a frame needs: those enabled, without demanded ones nobody asks for.
 V.wantedPasses = (p, demand) => {
   const wanted = new Set();
+  const byName = new Map(V.passes.map(pass => [pass.name, pass]));
+  const want = pass => {
+    if (!pass || wanted.has(pass.name) || !V.enabled(pass, p)) return;
+    wanted.add(pass.name);
+    pass.after.forEach(name => want(byName.get(name)));
+  };
   for (const pass of V.passes) {
     if (!V.enabled(pass, p)) continue;
     if (pass.demanded && !Object.keys(pass.targets(p)).some(name => demand.has(name))) continue;
-    wanted.add(pass.name);
+    want(pass);
   }
   return wanted;
 };

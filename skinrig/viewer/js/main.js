@@ -97,6 +97,7 @@ window.viewer = {
       V.uploadMesh();
       V.sideA = V.newSide();
       V.start.forEach(fn => fn());
+      V.buildScattering();
       V.drawFrame();
       V.finish();
       document.documentElement.dataset.ready = "true";

@@ -9,10 +9,11 @@ Object.assign(V.defaults, {
 //   slopes     names of `vec2 f(vec2 uv)`: slopes of relief, summed
 //   adjust     names of `void f(inout SurfacePoint s)`, called in order
 //   specular   by value of p.specular_model: name of `vec3 f(SurfacePoint s)`, 1/sr
+//   width      name of `float f(vec2 uv)`: how much wider than the profile light spreads, or null
 //   after      passes whose buffers they read; key(p): what else they depend on
 V.surface = {
   chunks: ["static_relief"], defines: {}, slopes: ["staticSlope"], adjust: [],
-  specular: {analytic: "analyticSpecular"}, after: ["hemoglobin_rig"], keys: [],
+  specular: {analytic: "analyticSpecular"}, width: null, after: ["hemoglobin_rig"], keys: [],
 };
 
 V.surfaceDefines = () => ({PI: "3.14159265358979", ...V.colorDefines(), ...V.surface.defines});
@@ -25,6 +26,7 @@ V.surfaceJoin = p => {
       ["vec2(0.0)", ...V.surface.slopes.map(f => `${f}(uv)`)].join(" + ") + "; }",
     `void adjustSurface(inout SurfacePoint s) { ${V.surface.adjust.map(f => `${f}(s);`).join(" ")} }`,
     "vec3 analyticSpecular(SurfacePoint s) { return vec3(kelemenSpecular(s, s.specularNormal)); }",
+    `float surfaceWidth(vec2 uv) { return ${V.surface.width ? V.surface.width + "(uv)" : "1.0"}; }`,
     `vec3 surfaceSpecular(SurfacePoint s) { return ${V.surface.specular[p.specular_model]}(s); }`,
   ].join("\n");
   return name;
