@@ -204,8 +204,12 @@ def reconstruct(
     previous = _previous(Path(out))
     outcome = stages.run(graph, list(want), cache=_Kept(graph, previous), progress=progress)
     outcome = replace(outcome, assumed=tuple(evidence.assumed))
-    if not outcome.ran and previous is not None and set(want) <= set(_contents(previous)):
-        return outcome
+    # what the subject agreed to goes wherever the maps go
+    consent = [opened.manifest.to_json()["subject"]] if opened.source == "measured" else []
+    current = previous is not None and previous.parameters.get("consent", []) == consent
+    if not outcome.ran and previous is not None and current:
+        if set(want) <= set(_contents(previous)):
+            return outcome
     keys = _all_keys(graph)
     kept = {name: outcome.products[name] for name in want}
     noted = dict(evidence.noted)
@@ -231,6 +235,7 @@ def reconstruct(
             "truth": truth,
             "stages": {stage.name: keys[stage.name] for stage in graph},
             "assumed": evidence.assumed,
+            "consent": consent,
             "noted": sorted(noted),
             **noted,
         },

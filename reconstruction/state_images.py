@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -72,6 +73,8 @@ class Subject:
         Names of the spectra that the color table is built for.
     has_white
         Whether the exposure is known from a white tile.
+    consent
+        What the subject of each measured session agreed to, as in its session.json.
     timed
         Whether times are those of capture: of photographs only that of their import is known.
     """
@@ -85,6 +88,7 @@ class Subject:
     illuminant: str
     has_white: bool
     timed: bool
+    consent: tuple[Mapping[str, Any], ...] = ()
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -175,6 +179,7 @@ def read(
         illuminant=illuminant,
         has_white=has_white,
         timed=not any("photographs" in session.manifest.extra for session in opened),
+        consent=tuple(s.manifest.to_json()["subject"] for s in opened if s.source == "measured"),
     )
 
 

@@ -19,7 +19,7 @@ from model.tissue_optics import ANISOTROPY_SKIN
 from model.wrinkle_expressions import ROW_OF_STATE, Clamp
 from model.wrinkle_model import FILE as WRINKLE_FILE
 from model.wrinkle_model import WrinkleModel
-from skinrig import dynamic_appearance
+from skinrig import consent, dynamic_appearance
 from skinrig.dynamic_appearance import FACIAL_COLOR, PARTS, WRINKLES
 
 KIND = "expression"
@@ -206,6 +206,7 @@ def apply_expression(
             parameters={
                 "kind": KIND, "weights": dict(expression.weights), "clamp": expression.clamp,
                 "emotional": expression.emotional, "gain": expression.gain,
+                consent.KEY: consent.carried(*_faces(appearance, expression)),
                 "figures": _without_times(done.figures),
             },
             inputs={
@@ -245,9 +246,14 @@ def normalized(expression: Expression) -> Expression:
     return replace(expression, weights=weights, normalize=False)
 
 
+def _faces(appearance: SkinAppearance, expression: Expression) -> tuple[SkinAppearance, ...]:
+    """Return the appearances that a result is made of."""
+    other = expression.onto
+    return (appearance,) if other is None else (appearance, other.appearance)
+
+
 def _source(appearance: SkinAppearance, expression: Expression) -> str:
-    other = appearance if expression.onto is None else expression.onto.appearance
-    both = {appearance.source, other.source}
+    both = {one.source for one in _faces(appearance, expression)}
     return "simulated" if "simulated" in both else "measured"
 
 

@@ -12,13 +12,37 @@ from skinrig.console import Console
 
 
 def export(
-    source: Annotated[
-        Path, typer.Argument(help="SESSION/ folder; APPEARANCE/ of a dome for merl and rgl.")
+    source: Annotated[Path, typer.Argument(help="APPEARANCE/ or SESSION/ folder.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            help="Of an appearance: maps, mtlx, gltf, merl, rgl. "
+            "Of a session: mhl, frames, event-model."
+        ),
     ],
-    to: Annotated[str, typer.Option(help="mhl, frames, event-model; merl, rgl.")],
     out: Out,
     use: Annotated[
-        str | None, typer.Option(help="What a session is for; the consent must cover it.")
+        str | None,
+        typer.Option(help="What the copy is for; the subjects' consent must cover it."),
+    ] = None,
+    unit: Annotated[
+        str | None, typer.Option(help="Scene unit: m (default), cm or mm (mtlx, usd).")
+    ] = None,
+    normal_y: Annotated[
+        str, typer.Option(help="Green of normal maps: gl is +Y up, dx is -Y (Unreal).")
+    ] = "gl",
+    udim: Annotated[
+        str, typer.Option(help="Names of textures: none, dot (.1001) or underscore (_1001).")
+    ] = "none",
+    with_errors: Annotated[
+        bool, typer.Option("--with-errors", help="Standard errors and masks beside the values.")
+    ] = False,
+    only: Annotated[
+        str | None, typer.Option(help="Names of maps (maps), joined by commas.")
+    ] = None,
+    mesh: Annotated[
+        Path | None,
+        typer.Option(help="Mesh with the maps' texture coordinates and blend shapes, in mm."),
     ] = None,
     at: Annotated[
         str | None, typer.Option(help="Place on the skin, U,V in 0 to 1: its BRDF too (merl, rgl).")
@@ -29,22 +53,32 @@ def export(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Hand a session on, within the subject's consent, or the BRDFs of an appearance.
+    """Hand a session or an appearance on to other programs, within the subject's consent.
 
     All files are listed in an ASC MHL manifest.
 
-    Example: skinrig export session --to frames --use research --out delivery
+    Example: skinrig export appearance --to gltf --out delivery
     """
-    from skinrig import export as hand_on
-    from skinrig.brdf_export import SUFFIX, place_of
+    from skinrig.exporting import appearances, brdfs, sessions
+    from skinrig.exporting.options import Delivery
 
     console = Console(json)
-    if to in SUFFIX:
-        place = place_of(at, radius_mm=radius, diffuse=not without_diffuse)
-        done = hand_on.export_brdfs(source, out, to=to, place=place)
+    if to in brdfs.SUFFIX:
+        place = brdfs.place_of(at, radius_mm=radius, diffuse=not without_diffuse)
+        done = appearances.export_brdfs(source, out, to=to, place=place, use=use)
+    elif to in appearances.FORMATS:
+        names = () if only is None else tuple(name.strip() for name in only.split(","))
+        delivery = Delivery(
+            unit=unit, normal_y=normal_y, udim=udim, with_errors=with_errors, only=names, mesh=mesh
+        )
+        done = appearances.export_appearance(source, out, to=to, delivery=delivery, use=use)
     else:
-        done = hand_on.export(source, out, to=to, use=hand_on.named(use))
+        done = sessions.export_session(source, out, to=to, use=sessions.named(use))
+    for what, why in done.left_out:
+        console.say(f"left out: {what}: {why}")
     console.say(f"{done.path}: {done.files} files, listed in {done.manifest}")
     console.document(
-        "skinrig.export/1", {"path": done.path, "files": done.files, "manifest": done.manifest}
-    )
+        "skinrig.export/1",
+        {"path": done.path, "files": done.files, "manifest": done.manifest, "to": to,
+         "left_out": [list(row) for row in done.left_out]},
+    )  # fmt: skip

@@ -1,11 +1,18 @@
-"""What a subject agreed to, as it is said on the command line."""
+"""What subjects agreed to: said on the command line, carried by maps, asked for by exports."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import date, datetime
+from datetime import UTC, date, datetime
+from typing import Any
 
-from capture.session import Subject
+from capture.session import ConsentError, Subject
+from capture.session.manifest import ANY_USE
+from model.skin import SkinAppearance
+from skinrig.errors import UsageError
+
+KEY = "consent"
+"""Of an appearance's parameters: what the subject of each measured session agreed to."""
 
 
 def subject_of(
@@ -35,3 +42,118 @@ def subject_of(
     words = [word.strip() for text in scopes or () for word in text.split(",")]
     day = expires.date() if isinstance(expires, datetime) else expires
     return Subject(pseudonym, tuple(dict.fromkeys(filter(None, words))), day)
+
+
+def recorded(appearance: SkinAppearance) -> list[dict[str, Any]]:
+    """Return what the subjects of an appearance's measured sessions agreed to, each once.
+
+    Parameters
+    ----------
+    appearance
+        Of a reconstruction, a fit, an edit or an evaluation.
+
+    Returns
+    -------
+    list of dict
+        ``pseudonym``, ``consent_scope`` and ``consent_expires`` (ISO date or None), as in
+        session.json.
+
+    Examples
+    --------
+    >>> told = {"pseudonym": "P042", "consent_scope": ["research"], "consent_expires": None}
+    >>> recorded(SkinAppearance({}, "measured", {"consent": [told]})) == [told]
+    True
+    """
+    found: list[dict[str, Any]] = []
+    for source in _sources(appearance):
+        found += [dict(one) for one in source.get(KEY) or () if dict(one) not in found]
+    return found
+
+
+def carried(*appearances: SkinAppearance) -> list[dict[str, Any]]:
+    """Return the record that what is made of several appearances must bear.
+
+    One that was measured and says nothing counts as of a subject who agreed to nothing.
+
+    Examples
+    --------
+    >>> carried(SkinAppearance({}, "measured"))[0]["consent_scope"], carried()
+    ([], [])
+    """
+    out: list[dict[str, Any]] = []
+    for appearance in appearances:
+        records = recorded(appearance)
+        if _silent(appearance):
+            records.append({"pseudonym": "unknown", "consent_scope": [], "consent_expires": None})
+        out += [one for one in records if one not in out]
+    return out
+
+
+def require(
+    appearance: SkinAppearance, use: str | None, *, where: str, today: date | None = None
+) -> None:
+    """Raise where a subject has not agreed to a use of what was measured of it.
+
+    Parameters
+    ----------
+    appearance
+        What is to be handed on. What was simulated needs no consent.
+    use
+        What for, such as "research"; None: not said.
+    where
+        Folder, for messages.
+    today
+        Day on which consent is judged; None: the present one, UTC.
+
+    Raises
+    ------
+    skinrig.errors.UsageError
+        When the use must be named, and is not.
+    ConsentError
+        When it lies outside what was agreed to, the consent has ended, or measured maps do not
+        say what was agreed to.
+    """
+    records = recorded(appearance)
+    if _silent(appearance):
+        raise ConsentError(
+            "does not record what its subjects agreed to", where=where,
+            advice="It was made before consent was kept with maps: make it again from its "
+            "sessions with `skinrig reconstruct` or `skinrig fit`.",
+        )  # fmt: skip
+    if records and use is None:
+        raise UsageError("--use: got none; say what the copy is for, e.g. research")
+    day = today or datetime.now(UTC).date()
+    for record in records:
+        scope = [str(word) for word in record.get("consent_scope") or ()]
+        expires = record.get("consent_expires")
+        if {use, ANY_USE} & set(scope) and (expires is None or day <= _day(expires, where)):
+            continue
+        allowed = ", ".join(scope) or "nothing"
+        raise ConsentError(
+            f"subject {record.get('pseudonym')} has not agreed to this use: got {use!r}, expected "
+            f"one of: {allowed}" + (f", until {expires}" if expires else ""), where=where,
+            advice="Ask the subject again, or keep the data inside the agreed scope.",
+        )  # fmt: skip
+
+
+def _day(text: object, where: str) -> date:
+    try:
+        return date.fromisoformat(str(text))
+    except ValueError as error:
+        raise ConsentError(
+            f"last day of the consent: got {text!r}, expected a day such as 2031-01-31", where=where
+        ) from error
+
+
+def _silent(appearance: SkinAppearance) -> bool:
+    """Return whether anything in it was measured of somebody whose consent is not told."""
+    parts = _sources(appearance)
+    return any(part.get("source") == "measured" and not part.get(KEY) for part in parts)
+
+
+def _sources(appearance: SkinAppearance) -> list[dict[str, Any]]:
+    """Return what an appearance, or each part of one that moves, says of where it is from."""
+    parts = appearance.parameters.get("parts")
+    if isinstance(parts, dict) and parts:
+        return [dict(part) for part in parts.values()]
+    return [{"source": appearance.source, **appearance.parameters}]

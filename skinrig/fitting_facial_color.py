@@ -91,6 +91,7 @@ def fit_facial_color(
                 "camera": subject.camera,
                 "illuminant": subject.illuminant,
                 "assumed": list(subject.assumed),
+                "consent": [dict(one) for one in subject.consent],
                 "truth": truths,
             },
             inputs=subject.inputs,

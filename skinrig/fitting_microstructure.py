@@ -17,7 +17,7 @@ from model.microstructure import FOREHEAD, KernelTable, KernelTableError
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.gradient_stages import KERNEL_FILE
 from reconstruction.kernel_table import KernelTableFitError, fit_table
-from skinrig import dynamic_appearance
+from skinrig import consent, dynamic_appearance
 from skinrig.dynamic_appearance import MICROSTRUCTURE, Part
 
 SITE = re.compile(r"[a-z][a-z0-9_]{0,31}")
@@ -126,7 +126,10 @@ def fit_microstructure(
         Part(
             maps=maps,
             files=files,
-            parameters={"sites": {site: fit.document() for site, fit in fits.items()}},
+            parameters={
+                "sites": {site: fit.document() for site, fit in fits.items()},
+                "consent": consent.carried(*(one for _, one in everything)),
+            },
             inputs=inputs,
             source="simulated" if "simulated" in sources else "measured",
             left_out=left_out,

@@ -14,7 +14,7 @@ from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import TRANSLUCENCY, SkinReflectance
 from reconstruction.probe_stages import SUBSURFACE_FILE
 from reconstruction.translucency import population_prior
-from skinrig import probe_sites
+from skinrig import consent, probe_sites
 from skinrig.errors import UsageError
 from skinrig.probe_sites import PlacedTranslucency
 
@@ -80,10 +80,12 @@ def fit_reflectance(
     left_out = list(surface.left_out)
     files = dict(surface.files)
     sources = {surface.source}
+    agreed = consent.carried(surface)
     if probe is not None:
         measured = store.read(probe)
         inputs["probe"] = _digest(probe)
         sources.add(measured.source)
+        agreed = consent.carried(surface, measured)
         try:
             placed = probe_sites.place(measured, _position(surface), landmarks=landmarks)
         except ValueError as error:
@@ -104,6 +106,7 @@ def fit_reflectance(
         parameters={
             **surface.parameters,
             "assumed": assumed,
+            consent.KEY: agreed,
             "appearances": [path.name for path in (dome, probe) if path is not None],
             KEY: _record(placed),
         },

@@ -20,7 +20,7 @@ from reconstruction.normal_maps import NormalMaps
 from reconstruction.tangent_space import SMOOTHING_MM, tangent_normals
 from reconstruction.wrinkle_fit import WrinkleFit, fit
 from reconstruction.wrinkle_zones import ZoneFit, amplitudes, fit_zones
-from skinrig import dynamic_appearance
+from skinrig import consent, dynamic_appearance
 from skinrig.dynamic_appearance import WRINKLES, Part
 
 STATE = re.compile(r"[a-z][a-z0-9_]{0,31}")
@@ -126,6 +126,7 @@ def fit_wrinkles(
                 "rank_one_share": None if found_zones is None else found_zones.rank_one_share,
                 "distinct_zones": None if found_zones is None else found_zones.distinct,
                 "smoothing_mm": smoothing_mm,
+                "consent": consent.carried(*(one for _, one in read.values())),
                 "truth": {state: one.parameters.get("truth", "") for state, (_, one) in
                           read.items()},
             },

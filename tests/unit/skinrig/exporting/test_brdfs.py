@@ -8,9 +8,10 @@ import pytest
 from model import brdf_tables, fresnel, merl, rgl, store
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.dome_stages import BASIS_FILE, _basis_bytes
-from skinrig.brdf_export import BrdfExportError, Place, write_brdfs
 from skinrig.cli import main
-from skinrig.export import ExportError, export_brdfs
+from skinrig.exporting.appearances import export_brdfs
+from skinrig.exporting.brdfs import BrdfExportError, Place, write_brdfs
+from skinrig.exporting.sealing import ExportError
 
 UP = np.array([0.0, 0.0, 1.0])
 R_D = np.array([0.5, 0.35, 0.25])

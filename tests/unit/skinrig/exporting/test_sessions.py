@@ -14,7 +14,9 @@ from capture.rig import load_rig
 from capture.session import ConsentError, Session, SessionDamage, Subject, verify
 from capture.session.mhl import c4_id
 from skinrig.cli import main
-from skinrig.export import FORMATS, ExportError, export
+from skinrig.exporting.sealing import ExportError
+from skinrig.exporting.sessions import FORMATS
+from skinrig.exporting.sessions import export_session as export
 
 RIG = load_rig("flash").resized(16)
 DAY = date(2030, 1, 1)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from model import fresnel, merl, rgl, skin_reflectance, store
+from model import fresnel, merl, rgl, skin_reflectance
 from model.brdf_tables import BrdfBasis
 from model.skin import SkinAppearance
 from skinrig.errors import UsageError
@@ -73,14 +73,14 @@ def place_of(at: str | None, *, radius_mm: float, diffuse: bool) -> Place | None
 
 
 def write_brdfs(
-    appearance_path: str | Path, folder: Path, *, to: str, place: Place | None = None
+    appearance: SkinAppearance, folder: Path, *, to: str, place: Place | None = None
 ) -> None:
     """Write each lobe as lobe_K, and the BRDF of a place as place, with a document that tells all.
 
     Parameters
     ----------
-    appearance_path
-        APPEARANCE/ folder of a dome, or a fitted MODEL.
+    appearance
+        Of a dome, or a fitted model.
     folder
         Existing folder.
     to
@@ -95,7 +95,6 @@ def write_brdfs(
     model.skin_reflectance.SkinReflectanceError
         Where the appearance has no lobes.
     """
-    appearance = store.read(appearance_path)
     lobes = skin_reflectance.lobes_of(appearance)
     files: dict[str, object] = {}
     for k in range(lobes.size):

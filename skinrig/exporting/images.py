@@ -1,0 +1,239 @@
+"""Images as other programs read them: float EXR and 16-bit PNG, each described in one record.
+
+An EXR says its unit and color space in its header. A PNG can hold neither numbers below 0 nor
+above 1: its record says how codes become values again, and which share of the pixels was clipped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinrig import png
+from skinrig.exporting.options import Delivery
+
+Floats = NDArray[np.floating[Any]]
+Bools = NDArray[np.bool_]
+
+SRGB: Final = "linear sRGB"
+CAMERA: Final = "camera RGB, linear, white balanced"
+DATA: Final = "data"
+REC709: Final = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+"""Chromaticities of sRGB's primaries and D65, for headers."""
+CODES: Final = 65535
+RANGES: Final[Mapping[str, tuple[float, float]]] = {
+    "melanin": (0.0, 0.5),
+    "hemoglobin": (0.0, 0.25),
+    "normals": (-1.0, 1.0),
+    "translucency": (0.0, 16.0),
+    "basis_weight": (0.0, 2.0),
+}
+"""Ranges of PNG codes of maps whose names begin so, equal for all subjects."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Image:
+    """One image to write.
+
+    Attributes
+    ----------
+    name
+        Of the files, without suffix.
+    values
+        (H, W) or (H, W, 3), row 0 at the top (v = 1).
+    unit
+        "1" for numbers without dimension.
+    space
+        `SRGB`, `CAMERA` or `DATA`.
+    what
+        One line for people.
+    low, high
+        Values of PNG codes 0 and 65535; None: the least and largest valid value.
+    valid
+        (H, W); values elsewhere mean nothing. None: all mean something.
+    """
+
+    name: str
+    values: Floats
+    unit: str
+    space: str = DATA
+    what: str = ""
+    low: float | None = None
+    high: float | None = None
+    valid: Bools | None = None
+
+
+@dataclass(slots=True)
+class ImageFolder:
+    """Writes images below a folder and keeps a record of each.
+
+    Attributes
+    ----------
+    root
+        Existing folder.
+    delivery
+        Names of tiles.
+    records
+        File name to what the file holds, JSON values.
+    """
+
+    root: Path
+    delivery: Delivery
+    records: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def exr(self, image: Image, folder: str = "exr") -> str:
+        """Write a float32 EXR; return its name below the root."""
+        file = self._place(folder, image.name, "exr")
+        write_exr(
+            self.root / file, image.values,
+            {"unit": image.unit, "colorSpace": image.space, "comments": image.what},
+            rec709=image.space == SRGB,
+        )  # fmt: skip
+        self._record(file, image, {"encoding": "32-bit float, the value itself"})
+        return file
+
+    def png(self, image: Image, folder: str = "png", *, depth: int = 16) -> str:
+        """Write a PNG of 16 or 8 bits; return its name below the root.
+
+        Colors in `SRGB` are coded by sRGB's curve, all else in proportion.
+        """
+        file = self._place(folder, image.name, "png")
+        codes, told = coded(image, depth=depth)
+        (self.root / file).write_bytes(png.encode(codes))
+        self._record(file, image, told)
+        return file
+
+    def _place(self, folder: str, name: str, suffix: str) -> str:
+        (self.root / folder).mkdir(exist_ok=True)
+        return f"{folder}/{self.delivery.tiled(name, suffix)}"
+
+    def _record(self, file: str, image: Image, told: Mapping[str, Any]) -> None:
+        with open(self.root / file, "rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        self.records[file] = {
+            "what": image.what,
+            "unit": image.unit,
+            "color_space": image.space,
+            "shape": list(image.values.shape),
+            "valid_share": 1.0 if image.valid is None else float(image.valid.mean()),
+            **told,
+            "sha256": digest,
+        }
+
+
+def coded(image: Image, *, depth: int = 16) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Return PNG codes and how they become values again.
+
+    Parameters
+    ----------
+    image
+        What to code.
+    depth
+        8 or 16 bits.
+
+    Returns
+    -------
+    codes : ndarray of uint8 or uint16, shape of the values
+    told : dict
+        JSON values: encoding, range, share of valid values that were clipped.
+
+    Examples
+    --------
+    >>> ramp = Image(name="a", values=np.array([[0.0, 1.0, 3.0]]), unit="mm", low=0.0, high=2.0)
+    >>> codes, told = coded(ramp)
+    >>> codes.tolist(), told["clipped_share"] > 0.3
+    ([[0, 32768, 65535]], True)
+    """
+    dtype: Any = {8: np.uint8, 16: np.uint16}[depth]
+    top = 2**depth - 1
+    values = np.nan_to_num(np.asarray(image.values, np.float64))
+    shown = values if image.valid is None else values[image.valid]
+    if image.space == SRGB:
+        low, high = 0.0, 1.0
+        position = srgb_curve(np.clip(values, 0.0, 1.0))
+        encoding = f"sRGB curve (IEC 61966-2-1): value = inverse curve of code / {top}"
+    else:
+        low = float(shown.min(initial=np.inf)) if image.low is None else image.low
+        high = float(shown.max(initial=-np.inf)) if image.high is None else image.high
+        if not np.isfinite(low) or not np.isfinite(high):
+            low, high = 0.0, 1.0  # nothing is valid
+        if high <= low:
+            high = low + 1.0
+        position = np.clip((values - low) / (high - low), 0.0, 1.0)
+        encoding = f"value = low + (high - low) * code / {top}; import as raw, Non-Color"
+    slack = 0.5 / top * (high - low)
+    clipped = (shown < low - slack) | (shown > high + slack)
+    told = {
+        "encoding": encoding,
+        "low": low,
+        "high": high,
+        "step": (high - low) / top,
+        "clipped_share": float(clipped.mean()) if clipped.size else 0.0,
+    }
+    return np.round(position * top).astype(dtype), told
+
+
+def srgb_curve(linear: Floats) -> NDArray[np.float64]:
+    """Return sRGB's curve of values in [0, 1], IEC 61966-2-1.
+
+    Examples
+    --------
+    >>> srgb_curve(np.array([0.0, 0.0031308, 1.0])).round(4).tolist()
+    [0.0, 0.0404, 1.0]
+    """
+    value = np.asarray(linear, np.float64)
+    power = 1.055 * np.maximum(value, 1e-12) ** (1 / 2.4) - 0.055
+    return np.where(value <= 0.0031308, 12.92 * value, power)
+
+
+def png_range(name: str) -> tuple[float | None, float | None]:
+    """Return the fixed range of a map's PNG, None and None where it follows the values."""
+    for start, (low, high) in RANGES.items():
+        if name.startswith(start):
+            return low, high
+    return None, None
+
+
+def write_exr(
+    path: Path, values: Floats, attributes: Mapping[str, str], *, rec709: bool = False
+) -> None:
+    """Write (H, W) as channel Y or (H, W, 3) as R, G, B, float32, compressed without loss."""
+    channel = "Y" if values.ndim == 2 else "RGB"
+    write_channels(path, {channel: values}, attributes, rec709=rec709)
+
+
+def write_channels(
+    path: Path, channels: Mapping[str, Floats], attributes: Mapping[str, str], *,
+    rec709: bool = False,
+) -> None:  # fmt: skip
+    """Write named channels of one size as float32 EXR, compressed without loss.
+
+    Parameters
+    ----------
+    path
+        File.
+    channels
+        (H, W) by name; or (H, W, 3) as ``"RGB"``.
+    attributes
+        Texts of the header; empty ones are left out.
+    rec709
+        Whether R, G, B are linear sRGB.
+    """
+    import OpenEXR
+
+    header: dict[str, Any] = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        **{name: text for name, text in attributes.items() if text},
+    }
+    if rec709:
+        header["chromaticities"] = REC709
+    pixels = {name: np.ascontiguousarray(v, np.float32) for name, v in channels.items()}
+    with OpenEXR.File(header, pixels) as file:
+        file.write(str(path))

@@ -1,0 +1,213 @@
+"""Every map of an appearance as float EXR and 16-bit PNG, with one document that says it all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from model.skin import SkinAppearance, SkinMap
+from skinrig.exporting import materialx
+from skinrig.exporting.images import CAMERA, DATA, SRGB, Image, ImageFolder, png_range
+from skinrig.exporting.options import NORMAL_Y, Delivery
+from skinrig.exporting.sealing import ExportError, write_json
+from skinrig.rendering_geometry import MESH_FILES
+
+DOCUMENT: Final = "maps.json"
+SCHEMA: Final = "skinrig.export.maps/1"
+PACKED: Final = "chromophores"
+"""Melanin in R, hemoglobin in G, as texture suppliers deliver them."""
+LINEAR_SRGB: Final = ("picture", "specular_picture", "color")
+CAMERA_RGB: Final = ("diffuse", "specular", "r_d", "reflectance", "albedo", "crossed")
+ORIENTATION: Final = (
+    "row 0 of every image is its top; of a texture that is v = 1, with (0, 0) bottom left"
+)
+
+
+def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
+    """Write the maps of an appearance.
+
+    Parameters
+    ----------
+    appearance
+        Any.
+    folder
+        Existing, empty.
+    delivery
+        Which maps, names of tiles, green of normals, whether errors are written.
+
+    Returns
+    -------
+    list of (str, str)
+        What was left out, and why.
+
+    Raises
+    ------
+    ExportError
+        For a map that there is not, or an appearance without any.
+    """
+    names = list(delivery.only) or sorted(appearance.maps)
+    missing = [name for name in names if name not in appearance.maps]
+    if missing or not names:
+        raise ExportError(
+            f"maps: got {missing[0] if missing else 'an appearance without maps'}, expected of "
+            f"{', '.join(sorted(appearance.maps)) or 'a reconstruction that has some'}"
+        )
+    out = ImageFolder(folder, delivery)
+    left_out: list[tuple[str, str]] = []
+    on_mesh = any(name in appearance.files for name in MESH_FILES)
+    shown: dict[str, tuple[str, str]] = {}  # what a material file names: file and its type
+    for name in names:
+        image = _image(name, appearance.maps[name], delivery, on_mesh=on_mesh)
+        exr = out.exr(image)
+        out.png(image)
+        colored = "color3" if image.space == SRGB else "vector3"
+        shown[name] = (exr, colored if image.values.ndim == 3 else "float")
+        if delivery.with_errors:
+            _errors(name, appearance.maps[name], out)
+    if {"melanin", "hemoglobin"} <= set(names):
+        packed = _packed(appearance)
+        if packed is None:
+            left_out.append((PACKED, "melanin and hemoglobin are of different sizes"))
+        else:
+            out.exr(packed)
+            _packed_png(packed, out)
+    normal = None
+    if on_mesh:
+        normal, why = _tangent_normals(appearance, names, out, delivery)
+        if why:
+            left_out.append(("normal", why))
+    text = materialx.images_document(shown, delivery, tangent_normal=normal)
+    (folder / "maps.mtlx").write_text(text, encoding="utf-8")
+    for name, data in sorted(appearance.files.items()):
+        (folder / "files").mkdir(exist_ok=True)
+        (folder / "files" / name).write_bytes(data)
+    write_json(folder / DOCUMENT, _document(appearance, delivery, out.records, left_out))
+    return left_out
+
+
+def provenance(appearance: SkinAppearance) -> dict[str, Any]:
+    """Return where an appearance is from, as JSON values that every export's document holds."""
+    told = appearance.parameters
+    return {
+        "source": appearance.source,
+        "inputs": dict(appearance.inputs),
+        "versions": dict(appearance.versions),
+        "seed": appearance.seed,
+        "assumed": told.get("assumed", []),
+        "consent": told.get("consent", []),
+    }
+
+
+def _document(
+    appearance: SkinAppearance, delivery: Delivery, files: Mapping[str, Any],
+    left_out: list[tuple[str, str]],
+) -> dict[str, Any]:  # fmt: skip
+    return {
+        "schema": SCHEMA,
+        "orientation": ORIENTATION,
+        "normal_y": "+Y (OpenGL)" if NORMAL_Y[delivery.normal_y] > 0 else "-Y (DirectX)",
+        "udim": "none" if delivery.udim == "none" else "tile 1001",
+        "rig_frame": "mm, +x right, +y up, +z towards the main camera",
+        "files": dict(sorted(files.items())),
+        "left_out": [list(row) for row in left_out],
+        **provenance(appearance),
+    }
+
+
+def _image(name: str, one: SkinMap, delivery: Delivery, *, on_mesh: bool) -> Image:
+    """Return a map as an image: normals seen by a camera get the green that is asked for."""
+    values, what = one.values, one.description
+    low, high = png_range(name)
+    if _is_normals(name, one):
+        low, high = -1.0, 1.0
+        if not on_mesh:
+            y = NORMAL_Y[delivery.normal_y]
+            values = values * np.array([1.0, y, 1.0], np.float32)
+            what = f"{what}; picture's frame: x right, y {'up' if y > 0 else 'down'}".strip("; ")
+        else:
+            what = f"{what}; rig frame, green is not flipped".strip("; ")
+    space = DATA
+    if values.ndim == 3 and name.startswith(LINEAR_SRGB):
+        space = SRGB
+    elif values.ndim == 3 and name.startswith(CAMERA_RGB):
+        space = CAMERA
+        low, high = (0.0, 1.0) if low is None else (low, high)
+    return Image(
+        name=name, values=values, unit=one.unit, space=space, what=what, low=low, high=high,
+        valid=one.valid,
+    )  # fmt: skip
+
+
+def _is_normals(name: str, one: SkinMap) -> bool:
+    return "normals" in name and one.values.ndim == 3
+
+
+def _errors(name: str, one: SkinMap, out: ImageFolder) -> None:
+    if one.stderr is not None:
+        unit = "rad" if _is_normals(name, one) else one.unit
+        out.exr(
+            Image(name=f"{name}.stderr", values=one.stderr, unit=unit,
+                  what=f"standard error of {name}, 68 %", valid=one.valid)
+        )  # fmt: skip
+    valid = np.ones(one.values.shape[:2], bool) if one.valid is None else one.valid
+    out.exr(
+        Image(name=f"{name}.valid", values=valid.astype(np.float32), unit="1",
+              what=f"1 where {name} means something, else 0")
+    )  # fmt: skip
+
+
+def _packed(appearance: SkinAppearance) -> Image | None:
+    melanin, blood = appearance.maps["melanin"], appearance.maps["hemoglobin"]
+    if melanin.values.shape != blood.values.shape:
+        return None
+    valid = np.ones(melanin.values.shape, bool)
+    for one in (melanin, blood):
+        valid &= True if one.valid is None else one.valid
+    layers = [melanin.values, blood.values, np.zeros_like(blood.values)]
+    what = "R melanin (epidermis), G hemoglobin (dermis), volume fractions; B is empty, 0"
+    return Image(name=PACKED, values=np.stack(layers, axis=-1), unit="1", what=what, valid=valid)
+
+
+def _packed_png(packed: Image, out: ImageFolder) -> None:
+    """Write the pack with the ranges of its channels: values times 2 and 4, blue 0."""
+    scale = np.array([2.0, 4.0, 1.0], np.float32)
+    what = f"{packed.what}; R is 2 times melanin, G is 4 times hemoglobin"
+    out.png(
+        Image(name=packed.name, values=packed.values * scale, unit="1", what=what, low=0.0,
+              high=1.0, valid=packed.valid)
+    )  # fmt: skip
+
+
+def _tangent_normals(
+    appearance: SkinAppearance, names: list[str], out: ImageFolder, delivery: Delivery
+) -> tuple[str | None, str]:
+    """Write normals in the mesh's frames; return the PNG's name, and why there is none."""
+    from skinrig.exporting import tangents
+    from skinrig.exporting.tangents import FramedMesh
+    from skinrig.rendering_geometry import GeometryError, own_mesh
+
+    found = next((n for n in ("normals_refined", "normals") if n in names), None)
+    if found is None:
+        return None, "neither normals_refined nor normals is among the maps"
+    one = appearance.maps[found]
+    height, width = one.values.shape[:2]
+    if height != width:
+        return None, f"{found} is {height} x {width}, expected a square texture"
+    try:
+        mesh = own_mesh(appearance)
+    except GeometryError as error:
+        return None, str(error)
+    axes, covered = FramedMesh.of(mesh).texel_frames(height)
+    y = NORMAL_Y[delivery.normal_y]
+    turned = tangents.to_tangent(one.values, axes, covered) * np.array([1.0, y, 1.0], np.float32)
+    green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
+    valid = covered if one.valid is None else covered & one.valid
+    image = Image(
+        name="normal_tangent", values=turned, unit="1", low=-1.0, high=1.0, valid=valid,
+        what=f"{found} in the tangent frames of the mesh's vertices (MikkTSpace's rules), {green}",
+    )  # fmt: skip
+    out.exr(image)
+    return out.png(image), ""

@@ -1,0 +1,82 @@
+"""How the receiver of an export wants it: scene unit, green of normal maps, names of tiles."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from skinrig.errors import UsageError
+
+UNITS_M: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+"""Length of a scene unit, m."""
+NORMAL_Y: Final[Mapping[str, float]] = {"gl": 1.0, "dx": -1.0}
+"""Sign of a normal map's green: +Y up (OpenGL, glTF, Blender, Maya) or down (DirectX, Unreal)."""
+TILES: Final[Mapping[str, str]] = {"none": "", "dot": ".1001", "underscore": "_1001"}
+"""What stands between a texture's name and its suffix."""
+UDIM: Final[Mapping[str, str]] = {"none": "", "dot": ".<UDIM>", "underscore": "_<UDIM>"}
+"""The same in a material file."""
+
+_WORD = re.compile(r"[a-z][a-z0-9_]{0,63}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Delivery:
+    """How an appearance is to be delivered.
+
+    Attributes
+    ----------
+    unit
+        Scene unit, of `UNITS_M`; None: the format's own.
+    normal_y
+        Of `NORMAL_Y`.
+    udim
+        Of `TILES`. Textures are those of tile 1001.
+    with_errors
+        Whether standard errors and masks are written beside the values.
+    only
+        Names of the maps, or of the states, to write; empty: all that there are.
+    mesh
+        A mesh with the maps' texture coordinates, perhaps with blend shapes, instead of the
+        appearance's own.
+    """
+
+    unit: str | None = None
+    normal_y: str = "gl"
+    udim: str = "none"
+    with_errors: bool = False
+    only: tuple[str, ...] = ()
+    mesh: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse words that mean nothing."""
+        for option, value, known in (
+            ("--unit", self.unit, UNITS_M),
+            ("--normal-y", self.normal_y, NORMAL_Y),
+            ("--udim", self.udim, TILES),
+        ):
+            if value is not None and value not in known:
+                raise UsageError(f"{option}: got {value!r}, expected one of {', '.join(known)}")
+        for name in self.only:
+            if not _WORD.fullmatch(name):
+                raise UsageError(f"--only: got {name!r}, expected names joined by commas")
+
+    def unit_or(self, default: str) -> str:
+        """Return the scene unit, or a format's own where none is asked for."""
+        return default if self.unit is None else self.unit
+
+    def tiled(self, name: str, suffix: str) -> str:
+        """Return a texture's file name.
+
+        Examples
+        --------
+        >>> Delivery(udim="underscore").tiled("normal", "png")
+        'normal_1001.png'
+        """
+        return f"{name}{TILES[self.udim]}.{suffix}"
+
+    def referred(self, name: str, suffix: str) -> str:
+        """Return a texture's name as a material file refers to all its tiles."""
+        return f"{name}{UDIM[self.udim]}.{suffix}"

@@ -1,0 +1,150 @@
+"""The nearest single GGX lobe to a mixture of tabulated lobes: what materials have a place for.
+
+Least squares over the directions of the lobes' grid up to half angles of 60 degrees between light
+and view, each counting by its solid angle and both cosines over the mean lobe there, so that neither
+the peak nor the tail decides alone. All sums are
+those of K lobes: a texel costs K^2 products, whatever its mixture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model import brdf_tables, merl, microfacet
+from model.brdf_tables import BrdfBasis
+
+Floats = NDArray[np.float64]
+
+ROUGHNESS: Final = np.linspace(0.15, 1.0, 69)
+"""Of materials: the square root of the slope width alpha."""
+LEAST_COSINE: Final = 0.2
+MOST_THETA_D: Final = np.deg2rad(60.0)
+"""Grazing light is left out: there one lobe of a smooth dielectric's index cannot follow a mixture,
+and would pay for it head-on, where skin is looked at."""
+FLOOR: Final = 0.03
+"""Of the greatest mean lobe, added to it: the far tail of a sharp lobe decides nothing."""
+STRIDE_D, STRIDE_PHI, STRIDE_H = 2, 3, 2
+"""Nodes of the grid are passed over: the lobes are smooth, and sums are of 3 000 directions."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceFit:
+    """One lobe a texel.
+
+    Attributes
+    ----------
+    roughness : ndarray of float32, shape (H, W)
+        Square root of GGX's alpha, as OpenPBR and glTF have it.
+    weight : ndarray of float32, shape (H, W)
+        Factor of the reflection of a smooth dielectric of the given index; not clipped.
+    misfit : ndarray of float32, shape (H, W)
+        RMS of what is left over the RMS of the mixture, by the sum's own weights.
+    """
+
+    roughness: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    misfit: NDArray[np.float32]
+
+
+def fit(lobes: BrdfBasis, weights: ArrayLike, *, eta: float) -> SurfaceFit:
+    """Fit roughness and weight to mixtures of lobes.
+
+    Parameters
+    ----------
+    lobes
+        K tables, 1/sr, Fresnel's reflection inside.
+    weights
+        Shares, (H, W, K), at least 0.
+    eta
+        Refractive index over that of air.
+
+    Returns
+    -------
+    SurfaceFit
+        Texels without any surface reflection have weight 0 and roughness 1.
+    """
+    share = np.asarray(weights, np.float64)
+    gram, cross, own = _products(lobes, eta)
+    energy = np.einsum("...k,kl,...l->...", share, gram, share)
+    along = share @ cross  # (H, W, R)
+    explained = np.maximum(along, 0.0) ** 2 / own
+    best = np.argmax(explained, axis=-1)
+    inner = np.clip(best, 1, len(ROUGHNESS) - 2)
+
+    def at(offset: int) -> Floats:
+        return np.take_along_axis(explained, (inner + offset)[..., None], axis=-1)[..., 0]
+
+    below, here, above = at(-1), at(0), at(1)
+    bend = below - 2.0 * here + above
+    curved = bend < -1e-12 * np.maximum(here, 1e-30)
+    shift = np.where(curved, 0.5 * (below - above) / np.where(curved, bend, -1.0), 0.0)
+    place = np.where(best == inner, inner + np.clip(shift, -0.5, 0.5), best)
+    nodes = np.arange(len(ROUGHNESS))
+    roughness = np.interp(place, nodes, ROUGHNESS)
+    low = np.clip(np.floor(place).astype(np.intp), 0, len(ROUGHNESS) - 2)
+    part = place - low
+
+    def between(table: Floats) -> Floats:
+        return (1.0 - part) * np.take_along_axis(table, low[..., None], -1)[..., 0] + (
+            part * np.take_along_axis(table, (low + 1)[..., None], -1)[..., 0]
+        )
+
+    scale = np.maximum(between(along / own), 0.0)
+    left = np.maximum(energy - np.maximum(here, explained.max(axis=-1)), 0.0)
+    dark = energy <= 1e-30
+    misfit = np.sqrt(left / np.where(dark, 1.0, energy))
+    return SurfaceFit(
+        np.where(dark, 1.0, roughness).astype(np.float32),
+        np.where(dark, 0.0, scale).astype(np.float32),
+        np.where(dark, 0.0, misfit).astype(np.float32),
+    )
+
+
+def lobe_values(roughness: float, eta: float) -> Floats:
+    """Return GGX of a roughness at the directions of the sums, 1/sr, shape (N,)."""
+    light, view, cos_h, cos_d, _ = _directions()
+    return microfacet.brdf(light, view, cos_h, cos_d, roughness=roughness**2, eta=eta, kind="ggx")
+
+
+def _products(lobes: BrdfBasis, eta: float) -> tuple[Floats, Floats, Floats]:
+    """Return weighted products: lobes with lobes (K, K), with GGX (K, R), of GGX itself (R,)."""
+    keep = _directions()[-1]
+    table = lobes.table[::STRIDE_D, ::STRIDE_PHI, ::STRIDE_H, : lobes.size]
+    values = table.reshape(-1, lobes.size)[keep].astype(np.float64)
+    mean = values.mean(axis=1)
+    weight = _solid()[keep] / (mean + FLOOR * mean.max(initial=1e-12))
+    model = np.stack([lobe_values(float(r), eta) for r in ROUGHNESS], axis=1)
+    scaled = values * weight[:, None]
+    return values.T @ scaled, scaled.T @ model, np.sum(weight[:, None] * model**2, axis=0)
+
+
+@lru_cache(maxsize=1)
+def _grid() -> tuple[Floats, Floats, Floats]:
+    d, phi, h = brdf_tables.nodes()
+    picked = np.meshgrid(d[::STRIDE_D], phi[::STRIDE_PHI], h[::STRIDE_H], indexing="ij")
+    theta_d, phi_d, theta_h = (axis.reshape(-1) for axis in picked)
+    return theta_d, phi_d, theta_h
+
+
+@lru_cache(maxsize=1)
+def _directions() -> tuple[Floats, Floats, Floats, Floats, NDArray[np.bool_]]:
+    """Return cosines of light, view, half vector and difference angle, and which nodes count."""
+    theta_d, phi_d, theta_h = _grid()
+    light, view = merl.to_directions(theta_h, theta_d, phi_d)
+    keep = (light[:, 2] > LEAST_COSINE) & (view[:, 2] > LEAST_COSINE) & (theta_d <= MOST_THETA_D)
+    return light[keep, 2], view[keep, 2], np.cos(theta_h[keep]), np.cos(theta_d[keep]), keep
+
+
+@lru_cache(maxsize=1)
+def _solid() -> Floats:
+    """Return the solid angle of each node times both cosines, up to a factor."""
+    theta_d, phi_d, theta_h = _grid()
+    light, view = merl.to_directions(theta_h, theta_d, phi_d)
+    # d theta_h grows with theta_h's square root, whose nodes are even
+    solid = np.sin(2.0 * theta_d) * np.sin(theta_h) * np.sqrt(np.maximum(theta_h, 0.0))
+    return solid * np.clip(light[:, 2], 0.0, 1.0) * np.clip(view[:, 2], 0.0, 1.0)
