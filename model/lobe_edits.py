@@ -219,7 +219,7 @@ def _with_lobe(
     found = [np.maximum(way, 0.0)]
     frame = reduced_spaces.framed(np.eye(len(vector)), metric)
     columns = np.vstack([lobes, np.eye(len(vector))]) @ frame
-    usual = t.mean(axis=0)
+    usual = _padded(t, len(lobes)).mean(axis=0)
     for given in GIVEN:
         wanted = given * usual @ lobes + strength * way
         found.append(nnls(columns.T, wanted @ frame, maxiter=50 * len(columns))[0][len(lobes) :])

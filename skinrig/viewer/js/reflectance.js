@@ -1,0 +1,81 @@
+// Fitted reflectance (Weyrich et al. 2006): shares of tabulated lobes under the surface traits, the
+// albedo under its own, and the fitted lobes beside the analytic specular part.
+Object.assign(V.defaults, {traits: {}, measured_translucency: false});
+
+V.profileName = p => p.measured_translucency && V.profiles.fitted ? "fitted" : "default";
+
+V.shareCount = () => 4 * (V.scene.textures.lobe_shares?.layers ?? 0);
+
+// Sum of the surface traits' pulls on the lobes, one number a lobe.
+V.traitPull = p => {
+  const pull = new Float32Array(V.shareCount());
+  const traits = V.scene.facts.surface_traits?.traits ?? {};
+  for (const [name, amount] of Object.entries(p.traits)) {
+    (traits[name]?.pull ?? []).forEach((one, k) => { pull[k] += Math.fround(amount) * one; });
+  }
+  return pull;
+};
+
+// A matrix of K lobes in one of as many as there are channels; those that fill it up do nothing.
+V.paddedGram = () => {
+  const count = V.shareCount();
+  const {gram, scale} = V.scene.facts.surface_traits ?? {gram: [], scale: []};
+  const out = new Float32Array(count * count);
+  for (let i = 0; i < count; i++) {
+    out[count * i + i] = 1;
+    for (let j = 0; i < scale.length && j < scale.length; j++) {
+      out[count * i + j] = gram[scale.length * i + j];
+    }
+  }
+  return {gram: out, scale: Float32Array.from({length: count}, (_, i) => scale[i] ?? 1)};
+};
+
+// Amounts of the layers of the albedo traits: each trait has one for less and one for more of it.
+V.albedoAmounts = p => (V.scene.facts.albedo_traits?.layers ?? [])
+  .map(({name, end}) => Math.max(0, end * (p.traits[name] ?? 0)));
+
+V.start.push(() => {
+  V.surface.keys.push(p => p.measured_translucency);
+  if (V.scene.facts.profile) V.profiles.fitted = V.scene.facts.profile;
+  if (V.scene.textures.translucency) {
+    V.surface.chunks.push("translucency_width");
+    V.surface.width = "translucencyWidth";
+  }
+  const shares = V.scene.textures.lobe_shares;
+  if (shares) {
+    const {width, height, layers} = shares;
+    const padded = V.paddedGram();
+    const sweeps = V.scene.facts.surface_traits?.sweeps ?? 1;
+    const active = p => Number(V.traitPull(p).some(one => one !== 0));
+    V.passes.push({
+      name: "surface_traits", after: [], key: p => V.traitPull(p).join(),
+      targets: () => Object.fromEntries(Array.from({length: layers}, (_, i) => [
+        `lobe_shares_${i}`, {format: "RGBA16F", size: [width, height], space: "uv"},
+      ])),
+      draw: ctx => ctx.full(V.program(["full_vertex"], ["lobe_share_pass"],
+        {SHARE_COUNT: 4 * layers, SWEEPS: sweeps}), {
+        u_gram: padded.gram, u_scale: padded.scale, u_pull: V.traitPull(ctx.p),
+        u_active: active(ctx.p),
+      }),
+      cost: () => ({taps: layers * width * height, bytes: 8 * layers * width * height}),
+    });
+    V.surface.chunks.push("fitted_brdf");
+    V.surface.specular.fitted = "fittedSpecular";
+    V.surface.after.push("surface_traits");
+  }
+  const factors = V.scene.textures.albedo_traits;
+  if (factors) {
+    const {width, height, layers} = factors;
+    V.passes.push({
+      name: "albedo_traits", after: [], key: p => V.albedoAmounts(p).join(),
+      targets: () => ({albedo_factor: {format: "RGBA16F", size: [width, height], space: "uv"}}),
+      draw: ctx => ctx.full(V.program(["full_vertex"], ["albedo_trait_pass"],
+        {TRAIT_LAYERS: layers}), {u_amounts: V.albedoAmounts(ctx.p)}),
+      cost: p => ({
+        taps: V.albedoAmounts(p).filter(amount => amount !== 0).length * width * height,
+        bytes: 8 * width * height,
+      }),
+    });
+    V.surface.after.push("albedo_traits");
+  }
+});
