@@ -5,13 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-from skinrig.viewer import facial_color_assets, scattering_assets, surface_assets
+from skinrig.viewer import (
+    facial_color_assets,
+    fitted_assets,
+    microstructure_assets,
+    scattering_assets,
+    surface_assets,
+)
 from skinrig.viewer.scene import Assets, SceneSource, ViewerScene
 
 BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
     facial_color_assets.assets,
     scattering_assets.assets,
     surface_assets.assets,
+    fitted_assets.assets,
+    microstructure_assets.assets,
 )
 """In the order in which their parts are listed; they do not see each other's."""
 

@@ -21,7 +21,10 @@ SCRIPTS: Final = (
     "camera.js",
     "color.js",
     "shading.js",
+    "strain.js",
+    "microstructure.js",
     "scattering.js",
+    "reflectance.js",
     "display.js",
     "main.js",
 )

@@ -1,0 +1,261 @@
+// Strain of the moved mesh (Nagano 2015, eqs. 10 to 13): a tensor at each vertex, in float64 on the
+// processor and only where weights changed; its principal axes at each pixel are the shader's.
+//
+// The definition is model/mesh_strain.py's, whose kernels this follows step by step: the right
+// stretch tensor less 1 of each triangle, turned into the vertex's plane, averaged by rest areas;
+// and the symmetric part of the map from skin to texture.
+V.strain = {SLIVER: 1e-6, FINE: 0, DEGENERATE: 1, NO_TEXTURE: 2};
+
+// Vertices at one place before and after the move share a number.
+V.strain.places = (rest, moved) => {
+  const count = rest.length / 3;
+  const place = new Int32Array(count);
+  const known = new Map();
+  const words = new Float64Array(6);
+  let places = 0;
+  for (let v = 0; v < count; v++) {
+    // sums with 0 make -0 and 0 one key
+    for (let c = 0; c < 3; c++) { words[c] = rest[3 * v + c] + 0; words[3 + c] = moved[3 * v + c] + 0; }
+    const key = words.join();
+    let at = known.get(key);
+    if (at === undefined) { at = places++; known.set(key, at); }
+    place[v] = at;
+  }
+  return {place, places};
+};
+
+// What each triangle does, in its own plane: kind, basis (9), twice its area, change (3), Q (4).
+V.strain.triangles = (rest, moved, faces, uv) => {
+  const count = faces.length / 3;
+  const out = {
+    kind: new Uint8Array(count), basis: new Float64Array(9 * count), area: new Float64Array(count),
+    change: new Float64Array(3 * count), toUv: new Float64Array(4 * count),
+  };
+  const {kind, basis, area, change, toUv} = out;
+  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+  const edge = (p, i, j) => [p[3 * j] - p[3 * i], p[3 * j + 1] - p[3 * i + 1],
+    p[3 * j + 2] - p[3 * i + 2]];
+  for (let f = 0; f < count; f++) {
+    const [i, j, k] = [faces[3 * f], faces[3 * f + 1], faces[3 * f + 2]];
+    const a = edge(rest, i, j);
+    const b = edge(rest, i, k);
+    const c = edge(rest, j, k);
+    const aa = dot(a, a);
+    let longest = Math.max(aa, dot(b, b), dot(c, c));
+    const n = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    const twice = Math.sqrt(dot(n, n));
+    if (!(twice > V.strain.SLIVER * longest)) { kind[f] = V.strain.DEGENERATE; continue; }
+    // on axes e1 = a / |a|, e2 = n x e1: a = (x, 0), b = (u, v)
+    const x = Math.sqrt(aa);
+    const u = dot(a, b) / x;
+    const v = twice / x;
+    const at = 9 * f;
+    for (let m = 0; m < 3; m++) { basis[at + m] = a[m] / x; basis[at + 6 + m] = n[m] / twice; }
+    const [nx, ny, nz] = [basis[at + 6], basis[at + 7], basis[at + 8]];
+    const [ex, ey, ez] = [basis[at], basis[at + 1], basis[at + 2]];
+    basis[at + 3] = ny * ez - nz * ey;
+    basis[at + 4] = nz * ex - nx * ez;
+    basis[at + 5] = nx * ey - ny * ex;
+    area[f] = twice;
+    // changes of the edges' inner products, without cancellation
+    const A = edge(moved, i, j);
+    const B = edge(moved, i, k);
+    const da = [A[0] - a[0], A[1] - a[1], A[2] - a[2]];
+    const db = [B[0] - b[0], B[1] - b[1], B[2] - b[2]];
+    const gaa = dot(da, [A[0] + a[0], A[1] + a[1], A[2] + a[2]]);
+    const gab = dot(da, B) + dot(a, db);
+    const gbb = dot(db, [B[0] + b[0], B[1] + b[1], B[2] + b[2]]);
+    // C - 1 = X^-T [gaa gab; gab gbb] X^-1 with X = [x u; 0 v]
+    const p = gaa / (x * x);
+    const q = (gab / x - p * u) / v;
+    const r = (gbb / v - u * (p * u / v + 2 * q)) / v;
+    // U - 1 of U = sqrt(C), Cayley-Hamilton: (C + J) / s, s^2 = tr C + 2 J
+    const det = p * r - q * q;
+    const J = Math.sqrt(Math.max(1 + p + r + det, 0));
+    const s = Math.sqrt(Math.max(2 + p + r + 2 * J, 0));
+    if (s > 0) {
+      const rest_of_it = det / (1 + J + s);
+      change[3 * f] = (p + rest_of_it) / s;
+      change[3 * f + 1] = q / s;
+      change[3 * f + 2] = (r + rest_of_it) / s;
+    } else {
+      change[3 * f] = -1;
+      change[3 * f + 2] = -1;
+    }
+    const [ua, va] = [uv[2 * j] - uv[2 * i], uv[2 * j + 1] - uv[2 * i + 1]];
+    const [ub, vb] = [uv[2 * k] - uv[2 * i], uv[2 * k + 1] - uv[2 * i + 1]];
+    longest = Math.max(ua * ua + va * va, ub * ub + vb * vb, (ub - ua) ** 2 + (vb - va) ** 2);
+    if (!(Math.abs(ua * vb - va * ub) > V.strain.SLIVER * longest)) {
+      kind[f] = V.strain.NO_TEXTURE;
+      continue;
+    }
+    // rows u, v; columns e1, e2
+    toUv[4 * f] = ua / x;
+    toUv[4 * f + 2] = va / x;
+    toUv[4 * f + 1] = (ub - toUv[4 * f] * u) / v;
+    toUv[4 * f + 3] = (vb - toUv[4 * f + 2] * u) / v;
+  }
+  return out;
+};
+
+// A triangle's axes turned by the shortest way into the plane across `normal`: six numbers.
+V.strain.carried = (basis, at, n, m) => {
+  const c = basis[at + 6] * n[m] + basis[at + 7] * n[m + 1] + basis[at + 8] * n[m + 2];
+  const sign = c >= 0 ? 1 : -1;
+  const scale = 1 / (1 + Math.abs(c));
+  const out = new Float64Array(6);
+  for (let e = 0; e < 2; e++) {
+    const b = at + 3 * e;
+    const d = (basis[b] * n[m] + basis[b + 1] * n[m + 1] + basis[b + 2] * n[m + 2]) * scale;
+    for (let i = 0; i < 3; i++) {
+      out[3 * e + i] = basis[b + i] - d * (sign * basis[at + 6 + i] + n[m + i]);
+    }
+  }
+  return out;
+};
+
+// Tensor T - 1 and texture metric at each vertex, three numbers each (11, 12, 22), and which hold.
+V.strain.vertices = (rest, moved, faces, uv) => {
+  const {place, places} = V.strain.places(rest, moved);
+  const {kind, basis, area, change, toUv} = V.strain.triangles(rest, moved, faces, uv);
+  const triangles = faces.length / 3;
+  const normal = new Float64Array(3 * places);
+  const widest = new Int32Array(places).fill(-1);
+  for (let f = 0; f < triangles; f++) {
+    if (kind[f] === V.strain.DEGENERATE) continue;
+    for (let corner = 0; corner < 3; corner++) {
+      const w = place[faces[3 * f + corner]];
+      if (widest[w] < 0 || area[f] > area[widest[w]]) widest[w] = f;
+      for (let m = 0; m < 3; m++) normal[3 * w + m] += area[f] * basis[9 * f + 6 + m];
+    }
+  }
+  const axes = new Float64Array(6 * places);
+  for (let w = 0; w < places; w++) {
+    if (widest[w] < 0) continue;
+    const length = Math.hypot(normal[3 * w], normal[3 * w + 1], normal[3 * w + 2]);
+    const flat = length <= 1e-6 * area[widest[w]]; // triangles that face all ways
+    for (let m = 0; m < 3; m++) {
+      normal[3 * w + m] = flat ? basis[9 * widest[w] + 6 + m] : normal[3 * w + m] / length;
+    }
+    axes.set(V.strain.carried(basis, 9 * widest[w], normal, 3 * w), 6 * w);
+  }
+  const count = rest.length / 3;
+  const sum = new Float64Array(3 * places);
+  const weight = new Float64Array(places);
+  // textures seen from both sides apart: what is folded there would cancel
+  const both = new Float64Array(8 * count);
+  const share = new Float64Array(2 * count);
+  for (let f = 0; f < triangles; f++) {
+    if (kind[f] === V.strain.DEGENERATE) continue;
+    const [p, q, r] = [change[3 * f], change[3 * f + 1], change[3 * f + 2]];
+    for (let corner = 0; corner < 3; corner++) {
+      const vertex = faces[3 * f + corner];
+      const w = place[vertex];
+      const here = V.strain.carried(basis, 9 * f, normal, 3 * w);
+      const a = 6 * w;
+      const b00 = axes[a] * here[0] + axes[a + 1] * here[1] + axes[a + 2] * here[2];
+      const b01 = axes[a] * here[3] + axes[a + 1] * here[4] + axes[a + 2] * here[5];
+      const b10 = axes[a + 3] * here[0] + axes[a + 4] * here[1] + axes[a + 5] * here[2];
+      const b11 = axes[a + 3] * here[3] + axes[a + 4] * here[4] + axes[a + 5] * here[5];
+      sum[3 * w] += area[f] * (b00 * b00 * p + 2 * b00 * b01 * q + b01 * b01 * r);
+      sum[3 * w + 1] += area[f] * (b00 * b10 * p + (b00 * b11 + b01 * b10) * q + b01 * b11 * r);
+      sum[3 * w + 2] += area[f] * (b10 * b10 * p + 2 * b10 * b11 * q + b11 * b11 * r);
+      weight[w] += area[f];
+      if (kind[f] === V.strain.NO_TEXTURE) continue;
+      const m00 = toUv[4 * f] * b00 + toUv[4 * f + 1] * b01;
+      const m01 = toUv[4 * f] * b10 + toUv[4 * f + 1] * b11;
+      const m10 = toUv[4 * f + 2] * b00 + toUv[4 * f + 3] * b01;
+      const m11 = toUv[4 * f + 2] * b10 + toUv[4 * f + 3] * b11;
+      const side = m00 * m11 - m01 * m10 > 0 ? 0 : 1;
+      const at = 8 * vertex + 4 * side;
+      share[2 * vertex + side] += area[f];
+      both[at] += area[f] * m00;
+      both[at + 1] += area[f] * m01;
+      both[at + 2] += area[f] * m10;
+      both[at + 3] += area[f] * m11;
+    }
+  }
+  const tensor = new Float32Array(3 * count);
+  const metric = new Float32Array(3 * count);
+  const valid = new Uint8Array(count);
+  for (let vertex = 0; vertex < count; vertex++) {
+    const w = place[vertex];
+    const side = share[2 * vertex] >= share[2 * vertex + 1] ? 0 : 1;
+    const part = share[2 * vertex + side];
+    if (weight[w] === 0 || part === 0) continue;
+    const [t0, t1, t2] = [0, 1, 2].map(i => sum[3 * w + i] / weight[w]);
+    const [m00, m01, m10, m11] = [0, 1, 2, 3].map(i => both[8 * vertex + 4 * side + i] / part);
+    // m = metric turn: the turn closest to m, a mirror image where the texture is one
+    let c = side === 0 ? m00 + m11 : m00 - m11;
+    let s = side === 0 ? m10 - m01 : m10 + m01;
+    const length = Math.hypot(c, s);
+    c /= length;
+    s /= length;
+    const [o00, o10] = [c, s];
+    const [o01, o11] = side === 0 ? [-s, c] : [s, -c];
+    metric[3 * vertex] = m00 * o00 + m01 * o01;
+    metric[3 * vertex + 2] = m10 * o10 + m11 * o11;
+    metric[3 * vertex + 1] = 0.5 * (m00 * o10 + m01 * o11 + m10 * o00 + m11 * o01);
+    tensor[3 * vertex] = o00 * o00 * t0 + 2 * o00 * o01 * t1 + o01 * o01 * t2;
+    tensor[3 * vertex + 1] = o00 * o10 * t0 + (o00 * o11 + o01 * o10) * t1 + o01 * o11 * t2;
+    tensor[3 * vertex + 2] = o10 * o10 * t0 + 2 * o10 * o11 * t1 + o11 * o11 * t2;
+    valid[vertex] = 1;
+  }
+  return {tensor, metric, valid};
+};
+
+// Positions in float64: what moves by a micrometer would be lost in float32 sums.
+V.strain.moved = weights => {
+  const sum = Float64Array.from(V.scene.mesh.positions);
+  for (const [name, weight] of Object.entries(weights)) {
+    const deltas = V.scene.mesh.shapes[name];
+    if (!deltas || weight === 0) continue;
+    for (let i = 0; i < sum.length; i++) sum[i] += weight * deltas[i];
+  }
+  return sum;
+};
+
+// Vertex arrays of the strain of a side, computed where its weights changed.
+V.strain.upload = (side, p) => {
+  const key = V.weightsKey(p);
+  if (side.strain?.key === key) return side.strain;
+  const gl = V.gl;
+  const {positions, faces, uv} = V.scene.mesh;
+  const begin = performance.now();
+  const rest = V.strain.rest ??= Float64Array.from(positions);
+  const found = V.strain.vertices(rest, V.strain.moved(p.weights), faces, uv);
+  const milliseconds = performance.now() - begin;
+  const made = side.strain ?? {
+    vao: gl.createVertexArray(), tensor: gl.createBuffer(), metric: gl.createBuffer(),
+    faces: gl.createBuffer(),
+  };
+  gl.bindVertexArray(made.vao);
+  [["a_tensor", made.tensor, found.tensor, 3], ["a_metric", made.metric, found.metric, 3],
+    ["a_uv", V.staticBuffers.uv, null, 2]].forEach(([name, buffer, data, width]) => {
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    if (data) gl.bufferData(gl.ARRAY_BUFFER, data, gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(V.ATTRIBUTES[name]);
+    gl.vertexAttribPointer(V.ATTRIBUTES[name], width, gl.FLOAT, false, 0, 0);
+  });
+  // the triangle of the lowest number has a pixel that several hold: it is drawn last
+  const drawn = [];
+  for (let f = faces.length - 3; f >= 0; f -= 3) {
+    const [a, b, c] = [faces[f], faces[f + 1], faces[f + 2]];
+    if (found.valid[a] && found.valid[b] && found.valid[c]) drawn.push(a, b, c);
+  }
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made.faces);
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, Uint32Array.from(drawn), gl.DYNAMIC_DRAW);
+  side.strain = {...made, key, count: drawn.length, milliseconds, found};
+  return side.strain;
+};
+V.ATTRIBUTES.a_tensor = 6;
+V.ATTRIBUTES.a_metric = 7;
+
+V.strain.draw = (ctx, program, uniforms) => {
+  const gl = V.gl;
+  const made = V.strain.upload(ctx.side, ctx.p);
+  ctx.clear(0, 0, 0, 0);
+  V.use(program, ctx.side, ctx.p, uniforms);
+  gl.bindVertexArray(made.vao);
+  gl.drawElements(gl.TRIANGLES, made.count, gl.UNSIGNED_INT, 0);
+};
