@@ -15,7 +15,7 @@ from model import brdf_tables, microfacet
 from model.brdf_tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
 from skinrig import brdf_truth
-from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure, once
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, Timing, measure, once
 
 FloatArray = NDArray[np.float64]
 
@@ -24,7 +24,12 @@ HELD_OUT_ERROR = 5.0
 TIMES_FASTER = 10.0
 RESIDUAL = 0.2
 ETA = 1.3
-SKINS = {"light": brdf_truth.LIGHT_SKIN, "dark": brdf_truth.DARK_SKIN}
+SKINS: dict[str, tuple[float, float, float]] = {
+    "light": brdf_truth.LIGHT_SKIN,
+    "medium": (0.315, 0.189, 0.133),
+    "dark": brdf_truth.DARK_SKIN,
+}
+"""Mean R_d of each band of `skinrig.skin_bands`; the middle one is the others' geometric mean."""
 
 
 def albedo(*, toy: bool) -> StageBenchmark:
@@ -32,7 +37,7 @@ def albedo(*, toy: bool) -> StageBenchmark:
     rng = np.random.default_rng(0)
     count = 12 if toy else 150
     points, limits = [], []
-    bands = {}
+    bands: dict[str, BandError] = {}
     for skin, r_d in SKINS.items():
         for noise in (0.02,) if toy else (0.005, 0.02, 0.08):
             for samples in (60,) if toy else (60, 240, 900):
@@ -55,16 +60,15 @@ def albedo(*, toy: bool) -> StageBenchmark:
                     spread = float(np.std(relative[:, channel]))
                     knobs = {
                         "skin": skin, "noise": noise, "samples": p.f.shape[1], "method": method,
-                        "bias_percent": round(bias, 2), "spread_percent": round(spread, 2),
                     }  # fmt: skip
+                    also = {"bias_percent": round(bias, 2), "spread_percent": round(spread, 2)}
                     # 68 % interval of a median of `count` errors of this spread
                     half = 1.2533 * float(np.std(np.abs(relative[:, channel]))) / np.sqrt(count)
                     error = float(worst[channel])
-                    points.append(
-                        Point(knobs, timing, error, (max(error - half, 0.0), error + half))
-                    )
+                    interval = (max(error - half, 0.0), error + half)
+                    points.append(Point(knobs, timing, error, interval, also=also))
                     if method == "envelope" and noise == 0.02 and (toy or samples == 900):
-                        bands[skin] = error
+                        bands[skin] = BandError(error, interval)
                         limits.append(
                             Limit(f"median error of R_d, worst channel, {skin} skin", error,
                                   ALBEDO_ERROR, "<=", "%")
@@ -77,6 +81,8 @@ def albedo(*, toy: bool) -> StageBenchmark:
         tuple(points),
         tuple(limits),
         by_band=bands,
+        condition=("skin", "noise"),
+        interval_of="points",
     )
 
 
@@ -88,17 +94,7 @@ def surface(*, toy: bool) -> StageBenchmark:
     points = []
     error = np.nan
     for samples in (100,) if toy else (100, 300, 900):
-        p = brdf_truth.dome(count, r_d=SKINS["light"], noise=0.02, samples=samples, rng=rng)
-        out = _left_out(p, rng)
-        # R_d as it would be known: estimated, from the same samples
-        found = diffuse_albedo.estimate(
-            p.f, p.light, p.view, p.normals, eta=ETA, variance=p.variance, valid=p.valid & ~out
-        )
-        given = brdf_basis.surface_samples(
-            p.f, p.light, p.view, p.normals, found.r_d, eta=ETA, variance=p.variance,
-            valid=p.valid & ~out,
-        )  # fmt: skip
-        diffuse = _diffuse(p, found.r_d)
+        p, out, given, diffuse = _given(SKINS["light"], count, samples, rng)
 
         def point(
             name: str, timing: Timing, lobe: FloatArray, *, rank: int = 0,
@@ -131,6 +127,12 @@ def surface(*, toy: bool) -> StageBenchmark:
             points.append(point("NMF, refitted", timing, lobe, rank=rank))
         points.append(point("GGX", *once(partial(_ggx, p, given))))
         points.append(point("roots of elements", *once(partial(_rooted, p, given, basis))))
+    bands = {}
+    for skin, r_d in SKINS.items():
+        p, out, given, diffuse = _given(r_d, count, 100 if toy else 300, rng)
+        timing, fit = once(partial(brdf_basis.fit_weights, given, basis, compress="cbrt"))
+        told = _judged("", timing, _lobes(fit.weights, basis, p), p, out, diffuse, 0, rng)
+        bands[skin] = BandError(told.error, told.error_interval)
     faster, excess = _beside_scipy(basis, toy=toy)
     limits = (
         Limit("median error of all light under lights left out", error, HELD_OUT_ERROR, "<=", "%"),
@@ -146,7 +148,26 @@ def surface(*, toy: bool) -> StageBenchmark:
         tuple(points),
         limits,
         left_out=(("SciPy on all 5,000 points", "its time is that of a subset, extrapolated"),),
+        by_band=bands,
+        interval_of="points",
     )
+
+
+def _given(
+    r_d: tuple[float, float, float], count: int, samples: int, rng: np.random.Generator
+) -> tuple[brdf_truth.Points, NDArray[np.bool_], brdf_basis.SurfaceSamples, FloatArray]:
+    """Return points, their samples left out, what is fitted, and the diffuse part taken off."""
+    p = brdf_truth.dome(count, r_d=r_d, noise=0.02, samples=samples, rng=rng)
+    out = _left_out(p, rng)
+    # R_d as it would be known: estimated, from the same samples
+    found = diffuse_albedo.estimate(
+        p.f, p.light, p.view, p.normals, eta=ETA, variance=p.variance, valid=p.valid & ~out
+    )
+    given = brdf_basis.surface_samples(
+        p.f, p.light, p.view, p.normals, found.r_d, eta=ETA, variance=p.variance,
+        valid=p.valid & ~out,
+    )  # fmt: skip
+    return p, out, given, _diffuse(p, found.r_d)
 
 
 def _left_out(p: brdf_truth.Points, rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -186,6 +207,8 @@ def _judged(
     bright = at & (p.surface > 0.5 * true_diffuse)
     knobs: dict[str, str | int | float | bool] = {
         "way": name, "samples": p.f.shape[1], "points": len(p.f),
+    }  # fmt: skip
+    also = {
         "highlight_error_percent": round(float(np.median(
             np.abs(lobe[bright] / p.surface[bright] - 1.0))) * 100.0, 2),
         "cube_root_rms": round(float(root), 4),
@@ -193,7 +216,7 @@ def _judged(
     if rank:
         knobs["rank"] = rank
     error = float(np.median(by_point))
-    return Point(knobs, timing, error, (float(low), float(high)))
+    return Point(knobs, timing, error, (float(low), float(high)), also=also)
 
 
 def _cosines(p: brdf_truth.Points, point: int) -> tuple[FloatArray, ...]:

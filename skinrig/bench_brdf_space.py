@@ -54,11 +54,13 @@ def space(*, toy: bool) -> StageBenchmark:
                 half = float(found.held_out_stderr[0])
                 knobs: dict[str, str | int | float | bool] = {
                     "set": data.name, "way": method, "rank": rank, "points": found.points,
+                }  # fmt: skip
+                also = {
                     "own_points_error_percent": round(100.0 * inside, 3),
                     "noise_percent": round(100.0 * data.noise, 1),
                 }  # fmt: skip
                 interval = (100.0 * max(error - half, 0.0), 100.0 * (error + half))
-                points.append(Point(knobs, timing, 100.0 * error, interval))
+                points.append(Point(knobs, timing, 100.0 * error, interval, also=also))
                 if method == "shares" and rank == NOISE_RANK:
                     beyond = max(beyond, inside / data.noise)
         shares, brdf = (
@@ -85,6 +87,9 @@ def space(*, toy: bool) -> StageBenchmark:
             ("all points of figure 15", "`skinrig analyse brdf --out analysis` has them"),
             ("a Cramer-Rao bound", "the number of mixtures is no parameter with one"),
         ),
+        condition=("set",),
+        interval_of="points left out",
+        no_bands="mixtures of the surface term, which pigment does not enter",
     )  # fmt: skip
 
 

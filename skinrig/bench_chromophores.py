@@ -11,12 +11,15 @@ from scipy.optimize import least_squares
 from model import color_table, metrics
 from model.tissue_optics import ANISOTROPY_SKIN
 from reconstruction import chromophores
-from skinrig.benchmark import Limit, Point, StageBenchmark, measure
-from skinrig.evaluation import BANDS
+from skinrig.bench_resampling import median_error
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.skin_bands import MELANIN_BANDS
 
 Floats = NDArray[np.float64]
 
 NOISE = 0.01
+LEAST_MELANIN = 0.004
+"""Volume fraction of the palest skin that is drawn."""
 SECONDS = 0.5
 TIMES_FASTER = 1000.0
 
@@ -73,16 +76,19 @@ def inversion(*, toy: bool) -> StageBenchmark:
         tuple(points),
         limits,
         by_band=_by_band(table, 500 if toy else 20_000, rng),
+        condition=("shading",),
+        interval_of="pixels",
     )
 
 
 def _by_band(
     table: color_table.ColorTable, count: int, rng: np.random.Generator
-) -> dict[str, float]:
+) -> dict[str, BandError]:
     """Return the median error of melanin in percent, shading free, from light skin to dark."""
     errors = {}
-    for low, high in BANDS:
-        c_m = rng.uniform(low, min(high, table.c_m_max), count)
+    for name, band in MELANIN_BANDS.items():
+        low, high = band.melanin_range
+        c_m = rng.uniform(max(low, LEAST_MELANIN), min(high, table.c_m_max), count)
         c_hd = rng.uniform(0.02, 0.08, count)
         color = table.lookup(c_m, c_hd)
         noisy = color * (1 + NOISE * rng.standard_normal(color.shape))
@@ -90,9 +96,10 @@ def _by_band(
             noisy.astype(np.float32)[None], table,
             variance=(NOISE * color[None]).astype(np.float32) ** 2,
         )  # fmt: skip
-        off = 100 * np.abs(found.melanin[0] / c_m - 1)[found.valid[0]]
-        if off.size:
-            errors[f"C_m {low:g}–{high:g}"] = float(np.median(off))
+        valid = found.valid[0]
+        off = 100 * np.abs(found.melanin[0] / c_m - 1)[valid]
+        bound = 67.45 * float(np.median((found.stderr_melanin[0] / c_m)[valid]))
+        errors[name] = median_error(off, bound=bound)
     return errors
 
 

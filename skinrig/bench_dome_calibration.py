@@ -80,6 +80,8 @@ def geometry(*, toy: bool) -> StageBenchmark:
         tuple(points),
         (Limit("worst camera's mean reprojection of the truth", worst, REPROJECTION_PX, "<=",
                "px"),),
+        interval_of="cameras",
+        no_bands="a calibration by targets: no skin is in the pictures",
     )  # fmt: skip
 
 
@@ -127,6 +129,8 @@ def lights(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         (Limit("median distance of a light from its place", last, LIGHT_MM, "<=", "mm"),),
+        interval_of="lights",
+        no_bands="a calibration by targets: no skin is in the pictures",
     )
 
 

@@ -52,4 +52,5 @@ def render(*, toy: bool) -> StageBenchmark:
         tuple(points),
         limits,
         left_out=(("subjects with relief and vellus hair", "Mitsuba has no such lobe"),),
+        interval_of="tiles of the pictures",
     )

@@ -94,6 +94,7 @@ def editing(*, toy: bool) -> StageBenchmark:
             Limit("tan and its opposite, what is left", returned, RETURN, "<=", "%"),
             Limit("tan of amount 0, largest change", zero, 1e-5, "<="),
         ),
+        interval_of="faces",
     )
 
 

@@ -86,6 +86,8 @@ def efficiency(*, toy: bool) -> StageBenchmark:
         tuple(left_out),
         by_band=bands,
         squared=True,
+        condition=("estimator", "subject"),
+        interval_of="draws of noise",
     )
 
 

@@ -47,6 +47,7 @@ def rig(*, toy: bool) -> StageBenchmark:
         predict: Callable[[str], NDArray[np.floating]],
         call: Callable[[], object] | None = None,
     ) -> Point:
+        knobs = {"misaligned_px": 0} | knobs
         timing = measure(call or (lambda: predict(names[0])), repeats=1 if toy else 3, memory=False)
         left = []
         for name in names:
@@ -115,6 +116,9 @@ def rig(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         limits,
+        condition=("misaligned_px",),
+        interval_of="states",
+        no_bands="maps of blood alone: melanin does not enter",
     )
 
 

@@ -41,6 +41,8 @@ def render(*, toy: bool) -> StageBenchmark:
         ours[-1].error * efforts[-1][0] / math.sqrt(REFERENCE_RAYS),
         (*ours, *theirs),
         limits,
+        interval_of="tiles of the pictures",
+        no_bands="a plastic sphere, as Mitsuba can render it too",
     )
 
 

@@ -76,6 +76,8 @@ def sphere_lights(*, toy: bool) -> StageBenchmark:
             Limit("analyser's misalignment over its error", last[2], MISALIGNMENT_SIGMAS, "<="),
         ),
         (("the whole sensor", "2048 px: four times the pixels, and its pictures take minutes"),),
+        interval_of="LEDs",
+        no_bands="a calibration by targets: no skin is in the pictures",
     )
 
 

@@ -193,6 +193,8 @@ def normals(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         limits,
+        condition=("noise",),
+        interval_of="blocks of pixels",
     )
 
 

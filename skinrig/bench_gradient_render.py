@@ -100,4 +100,6 @@ def render(*, toy: bool) -> StageBenchmark:
             ("polarization in the comparison", "Mitsuba has no film before each light here"),
             ("the lens", "Mitsuba's cameras do not diffract"),
         ),
+        interval_of="pixels",
+        no_bands="surface reflection, which pigment does not enter, is most of what is rendered",
     )

@@ -182,6 +182,9 @@ def integration(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         limits,
+        condition=("noise", "mask"),
+        interval_of="tiles of the relief",
+        no_bands="shape alone: no color of skin enters",
     )
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction import head_motion
-from skinrig.benchmark import Point, StageBenchmark, measure
+from skinrig.benchmark import BandError, Point, StageBenchmark, measure
+from skinrig.skin_bands import MELANIN_BANDS
 
 Floats = NDArray[np.float64]
 
@@ -72,6 +73,8 @@ def simulate(
     drift_mm: float,
     times_s: Sequence[float],
     twitch: bool = False,
+    preset: str = "III",
+    texels: int = 512,
 ) -> Drift:
     """Render tracking frames of a drifting head.
 
@@ -87,6 +90,10 @@ def simulate(
         Of the frames; the first should be 0.
     twitch
         Whether the mouth twitches; one more frame then shows it in the middle of that.
+    preset
+        Of the person's melanin.
+    texels
+        Side of the person's maps.
     """
     from capture.calibration.geometry import CameraPose
     from capture.rig import load_rig
@@ -101,7 +108,7 @@ def simulate(
     rig = rig.subset(lights=leds, views=[view.name for view in front]).resized(width_px)
     motion = drawn(3, drift_mm=drift_mm, drift_deg=drift_mm / 3, twitch=twitch)
     times_s = sorted([*times_s, motion.twitch_start_s + 0.25] if twitch else times_s)
-    subject = make_subject("III", seed=0)
+    subject = make_subject(preset, seed=0, size=texels)
     scene = DomeScene(rig, subject, motion=motion)
     frames = []
     for t in times_s:
@@ -129,14 +136,27 @@ def simulate(
 
 def motion(*, toy: bool) -> StageBenchmark:
     """Follow heads that drift little and much, with few and many tracks."""
-    width, views, times = (160, 2, (0.0, 8.0)) if toy else (484, 3, (0.0, 5.0, 12.5, 20.0))
+    width, views, times = (160, 2, (0.0, 8.0, 16.0)) if toy else (484, 3, (0.0, 5.0, 12.5, 20.0))
+    texels = 128 if toy else 512
     points = []
-    by_size: dict[str, float] = {}
     for drift_mm in (1.0,) if toy else (0.3, 1.0, 3.0):
-        seen = simulate(width_px=width, views=views, drift_mm=drift_mm, times_s=times)
+        seen = simulate(
+            width_px=width, views=views, drift_mm=drift_mm, times_s=times, texels=texels
+        )
         for tracks in (30, 60, 120, 200) if toy else (30, 100, 300):
             points.append(_point(seen, drift_mm, tracks, toy=toy))
-        by_size[f"moved by {seen.moved_mm().mean():.2g} mm"] = points[-1].error
+    bands = {}
+    for name, band in MELANIN_BANDS.items():
+        seen = simulate(
+            width_px=width,
+            views=views,
+            drift_mm=1.0,
+            times_s=times[:3],
+            preset=band.preset,
+            texels=texels,
+        )
+        one = _point(seen, 1.0, 100, toy=True)
+        bands[name] = BandError(one.error, one.error_interval)
     return StageBenchmark(
         "head-motion",
         "error of the head's place, mm",
@@ -144,7 +164,9 @@ def motion(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         left_out=(("Cramér-Rao bound", "shading that stays in space limits tracks, not noise"),),
-        by_band=by_size,
+        by_band=bands,
+        condition=("drift mm",),
+        interval_of="frames",
     )
 
 
@@ -160,4 +182,5 @@ def _point(seen: Drift, drift_mm: float, tracks: int, *, toy: bool) -> Point:
     error = float(errors.mean())
     spread = float(errors.std(ddof=1) / np.sqrt(len(errors))) if len(errors) > 1 else 0.0
     knobs: Mapping[str, str | int | float | bool] = {"drift mm": drift_mm, "tracks": tracks}
-    return Point(knobs, timing, error, (error - spread, error + spread))
+    also = {"moved_mm": round(float(seen.moved_mm().mean()), 3)}
+    return Point(knobs, timing, error, (error - spread, error + spread), also=also)

@@ -139,6 +139,7 @@ def curves(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         limits,
+        interval_of="runs",
     )
 
 

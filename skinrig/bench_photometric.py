@@ -11,7 +11,8 @@ from threadpoolctl import threadpool_limits
 
 from model.metrics import angular_error_rad
 from reconstruction.photometric_stereo import NormalMaps, Robustness, estimate_normals
-from skinrig.benchmark import Limit, Point, StageBenchmark, measure
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.skin_bands import MELANIN_BANDS
 
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -40,7 +41,9 @@ class Scene:
     albedo: Float32
 
 
-def glossy_ball(side: int, lights: int, *, noise: float, rng: np.random.Generator) -> Scene:
+def glossy_ball(
+    side: int, lights: int, *, noise: float, rng: np.random.Generator, albedo: float = 0.5
+) -> Scene:
     """Make a ball with painted albedo, highlights, attached shadows and shadows of three posts.
 
     Parameters
@@ -53,13 +56,15 @@ def glossy_ball(side: int, lights: int, *, noise: float, rng: np.random.Generato
         Standard deviation of each sample.
     rng
         Draws the noise.
+    albedo
+        Mean of the painted albedo, which varies by 60 % of it to both sides.
     """
     y, x = np.mgrid[0:side, 0:side].astype(np.float32)
     u, v = (x - (side - 1) / 2) / (0.48 * side), ((side - 1) / 2 - y) / (0.48 * side)
     inside = u * u + v * v < 0.92
     z = np.sqrt(np.maximum(1.0 - u * u - v * v, 0.0))
     n = np.where(inside[..., None], np.stack([u, v, z], axis=-1), [0, 0, 1]).astype(np.float32)
-    albedo = (0.5 + 0.3 * np.sin(20 * u) * np.cos(17 * v)).astype(np.float32)
+    paint = (albedo * (1.0 + 0.6 * np.sin(20 * u) * np.cos(17 * v))).astype(np.float32)
     k = np.arange(lights) + 0.5
     height = 1.0 - 0.8 * k / lights
     phi = np.pi * (1.0 + np.sqrt(5.0)) * k
@@ -77,10 +82,10 @@ def glossy_ball(side: int, lights: int, *, noise: float, rng: np.random.Generato
             way = post - n
             along = way @ light
             dark |= (along > 0) & (np.sum(way * way, axis=-1) - along * along < 0.45**2)
-        images[number] = np.where(dark, 0.0, albedo * cosine + gloss)
+        images[number] = np.where(dark, 0.0, paint * cosine + gloss)
         images[number] += noise * rng.standard_normal((side, side), np.float32)
         matte[number] = (cosine > 0) & ~dark & (gloss < noise)
-    return Scene(images, towards, n, inside, matte, albedo)
+    return Scene(images, towards, n, inside, matte, paint)
 
 
 def numpy_irls_l1(
@@ -161,7 +166,8 @@ def normals(*, toy: bool) -> StageBenchmark:
 
         timing = measure(run, repeats=1 if toy else 3)
         error, interval = _mean_deg(run(), scene, rng)
-        points.append(Point(knobs, timing, error, interval, _mean_bound_deg(scene, noise)))
+        bound = _mean_bound_deg(scene, noise)
+        points.append(Point({"noise": noise} | knobs, timing, error, interval, bound))
 
     for lights in (30, 12) if toy else (150, 75, 30, 12):
         add(glossy_ball(side, lights, noise=NOISE, rng=rng), NOISE,
@@ -173,7 +179,14 @@ def normals(*, toy: bool) -> StageBenchmark:
     add(dense, NOISE, {"lights": len(dense.lights), "fit": "least squares"}, robust=False)
     for noise in (0.02,) if toy else (0.001, 0.02):
         scene = glossy_ball(side, len(dense.lights), noise=noise, rng=rng)
-        add(scene, noise, {"lights": len(scene.lights), "fit": "robust", "noise": noise})
+        add(scene, noise, {"lights": len(scene.lights), "fit": "robust"})
+    bands = {}
+    for name, band in MELANIN_BANDS.items():
+        # gloss and noise stay as they are: on dark skin there is less of what is fitted
+        green = float(band.reflectance()[1])
+        scene = glossy_ball(side, len(dense.lights), noise=NOISE, rng=rng, albedo=green)
+        error, interval = _mean_deg(estimate_normals(scene.images, scene.lights), scene, rng)
+        bands[name] = BandError(error, interval, _mean_bound_deg(scene, NOISE))
     limits = () if toy else _full_size(rng)
     return StageBenchmark(
         "normals",
@@ -182,6 +195,9 @@ def normals(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         limits,
+        condition=("noise",),
+        interval_of="pixels",
+        by_band=bands,
     )
 
 

@@ -64,6 +64,8 @@ def session(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         () if toy else _limits(by_method),
+        condition=("channel",),
+        interval_of="media",
     )
 
 

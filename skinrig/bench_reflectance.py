@@ -15,8 +15,9 @@ from model.brdf_tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
 from reconstruction.brdf_basis import SurfaceSamples
 from skinrig import bench_texture
-from skinrig.benchmark import Limit, Point, StageBenchmark, measure
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.photograph_errors import LIMIT, luminance
+from skinrig.skin_bands import MELANIN_BANDS
 
 FloatArray = NDArray[np.float64]
 
@@ -27,7 +28,9 @@ LEFT_OUT: Final = 0.2
 """Share of the lights that no fit sees."""
 LEAST_COSINE: Final = 0.15
 ETA: Final = 1.4
-SUBJECTS: Final = ("palest", "III", "darkest")
+SUBJECTS: Final = tuple(band.preset for band in MELANIN_BANDS.values())
+EXTREMES: Final = ("palest", "darkest")
+"""Beyond the typical people of the bands; of the full size alone."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,9 +118,9 @@ def model(*, toy: bool) -> StageBenchmark:
     materials = brdf_tables.default()
     count, samples = (10, 120) if toy else (150, 400)
     points: list[Point] = []
-    bands: dict[str, float] = {}
+    bands: dict[str, BandError] = {}
     usual: list[float] = []
-    for subject in SUBJECTS[1:2] if toy else SUBJECTS:
+    for subject in SUBJECTS if toy else (*SUBJECTS, *EXTREMES):
         p = face_points(subject, points=count, samples=samples, rng=rng)
         use = p.seen & ~p.left_out
         albedo = diffuse_albedo.estimate(
@@ -149,11 +152,13 @@ def model(*, toy: bool) -> StageBenchmark:
             total = float(np.median(everything))
             knobs: dict[str, str | int | float | bool] = {
                 "part": "lobes", "rank": rank, "subject": subject, "points": len(surface),
-                "samples": samples, "all_light_error_percent": round(total, 3),
+                "samples": samples,
             }  # fmt: skip
-            points.append(Point(knobs, timing, error, (low, high)))
+            also = {"all_light_error_percent": round(total, 3)}
+            points.append(Point(knobs, timing, error, (low, high), also=also))
             if rank == USUAL_RANK:
-                bands[subject] = error
+                for band in (b for b, one in MELANIN_BANDS.items() if one.preset == subject):
+                    bands[band] = BandError(error, (low, high))
                 usual.append(total)
     texture = [
         dataclasses.replace(point, knobs={"part": "texture", **point.knobs})
@@ -176,6 +181,8 @@ def model(*, toy: bool) -> StageBenchmark:
             ),
         ),
         by_band=bands,
+        condition=("part", "subject"),
+        interval_of="points",
     )
 
 

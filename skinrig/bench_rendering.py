@@ -97,6 +97,8 @@ def model(*, toy: bool) -> StageBenchmark:
         left_out=(
             ("a peer that renders these maps", "no renderer at hand reads tabulated mixtures"),
         ),
+        condition=("vary",),
+        interval_of="tiles of the picture",
     )  # fmt: skip
 
 

@@ -12,7 +12,9 @@ from model.color_table import ColorTable
 from reconstruction import chromophore_posterior, model_error, shading_prior, shared_melanin
 from reconstruction.shading_prior import ShadingPrior
 from skinrig.bench_alignment import face_of, oval, table
-from skinrig.benchmark import Limit, Point, StageBenchmark, measure
+from skinrig.bench_resampling import median_error
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.skin_bands import MELANIN_BANDS
 
 Floats = NDArray[np.float64]
 
@@ -67,6 +69,10 @@ def inversion(*, toy: bool) -> StageBenchmark:
                 mask,
             )
         )
+    bands = {
+        name: _on_skin(band.preset, side, colors, prior, covariance)
+        for name, band in MELANIN_BANDS.items()
+    }
     limits: tuple[Limit, ...] = ()
     if not toy:
         found = together(7, 3.0)
@@ -86,7 +92,9 @@ def inversion(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         limits,
+        by_band=bands,
         left_out=(("Cramér-Rao bound", "differs by pixel; unit tests hold errors to it"),),
+        interval_of="pixels",
     )
 
 
@@ -116,6 +124,20 @@ def pictures(
     clean = clean * np.exp(shared) * light[..., None]
     seen = clean * (1.0 + noise * rng.standard_normal(clean.shape))
     return seen.astype(np.float32), ((noise * clean) ** 2).astype(np.float32)
+
+
+def _on_skin(
+    preset: str, side: int, colors: ColorTable, prior: ShadingPrior, covariance: Floats
+) -> BandError:
+    """Return the error of smile's change of blood on skin of a preset, three states together."""
+    face, mask = face_of(preset, side, seed=3), oval(side)
+    blood = np.stack([face.hemoglobin(state) for state in STATES[:3]]).astype(np.float64)
+    rgb, variance = pictures(colors, face.melanin, blood, covariance, rng=np.random.default_rng(0))
+    found = shared_melanin.weigh(
+        rgb, colors, prior=prior, variance=variance, model_error=covariance,
+        valid=np.broadcast_to(mask, blood.shape), shading_window_px=3.0,
+    )  # fmt: skip
+    return median_error(np.abs(found.change[1] - (blood[1] - blood[0]))[mask])
 
 
 def _point(

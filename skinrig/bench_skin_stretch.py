@@ -72,6 +72,9 @@ def stretched(*, toy: bool) -> StageBenchmark:
         0.01,
         tuple(points),
         () if toy else _limits(),
+        condition=("stretch",),
+        interval_of="patches of skin",
+        no_bands="shape alone: no color of skin enters",
     )
 
 

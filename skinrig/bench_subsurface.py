@@ -16,7 +16,9 @@ from reconstruction import subsurface
 from reconstruction.subsurface_models import Method
 from rigsim.fibre_profile import fibre_profile
 from rigsim.tissue_mc import Layer, LayerStack
-from skinrig.benchmark import Limit, Point, StageBenchmark, measure
+from skinrig.bench_resampling import median_error
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.skin_bands import MELANIN_BANDS, MelaninBand
 
 Floats = NDArray[np.float64]
 
@@ -36,16 +38,18 @@ PEERS = 60
 def transport_profiles(*, toy: bool) -> tuple[Floats, Floats, Floats]:
     """Return true sigma_tr (N,), profiles in fibres and their errors (N, 28) by Monte Carlo.
 
-    sigma_tr from 0.3 to 3.0 per mm, and sigma_s', and g in turn.
+    sigma_tr from 0.3 to 3.0 per mm, and sigma_s', and g in turn; then the three bands of skin.
     """
     rng = np.random.default_rng(0)
-    count = 3 if toy else 10
-    sigma_tr = np.geomspace(0.3, 3.0, count)
-    profiles, errors = np.empty((2, count, RADIUS_MM.size))
-    for n, k in enumerate(sigma_tr):
-        g = (0.8, 0.73, 0.9)[n % 3]
+    media = []
+    for k in np.geomspace(0.3, 3.0, 3 if toy else 10):
         s = float(np.exp(rng.uniform(np.log(0.7), np.log(4.0))))
-        a = 0.5 * (np.sqrt(s**2 + 4.0 / 3.0 * k**2) - s)
+        media.append((0.5 * (np.sqrt(s**2 + 4.0 / 3.0 * k**2) - s), s))
+    media += [(b.sigma_a_per_mm, b.sigma_s_prime_per_mm) for b in MELANIN_BANDS.values()]
+    sigma_tr = np.array([np.sqrt(3.0 * a * (a + s)) for a, s in media])
+    profiles, errors = np.empty((2, len(media), RADIUS_MM.size))
+    for n, (a, s) in enumerate(media):
+        g = (0.8, 0.73, 0.9)[n % 3]
         found = fibre_profile(
             LayerStack((Layer(inf, a, s / (1.0 - g), g, 1.4),)), radii_mm=RADIUS_MM,
             photons=3_000 if toy else 100_000, rng=np.random.default_rng(n), core_mm=CORE_MM,
@@ -59,6 +63,8 @@ def tiers(*, toy: bool) -> StageBenchmark:
     """Fit Monte Carlo profiles by the three models, with all fibres and with fewer."""
     rng = np.random.default_rng(1)
     sigma_tr, profiles, errors = transport_profiles(toy=toy)
+    spread = slice(0, len(sigma_tr) - len(MELANIN_BANDS))
+    bands: dict[str, BandError] = {}
     draws = 4 if toy else 40
     shape = (draws, *profiles.shape)
     noisy = profiles * np.exp(COMMON_ERROR * rng.standard_normal((*shape[:2], 1)))
@@ -82,20 +88,27 @@ def tiers(*, toy: bool) -> StageBenchmark:
 
         timing = measure(fit, repeats=1 if toy else 3)
         found = fit()
-        error = np.abs(found.sigma_tr_per_mm / sigma_tr - 1.0)
-        bias = np.median(found.sigma_tr_per_mm / sigma_tr - 1.0, axis=0)
-        low, high = np.quantile(error, [0.16, 0.84])
+        relative = found.sigma_tr_per_mm / sigma_tr - 1.0
+        if not bands:
+            bands = {
+                name: median_error(np.abs(relative[:, k - len(MELANIN_BANDS)]))
+                for k, name in enumerate(MELANIN_BANDS)
+            }
+        error = np.abs(relative[:, spread])
+        bias = np.median(relative[:, spread], axis=0)
+        interval = _over_media(error)
         radius = RADIUS_MM[part]
         knobs: dict[str, str | int | float] = {
             "model": method, "fibres": radius.size, "from mm": float(radius[0]),
             "to mm": float(radius[-1]),
         }  # fmt: skip
-        points.append(Point(knobs, timing, float(np.median(error)), (float(low), float(high))))
+        points.append(Point(knobs, timing, float(np.median(error)), interval))
         if part != slice(None):
             continue
         inside = (found.interval_per_mm[..., 0] <= sigma_tr) & (
             sigma_tr <= found.interval_per_mm[..., 1]
         )
+        inside = inside[:, spread]
         # 60...76 %, and what the simulation's own error makes ten media's share scatter
         share = float(inside.mean())
         if method == "photon_table":
@@ -123,7 +136,17 @@ def tiers(*, toy: bool) -> StageBenchmark:
         float(np.median(errors / profiles)) / np.sqrt(RADIUS_MM.size),
         tuple(points),
         () if toy else tuple(limits),
+        interval_of="media, drawn again with their noise",
+        by_band=bands,
     )
+
+
+def _over_media(error: Floats) -> tuple[float, float]:
+    """Return a 68 % interval of the median of errors (draws, media), of other media."""
+    rng = np.random.default_rng(0)
+    chosen = rng.integers(0, error.shape[1], (200, error.shape[1]))
+    low, high = np.quantile(np.median(error[:, chosen], axis=(0, 2)), [0.16, 0.84])
+    return float(low), float(high)
 
 
 def _spent(call: Callable[[], Any], repeats: int) -> float:
@@ -134,6 +157,11 @@ def _spent(call: Callable[[], Any], repeats: int) -> float:
         call()
         seconds.append(time.process_time() - begin)
     return min(seconds)
+
+
+def _absorbs_like(sigma_a: Floats, band: MelaninBand) -> NDArray[np.bool_]:
+    """Return which media absorb within a factor of two of a band's skin."""
+    return np.asarray(np.abs(np.log(sigma_a / band.sigma_a_per_mm)) < np.log(2.0))
 
 
 def batches(*, toy: bool) -> StageBenchmark:
@@ -154,6 +182,7 @@ def batches(*, toy: bool) -> StageBenchmark:
         )  # fmt: skip
 
     points = []
+    bands: dict[str, BandError] = {}
     for model_error in (0.0, None):
         for n in (count // 10, count):
             timing = measure(
@@ -161,12 +190,15 @@ def batches(*, toy: bool) -> StageBenchmark:
                 repeats=1 if toy else 3,
             )
             error = np.abs(ours(n, model_error).sigma_tr_per_mm / k[:n] - 1.0)
-            low, high = np.quantile(error, [0.16, 0.84])
+            told = median_error(error)
             own = "none" if model_error == 0.0 else "diffusion's"
-            points.append(
-                Point({"profiles": n, "model error": own}, timing, float(np.median(error)),
-                      (float(low), float(high)))
-            )  # fmt: skip
+            knobs: dict[str, str | int | float] = {"profiles": n, "model error": own}
+            points.append(Point(knobs, timing, told.error, told.error_interval))
+            if not bands and n == count:
+                bands = {
+                    name: median_error(error[_absorbs_like(a, band)])
+                    for name, band in MELANIN_BANDS.items()
+                }
     limits: tuple[Limit, ...] = ()
     if not toy:
         found, above, apart = ours(), [], []
@@ -203,4 +235,7 @@ def batches(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         limits,
+        condition=("profiles",),
+        interval_of="profiles",
+        by_band=bands,
     )

@@ -13,7 +13,8 @@ from model import dipole_sum
 from model.dipole_gather import TOLERANCE, SourceTree, gather
 from model.dipole_sum import Media, exitance_directly
 from model.fresnel import ETA_SKIN
-from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, Timing, measure
+from skinrig.skin_bands import MELANIN_BANDS
 
 Floats = NDArray[np.float64]
 
@@ -26,6 +27,8 @@ DIM = 0.01
 R_D = np.array([0.55, 0.35, 0.25])
 TRANSLUCENCY_MM = 1.0 / np.array([0.598, 1.069, 1.672])
 """Of a mean face, table 2 of Weyrich et al. 2005."""
+USUAL_STEP_MM = 0.8
+"""Of the sources where errors are told by skin."""
 EDGE_MM = np.linspace(-3.0, 3.0, 60)
 
 
@@ -81,6 +84,9 @@ def gathering(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         () if toy else _full_size(rng),
+        by_band=_bands(rng),
+        condition=("scene",),
+        interval_of="points",
     )
 
 
@@ -97,13 +103,22 @@ def _tolerances(side: int, steps: int, rng: np.random.Generator) -> list[Point]:
 
         timing = measure(run, repeats=1)
         error = (run()[at] - truth) / (scene.r_d[at] * scene.entered.max())
-        points.append(Point({"texels": side**2, "tolerance": tolerance}, timing, *_rms(error, rng)))
+        points.append(
+            Point(
+                {"scene": "face", "texels": side**2, "tolerance": tolerance},
+                timing,
+                *_rms(error, rng),
+            )
+        )
     direct = measure(lambda: _directly(scene, at[:10]), repeats=1, memory=False)
     scale = side**2 / 10
     points.append(
         Point(
-            {"texels": side**2, "sum": "direct, NumPy, extrapolated"},
-            Timing(direct.seconds * scale, (direct.seconds * scale,) * 2, direct.cold_s, 0.0),
+            {"scene": "face", "texels": side**2, "sum": "direct, NumPy, extrapolated"},
+            Timing(
+                direct.seconds * scale, (direct.seconds * scale,) * 2, direct.cold_s, None,
+                no_memory="its seconds are extrapolated from those of 10 points",
+            ),
             0.0, (0.0, 0.0),
         )
     )  # fmt: skip
@@ -121,13 +136,37 @@ def _edges(toy: bool, rng: np.random.Generator) -> list[Point]:
                 return _edge(step, known)
 
             timing = measure(run, repeats=1)
-            knobs = {"edge": "own light" if known else "sources alone", "source mm": step}
+            knobs = {
+                "scene": "a shadow's edge",
+                "edge": "own light" if known else "sources alone",
+                "source mm": step,
+            }
             points.append(Point(knobs, timing, *_rms(run() - truth, rng)))
     return points
 
 
-def _edge(step_mm: float, known: bool, *, normalize: bool = True) -> Floats:
-    """Return the profile of a shadow's edge from sources a step apart, (X, 3)."""
+def _bands(rng: np.random.Generator) -> dict[str, BandError]:
+    """Return the error of a shadow's edge on skin from light to dark, over its own R_d."""
+    found = {}
+    for name, band in MELANIN_BANDS.items():
+        sigma_tr = np.sqrt(
+            3.0 * band.sigma_a_per_mm * (band.sigma_a_per_mm + band.sigma_s_prime_per_mm)
+        )
+        skin = band.reflectance(), TRANSLUCENCY_MM / TRANSLUCENCY_MM[0] / sigma_tr
+        media = [Media.of(r, t, eta=ETA_SKIN) for r, t in zip(*skin, strict=True)]
+        truth = np.stack([edge_profile(EDGE_MM, medium) for medium in media], axis=-1)
+        error, interval = _rms(_edge(USUAL_STEP_MM, True, skin=skin) - truth, rng)
+        found[name] = BandError(error, interval)
+    return found
+
+
+def _edge(
+    step_mm: float, known: bool, *, skin: tuple[Floats, Floats] = (R_D, TRANSLUCENCY_MM)
+) -> Floats:
+    """Return the profile of a shadow's edge from sources a step apart, (X, 3).
+
+    On skin of a diffuse albedo and a mean free path, mm.
+    """
     half = step_mm * round(10.0 / step_mm)  # so that no source lies on the edge
     grid = np.arange(-half, half, step_mm) + 0.5 * step_mm
     x, y = np.meshgrid(grid, grid)
@@ -136,8 +175,8 @@ def _edge(step_mm: float, known: bool, *, normalize: bool = True) -> Floats:
     at = np.stack([EDGE_MM, 0.3 * EDGE_MM, np.zeros_like(EDGE_MM)], axis=-1)
     own = np.repeat(EDGE_MM[:, None] < 0.0, 3, axis=1).astype(np.float64) if known else None
     tree = SourceTree.of(place, np.full(len(place), step_mm**2))
-    found = gather(tree, lit, at, R_D, TRANSLUCENCY_MM, entered_at=own, normalize=normalize)
-    return np.asarray(found.exitance / R_D)
+    found = gather(tree, lit, at, *skin, entered_at=own)
+    return np.asarray(found.exitance / skin[0])
 
 
 def _gathered(scene: Scene, tree: SourceTree, tolerance: float = TOLERANCE) -> Floats:

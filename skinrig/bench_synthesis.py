@@ -164,6 +164,8 @@ def growth(*, toy: bool) -> StageBenchmark:
         tuple(points),
         () if toy else _judged(patches, truth, theirs[0]),
         left_out=(("the whole map of 16,384 x 16,384", "judged by its tiles: all are made alike"),),
+        interval_of="quarters of the map",
+        no_bands="shape alone: no color of skin enters",
     )
 
 

@@ -139,6 +139,9 @@ def matching(*, toy: bool) -> StageBenchmark:
         tuple(found),
         limits,
         left_out,
+        condition=("side", "start"),
+        interval_of="textures",
+        no_bands="histograms relative to their own spread; melanin scales them alike",
     )
 
 

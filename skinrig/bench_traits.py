@@ -15,7 +15,7 @@ from model.reduced_spaces import SpaceKind
 from model.traits import TraitSpace, cosine
 from reconstruction import brdf_basis, common_regions
 from rigsim.population import Member, shifted, table_1
-from skinrig import albedo_vectors, fitting_traits, trait_truth
+from skinrig import albedo_vectors, fitting_traits, resident_memory, trait_truth
 from skinrig.albedo_vectors import VectorKind
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
 from skinrig.trait_labels import Labels
@@ -31,6 +31,8 @@ TAN = 1.5
 DRAWS = 12
 """Random choices of so many people, whose scatter is the error's."""
 SHUFFLES = 200
+LEFT_OUT = 10
+"""Groups of people, each left out once, for the error of what all of them tell."""
 RANK = 8
 SPACES: tuple[SpaceKind, ...] = ("pca", "nmf")
 KINDS: tuple[VectorKind, ...] = ("quantiles", "histograms")
@@ -53,6 +55,9 @@ def traits(*, toy: bool) -> StageBenchmark:
         left_out=(
             ("the time to fit lobes and to draw faces", "that of learning alone is measured"),
         ),
+        condition=("trait", "noise"),
+        interval_of="random choices of people",
+        no_bands="one vector is learned of people of all skins together",
     )
 
 
@@ -127,10 +132,15 @@ def _drawn(
     whole = most == min(len(side) for side in sides)
     rng = np.random.default_rng(5)
     seconds, errors, told, kept = [], [], [], []
-    for _ in range(1 if whole else DRAWS):
-        rows = np.sort(np.concatenate([
+    groups = [
+        np.sort(np.concatenate([
             side if whole else rng.choice(side, most, replace=False) for side in sides
-        ]))  # fmt: skip
+        ]))
+        for _ in range(1 if whole else DRAWS)
+    ]  # fmt: skip
+    with resident_memory.watched() as rise:
+        fit(groups[0])
+    for rows in groups:
         start = time.perf_counter()
         space = fit(rows)
         seconds.append(time.perf_counter() - start)
@@ -138,12 +148,25 @@ def _drawn(
         told.append(space.trait("trait").confidence.expected_cosine)
         kept.append(len(space.basis))
     low, middle, high = (float(v) for v in np.quantile(errors, (0.16, 0.5, 0.84)))
-    timing = Timing(float(np.median(seconds)), (min(seconds), max(seconds)), seconds[0], 0.0)
-    shown = {
-        **knobs, "people": 2 * most if not whole else len(label),
+    if whole:
+        half = _jackknife(lambda rows: 1.0 - judged(fit(rows)), groups[0])
+        low, high = max(middle - half, 0.0), middle + half
+    timing = Timing(
+        float(np.median(seconds)), (min(seconds), max(seconds)), seconds[0], rise.mb, "resident"
+    )
+    shown = {**knobs, "people": 2 * most if not whole else len(label)}
+    also = {
         "components": int(np.median(kept)), "expected_cosine": round(float(np.median(told)), 4),
     }  # fmt: skip
-    return Point(shown, timing, middle, (low, high))
+    return Point(shown, timing, middle, (low, high), also=also)
+
+
+def _jackknife(value: Callable[[NDArray[np.intp]], float], rows: NDArray[np.intp]) -> float:
+    """Return a value's standard error by leaving out each of :data:`LEFT_OUT` groups of people."""
+    parts = np.array_split(np.random.default_rng(9).permutation(len(rows)), LEFT_OUT)
+    values = [value(np.delete(rows, part)) for part in parts if part.size]
+    count = len(values)
+    return float(np.std(values) * np.sqrt(count - 1))
 
 
 def _false_alarms(what: str, samples: Floats, metric: Floats | None, *, toy: bool) -> Limit:

@@ -15,13 +15,18 @@ from threadpoolctl import threadpool_limits
 from model import photon_table
 from reconstruction import anisotropy, subsurface, translucency
 from reconstruction.translucency import SITE_UV, TEXTURE_MM, TranslucencyPrior
-from skinrig.benchmark import Limit, Point, StageBenchmark, measure
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.skin_bands import MELANIN_BANDS
 
 Floats = NDArray[np.float64]
 Way = Literal["sigma_tr", "profiles"]
 
 RADIUS_MM = 0.3 + 0.25 * np.arange(28)
-SIGMA_A_PER_MM, SIGMA_S_PRIME_PER_MM, ETA = 0.04, 1.5, 1.4
+Medium = tuple[float, float]
+"""sigma_a and sigma_s', 1/mm."""
+
+MEDIUM: Medium = (0.04, 1.5)
+ETA = 1.4
 RATIO, AXIS_RAD = 1.1, 0.6
 """Greatest over least 1/sigma_tr."""
 COUPLING, FIBRE, DARK = 0.02, 0.01, 1e-7
@@ -37,26 +42,29 @@ def _directions(count: int) -> Floats:
     return np.asarray(np.arange(count) * (math.tau / count))
 
 
-def _profiles(angle: Floats, ratio: float, cases: int, *, rng: np.random.Generator) -> Floats:
+def _profiles(
+    angle: Floats, ratio: float, cases: int, *, medium: Medium = MEDIUM, rng: np.random.Generator
+) -> Floats:
     """Return readings (N, cases, F) of tissue that scatters less along an axis, heads set down."""
     sigma_tr = np.hypot(np.cos(angle - AXIS_RAD) / ratio, np.sin(angle - AXIS_RAD))
     # sigma_tr^2 = 3 sigma_a (sigma_a + sigma_s'), scaled about the middle of its extremes
-    total = (SIGMA_A_PER_MM + SIGMA_S_PRIME_PER_MM) * ratio * sigma_tr**2
-    truth = photon_table.reflectance(
-        RADIUS_MM, SIGMA_A_PER_MM, (total - SIGMA_A_PER_MM)[:, None], eta=ETA
-    )
+    sigma_a, sigma_s_prime = medium
+    total = (sigma_a + sigma_s_prime) * ratio * sigma_tr**2
+    truth = photon_table.reflectance(RADIUS_MM, sigma_a, (total - sigma_a)[:, None], eta=ETA)
     shape = (angle.size, cases, RADIUS_MM.size)
     seen = truth[:, None] * np.exp(COUPLING * rng.standard_normal((*shape[:2], 1)))
     seen = seen * (1.0 + FIBRE * rng.standard_normal(shape))
     return np.asarray(seen + DARK * rng.standard_normal(shape))
 
 
-def _told(way: Way, angle: Floats, profiles: Floats) -> anisotropy.Anisotropy:
+def _told(
+    way: Way, angle: Floats, profiles: Floats, *, medium: Medium = MEDIUM
+) -> anisotropy.Anisotropy:
     variance = np.full(profiles.shape, DARK**2)
     if way == "profiles":
         return anisotropy.estimate_from_profiles(
-            angle, RADIUS_MM, profiles, variance, sigma_a_per_mm=SIGMA_A_PER_MM,
-            sigma_s_prime_per_mm=SIGMA_S_PRIME_PER_MM, eta=ETA, floor=FIBRE,
+            angle, RADIUS_MM, profiles, variance, sigma_a_per_mm=medium[0],
+            sigma_s_prime_per_mm=medium[1], eta=ETA, floor=FIBRE,
         )  # fmt: skip
     fits = subsurface.invert(
         RADIUS_MM, profiles, eta=ETA, variance=variance + (FIBRE * profiles) ** 2,
@@ -65,11 +73,12 @@ def _told(way: Way, angle: Floats, profiles: Floats) -> anisotropy.Anisotropy:
     return anisotropy.estimate(angle, fits.sigma_tr_per_mm, fits.sigma_tr_stderr, valid=fits.valid)
 
 
-def _bound(count: int) -> float:
+def _bound(count: int, medium: Medium = MEDIUM) -> float:
     """Return the least standard deviation of the log ratio, absorption known, coupling not."""
-    here = photon_table.derivatives(RADIUS_MM, SIGMA_A_PER_MM, SIGMA_S_PRIME_PER_MM, eta=ETA)
+    sigma_a, sigma_s_prime = medium
+    here = photon_table.derivatives(RADIUS_MM, sigma_a, sigma_s_prime, eta=ETA)
     light = here.reflectance_per_mm2
-    by_log = here.by_sigma_s_prime * SIGMA_S_PRIME_PER_MM
+    by_log = here.by_sigma_s_prime * sigma_s_prime
     # deviations known, as those of readings with weights: coupling is free beside its prior
     weight = 1.0 / ((FIBRE * light) ** 2 + DARK**2)
     across = (weight * light * by_log).sum()
@@ -80,7 +89,7 @@ def _bound(count: int) -> float:
         ]
     )
     of_one = math.sqrt(np.linalg.inv(fisher)[1, 1])
-    of_one *= 0.5 * SIGMA_S_PRIME_PER_MM / (SIGMA_A_PER_MM + SIGMA_S_PRIME_PER_MM)
+    of_one *= 0.5 * sigma_s_prime / (sigma_a + sigma_s_prime)
     # sigma_tr is its mean times 1 - h / 2 cos 2 theta, h the log of the ratio
     return 2.0 * of_one * math.sqrt(2.0 / count)
 
@@ -112,6 +121,10 @@ def directions(*, toy: bool) -> StageBenchmark:
                     (error - spread, error + spread), _bound(count),
                 )
             )  # fmt: skip
+    bands = {
+        name: _in_band((band.sigma_a_per_mm, band.sigma_s_prime_per_mm), 16, cases, rng=rng)
+        for name, band in MELANIN_BANDS.items()
+    }
     limits = () if toy else _direction_limits(errors, rng=rng)
     return StageBenchmark(
         "anisotropy",
@@ -122,7 +135,19 @@ def directions(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         limits,
+        interval_of="cases",
+        by_band=bands,
     )
+
+
+def _in_band(medium: Medium, count: int, cases: int, *, rng: np.random.Generator) -> BandError:
+    """Return the error of comparing profiles of skin that absorbs like this."""
+    angle = _directions(count)
+    profiles = _profiles(angle, RATIO, cases, medium=medium, rng=rng)
+    h = np.log(_told("profiles", angle, profiles, medium=medium).ratio)
+    error = float(np.sqrt(((h - math.log(RATIO)) ** 2).mean()))
+    spread = error / math.sqrt(2.0 * (cases - 1))
+    return BandError(error, (error - spread, error + spread), _bound(count, medium))
 
 
 def _direction_limits(
@@ -229,6 +254,8 @@ def sites(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         limits,
+        interval_of="faces",
+        no_bands="faces are drawn from one prior, whatever their pigment",
     )
 
 

@@ -11,7 +11,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from capture.rig import load_rig
-from skinrig.benchmark import Limit, Point, StageBenchmark, measure
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.skin_bands import MELANIN_BANDS
 
 Floats = NDArray[np.float64]
 
@@ -112,7 +113,8 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
         timing = measure(next_event, repeats=1, memory=None)
         run = next_event()
         relative = 100.0 * run.stderr / run.reflectance_per_mm2
-        points.append(_point({"score": "next event", "photons": photons}, timing, relative))
+        knobs: dict[str, str | int | float] = {"quantity": "fibres", "score": "next event"}
+        points.append(_point(knobs | {"photons": photons}, timing, relative))
     for photons in (1000, 2000) if toy else (80_000, 320_000):
 
         def in_the_cone(photons: int = photons) -> Floats:
@@ -120,7 +122,8 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
 
         timing = measure(in_the_cone, repeats=1, memory=None)
         relative = in_the_cone()
-        points.append(_point({"score": "leaves in the cone", "photons": photons}, timing, relative))
+        knobs = {"quantity": "fibres", "score": "leaves in the cone"}
+        points.append(_point(knobs | {"photons": photons}, timing, relative))
     medium = LayerStack((Layer(inf, SPEED_MEDIUM[0], *SPEED_MEDIUM[1:]),))
     for engine in ("numba", "drjit"):
 
@@ -134,9 +137,10 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
             continue
         total = all_angles()
         error = 100.0 * total.reflectance_stderr / total.reflectance
+        spread = error / sqrt(2.0 * (total.batches - 1))
         points.append(
-            Point({"score": "all that leaves", "engine": engine, "photons": total.photons},
-                  timing, error, (error, error))
+            Point({"quantity": "all that leaves", "engine": engine, "photons": total.photons},
+                  timing, error, (error - spread, error + spread))
         )  # fmt: skip
     return StageBenchmark(
         "photon-transport",
@@ -146,7 +150,27 @@ def photon_transport(*, toy: bool) -> StageBenchmark:
         tuple(points),
         () if toy else (*_one_percent(radii, stack), *_against_volpath(radii), *_rates(medium)),
         (("volpath's values", "their tails are too heavy to converge in this time"),),
+        by_band=_bands(radii, photons=2000 if toy else 20_000),
+        condition=("quantity",),
+        interval_of="batches of photons",
     )
+
+
+def _bands(radii: Floats, *, photons: int) -> dict[str, BandError]:
+    """Return the error of as many photons in skin that absorbs little and much."""
+    from rigsim.fibre_profile import fibre_profile
+    from rigsim.tissue_mc import Layer, LayerStack
+
+    found = {}
+    for name, band in MELANIN_BANDS.items():
+        layer = Layer(inf, band.sigma_a_per_mm, band.sigma_s_prime_per_mm / (1.0 - G), G, ETA)
+        run = fibre_profile(
+            LayerStack((layer,)), radii_mm=radii, photons=photons,
+            rng=np.random.default_rng(1), threads=CORES,
+        )  # fmt: skip
+        point = _point({}, None, 100.0 * run.stderr / run.reflectance_per_mm2)
+        found[name] = BandError(point.error, point.error_interval)
+    return found
 
 
 def _point(knobs: dict[str, str | int | float], timing: Any, relative: Floats) -> Point:

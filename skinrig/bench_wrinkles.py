@@ -186,6 +186,8 @@ def fitting(*, toy: bool) -> StageBenchmark:
             Limit("of the neutral face's error, with the best map", best / rest, 0.6, "<="),
         ),
         left_out=(("masks from the data", "see tests of reconstruction.wrinkle_zones"),),
+        interval_of="squares of the face",
+        no_bands="shape alone: no color of skin enters",
     )  # fmt: skip
 
 
@@ -246,6 +248,8 @@ def summing(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         limits,
+        interval_of="squares of the face",
+        no_bands="shape alone: no color of skin enters",
     )
 
 
@@ -307,6 +311,8 @@ def storing(*, toy: bool) -> StageBenchmark:
         "the same wrinkles, stored without loss",
         0.0,
         tuple(points),
+        interval_of="squares of the face",
+        no_bands="shape alone: no color of skin enters",
     )
 
 
@@ -355,6 +361,9 @@ def weighing(*, toy: bool) -> StageBenchmark:
         0.0,
         tuple(points),
         () if toy else limits,
+        condition=("noise, mrad",),
+        interval_of="draws of noise",
+        no_bands="shape alone: no color of skin enters",
     )
 
 

@@ -1,40 +1,140 @@
-"""Each benchmark once at toy size: it runs, and its document holds what the schema promises."""
+"""Each benchmark once at toy size: it runs, and its document holds what docs/measuring.md says."""
 
+import copy
 import itertools
 import json
+import math
 
 import pytest
 
+from skinrig.bench_document import SCHEMA
 from skinrig.bench_stages import STAGES, BenchError, run_stages
 from skinrig.console import Console, plain
+from skinrig.skin_bands import MELANIN_BANDS
 
 # simulated sessions, surveys and faces: over 5 s of processor time even when small
 HEAVY = {
     "dome-geometry", "editing", "gradient-normals", "probe-session", "render-gradient",
     "sphere-lights", "traits",
 }  # fmt: skip
+LEAST_POINTS = 4
+
+
+def problems(stage):
+    """Return what is wrong with a stage's part of a document, in words."""
+    points, fronts = stage["points"], stage["fronts"]
+    found = []
+
+    def expect(kept, what):
+        if not kept:
+            found.append(what)
+
+    # small sizes have the fewest: a run within any budget shows so many
+    expect(len(points) >= LEAST_POINTS, f"{len(points)} points")
+    expect(stage["error_name"] and stage["reference"], "no reference")
+    expect(stage["reference_error"] >= 0.0, "no reference error")
+    expect(stage["reference_error_means"], "a reference error that means nothing")
+    expect(stage["interval_of"], "intervals of nothing")
+    for number, point in enumerate(points):
+        low, high = point["error_interval"]
+        expect(point["seconds"] > 0.0, f"{number}: no seconds")
+        expect(point["cold_seconds"] > 0.0, f"{number}: no cold seconds")
+        fast, slow = point["seconds_spread"]
+        expect(fast <= point["seconds"] <= slow, f"{number}: seconds outside their spread")
+        # the middle of a bootstrap is not always within it, but for rounding it is
+        slack = 1e-9 * abs(point["error"])
+        expect(low - slack <= point["error"] <= high + slack, f"{number}: error outside interval")
+        expect(
+            (point["peak_memory_mb"] is None) == bool(point["no_memory"])
+            and (point["peak_memory_mb"] is None)
+            != (point["memory_of"] in {"allocated", "resident"}),
+            f"{number}: neither memory nor a reason",
+        )
+        expect(
+            (point["efficiency"] is None) == (not point["cramer_rao_bound"]),
+            f"{number}: efficiency without bound, or the reverse",
+        )
+    expect(fronts, "no front")
+    seen = []
+    for front in fronts:
+        names = front["condition"]
+        own = [
+            n for n, p in enumerate(points) if all(p["knobs"].get(k) == v for k, v in names.items())
+        ]
+        seen += own
+        expect(set(front["points"]) <= set(own), f"{names}: a front of other conditions")
+        along = [(points[n]["seconds"], points[n]["error"]) for n in front["points"]]
+        expect(
+            all(a[0] < b[0] and a[1] > b[1] for a, b in itertools.pairwise(along)),
+            f"{names}: error does not fall as seconds rise",
+        )
+        for n in own:
+            here = points[n]["seconds"], points[n]["error"]
+            expect(
+                any(s <= here[0] and e <= here[1] for s, e in along),
+                f"{names}: point {n} is beaten by none of the front",
+            )
+    expect(sorted(seen) == list(range(len(points))), "points of no condition, or of two")
+    marked = {n for front in fronts for n in front["points"]}
+    expect(marked == {n for n, p in enumerate(points) if p["on_front"]}, "marks of other fronts")
+    bands = [one["band"] for one in stage["by_band"]]
+    expect(bool(bands) != bool(stage["no_bands"]), "neither bands of skin nor a reason")
+    expect(bands in ([], list(MELANIN_BANDS)), f"bands {bands}")
+    for one in stage["by_band"]:
+        low, high = one["error_interval"]
+        expect(low <= one["error"] <= high, f"{one['band']}: error outside its interval")
+        expect(math.isfinite(one["error"]), f"{one['band']}: no error")
+    return found
 
 
 @pytest.mark.parametrize(
     "stage", [pytest.param(s, marks=pytest.mark.long if s in HEAVY else ()) for s in STAGES]
 )
-def test_a_stage_gives_points_with_errors_and_intervals(stage, tmp_path, capsys):
+def test_a_stage_holds_what_the_schema_promises(stage, tmp_path, capsys):
     document = run_stages([stage], budget_s=60.0, toy=True, out=tmp_path, console=Console(True))
     written = json.loads((tmp_path / "bench.json").read_text())
     assert written == plain(document)
-    points = written["stages"][stage]["points"]
-    # small sizes have the fewest: a run within any budget shows so many
-    assert len(points) >= 4
-    front = sorted((p["seconds"], p["error"]) for p in points if p["on_front"])
-    assert front
-    assert all(a[0] < b[0] and a[1] > b[1] for a, b in itertools.pairwise(front))
-    assert written["stages"][stage]["reference"]
-    assert written["stages"][stage]["reference_error"] >= 0.0
-    for point in points:
-        low, high = point["error_interval"]
-        assert point["seconds"] > 0
-        assert (point["efficiency"] is None) == (not point["cramer_rao_bound"])
-        assert low <= point["error"] <= high or point["error"] == pytest.approx(high, rel=0.5)
+    assert written["schema"] == SCHEMA
+    assert written["skin_bands"].keys() == MELANIN_BANDS.keys()
+    assert list(written["stages"]) == [stage]
+    assert problems(written["stages"][stage]) == []
+
+
+@pytest.fixture(scope="module")
+def sound():
+    document = run_stages(
+        ["subsurface-batch"], budget_s=60.0, toy=True, out=None, console=Console(True)
+    )
+    return plain(document)["stages"]["subsurface-batch"]
+
+
+def slower_and_worse(stage):
+    extra = {**stage["points"][0], "seconds": 1e3, "error": 1e3, "on_front": True}
+    extra |= {"seconds_spread": [1e3, 1e3], "error_interval": [1e3, 1e3]}
+    stage["points"].append(extra)
+    stage["fronts"][0]["points"].append(len(stage["points"]) - 1)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (lambda s: s.update(points=[], fronts=[]), "0 points"),
+        (slower_and_worse, "error does not fall"),
+        (lambda s: s.update(fronts=[]), "no front"),
+        (lambda s: s["fronts"].pop(), "points of no condition"),
+        (lambda s: s.update(reference_error=-1.0), "no reference error"),
+        (lambda s: s["points"][0].update(peak_memory_mb=None), "neither memory nor a reason"),
+        (lambda s: s["points"][0].update(error_interval=[0.0, 0.0]), "outside interval"),
+        (lambda s: s.update(by_band=[]), "neither bands of skin nor a reason"),
+        (lambda s: s["by_band"].reverse(), "bands "),
+        (lambda s: s["points"][0].update(efficiency=1.0), "efficiency without bound"),
+    ],
+)
+def test_the_check_finds_what_is_spoiled(sound, spoil, expected):
+    assert problems(sound) == []
+    broken = copy.deepcopy(sound)
+    spoil(broken)
+    assert any(expected in problem for problem in problems(broken))
 
 
 def test_an_unknown_stage_is_named_with_the_known_ones():

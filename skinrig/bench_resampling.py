@@ -1,0 +1,91 @@
+"""Intervals of errors by drawing again: of medians over things, of root mean squares over tiles."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model import metrics
+from skinrig.benchmark import BandError
+
+DRAWS = 200
+TILE_PX = 16
+
+
+def median_error(values: ArrayLike, *, bound: float | None = None, seed: int = 0) -> BandError:
+    """Return the median of errors that are independent of each other, with its 68 % interval.
+
+    Parameters
+    ----------
+    values
+        Sizes of errors, any shape; NaN are dropped.
+    bound
+        Least median that any unbiased estimator could have.
+    seed
+        Of the bootstrap.
+
+    Examples
+    --------
+    >>> median_error([1.0, 2.0, 3.0]).error
+    2.0
+    """
+    found, interval = metrics.median_with_interval(values, rng=np.random.default_rng(seed))
+    return BandError(found, interval, bound)
+
+
+def mean_error(values: ArrayLike) -> BandError:
+    """Return the mean of independent errors with its standard error to both sides.
+
+    Examples
+    --------
+    >>> mean_error([1.0, 3.0]).error_interval
+    (1.0, 3.0)
+    """
+    sizes = np.asarray(values, np.float64).ravel()
+    mean = float(sizes.mean())
+    half = float(sizes.std(ddof=1) / np.sqrt(sizes.size)) if sizes.size > 1 else float("nan")
+    return BandError(mean, (mean - half, mean + half))
+
+
+def tiled_rms(
+    difference: NDArray[np.floating],
+    where: NDArray[np.bool_],
+    *,
+    tile_px: int = TILE_PX,
+    seed: int = 0,
+) -> BandError:
+    """Return the root mean square of a picture's errors; the interval is over its tiles.
+
+    Neighboring pixels err alike, so that tiles are drawn again, not pixels.
+
+    Parameters
+    ----------
+    difference
+        (H, W) or (H, W, C).
+    where
+        (H, W), pixels that count; at least one.
+    tile_px
+        Side of the tiles.
+    seed
+        Of the bootstrap.
+
+    Returns
+    -------
+    BandError
+        In the unit of the difference.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> tiled_rms(np.full((32, 32), 2.0), np.ones((32, 32), bool)).error_interval
+    (2.0, 2.0)
+    """
+    squared = np.square(np.asarray(difference, np.float64))
+    squared = squared if squared.ndim == 2 else squared.mean(axis=-1)
+    rows, columns = np.nonzero(where)
+    _, which = np.unique(np.stack([rows, columns]) // tile_px, axis=1, return_inverse=True)
+    sums, counts = np.bincount(which, squared[where]), np.bincount(which)
+    drawn = np.random.default_rng(seed).integers(len(sums), size=(DRAWS, len(sums)))
+    roots = np.sqrt(sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1))
+    low, high = np.percentile(roots, [16, 84])
+    return BandError(float(np.sqrt(squared[where].mean())), (float(low), float(high)))
