@@ -119,20 +119,22 @@ def _exchange(
     step = max(1, PAIRS_AT_ONCE // count)
     for first in range(0, count, step):
         block = np.arange(first, min(first + step, count))
-        strength = np.zeros((len(block), count), np.float32)
+        strength = np.zeros((len(block), count - first), np.float32)
         _form(point, normal, first, strength)
         i, j = np.nonzero(strength)
         start = point[block[i]] + np.float32(OFFSET_MM) * normal[block[i]]
-        way = point[j] + np.float32(OFFSET_MM) * normal[j] - start
+        way = point[first + j] + np.float32(OFFSET_MM) * normal[first + j] - start
         length = np.linalg.norm(way, axis=-1)
         way /= length[:, None]
         free = ~caster.blocked(start, way, 0.999 * length)
         i, j = i[free], j[free]
         share = strength[i, j]
-        # A patch that is near is no point: its whole hemisphere holds no more than all light.
-        values.append(share * area[j] / (math.pi + share * area[j]))
-        rows.append(block[i])
-        columns.append(j)
+        # what two patches send each other goes along one line: it is traced once
+        for here, there in ((block[i], first + j), (first + j, block[i])):
+            # A patch that is near is no point: its whole hemisphere holds no more than all light.
+            values.append(share * area[there] / (math.pi + share * area[there]))
+            rows.append(here)
+            columns.append(there)
     shape = (count, count)
     pairs = (np.concatenate(rows), np.concatenate(columns))
     return sparse.csr_array((np.concatenate(values), pairs), shape=shape)
@@ -140,10 +142,10 @@ def _exchange(
 
 @njit(parallel=True, cache=True)
 def _form(point, normal, first, out):  # type: ignore[no-untyped-def]
-    """Write cos cos T T / d^2 for pairs that face each other."""
+    """Write cos cos T T / d^2 for pairs that face each other, of each the first alone."""
     for n in prange(out.shape[0]):
         i = first + n
-        for j in range(out.shape[1]):
+        for j in range(i + 1, first + out.shape[1]):
             x = float(point[j, 0]) - point[i, 0]
             y = float(point[j, 1]) - point[i, 1]
             z = float(point[j, 2]) - point[i, 2]
@@ -154,4 +156,4 @@ def _form(point, normal, first, out):  # type: ignore[no-untyped-def]
             squared = x * x + y * y + z * z
             length = math.sqrt(squared)
             here, there = min(here / length, 1.0), min(there / length, 1.0)
-            out[n, j] = here * there * through(here) * through(there) / squared
+            out[n, j - first] = here * there * through(here) * through(there) / squared

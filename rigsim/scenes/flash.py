@@ -22,13 +22,17 @@ from numpy.typing import NDArray
 from capture.rig import Rig, RigError, View
 from model import spectra
 from rigsim import landmarks, shading
+from rigsim.effect_sizes import exchange_share
 from rigsim.films import Films, films_of
 from rigsim.lateral import line_spread_mm
 from rigsim.mesh import Float32Array, Mesh
 from rigsim.render import Caster, camera_rays
+from rigsim.scene_needs import Noise, SceneNeeds
+from rigsim.scenes.flash_needs import BOUNCES, LATERAL, SPECTRAL, flash_needs
 from rigsim.scenes.picture import Look, Picture
 from rigsim.scenes.skin_glow import SkinGlow, SurfaceLight, light_skin, light_surface
 from rigsim.sensor import Sensor, expose, sensor_of
+from rigsim.skin_bounce import SkinBounce
 from rigsim.subject import Subject
 from rigsim.targets import Target
 from rigsim.variant import VariantChoice
@@ -79,6 +83,22 @@ class _Stage:
     caster: Caster
     light: dict[object, SurfaceLight] = field(default_factory=dict)
     """Light on the face, by what it comes from."""
+    hollows: dict[str, float] = field(default_factory=dict)
+    """`exchange_share` of the mesh, once it was asked for."""
+    bounce: dict[str, SkinBounce] = field(default_factory=dict)
+    """How light goes from skin to skin, once a scene needed it."""
+
+    def share(self) -> float:
+        """Return `exchange_share` of the mesh."""
+        if not self.hollows:
+            self.hollows["share"] = exchange_share(self.caster)
+        return self.hollows["share"]
+
+    def exchange(self) -> SkinBounce:
+        """Return how light goes from skin to skin."""
+        if not self.bounce:
+            self.bounce["skin"] = SkinBounce(self.caster)
+        return self.bounce["skin"]
 
 
 _stages: WeakValueDictionary[tuple[object, ...], _Stage] = WeakValueDictionary()
@@ -119,7 +139,12 @@ class FlashScene:
     seed
         Seeds what differs from pop to pop.
     lateral
-        Whether light spreads inside the skin.
+        Whether light spreads inside the skin. This and the next two: ``None`` decides by how much
+        it changes pixels, see `needs`.
+    interreflections
+        Whether light goes from skin to skin.
+    spectral
+        Whether that light is reflected wavelength by wavelength.
     subpixels
         Rays along each side of a pixel.
     choice
@@ -136,7 +161,9 @@ class FlashScene:
         sensor: Sensor | None = None,
         films: Films | None = None,
         seed: int = 0,
-        lateral: bool = True,
+        lateral: bool | None = None,
+        interreflections: bool | None = None,
+        spectral: bool | None = None,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
     ) -> None:
@@ -155,7 +182,6 @@ class FlashScene:
         self.movement = movement
         self.films = films_of(rig) if films is None else films
         self.seed = seed
-        self.lateral = lateral
         self.subpixels = subpixels
         self._illuminant = rig.lights[0].illuminant
         self._sensors = {
@@ -168,40 +194,27 @@ class FlashScene:
         self._glow: dict[str, SkinGlow] = {}
         self._pictures: dict[str, Picture] = {}
         self._blurs: dict[str, Mapping[str, Float32Array]] = {}
+        self.needs: SceneNeeds = flash_needs(
+            rig,
+            subject,
+            state,
+            caster=self._caster,
+            noise=Noise.of(self._sensors[rig.views[0].name]),
+            white_level=METER_LEVEL,
+            movement=movement,
+            lateral=lateral,
+            interreflections=interreflections,
+            spectral=spectral,
+            share=self._stage.share(),
+        )
+        """What is built, what is not, and why."""
+        self.lateral = self.needs.builds(LATERAL)
+        self.interreflections = self.needs.builds(BOUNCES)
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
         """What this scene does not build, with the reason."""
-        out = [
-            (
-                "light from skin to skin",
-                "one bounce would add a few percent in red beside the nose",
-            ),
-            (
-                "depth of field and lens blur",
-                "at f/11, 60 mm off focus: 6 pixels of the full sensor",
-            ),
-            ("ambient light", "the room is dark and the flash is short"),
-        ]
-        if isinstance(self.subject, Subject):
-            out += [
-                ("eyes, teeth and hair on the head", "the eyes are closed; only skin is estimated"),
-                ("kernels that vary over the face", "one lateral profile, of its median skin"),
-                ("polarized single scattering", "light from inside is taken as depolarized"),
-            ]
-            if not self.movement:
-                out.append(("movement of the face with the states", "movement=False asks for it"))
-            elif self.subject.pose is not None:
-                out += [
-                    ("shadows of wrinkles", "they tilt the surface only"),
-                    ("parted lips and open eyes", "a mesh without an opening stretches instead"),
-                ]
-                if self.subject.pose.wrinkles.left_out:
-                    zones = ", ".join(self.subject.pose.wrinkles.left_out)
-                    out.append((f"fine wrinkles ({zones})", "the texture's texels are too coarse"))
-            if not self.lateral:
-                out.append(("light spreading sideways in skin", "lateral=False asks for it"))
-        return out
+        return self.needs.left_out
 
     def white_rgb(self, view_name: str | None = None) -> Float32Array:
         """Return the camera RGB of the white reference at power 1, fraction of full scale, (3,)."""
@@ -301,8 +314,8 @@ class FlashScene:
             as the skin looks after its light has spread, all else known;
             ``reflectance``, ``reflectance_blurred``: white-balanced diffuse reflectance, (H, W, 3);
             ``shading``: what reflectance times `white_rgb` is multiplied with in the crossed image
-            at power 1, without specular leak and spreading of light;
-            ``irradiance``: light on the surface over light on the white reference;
+            at power 1, without specular leak, spreading of light and light from other skin;
+            ``irradiance``: light of the flashes on the surface over that on the white reference;
             ``diffuse``, ``specular``: camera RGB without analyser at power 1 in fraction of full
             scale, light from inside and from the surface, (H, W, 3); crossed is about half the
             first, parallel half the first and the second;
@@ -410,6 +423,8 @@ class FlashScene:
                 camera=camera,
                 illuminant=self._illuminant,
                 lateral_transport=self.lateral,
+                bounce=self._stage.exchange() if self.interreflections else None,
+                spectral=self.interreflections and self.needs.builds(SPECTRAL),
             )
         return self._glow[camera]
 

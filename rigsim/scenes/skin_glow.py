@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from rigsim.skin_color import skin_color
 from rigsim.skin_layers import ETA
 from rigsim.skin_table import SkinTable
 from rigsim.subject import Subject
+
+if TYPE_CHECKING:
+    from rigsim.skin_bounce import SkinBounce
 
 SIGMAS_MM: Final = (0.02, 0.06, 0.15, 0.35, 0.8, 1.8, 4.0)
 """Widths of the Gaussians that stand for the lateral profiles, mm."""
@@ -57,8 +60,8 @@ class SkinGlow:
     reflectance: Float32Array
     """Sharp white-balanced diffuse reflectance of the skin, shape (N, N, 3)."""
     sharp: Float32Array
-    """Light that would leave where it entered, before the surface's exit: ``entered`` times
-    reflectance times the interior's scale, shape (N, N, 3)."""
+    """Light that would leave where it entered, before the surface's exit: what entered, from
+    flashes and from other skin, times reflectance and the interior's scale, shape (N, N, 3)."""
     spread: Float32Array
     """The same with lateral transport unless it is left out, and behind hair."""
     kernels: GaussianSum
@@ -139,6 +142,8 @@ def light_skin(
     camera: str,
     illuminant: str,
     lateral_transport: bool,
+    bounce: SkinBounce | None = None,
+    spectral: bool = True,
 ) -> SkinGlow:
     """Let the light on a face into its skin and out again.
 
@@ -152,6 +157,10 @@ def light_skin(
         Names of the camera's sensitivity and of the flashes' spectrum.
     lateral_transport
         Whether light spreads inside the skin.
+    bounce
+        How light goes from skin to skin; None leaves that out.
+    spectral
+        Whether that light is reflected wavelength by wavelength.
 
     Returns
     -------
@@ -160,19 +169,31 @@ def light_skin(
     """
     melanin, blood = subject.melanin, subject.hemoglobin(state)
     reflectance = skin_color(camera, illuminant).rgb(melanin, blood)
-    within = surface.entered
     scale = np.float32(shading.interior_scale(ETA))
-    sharp = scale * within[..., None] * reflectance
+    hair = subject.hair[..., None]
+    covering = np.asarray(HAIR_REFLECTANCE, np.float32) * hair
+    within = surface.entered[..., None]
+    if bounce is not None:
+        from rigsim.bounce_color import BounceColor  # which knows of skin, and so of this module
+
+        outside = scale * ((1.0 - hair) * reflectance + covering)
+        color = BounceColor(
+            bounce, subject, state, outside, reflectance,
+            camera=camera, light=illuminant, spectral=spectral,
+        )  # fmt: skip
+        covered = subject.atlas.covered
+        sums = bounce.coarsen(np.dstack([surface.entered, covered]).astype(np.float32))
+        came = color.on_texture(sums[:, 0] / np.maximum(sums[:, 1], 1e-6), subject.size)
+        within = within + np.where(covered[..., None], came, np.float32(0.0))
+    sharp = scale * within * reflectance
     kernels = typical_kernels(subject, state, camera, illuminant)
     spread = sharp
     if lateral_transport:
         spread = scale * spread_through_pigment(
             subject, state, reflectance, within, kernels, camera, illuminant
         )
-    hair = subject.hair[..., None]
     # Hair is dark and matt, and lets no light into the skin below it.
-    over = scale * within[..., None] * np.asarray(HAIR_REFLECTANCE, np.float32) * hair
-    spread = (1.0 - hair) * spread + over
+    spread = (1.0 - hair) * spread + scale * within * covering
     return SkinGlow(surface, reflectance, sharp, spread, kernels)
 
 
@@ -230,7 +251,7 @@ def spread_pattern(
     without_melanin
         The same of skin with its blood but no melanin, shape (N, N, C).
     entered
-        Light that enters, shape (N, N).
+        Light that enters, shape (N, N), or (N, N, C) where it has a color.
     atlas
         The surface.
     kernels
@@ -254,7 +275,8 @@ def spread_pattern(
     channels = reflectance.shape[-1]
     log_m = np.log(reflectance / without_melanin) * np.float32(0.5)
     pigment = np.exp(lateral.spread_light(log_m, atlas, [PIGMENT_BLUR_MM], np.ones((channels, 1))))
-    inside = pigment * without_melanin * entered[..., None]
+    light = entered if entered.ndim == 3 else entered[..., None]
+    inside = np.ascontiguousarray(pigment * without_melanin * light, np.float32)
     return pigment * lateral.spread_light(inside, atlas, kernels.sigmas_mm, kernels.weights)
 
 

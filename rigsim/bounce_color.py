@@ -1,0 +1,105 @@
+"""The color of light that went from skin to skin: reflected twice or more, so redder than once.
+
+A camera's channel is a sum over wavelengths. What is reflected once may be summed before, as its
+channel's mean reflectance; a product of two reflectances may not: in skin's red channel, which
+blood and melanin make uneven, the mean of the square is larger than the square of the mean.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from model import spectra
+from rigsim.mesh import Float32Array
+from rigsim.skin_bounce import SkinBounce
+from rigsim.skin_table import SkinTable
+from rigsim.subject import Subject
+
+LEAST: Final = 1e-6
+"""Reflectance and cover below which a patch has no color."""
+
+
+class BounceColor:
+    """How light goes from skin to skin on one face in one state, seen by one camera.
+
+    Parameters
+    ----------
+    bounce
+        How light goes from patch to patch.
+    subject, state
+        Whose skin, in which state of its blood.
+    r_d
+        Factor of the diffuse term per channel with what covers the skin, shape (N, N, 3).
+    reflectance
+        White-balanced reflectance of the skin per channel, shape (N, N, 3).
+    camera, light
+        Names known to `model.spectra`.
+    spectral
+        Whether wavelengths are told apart; without, each channel is taken as one.
+    """
+
+    def __init__(
+        self,
+        bounce: SkinBounce,
+        subject: Subject,
+        state: str,
+        r_d: Float32Array,
+        reflectance: Float32Array,
+        *,
+        camera: str,
+        light: str,
+        spectral: bool = True,
+    ) -> None:
+        self._bounce = bounce
+        covered = subject.atlas.covered.astype(np.float32)
+        blood = subject.hemoglobin(state)
+        factor = r_d / np.maximum(reflectance, np.float32(LEAST))
+        layers = np.dstack([covered, subject.melanin, blood, factor, r_d]) * covered[..., None]
+        coarse = bounce.coarsen(np.asarray(layers, np.float32))
+        coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(LEAST))
+        self._r_d = np.ascontiguousarray(coarse[:, 6:])
+        self._weights: Float32Array | None = None
+        if spectral:
+            table = SkinTable.load()
+            weights = spectra.band_weights(camera, light, table.wavelength_nm)
+            skin = table.spectra(coarse[:, 1], coarse[:, 2])
+            # what covers the skin (hair, makeup) is gray beside it
+            cover = coarse[:, 3:6].mean(axis=1, keepdims=True)
+            self._spectrum = np.asarray(skin * cover, np.float32)
+            self._channel = np.maximum(self._spectrum @ weights, LEAST).astype(np.float32)
+            self._weights = np.asarray(weights, np.float32)
+
+    def entering(self, direct: Float32Array) -> Float32Array:
+        """Return the light that enters by way of other skin.
+
+        Parameters
+        ----------
+        direct
+            Light that enters each patch directly, shape (P,).
+
+        Returns
+        -------
+        ndarray of float32
+            As the coarse texture, shape (n, n, 3), same unit: multiplied by the patch's reflectance
+            in a channel it gives what leaves in that channel.
+        """
+        if self._weights is None:
+            return self._bounce.indirect(direct, self._r_d)
+        each = self._bounce.indirect(direct, self._spectrum)
+        covered = self._bounce.atlas.covered
+        out = np.zeros((*covered.shape, self._weights.shape[1]), np.float32)
+        out[covered] = ((each[covered] * self._spectrum) @ self._weights) / self._channel
+        return out
+
+    def on_texture(self, direct: Float32Array, size: int) -> Float32Array:
+        """Return `entering` on a texture of so many texels a side, shape (size, size, 3)."""
+        from rigsim.atlas import sample, spread
+
+        coarse = self.entering(direct)
+        filled = spread(coarse, self._bounce.atlas.covered, steps=2)
+        middle = (np.arange(size, dtype=np.float32) + np.float32(0.5)) / np.float32(size)
+        u, v = np.meshgrid(middle, middle[::-1])
+        uv = np.ascontiguousarray(np.stack([u, v], axis=-1))
+        return sample(filled, uv, np.ones((size, size), np.bool_))

@@ -1,0 +1,247 @@
+"""What a scene must hold: every effect of light with what became of it and why.
+
+A scene builds what changes a picture and nothing else. Whether an effect does is asked for the
+plan's sensor and for the subject: its largest change of any pixel against that pixel's noise.
+What is below `ENOUGH` may be left out; `skinrig bench --stage omissions` renders scenes with and
+without to check that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigsim.sensor import Sensor
+
+Verdict: TypeAlias = Literal["built", "negligible", "absent", "asked", "unmodeled"]
+
+ENOUGH: Final = 0.1
+"""Largest change of a pixel over its noise that may be left out."""
+
+MEANING: Final[dict[str, str]] = {
+    "built": "it changes pixels, and is in the picture",
+    "negligible": f"it changes no pixel by {ENOUGH:g} of its noise",
+    "absent": "the simulated world has none: rig, plan or subject say so",
+    "asked": "it would change pixels, but was asked to be left out",
+    "unmodeled": "a real rig has it and it may change pixels: the simulator cannot build it",
+}
+"""What each verdict says."""
+
+
+class NeedsError(ValueError):
+    """A record that contradicts itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Noise of one exposure of one pixel, where 1 is full scale."""
+
+    scale: float
+    """Variance per signal, > 0: shot noise."""
+    offset: float
+    """Variance without signal, >= 0: dark, read and rounding noise."""
+
+    def __post_init__(self) -> None:
+        """Check signs."""
+        if not (0.0 < self.scale < math.inf and 0.0 <= self.offset < math.inf):
+            raise NeedsError(
+                f"noise: got scale {self.scale}, offset {self.offset}, expected > 0 and >= 0"
+            )
+
+    @classmethod
+    def of(cls, sensor: Sensor, exposure_s: float = 0.0) -> Noise:
+        """Return the noise of a sensor's pixels.
+
+        Parameters
+        ----------
+        sensor
+            The sensor.
+        exposure_s
+            Exposure time, s; the shortest of a plan is the least noisy.
+        """
+        return cls(*sensor.noise_profile(exposure_s))
+
+    def sigma(self, level: NDArray[np.floating] | float) -> NDArray[np.float64]:
+        """Return the standard deviation at signals of any shape; below 0 as at 0.
+
+        Examples
+        --------
+        >>> float(Noise(1e-4, 9e-8).sigma(1.0).round(5))
+        0.01
+        """
+        return np.sqrt(self.scale * np.maximum(level, 0.0) + self.offset)
+
+    def share(self, change: float, level: float = 1.0) -> float:
+        """Return a relative change of a signal over its noise.
+
+        Parameters
+        ----------
+        change
+            Relative to the signal.
+        level
+            The signal, full scales. At 1, the brightest, a relative change shows most.
+
+        Examples
+        --------
+        >>> round(Noise(1e-4, 0.0).share(0.002), 3)
+        0.2
+        """
+        return abs(change) * level / float(self.sigma(level))
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """One effect of light on a picture."""
+
+    name: str
+    """In words."""
+    verdict: Verdict
+    """What became of it, see `MEANING`."""
+    reason: str
+    """Why, in words."""
+    over_noise: float | None = None
+    """Largest change of a pixel over its noise as the scene's rule tells it; None: the rule needs
+    no number."""
+    switch: str = ""
+    """Argument of the scene that builds it or not, which is how it is checked; empty: none."""
+
+    def __post_init__(self) -> None:
+        """Refuse a verdict that the number contradicts."""
+        if self.verdict not in get_args(Verdict):
+            expected = ", ".join(get_args(Verdict))
+            raise NeedsError(
+                f"{self.name}: verdict: got {self.verdict!r}, expected one of {expected}"
+            )
+        if not (self.name and self.reason):
+            raise NeedsError(f"effect {self.name!r}: got no name or no reason, expected both")
+        small = self.over_noise is not None and self.over_noise < ENOUGH
+        if self.verdict == "negligible" and self.over_noise is not None and not small:
+            raise NeedsError(
+                f"{self.name}: negligible: got a change of {self.over_noise:.3g} of the noise, "
+                f"expected below {ENOUGH:g}; build it"
+            )
+
+    @property
+    def built(self) -> bool:
+        """Whether it is in the picture."""
+        return self.verdict == "built"
+
+    def document(self) -> dict[str, str | float | None]:
+        """Return this as JSON values.
+
+        Examples
+        --------
+        >>> Effect("ambient light", "absent", "the room is dark").document()["verdict"]
+        'absent'
+        """
+        return {
+            "name": self.name,
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "over_noise": None if self.over_noise is None else float(f"{self.over_noise:.4g}"),
+            "switch": self.switch,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class SceneNeeds:
+    """All effects that a scene knows of.
+
+    Examples
+    --------
+    >>> needs = SceneNeeds((
+    ...     Effect("polarization", "built", "films before lights and camera"),
+    ...     Effect("ambient light", "absent", "the room is dark"),
+    ... ))
+    >>> needs.builds("polarization"), needs.left_out
+    (True, [('ambient light', 'the room is dark')])
+    """
+
+    effects: tuple[Effect, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse the same effect twice."""
+        names = [effect.name for effect in self.effects]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise NeedsError(f"effects: got {', '.join(twice)} twice, expected each once")
+
+    def __iter__(self) -> Iterator[Effect]:
+        """Iterate over the effects."""
+        return iter(self.effects)
+
+    def __getitem__(self, name: str) -> Effect:
+        """Return an effect by its name."""
+        for effect in self.effects:
+            if effect.name == name:
+                return effect
+        raise KeyError(name)
+
+    def builds(self, name: str) -> bool:
+        """Return whether an effect is built."""
+        return self[name].built
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """Return what is not built, with the reasons."""
+        return [(effect.name, effect.reason) for effect in self.effects if not effect.built]
+
+    def document(self) -> list[dict[str, str | float | None]]:
+        """Return this as JSON values."""
+        return [effect.document() for effect in self.effects]
+
+
+def decide(
+    name: str, over_noise: float, asked: bool | None, *, switch: str, because: str
+) -> Effect:
+    """Decide on an effect that a scene can build: as it was asked for, or by its size.
+
+    Parameters
+    ----------
+    name
+        Of the effect.
+    over_noise
+        Largest change of a pixel over its noise, as a rule tells it, >= 0.
+    asked
+        True builds it, False leaves it out, None decides by its size.
+    switch
+        Argument of the scene.
+    because
+        What the size follows from.
+
+    Examples
+    --------
+    >>> decide("bounces", 3.0, None, switch="bounces", because="hollows").verdict
+    'built'
+    >>> decide("bounces", 0.0, None, switch="bounces", because="all is flat").verdict
+    'negligible'
+    >>> decide("bounces", 3.0, False, switch="bounces", because="hollows").reason
+    'bounces=False asks for it; hollows: up to 3 times the noise'
+    """
+    if not over_noise >= 0.0:
+        raise NeedsError(f"{name}: over_noise: got {over_noise}, expected >= 0")
+    size = f"{because}: up to {over_noise:.3g} times the noise"
+    if asked is None:
+        verdict: Verdict = "built" if over_noise >= ENOUGH else "negligible"
+        return Effect(name, verdict, size, over_noise, switch)
+    if asked:
+        text = size if over_noise >= ENOUGH else f"{switch}=True asks for it; {size}"
+        return Effect(name, "built", text, over_noise, switch)
+    if over_noise < ENOUGH:
+        return Effect(name, "negligible", size, over_noise, switch)
+    return Effect(name, "asked", f"{switch}=False asks for it; {size}", over_noise, switch)
+
+
+def absent(reasons: Sequence[tuple[str, str]]) -> list[Effect]:
+    """Return effects that the simulated world has not, by name and reason."""
+    return [Effect(name, "absent", reason) for name, reason in reasons]
+
+
+def unmodeled(reasons: Sequence[tuple[str, str]]) -> list[Effect]:
+    """Return effects that the simulator cannot build, by name and reason."""
+    return [Effect(name, "unmodeled", reason) for name, reason in reasons]

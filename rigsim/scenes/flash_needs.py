@@ -1,0 +1,180 @@
+"""What the flash rig's pictures of a face or a target must hold, and what they need not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from capture.rig import Rig, View
+from model import spectra
+from rigsim.effect_sizes import bounced, defocus_px, edge_loss, exchange_share
+from rigsim.render import Caster
+from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
+from rigsim.scenes.skin_glow import typical_kernels
+from rigsim.skin_color import skin_color
+from rigsim.skin_table import SkinTable
+from rigsim.subject import Subject
+from rigsim.targets import Target
+
+LATERAL = "light spreading sideways in skin"
+BOUNCES = "light from skin to skin"
+SPECTRAL = "color of light from skin to skin, wavelength by wavelength"
+POLARIZATION = "polarization"
+SHADOWS = "shadows"
+
+OFF_FOCUS_MM = 60.0
+"""How far a face's relief stands off the plane in focus."""
+
+EVERY = 16
+"""Of the texels whose reflectance is looked at."""
+
+
+def flash_needs(
+    rig: Rig,
+    subject: Subject | Target,
+    state: str,
+    *,
+    caster: Caster,
+    noise: Noise,
+    white_level: float,
+    movement: bool,
+    lateral: bool | None,
+    interreflections: bool | None,
+    spectral: bool | None,
+    share: float | None = None,
+) -> SceneNeeds:
+    """Decide what a scene before the flash rig builds.
+
+    Parameters
+    ----------
+    rig
+        The rig; of several cameras the first decides.
+    subject, state
+        Who stands there, in which state.
+    caster
+        The mesh.
+    noise
+        Of the sensor.
+    white_level
+        What a white plate in the origin gives at power 1, full scales.
+    movement
+        Whether the face moves with its state.
+    lateral, interreflections, spectral
+        What is asked for; None lets the sizes decide.
+    share
+        `exchange_share` of the mesh, where it is known already.
+    """
+    view = rig.views[0]
+    films = [light.name for light in rig.lights if light.polarizer_axis_deg is not None]
+    made = [_polarization(rig, view, films), _bands(view)]
+    dark = [("ambient light", "the room is dark and the flash is short")]
+    if isinstance(subject, Target):
+        return SceneNeeds((*made, *_of_target(subject, caster), *absent(dark)))
+    skin = skin_color(view.spectral_sensitivity, rig.lights[0].illuminant)
+    covered = subject.atlas.covered
+    blood = subject.hemoglobin(state)
+    brightest = skin.rgb(subject.melanin[covered][::EVERY], blood[covered][::EVERY]).max(axis=0)
+    level = min(1.0, white_level * float(brightest.max()))
+    pixel_mm = view.distance_mm / view.focal_px
+    kernels = typical_kernels(subject, state, view.spectral_sensitivity, rig.lights[0].illuminant)
+    lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
+    share = exchange_share(caster) if share is None else share
+    more = level * bounced(share, float(brightest.max()))
+    unseen = more / float(noise.sigma(more))  # where nothing else shines
+    off = more * _color_error(subject, state, view, rig.lights[0].illuminant)
+    bounces = decide(
+        BOUNCES, unseen, interreflections, switch="interreflections",
+        because=f"hollows get {100 * share:.0f} % of what their surroundings send out",
+    )  # fmt: skip
+    made += [
+        Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0, level)),
+        decide(
+            LATERAL, noise.share(lost, level), lateral, switch="lateral",
+            because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost:.1f} % at a shadow's edge",
+        ),
+        bounces,
+        decide(
+            SPECTRAL, off / float(noise.sigma(more)) if bounces.built else 0.0, spectral,
+            switch="spectral",
+            because="a channel's mean of squares is not the square of its mean"
+            if bounces.built else "there is no such light",
+        ),
+    ]  # fmt: skip
+    return SceneNeeds((*made, *_movement(subject, movement), *absent(dark), *_limits(view)))
+
+
+def _polarization(rig: Rig, view: View, films: list[str]) -> Effect:
+    if films or view.analyser_axis_deg is not None:
+        what = f"films before {', '.join(films) or 'no light'}"
+        return Effect(POLARIZATION, "built", f"{what}, and an analyser that turns")
+    return Effect(POLARIZATION, "absent", "the rig has no polarizing film")
+
+
+def _bands(view: View) -> Effect:
+    name = "bands of the camera"
+    if view.cfa == "MONO":
+        return Effect(name, "built", "one: the sensor has no filters")
+    return Effect(name, "built", "three: those of the sensor's filters")
+
+
+def _of_target(target: Target, caster: Caster) -> list[Effect]:
+    """Return what flat targets need: no effect of depth."""
+    share = exchange_share(caster)
+    because = "the target is flat" if share == 0.0 else "the target has hollows"
+    size = 0.0 if share == 0.0 else float("inf")
+    return [
+        decide(SHADOWS, size, None, switch="", because=because),
+        decide(BOUNCES, size, None, switch="interreflections", because=because),
+        Effect(LATERAL, "absent", f"{target.name} is opaque"),
+    ]
+
+
+def _color_error(subject: Subject, state: str, view: View, illuminant: str) -> float:
+    """Return by how much a channel's mean of R^2 is off the square of its mean, of typical skin."""
+    table = SkinTable.load()
+    weights = spectra.band_weights(view.spectral_sensitivity, illuminant, table.wavelength_nm)
+    covered = subject.atlas.covered
+    blood = subject.hemoglobin(state)
+    skin = table.spectra(np.median(subject.melanin[covered]), np.median(blood[covered]))
+    return float(np.abs((skin**2 @ weights) / (skin @ weights) ** 2 - 1.0).max())
+
+
+def _movement(subject: Subject, movement: bool) -> list[Effect]:
+    name = "movement of the face with the states"
+    if not movement:
+        return [Effect(name, "asked", "movement=False asks for it", switch="movement")]
+    if subject.pose is None:
+        return [Effect(name, "absent", "at rest nothing moves", switch="movement")]
+    out = [Effect(name, "built", "the state moves the face", switch="movement")]
+    out += unmodeled(
+        [
+            ("shadows of wrinkles", "they tilt the surface only"),
+            ("parted lips and open eyes", "a mesh without an opening stretches instead"),
+        ]
+    )
+    if subject.pose.wrinkles.left_out:
+        zones = ", ".join(subject.pose.wrinkles.left_out)
+        out += unmodeled([(f"fine wrinkles ({zones})", "the texture's texels are too coarse")])
+    return out
+
+
+def _limits(view: View) -> list[Effect]:
+    blur = defocus_px(
+        OFF_FOCUS_MM, f_number=view.f_number, focal_mm=view.focal_mm,
+        distance_mm=view.distance_mm, pixel_um=view.pixel_um,
+    )  # fmt: skip
+    return [
+        *absent(
+            [("open eyes, teeth and hair on the head", "the subject has none; brows are matt")]
+        ),
+        *unmodeled(
+            [
+                (
+                    "depth of field and lens blur",
+                    f"at f/{view.f_number:g}, {OFF_FOCUS_MM:.0f} mm off focus: {blur:.1f} pixels",
+                ),
+                ("highlights of skin on skin", "only light from inside goes on to other skin"),
+                ("lateral kernels that vary over the face", "one profile, of its median skin"),
+                ("polarized single scattering", "light from inside is taken as depolarized"),
+            ]
+        ),
+    ]
