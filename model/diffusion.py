@@ -21,6 +21,9 @@ from model import fresnel
 
 FloatArray = NDArray[np.float64]
 
+LARGEST = 1e100
+"""Most of a coefficient, 1/mm, or a distance, mm: its cube is still a number."""
+
 
 class Slopes(NamedTuple):
     """A profile of reflectance and its derivatives, broadcast alike."""
@@ -44,9 +47,9 @@ def reflectance(
     Parameters
     ----------
     radius_mm
-        Distance from the beam, mm, at least 0; broadcast with the coefficients.
+        Distance from the beam, mm, 0 to 1e100; broadcast with the coefficients.
     sigma_a_per_mm, sigma_s_prime_per_mm
-        Absorption and reduced scattering, 1/mm, at least 0.
+        Absorption and reduced scattering, 1/mm, 0 to 1e100.
     eta
         Refractive index of the medium over that of its surroundings, at least 1.
 
@@ -59,7 +62,7 @@ def reflectance(
     Raises
     ------
     ValueError
-        For negative or non-finite arguments.
+        For arguments that are negative, not finite or above 1e100.
 
     Notes
     -----
@@ -91,7 +94,7 @@ def derivatives(
     >>> bool(np.all(slopes.by_sigma_a < 0.0))
     True
     """
-    rho, sigma_a, sigma_s = np.broadcast_arrays(
+    radius, absorption, scattering = np.broadcast_arrays(
         *(
             _not_negative(name, value)
             for name, value in (
@@ -102,34 +105,36 @@ def derivatives(
         )
     )
     c_phi, c_flux = exit_coefficients(eta)
-    scatters = sigma_s > 0.0
-    t = np.where(scatters, sigma_a + sigma_s, 1.0)
-    k = np.sqrt(3.0 * sigma_a * t)
-    z_1 = 1.0 / t
-    z_2 = z_1 * image_depth(eta)
+    scatters = scattering > 0.0
+    unit = np.where(scatters, absorption + scattering, 1.0)
+    # in transport lengths, so that no size of the medium overflows
+    rho = np.minimum(radius * unit, LARGEST)
+    sigma_a, sigma_s = absorption / unit, scattering / unit
+    k = np.sqrt(3.0 * sigma_a)
+    z_1, z_2 = 1.0, image_depth(eta)
     r_1, r_2 = np.hypot(rho, z_1), np.hypot(rho, z_2)
     e_1, e_2 = np.exp(-k * r_1), np.exp(-k * r_2)
     # Fluence 3 t (e_1/r_1 - e_2/r_2) and flux D dphi/dz, both over alpha'/(4 pi).
     f_1, f_2 = e_1 / r_1, e_2 / r_2
-    fluence = 3.0 * t * (f_1 - f_2)
+    fluence = 3.0 * (f_1 - f_2)
     h_1, h_2 = (1.0 + k * r_1) * f_1 / r_1**2, (1.0 + k * r_2) * f_2 / r_2**2
     flux = z_1 * h_1 + z_2 * h_2
     both = c_phi * fluence + c_flux * flux
     # (e_1 - e_2)/k, which stays finite without absorption
     apart = r_2 - r_1
     shared = e_1 * np.where(k > 0.0, -np.expm1(-k * apart) / np.where(k > 0.0, k, 1.0), apart)
-    by_k_over_k = c_phi * 3.0 * t * -shared - c_flux * (z_1 * f_1 + z_2 * f_2)
-    by_t = c_phi * fluence / t - c_flux * flux / t
+    by_k_over_k = c_phi * 3.0 * -shared - c_flux * (z_1 * f_1 + z_2 * f_2)
+    by_t = c_phi * fluence - c_flux * flux
     for sign, z, r, f in ((1.0, z_1, r_1, f_1), (-1.0, z_2, r_2, f_2)):
-        moved = -(z**2) / (r * t)  # dr/dt
-        by_t = by_t - sign * c_phi * 3.0 * t * f * (k + 1.0 / r) * moved
+        moved = -(z**2) / r  # dr/dt
+        by_t = by_t - sign * c_phi * 3.0 * f * (k + 1.0 / r) * moved
         by_t = by_t - c_flux * z * f * (k**2 + 3.0 * (1.0 + k * r) / r**2) * moved / r
-    albedo = sigma_s / t
     scale = np.where(scatters, 1.0 / (4.0 * np.pi), 0.0)
-    k_k_by_a, k_k_by_s = 1.5 * (t + sigma_a), 1.5 * sigma_a
-    by_a = albedo * (by_t + k_k_by_a * by_k_over_k - both / t)
-    by_s = albedo * (by_t + k_k_by_s * by_k_over_k) + both * sigma_a / t**2
-    return Slopes(*(np.asarray(scale * part) for part in (albedo * both, by_a, by_s)))
+    k_k_by_a, k_k_by_s = 1.5 * (1.0 + sigma_a), 1.5 * sigma_a
+    by_a = sigma_s * (by_t + k_k_by_a * by_k_over_k - both)
+    by_s = sigma_s * (by_t + k_k_by_s * by_k_over_k) + both * sigma_a
+    whole = (sigma_s * unit * both * unit, by_a * unit, by_s * unit)
+    return Slopes(*(np.asarray(scale * part) for part in whole))
 
 
 def exit_coefficients(eta: float) -> tuple[float, float]:
@@ -172,6 +177,8 @@ def image_depth(eta: float) -> float:
 
 def _not_negative(name: str, value: ArrayLike) -> FloatArray:
     array = np.asarray(value, dtype=np.float64)
-    if not np.all((array >= 0.0) & (array < np.inf)):
-        raise ValueError(f"{name}: got negative or non-finite values, expected at least 0")
+    if not np.all((array >= 0.0) & (array <= LARGEST)):
+        raise ValueError(
+            f"{name}: got negative, non-finite or too large values, expected 0 to {LARGEST:g}"
+        )
     return array

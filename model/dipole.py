@@ -18,6 +18,8 @@ from model import fresnel
 
 FloatArray = NDArray[np.float64]
 
+LARGEST = 1e100
+"""Most of a coefficient, 1/mm, or a distance, mm, of a profile: its cube is still a number."""
 _STEPS = 80  # bisection alone needs 60 for all digits; Newton steps are usually 5
 
 
@@ -36,9 +38,9 @@ def reflectance(
     Parameters
     ----------
     radius_mm
-        Distance from the beam, mm, at least 0; broadcast with the coefficients.
+        Distance from the beam, mm, 0 to 1e100; broadcast with the coefficients.
     sigma_a_per_mm, sigma_s_prime_per_mm
-        Absorption and reduced scattering, 1/mm, at least 0.
+        Absorption and reduced scattering, 1/mm, 0 to 1e100.
     eta
         Refractive index of the medium over that of its surroundings, at least 1.
 
@@ -51,7 +53,7 @@ def reflectance(
     Raises
     ------
     ValueError
-        For negative or non-finite arguments.
+        For arguments that are negative, not finite or above 1e100.
 
     Examples
     --------
@@ -60,7 +62,7 @@ def reflectance(
     """
     r, sigma_a, sigma_s = np.broadcast_arrays(
         *(
-            _not_negative(name, value)
+            _not_negative(name, value, most=LARGEST)
             for name, value in (
                 ("radius_mm", radius_mm),
                 ("sigma_a_per_mm", sigma_a_per_mm),
@@ -71,14 +73,15 @@ def reflectance(
     A = fresnel.boundary_factor(eta)
     scatters = sigma_s > 0.0
     sigma_t = np.where(scatters, sigma_a + sigma_s, 1.0)
-    sigma_tr = np.sqrt(3.0 * sigma_a * sigma_t)
-    z_r = 1.0 / sigma_t
-    z_v = z_r * (1.0 + 4.0 / 3.0 * A)
+    # in transport lengths, so that no size of the medium overflows
+    decay = np.sqrt(3.0 * (sigma_a / sigma_t))
+    far = np.minimum(r * sigma_t, LARGEST)
     profile = np.zeros(r.shape)
-    for z in (z_r, z_v):
-        d = np.hypot(r, z)
-        profile = profile + z * (1.0 + sigma_tr * d) * np.exp(-sigma_tr * d) / d**3
-    return np.asarray(np.where(scatters, sigma_s / sigma_t * profile / (4.0 * np.pi), 0.0))
+    for z in (1.0, 1.0 + 4.0 / 3.0 * A):
+        d = np.hypot(far, z)
+        profile = profile + z * (1.0 + decay * d) * np.exp(-decay * d) / d**3
+    per_area = sigma_s * sigma_t * profile / (4.0 * np.pi)
+    return np.asarray(np.where(scatters, per_area, 0.0))
 
 
 def total_reflectance(albedo_prime: ArrayLike, eta: float) -> FloatArray:
@@ -238,7 +241,7 @@ def effective_transport(sigma_a_per_mm: ArrayLike, sigma_s_prime_per_mm: ArrayLi
     """
     sigma_a = _not_negative("sigma_a_per_mm", sigma_a_per_mm)
     sigma_s = _not_negative("sigma_s_prime_per_mm", sigma_s_prime_per_mm)
-    return np.asarray(np.sqrt(3.0 * sigma_a * (sigma_a + sigma_s)))
+    return np.asarray(np.sqrt(3.0 * sigma_a) * np.sqrt(sigma_a + sigma_s))
 
 
 def _survival(q: FloatArray, eta: float) -> FloatArray:
@@ -285,8 +288,11 @@ def _in_unit(name: str, value: ArrayLike) -> FloatArray:
     return array
 
 
-def _not_negative(name: str, value: ArrayLike) -> FloatArray:
+def _not_negative(name: str, value: ArrayLike, *, most: float = np.inf) -> FloatArray:
     array = np.asarray(value, dtype=np.float64)
-    if not np.all((array >= 0.0) & (array < np.inf)):
-        raise ValueError(f"{name}: got negative or non-finite values, expected at least 0")
+    if not np.all((array >= 0.0) & (array <= most) & (array < np.inf)):
+        limit = "" if most == np.inf else f" and at most {most:g}"
+        raise ValueError(
+            f"{name}: got negative, non-finite or too large values, expected at least 0{limit}"
+        )
     return array

@@ -105,7 +105,8 @@ def profile(radius_mm: ArrayLike, media: Media) -> FloatArray:
     for z in (media.depth_mm, media.height_mm):
         d = np.maximum(np.hypot(r, z), 1e-300)
         x = media.sigma_tr_per_mm * d
-        total = total + z / d * (1.0 + x) * np.exp(-x) / d**2
+        # one by one: the square of a distance of 0 would be lost
+        total = total + z / d * (1.0 + x) * np.exp(-x) / d / d
     return np.asarray(media.scale * total / (2.0 * np.pi))
 
 

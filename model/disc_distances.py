@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
+_POINT = 1e-6  # cores below this part of the largest length are points
 _NEAR, _FAR = 3.0, 10.0  # centre distances over the sum of core radii at which fewer nodes do
 _NODES = (8, 5, 3)  # relative error below 1e-5 for the profiles of tissue: see the tests
 _RINGS, _ANGLES = 48, 96
@@ -53,18 +54,27 @@ def distance_rule(
     ):
         if not 0.0 <= value < np.inf:
             raise ValueError(f"{name}: got {value}, expected a finite length of at least 0")
-    a, b = 0.5 * core_mm, 0.5 * source_core_mm
+    # squares of lengths in a unit near the largest neither vanish nor overflow; by a power of two
+    # no digit changes
+    exponent = int(np.frexp(max(radius_mm, core_mm, source_core_mm))[1])
+    radius, core, source = (
+        float(np.ldexp(length, -exponent)) for length in (radius_mm, core_mm, source_core_mm)
+    )
+    a, b = 0.5 * core, 0.5 * source
+    # its share of a squared distance, 1e-12, is lost in the recurrence of the Gauss rule
+    least = _POINT * max(radius, a, b)
+    a, b = (0.0 if half < least else half for half in (a, b))
     reach = a + b
     if reach == 0.0:
         return np.array([radius_mm]), np.array([1.0])
-    count = _NODES[int(radius_mm > _NEAR * reach) + int(radius_mm > _FAR * reach)]
+    count = _NODES[int(radius > _NEAR * reach) + int(radius > _FAR * reach)]
     offset, offset_weight = _offsets(a, b)
     angle = np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES
-    across = radius_mm + offset[:, None] * np.cos(angle)
+    across = radius + offset[:, None] * np.cos(angle)
     distance = np.hypot(across, offset[:, None] * np.sin(angle)).ravel()
     weight = np.repeat(offset_weight / _ANGLES, _ANGLES)
     node, node_weight = _gauss(distance, weight / distance, count)
-    return node, node_weight * node
+    return np.ldexp(node, exponent), node_weight * node
 
 
 def distance_rules(
