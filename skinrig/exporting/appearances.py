@@ -35,11 +35,18 @@ def _gltf() -> Write:
     return gltf.write
 
 
+def _usd() -> Write:
+    from skinrig.exporting import usd
+
+    return usd.write
+
+
 # each format imports its own libraries only
 FORMATS: Final[Mapping[str, Callable[[], Write]]] = {
     "maps": _maps,
     "mtlx": _materialx,
     "gltf": _gltf,
+    "usd": _usd,
 }
 
 

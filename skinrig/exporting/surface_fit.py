@@ -1,8 +1,8 @@
 """The nearest single GGX lobe to a mixture of tabulated lobes: what materials have a place for.
 
-Least squares over the directions of the lobes' grid up to half angles of 60 degrees between light
-and view, each counting by its solid angle and both cosines over the mean lobe there, so that neither
-the peak nor the tail decides alone. All sums are
+Least squares over the directions of the lobes' grid up to 60 degrees of half angle between light
+and view, each counting by its solid angle and both cosines over the mean lobe there: neither the
+peak nor the tail decides alone. All sums are
 those of K lobes: a texel costs K^2 products, whatever its mixture.
 """
 
