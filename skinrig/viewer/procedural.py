@@ -1,14 +1,27 @@
-"""The procedural head: a simulated person, needing no file at all."""
+"""Simulated faces: the procedural head, needing no file at all, or another mesh grown a skin."""
 
 from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from skinrig.viewer.assembling import assemble
-from skinrig.viewer.scene import SceneSource, ViewerMesh, ViewerScene
+from skinrig.viewer.scene import LARGEST_TEXTURE, SceneError, SceneSource, ViewerMesh, ViewerScene
+
+if TYPE_CHECKING:
+    from rigsim.mesh import Mesh
+    from rigsim.subject import Subject
+
+PRESET = "III"
+"""Skin type of faces of whom nothing else is known."""
+SMALLEST = 64
 
 
-def scene(*, preset: str = "III", size: int = 2048, seed: int = 0) -> ViewerScene:
+def scene(
+    *, preset: str = PRESET, size: int = 2048, seed: int = 0, mesh: Path | None = None
+) -> ViewerScene:
     """Return the scene of a simulated person.
 
     Parameters
@@ -19,19 +32,73 @@ def scene(*, preset: str = "III", size: int = 2048, seed: int = 0) -> ViewerScen
         Texels a side of the textures, 64 to 4096.
     seed
         Of the person.
+    mesh
+        A face to grow the skin on instead of the procedural head; see `load_mesh`.
+
+    Raises
+    ------
+    SceneError
+        For a size out of range.
+    rigsim.subject.SubjectError, rigsim.mesh.MeshError, skinrig.blend_shapes.BlendShapeError
+        For a preset, seed or mesh that cannot be used.
     """
+    check_size(size)
+    surface = None if mesh is None else load_mesh(mesh)
+    subject = simulated(surface, preset=preset, size=size, seed=seed)
+    source = SceneSource(
+        "procedural" if mesh is None else "mesh",
+        viewer_mesh(subject),
+        size,
+        seed=seed,
+        subject=subject,
+    )
+    provenance = {"source": "simulated", "kind": source.kind, "preset": preset, "seed": seed}
+    if mesh is not None:
+        provenance["mesh"] = mesh.name
+    return assemble(source, provenance=provenance)
+
+
+def check_size(size: int) -> None:
+    """Refuse a texture size that no page can hold."""
+    if not SMALLEST <= size <= LARGEST_TEXTURE:
+        raise SceneError(f"size: got {size}, expected {SMALLEST} to {LARGEST_TEXTURE} texels")
+
+
+def simulated(mesh: Mesh | None, *, preset: str, size: int, seed: int) -> Subject:
+    """Return the simulated person that wears a mesh, or the procedural head."""
     from rigsim.subject import make_subject
 
-    subject = make_subject(preset, seed=seed, size=size)
-    mesh = ViewerMesh(
+    return make_subject(preset, seed=seed, size=size, mesh=mesh)
+
+
+def load_mesh(path: Path) -> Mesh:
+    """Return a face mesh of a file with or without blend shapes, in place of the procedural head.
+
+    Parameters
+    ----------
+    path
+        .npz, .obj (or a folder of them), .gltf or .glb, see `skinrig.blend_shapes.load`. The face
+        looks towards +z, and its foremost vertex is the tip of the nose.
+    """
+    from rigsim.mesh import build_mesh, centered
+    from skinrig import blend_shapes
+
+    loaded = blend_shapes.load(path)
+    if loaded.uv.min() < 0.0 or loaded.uv.max() > 1.0:
+        raise SceneError(
+            f"{path}: texture coordinates reach from {loaded.uv.min():g} to {loaded.uv.max():g}, "
+            "expected 0 to 1; export the tile of the face alone"
+        )
+    return centered(build_mesh(loaded.vertices_mm, loaded.faces, loaded.uv, shapes=loaded.shapes))
+
+
+def viewer_mesh(subject: Subject) -> ViewerMesh:
+    """Return a person's mesh; its own blend shapes come behind those of the expressions."""
+    own = {n: d for n, d in subject.mesh.shapes.items() if np.any(d)}
+    return ViewerMesh(
         positions=subject.mesh.vertices_mm,
         normals=subject.mesh.normals,
         uv=subject.mesh.uv,
         faces=subject.mesh.faces.astype(np.int32),
-        shapes=subject.blend_shapes(),
-    )
-    source = SceneSource("procedural", mesh, size, seed=seed, subject=subject)
-    return assemble(
-        source,
-        provenance={"source": "simulated", "kind": "procedural", "preset": preset, "seed": seed},
+        shapes={**subject.blend_shapes(), **own},
     )

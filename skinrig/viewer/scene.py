@@ -143,6 +143,8 @@ class SceneSource:
         Fitted folders by kind: "dynamic" (facial color, wrinkles, microstructure), "dome", "model".
     paths
         Those folders.
+    landmarks
+        Table of named points of the picture that the flash rig's maps are drawn on.
     """
 
     kind: Kind
@@ -152,6 +154,7 @@ class SceneSource:
     subject: Subject | None = None
     appearances: Mapping[str, SkinAppearance] = field(default_factory=dict)
     paths: Mapping[str, Path] = field(default_factory=dict)
+    landmarks: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,28 +1,43 @@
-"""The static surface: slopes of pores and lines, roughness and strength of the reflection."""
+"""The static surface: relief of pores and lines, roughness and strength of the reflection."""
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
-from skinrig.viewer.facial_color_assets import filled
+from skinrig.viewer.facial_color_assets import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
+
+MAPS_SIZE: Final = 256
+"""Most texels a side of roughness and intensity, which vary by region."""
+BECKMANN_PER_GGX: Final = 1.0
+"""Beckmann's m of the same curvature of the peak as GGX's alpha (both are 1/(pi a^2) high)."""
 
 
 def assets(source: SceneSource) -> Assets:
-    """Return slopes of the relief at rest, and the surface's roughness, of a simulated face."""
+    """Return the relief at rest, um, and roughness (Beckmann m) and intensity by region."""
     subject = source.subject
     if subject is None:
         return {"left_out": (("relief", "nothing of the surface was measured"),)}
     covered = subject.atlas.covered
-    normal = subject.tangent_normal().astype(np.float64)
-    slopes = -normal[..., :2] / np.maximum(normal[..., 2:], 0.2)
-    slopes = np.stack([filled(slopes[..., c], covered) for c in range(2)], axis=-1)
-    step = max(1, subject.size // 256)
-    roughness = filled(subject.roughness, covered)[::step, ::step]
-    maps = np.stack([roughness, np.ones_like(roughness)], axis=-1)
+    height = filled(subject.height_um, covered)[..., None]
+    roughness = BECKMANN_PER_GGX * halved(filled(subject.roughness, covered), MAPS_SIZE)
+    # hair hides the skin's gloss, as the subject's own renderings have it
+    intensity = 1.0 - halved(filled(subject.hair, covered), MAPS_SIZE)
+    maps = np.stack([roughness, intensity], axis=-1)
+    left_out = ()
+    if source.kind in ("dynamic", "dome", "model"):
+        left_out = (
+            (
+                "pores and roughness of this face",
+                "what is drawn of them is simulated; the analytic reflection uses it",
+            ),
+        )
     return {
         "textures": {
-            "relief_slopes": Texture(slopes.astype(np.float32), "u8"),
+            "relief_height": Texture(height.astype(np.float32), "u8", "mipmap"),
             "surface_maps": Texture(maps.astype(np.float32), "u8"),
-        }
+        },
+        "left_out": left_out,
     }

@@ -35,7 +35,17 @@ vec3 skinColorOf(float melanin, float hemoglobin) {
   return max(table_skin_color((at * (TABLE_SIZE - 1.0) + 0.5) / TABLE_SIZE).rgb, 0.0);
 }
 vec3 skinAlbedo(vec2 uv) {
-  return skinColorOf(melaninFraction(uv), blendHemoglobin(uv));
+  float melanin = melaninFraction(uv);
+  vec3 color = skinColorOf(melanin, blendHemoglobin(uv));
+#ifdef HAS_albedo_map
+  // a measured albedo changes as the modeled color does
+  float root = sample_chromophores(uv).r;
+  color *= sample_albedo_map(uv).rgb / skinColorOf(root * root * root, neutralHemoglobin(uv));
+#endif
+#ifdef HAS_albedo_factor
+  color *= buffer_albedo_factor(uv).rgb;
+#endif
+  return color;
 }
 //@chunk color_uv_fragment
 layout(location = 0) out vec4 o_chromophores;

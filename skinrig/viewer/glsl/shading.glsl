@@ -18,9 +18,23 @@ vec3 tilted(SurfacePoint s, vec2 slope) {
   return normalize(s.normal - slope.x * s.tangent - slope.y * s.bitangent);
 }
 //@chunk static_relief
-vec2 staticSlope(vec2 uv) {
-#ifdef HAS_relief_slopes
-  return p_relief * sample_relief_slopes(uv).rg;
+// Slopes of the relief at rest on the surface as it is now: stretched skin has flatter relief.
+vec2 staticSlope(SurfacePoint s, vec3 du, vec3 dv) {
+#ifdef HAS_relief_height
+  vec2 texel = 1.0 / vec2(textureSize(t_relief_height, 0));
+  float left = sample_relief_height(s.uv - vec2(texel.x, 0.0)).r;
+  float right = sample_relief_height(s.uv + vec2(texel.x, 0.0)).r;
+  float below = sample_relief_height(s.uv - vec2(0.0, texel.y)).r;
+  float above = sample_relief_height(s.uv + vec2(0.0, texel.y)).r;
+  vec2 change = 0.5e-3 * vec2(right - left, above - below) / texel;  // mm per unit of u and v
+  float e = dot(du, du);
+  float f = dot(du, dv);
+  float g = dot(dv, dv);
+  float determinant = e * g - f * f;
+  if (determinant <= 1e-9 * max(e, g) * max(e, g)) return vec2(0.0);
+  vec3 gradient = ((g * change.x - f * change.y) * du + (e * change.y - f * change.x) * dv)
+    / determinant;
+  return p_relief * vec2(dot(gradient, s.tangent), dot(gradient, s.bitangent));
 #else
   return vec2(0.0);
 #endif
@@ -57,7 +71,7 @@ void main() {
   if (dot(s.bitangent, v_bitangent) < 0.0) s.bitangent = -s.bitangent;
   s.toLight = u_to_light;
   s.toEye = normalize(u_eye - v_position);
-  s.slope = surfaceSlope(v_uv);
+  s.slope = staticSlope(s, v_tangent, v_bitangent) + surfaceSlope(v_uv);
   vec3 n = tilted(s, s.slope);
   s.diffuseNormals = mat3(n, n, n);
   s.specularNormal = n;
@@ -73,6 +87,9 @@ void main() {
   vec3 irradiance = p_light_intensity * cosines + p_ambient * (0.6 + 0.4 * s.normal.y);
   o_irradiance = vec4(irradiance, v_depth);
   o_albedo = vec4(skinAlbedo(v_uv), 1.0);
+#ifdef HAS_albedo_factor
+  o_albedo.rgb *= buffer_albedo_factor(v_uv).rgb;
+#endif
   float facing = clamp(dot(s.specularNormal, s.toLight), 0.0, 1.0);
   o_specular = vec4(PI * p_light_intensity * facing * s.intensity * surfaceSpecular(s),
     surfaceWidth(v_uv));

@@ -33,7 +33,7 @@ V.start.push(() => {
   }
   const {width, height} = V.scene.textures.chromophores;
   V.passes.push({
-    name: "color_uv", after: ["hemoglobin_rig"], demanded: true, key: V.colorKey,
+    name: "color_uv", after: ["hemoglobin_rig", "albedo_traits"], demanded: true, key: V.colorKey,
     targets: () => ({
       chromophores: {format: "RGBA32F", size: [width, height], space: "uv"},
       color: {format: "RGBA32F", size: [width, height], space: "uv"},

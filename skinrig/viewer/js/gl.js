@@ -77,7 +77,8 @@ V.program = (vertex, fragment, defines = {}) => {
 V.ATTRIBUTES = {a_position: 0, a_normal: 1, a_uv: 2, a_tangent: 3, a_bitangent: 4, a_rest: 5};
 
 V.knownNames = () => [
-  ...Object.keys(V.scene.textures), ...Object.keys(V.scene.tables), ...V.bufferNames(V.params),
+  ...Object.keys(V.scene.textures), ...Object.keys(V.scene.tables),
+  ...V.passes.flatMap(pass => Object.keys(pass.targets(V.params))),
 ];
 
 // Declarations of the protocol's names that a text uses.

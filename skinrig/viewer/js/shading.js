@@ -12,8 +12,8 @@ Object.assign(V.defaults, {
 //   width      name of `float f(vec2 uv)`: how much wider than the profile light spreads, or null
 //   after      passes whose buffers they read; key(p): what else they depend on
 V.surface = {
-  chunks: ["static_relief"], defines: {}, slopes: ["staticSlope"], adjust: [],
-  specular: {analytic: "analyticSpecular"}, width: null, after: ["hemoglobin_rig"], keys: [],
+  chunks: ["static_relief"], defines: {}, slopes: [], adjust: [],
+  specular: {analytic: "analyticSpecular"}, width: null, after: ["hemoglobin_rig", "albedo_traits"], keys: [],
 };
 
 V.surfaceDefines = () => ({PI: "3.14159265358979", ...V.colorDefines(), ...V.surface.defines});
@@ -73,7 +73,7 @@ V.start.push(() => {
     cost: () => ({taps: 8 * V.screen()[0] * V.screen()[1], bytes: 32 * V.screen()[0] * V.screen()[1]}),
   });
   V.passes.push({
-    name: "inspect", after: ["hemoglobin_rig"], depth: true, demanded: true,
+    name: "inspect", after: ["hemoglobin_rig", "albedo_traits"], depth: true, demanded: true,
     key: p => [V.meshKey(p), V.colorKey(p)].join(),
     targets: () => ({
       inspect: {format: "RGBA32F", size: V.screen(), space: "screen", filter: "nearest"},

@@ -1,0 +1,161 @@
+"""Faces that were captured: moving faces of the flash rig, the dome's maps with their mesh.
+
+What a folder does not hold is simulated on its mesh, and the scene says so.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from model import skin_reflectance, store
+from model.skin import SkinAppearance
+from skinrig import dynamic_appearance
+from skinrig.viewer import procedural
+from skinrig.viewer.assembling import assemble
+from skinrig.viewer.scene import SceneError, SceneSource, ViewerScene
+
+if TYPE_CHECKING:
+    from rigsim.mesh import Mesh
+
+MESH: Final = "mesh.obj"
+ALBEDO: Final = "r_d"
+
+
+def scene(
+    paths: Sequence[Path],
+    *,
+    mesh: Path | None = None,
+    landmarks: Path | None = None,
+    size: int = 2048,
+) -> ViewerScene:
+    """Return the scene of fitted folders.
+
+    Parameters
+    ----------
+    paths
+        Folders of `skinrig reconstruct` (dome) or `skinrig fit`, one of a kind.
+    mesh
+        The face they belong to; None: the mesh that a folder holds, else the procedural head.
+    landmarks
+        Table ``name,x,y`` of the neutral picture that the flash rig's maps are drawn on; None: a
+        simulation's own, from its TRUTH/ folder beside.
+    size
+        Texels a side of the large textures.
+
+    Raises
+    ------
+    SceneError
+        A folder of a kind that cannot be shown, two of one kind, or no landmarks.
+    model.store.StoreError
+        A folder that cannot be read.
+    """
+    procedural.check_size(size)
+    appearances: dict[str, SkinAppearance] = {}
+    folders: dict[str, Path] = {}
+    for path in paths:
+        appearance = store.read(path)
+        kind = kind_of(path, appearance)
+        if kind in folders:
+            raise SceneError(f"{path}: {folders[kind]} is of the same kind ({kind}); show one")
+        appearances[kind], folders[kind] = appearance, path
+    surface, told = _mesh(appearances, mesh)
+    first = next(iter(appearances.values()))
+    seed = first.seed if isinstance(first.seed, int) and first.seed >= 0 else 0
+    subject = procedural.simulated(surface, preset=procedural.PRESET, size=size, seed=seed)
+    kind = next(name for name in ("model", "dome", "dynamic") if name in appearances)
+    source = SceneSource(
+        kind,  # type: ignore[arg-type]
+        procedural.viewer_mesh(subject),
+        size,
+        seed=seed,
+        subject=subject,
+        appearances=appearances,
+        paths=folders,
+        landmarks=landmarks,
+    )
+    left_out = [
+        (
+            "expressions of this face",
+            "its movement was not captured: the blend shapes are those of the file, or simulated "
+            "action units",
+        )
+    ]
+    if surface is None:
+        left_out.insert(0, ("geometry of this face", f"{told}; --mesh FILE shows another"))
+    found = assemble(
+        source,
+        provenance={
+            "source": " and ".join(sorted({one.source for one in appearances.values()})),
+            "kind": source.kind,
+            "appearances": [path.name for path in paths],
+            "mesh": told,
+        },
+    )
+    return found.with_assets({"left_out": tuple(left_out)})
+
+
+def kind_of(path: Path, appearance: SkinAppearance) -> str:
+    """Return "dynamic", "dome" or "model".
+
+    Raises
+    ------
+    SceneError
+        Nothing of it can be drawn on a face.
+    """
+    if dynamic_appearance.parts_of(appearance):
+        return "dynamic"
+    if skin_reflectance.BASIS_FILE in appearance.files and "reflectance_model" in (
+        appearance.parameters
+    ):
+        return "model"
+    if MESH in appearance.files and ALBEDO in appearance.maps:
+        return "dome"
+    raise SceneError(
+        f"{path}: holds {', '.join(sorted(appearance.maps)) or 'no maps'}, expected a moving face "
+        "(`skinrig fit facial-color`, `wrinkles` or `microstructure`), or a dome's maps with "
+        f"{ALBEDO} and {MESH}"
+    )
+
+
+def _mesh(appearances: dict[str, SkinAppearance], asked: Path | None) -> tuple[Mesh | None, str]:
+    """Return the mesh to show, None for the procedural head, and words for it."""
+    if asked is not None:
+        return procedural.load_mesh(asked), asked.name
+    for kind in ("model", "dome"):
+        appearance = appearances.get(kind)
+        if appearance is not None and MESH in appearance.files:
+            from rigsim.mesh import load_mesh
+
+            with tempfile.TemporaryDirectory() as folder:
+                copy = Path(folder) / MESH
+                copy.write_bytes(appearance.files[MESH])
+                return load_mesh(copy), f"{MESH} of the {kind}"
+    return None, "the procedural head stands for the face"
+
+
+def picture_landmarks(source: SceneSource, part: dict[str, Any]) -> dict[str, tuple[float, float]]:
+    """Return named points of the neutral picture that the flash rig's maps are drawn on, px.
+
+    Raises
+    ------
+    SceneError
+        There is no table, and no simulation's truth beside the folder.
+    """
+    from reconstruction import landmark_table
+
+    if source.landmarks is not None:
+        return landmark_table.read(source.landmarks)
+    name = (part.get("truth") or {}).get("neutral")
+    if isinstance(name, str):
+        folder = source.paths["dynamic"].resolve().parent / Path(name).name
+        if (folder / store.DOCUMENT).is_file():
+            points = store.read_document(folder).parameters.get("landmarks_px")
+            if isinstance(points, dict):
+                return {key: (float(x), float(y)) for key, (x, y) in points.items()}
+    raise SceneError(
+        f"{source.paths['dynamic']}: its maps are drawn on a picture, and nothing says where that "
+        "lies on the mesh; give --landmarks FILE, a table name,x,y of the neutral picture"
+    )
