@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final
+from typing import Any, Final
 
-import click
 from typer.core import TyperGroup
 
 SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
@@ -22,13 +21,13 @@ OTHER: Final = "More"
 class Commands(TyperGroup):
     """A group that lists its commands under the headings of `SECTIONS`, nothing cut off."""
 
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the headings and the commands below them."""
         for title, rows in self._sections(ctx):
             with formatter.section(title):
                 formatter.write_dl(rows)
 
-    def _sections(self, ctx: click.Context) -> Iterator[tuple[str, list[tuple[str, str]]]]:
+    def _sections(self, ctx: Any) -> Iterator[tuple[str, list[tuple[str, str]]]]:
         left = {
             name: command
             for name in self.list_commands(ctx)
@@ -45,14 +44,14 @@ class Commands(TyperGroup):
 class Subcommands(TyperGroup):
     """A group within the group: one list, nothing cut off."""
 
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands with their whole summaries."""
         found = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
             formatter.write_dl([(name, summary(one)) for name, one in found if one is not None])
 
 
-def summary(command: click.Command) -> str:
+def summary(command: Any) -> str:
     """Return the first paragraph of a command's help on one line, without its full stop."""
     text = (command.short_help or command.help or "").split("\n\n")[0]
     return " ".join(text.split()).rstrip(".")
