@@ -16,7 +16,7 @@ from model.wrinkle_expressions import clamped, zone_sums
 from model.wrinkle_model import FILE as WRINKLE_FILE
 from model.wrinkle_model import WrinkleModel
 from skinrig import facial_color_evaluation as evaluation
-from skinrig import figures, page
+from skinrig import figures, map_pictures, page
 from skinrig.applying import colors, hemoglobin_rig
 from skinrig.dynamic_appearance import FACIAL_COLOR, KIND, MICROSTRUCTURE, WRINKLES, parts_of
 
@@ -74,7 +74,7 @@ def _facial_color(
 ) -> str:
     rig = hemoglobin_rig(appearance)
     body = (
-        "<h3>Hemoglobin rig</h3><p class=note>Each state is a scale and a bias of the neutral "
+        "<h3>Hemoglobin rig</h3><p class='note'>Each state is a scale and a bias of the neutral "
         f"map, over discs of {rig.radius_px:.1f} px; a blend is an affine combination.</p>"
     )
     body += _blends(appearance, rig)
@@ -109,7 +109,7 @@ def _facial_color(
             continue
         blend = rig.evaluate({state: 1.0})
         seen = blend.valid if true is None or true.valid is None else blend.valid & true.valid
-        body += page.map_panel(
+        body += map_pictures.map_panel(
             f"blood of {state}, by the rig", "volume fraction",
             estimate=np.where(blend.valid, blend.hemoglobin, 0.0),
             standard_error=np.where(blend.valid, blend.stderr, 0.0),
@@ -160,9 +160,9 @@ def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> str:
         blend = rig.evaluate(weights)
         seen = blend.valid if melanin.valid is None else blend.valid & melanin.valid
         color = colors(melanin.values, np.where(seen, blend.hemoglobin, 0.0), seen)
-        pictures += page.color_picture(title, color, width=WIDTH_PX)
+        pictures += map_pictures.color_picture(title, color, width=WIDTH_PX)
     return (
-        f"<div class=maps>{pictures}</div><p class=note>Diffuse color without shading, linear "
+        f"<div class='maps'>{pictures}</div><p class='note'>Diffuse color without shading, linear "
         "sRGB under D65.</p>"
     )
 
@@ -192,6 +192,7 @@ def _errors(
              100 * row.bias, 100 * row.coverage, row.pixels)
             for row in states
         ],
+        caption="Against the true blood of each state, by way of getting it",
     )  # fmt: skip
     body += page.table(
         ("state", "true change, points", "found, points", "rms of the map, points",
@@ -212,7 +213,7 @@ def _errors(
         for way in evaluation.WAYS
     }  # fmt: skip
     plot = figures.bars("median error of a state's blood", labels, series, unit="%")
-    return body + f"<div class=plots>{plot}</div>"
+    return body + f"<div class='plots'>{plot}</div>"
 
 
 def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
@@ -220,12 +221,15 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
     layer = model.layers[0]
     masks = np.moveaxis(np.asarray(layer.masks, float), 0, 2)
     tints = ZONE_COLORS[np.arange(masks.shape[2]) % len(ZONE_COLORS)]
-    pictures = page.color_picture("zones", masks @ tints, width=WIDTH_PX)
-    pictures += page.plain_picture("wrinkle map", _normals_rgb(layer.wrinkle))
+    pictures = map_pictures.color_picture("zones", masks @ tints, width=WIDTH_PX)
+    relief = _normals(layer.wrinkle)
+    pictures += map_pictures.normal_picture(
+        "wrinkle map", relief, valid=np.ones(relief.shape[:2], bool), width=WIDTH_PX
+    )
     for name in list(part["expressions"])[:SHOWN]:
         shown = model.evaluate({name: 1.0}).normals
-        pictures += page.plain_picture(
-            f"normals, {name}", page.shrink(_rgb(shown), WIDTH_PX).astype(np.uint8)
+        pictures += map_pictures.normal_picture(
+            f"normals, {name}", shown, valid=np.ones(shown.shape[:2], bool), width=WIDTH_PX
         )
     table: Any = layer.table
     rows = []
@@ -244,26 +248,20 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
     sums = zone_sums(together, table)
     clamps = [(clamp, *(float(v) for v in clamped(sums, clamp))) for clamp in ("unit", "signed")]
     return (
-        f"<h3>Wrinkles</h3><div class=maps>{pictures}</div>"
+        f"<h3>Wrinkles</h3><div class='maps'>{pictures}</div>"
         + page.table(("expression", *table.zones), rows, caption="Weights (standard error)")
         + page.table(
             ("clamp", *table.zones), clamps, caption=f"{' + '.join(together)}: zones' sums"
         )
-        + f"<p class=note>Map and zones explain {100 * part['explained']:.0f} % of the "
+        + f"<p class='note'>Map and zones explain {100 * part['explained']:.0f} % of the "
         "differences between expressions and neutral.</p>"
     )
 
 
-def _normals_rgb(derivatives: Any) -> NDArray[np.uint8]:
+def _normals(derivatives: Any) -> NDArray[np.float64]:
     values = np.asarray(derivatives, float)
     small = np.concatenate([values, np.ones((*values.shape[:2], 1))], axis=2)
-    unit = small / np.linalg.norm(small, axis=2, keepdims=True)
-    return np.asarray(page.shrink(_rgb(unit), WIDTH_PX), np.uint8)
-
-
-def _rgb(normals: Any) -> NDArray[np.uint8]:
-    """Return normals as the usual colors: x red, y green, z blue."""
-    return np.clip(127.5 + 127.5 * np.asarray(normals, float), 0, 255).astype(np.uint8)
+    return np.asarray(small / np.linalg.norm(small, axis=2, keepdims=True))
 
 
 def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
@@ -277,7 +275,7 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
         sigmas.append(figures.Curve(site, r.tolist(), sigma_um.tolist(), marks=False))
         relief = appearance.maps[entry["map"]]
         spread = 2.5 * float(np.std(relief.values[_valid(relief)]))
-        pictures += page.scalar_picture(
+        pictures += map_pictures.scalar_picture(
             f"{site}: neutral relief", relief.values, low=-spread, high=spread, scale="gray",
             valid=relief.valid, unit="um", width=WIDTH_PX,
         )  # fmt: skip
@@ -288,8 +286,12 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
     plots = figures.curves("strength", "stretch ratio", "alpha", alphas)
     plots += figures.curves("width", "stretch ratio", "sigma, um", sigmas)
     return (
-        f"<h3>Microstructure</h3><div class=maps>{pictures}</div><div class=plots>{plots}</div>"
-        + page.table(("site", "pixel, um", "kernels fitted", "stretch", "table from"), rows)
+        f"<h3>Microstructure</h3><div class='maps'>{pictures}</div><div class='plots'>{plots}</div>"
+        + page.table(
+            ("site", "pixel, um", "kernels fitted", "stretch", "table from"),
+            rows,
+            caption="Sites with microstructure",
+        )
     )
 
 

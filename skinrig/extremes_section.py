@@ -67,5 +67,7 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
         for case in cases
     ]  # fmt: skip
     return "<h2>Stiff and extreme cases</h2>" + page.table(
-        ("stage", "case", "extreme", "why it can break", "expected", *PRECISIONS), rows
+        ("stage", "case", "extreme", "why it can break", "expected", *PRECISIONS),
+        rows,
+        caption=f"{len(cases)} cases in both precisions, {failed or 'none'} failed",
     )

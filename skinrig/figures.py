@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from skinrig import svg
 
 _COLORS = ("#2a78b8", "#d1602c", "#3f8f4f", "#8458a8")
 
@@ -31,14 +32,30 @@ def _figure(width_in: float, height_in: float) -> tuple[Any, Any]:
     return figure, axes
 
 
-def _svg(figure: Any) -> str:
+def _svg(figure: Any, alt: str) -> str:
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
-    # black becomes the text color of the page, so that dark mode stays readable
-    text = text[text.index("<svg") :].replace("#000000", "currentColor")
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    return text.replace("<svg ", '<svg aria-hidden="true" ', 1)
+    return svg.simplified(buffer.getvalue(), alt=alt)
+
+
+def _plain_numbers(*log_axes: Any) -> None:
+    """Label decades by plain numbers, and what lies between them where decades are too few."""
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    for axis in log_axes:
+        low, high = axis.get_view_interval()
+        plain = FuncFormatter(lambda value, _: f"{value:g}")
+        axis.set_major_formatter(plain)
+        few = high < 30.0 * low
+        some = FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
+        axis.set_minor_formatter(some if few else NullFormatter())
+        axis.set_tick_params(which="minor", labelsize=7)
+
+
+def _span(values: NDArray[np.floating]) -> str:
+    """Return the ends of what is finite, as words."""
+    finite = values[np.isfinite(values)]
+    return f"{finite.min():.3g} to {finite.max():.3g}" if finite.size else "none"
 
 
 def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
@@ -54,9 +71,9 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     Returns
     -------
     str
-        SVG. The Pareto front of each condition is joined, in a color of its own, and its points
-        are labelled with their effort; others are hollow. Knees have a ring, and the Cramer-Rao
-        bound a dash where it is known.
+        An image with a name, as SVG. The Pareto front of each condition is joined, in a color of
+        its own, and its points are labelled with their effort; others are hollow. Knees have a
+        ring, and the Cramer-Rao bound a dash where it is known.
     """
     figure, axes = _figure(5.2, 3.4)
     points, fronts = document["points"], document["fronts"]
@@ -105,7 +122,7 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     bounds = np.array([p.get("cramer_rao_bound") or np.nan for p in points], float)
     if np.isfinite(bounds).any():
         known = np.isfinite(bounds)
-        axes.plot(seconds[known], bounds[known], "_", color="0.4", ms=14, label="Cramér-Rao")
+        axes.plot(seconds[known], bounds[known], "_", color="0.5", ms=14, label="Cramér-Rao")
     if document.get("reference_error", 0) > 0:
         axes.axhline(
             document["reference_error"], color="0.5", lw=0.8, ls=":", label="reference's own"
@@ -113,14 +130,27 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.margins(x=0.25, y=0.2)
-    axes.tick_params(axis="x", which="minor", labelsize=6, labelrotation=60)
+    _plain_numbers(axes.xaxis, axes.yaxis)
     axes.set_xlabel("seconds, warm, median")
     axes.set_ylabel("\n".join(textwrap.wrap(document["error_name"], 36)))
     small = document.get("size") == "small"
     axes.set_title(f"{stage}, small size" if small else stage, fontsize=10)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=6, frameon=False)
-    return _svg(figure)
+    told = "; ".join(
+        f"{_words(front['condition']) or 'front'}: {len(front['points'])} settings"
+        + (
+            ""
+            if front["knee"] is None
+            else f", knee at {seconds[front['knee']]:.3g} s, error {error[front['knee']]:.3g}"
+        )
+        for front in fronts[:MOST_NAMED]
+    )
+    alt = (
+        f"{stage}: {document['error_name']}, {_span(error)}, against {_span(seconds)} seconds for "
+        f"{len(points)} settings; fronts: {told}"
+    )
+    return _svg(figure, alt)
 
 
 MOST_NAMED = 6
@@ -161,7 +191,17 @@ def bars(
     axes.set_ylabel(unit)
     axes.set_title(title, fontsize=10)
     axes.legend(fontsize=7, frameon=False)
-    return _svg(figure)
+    told = "; ".join(
+        f"{name}: "
+        + ", ".join(
+            f"{' '.join(label.split())} {value:.3g}"
+            for label, value in zip(labels, np.asarray(values, float), strict=True)
+            if np.isfinite(value)
+        )
+        for name, values in series.items()
+    )
+    held = "" if limit is None else f"; limit {limit:g}"
+    return _svg(figure, f"{title}, {unit}: {told}{held}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,11 +245,16 @@ def curves(
         )  # fmt: skip
     if log_y:
         axes.set_yscale("log")
+        _plain_numbers(axes.yaxis)
     axes.set_xlabel(x_name)
     axes.set_ylabel(y_name)
     axes.set_title(title, fontsize=10)
     axes.legend(fontsize=7, frameon=False)
-    return _svg(figure)
+    told = "; ".join(
+        f"{curve.name} {_span(np.asarray(curve.y, float))} over {_span(np.asarray(curve.x, float))}"
+        for curve in series
+    )
+    return _svg(figure, f"{title}: {y_name} against {x_name}; {told}")
 
 
 def sensitivity(
@@ -256,4 +301,11 @@ def sensitivity(
     axes.set_ylabel("hemoglobin fraction C_hd")
     axes.set_title(title, fontsize=10)
     figure.colorbar(mesh, ax=axes, label="log10 of percent")
-    return _svg(figure)
+    row, column = np.unravel_index(int(np.argmin(shown)), shown.shape)
+    alt = (
+        f"{title}: least relative standard error {shown[row, column]:.2g} % at melanin "
+        f"{c_m[column]:.2g}, hemoglobin {c_hd[row]:.2g}; below 10 % on "
+        f"{100 * float(np.mean(shown < 10)):.0f} %, above 100 % on "
+        f"{100 * float(np.mean(shown > 100)):.0f} % of the plane"
+    )
+    return _svg(figure, alt)

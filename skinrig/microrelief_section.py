@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.gradient_stages import HISTOGRAM_FILE, KERNEL_FILE, STRAIN_FILE
-from skinrig import figures, page
+from skinrig import figures, map_pictures, page
 from skinrig import microrelief_evaluation as evaluation
 
 WIDTH_PX = 200
@@ -67,7 +67,7 @@ def _pictures(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
             if skin_map is not None:
                 row += _shown(f"{title}, {_words(state)}", skin_map, appearance)
         if row:
-            series.append(f"<div class=maps>{row}</div>")
+            series.append(f"<div class='maps'>{row}</div>")
     if len(one) > 1:
         body += "<h3>From compressed to stretched</h3>" + "".join(series)
     return body
@@ -81,25 +81,25 @@ def _beside_truth(state: str, appearance: SkinAppearance, truth: SkinAppearance 
     if normals is not None:
         parts = []
         if true is not None:
-            parts.append(_normal_picture("truth", true))
-        parts.append(_normal_picture("estimate", normals))
+            parts.append(_normal_picture("truth", true, state))
+        parts.append(_normal_picture("estimate", normals, state))
         good = _valid(normals)
         if true is not None:
             from model import metrics
 
             good = good & _valid(true)
             error = np.degrees(metrics.angular_error_rad(normals.values, true.values))
-            parts.append(_angle_picture("error", np.nan_to_num(error), good))
+            parts.append(_angle_picture("error", np.nan_to_num(error), good, state))
         if normals.stderr is not None:
             spread = np.degrees(normals.stderr[..., 0])
-            parts.append(_angle_picture("standard error", spread, _valid(normals)))
-        body += f"<h3>normals, {_words(state)}</h3><div class=maps>{''.join(parts)}</div>"
+            parts.append(_angle_picture("standard error", spread, _valid(normals), state))
+        body += f"<h3>normals, {_words(state)}</h3><div class='maps'>{''.join(parts)}</div>"
     height = appearance.maps.get(f"height_{state}")
     if height is not None:
         relief = None
         if truth is not None:
             relief = evaluation.true_relief(appearance, truth, state)
-        body += page.map_panel(
+        body += map_pictures.map_panel(
             f"height, {_words(state)}", "um", estimate=height.values, standard_error=height.stderr,
             truth=relief, valid=_valid(height), width=280,
         )  # fmt: skip
@@ -108,27 +108,30 @@ def _beside_truth(state: str, appearance: SkinAppearance, truth: SkinAppearance 
 
 def _shown(title: str, skin_map: SkinMap, appearance: SkinAppearance) -> str:
     if skin_map.values.ndim == 3:
-        return _normal_picture(title, skin_map, width=WIDTH_PX)
+        return map_pictures.normal_picture(
+            title, skin_map.values, valid=_valid(skin_map), width=WIDTH_PX
+        )
     heights = [m.values[_valid(m)] for k, m in appearance.maps.items() if k.startswith("height_a")]
     reach = float(np.percentile(np.abs(np.concatenate(heights)), 99)) if heights else 1.0
-    return page.scalar_picture(
+    return map_pictures.scalar_picture(
         title, skin_map.values, low=-reach, high=reach, scale="RdBu_r", valid=_valid(skin_map),
         unit="um", width=WIDTH_PX,
     )  # fmt: skip
 
 
-def _normal_picture(title: str, skin_map: SkinMap, *, width: int = 280) -> str:
-    image = np.rint(255.0 * np.clip(0.5 + 0.5 * skin_map.values, 0.0, 1.0)).astype(np.uint8)
-    image[~_valid(skin_map)] = 128
-    return page.plain_picture(title, page.shrink(image, width).astype(np.uint8))
-
-
-def _angle_picture(title: str, degrees: NDArray[np.floating], valid: NDArray[np.bool_]) -> str:
-    inside = degrees[valid]
-    reach = float(np.percentile(inside, 98)) if inside.size else 1.0
-    return page.scalar_picture(
-        title, degrees, low=0.0, high=reach, scale="magma", valid=valid, unit="°"
+def _normal_picture(title: str, skin_map: SkinMap, state: str) -> str:
+    return map_pictures.normal_picture(
+        title, skin_map.values, valid=_valid(skin_map), of=f"normals, {_words(state)}"
     )
+
+
+def _angle_picture(
+    title: str, degrees: NDArray[np.floating], valid: NDArray[np.bool_], state: str
+) -> str:
+    return map_pictures.scalar_picture(
+        title, degrees, low=0.0, high=map_pictures.reach_of(degrees, valid, 98), scale="magma",
+        valid=valid, unit="°", of=f"normals, {_words(state)}",
+    )  # fmt: skip
 
 
 def _relief_errors(
@@ -141,10 +144,11 @@ def _relief_errors(
     for row in neutral:
         checks.append(
             page.Check(f"{name}: specular normals at the lens's resolution, mean error",
-                       row.mean_deg, evaluation.NORMAL_LIMIT_DEG, "<=", "°", row.state)
+                       row.mean_deg, evaluation.NORMAL_LIMIT_DEG, "<=", "°", row.state,
+                       masked=row.masked, coverage=row.coverage, worst=_worst(rows))
         )  # fmt: skip
     note = (
-        "<p class=note>Errors are told at the lens's resolution; the unblurred truth has detail "
+        "<p class='note'>Errors are told at the lens's resolution; the unblurred truth has detail "
         "that this aperture does not show. Heights have the lens's blur undone and are told "
         f"against the unblurred relief: {100 * evaluation.HEIGHT_LIMIT:g} % is kept on smooth "
         "relief; on skin, steep walls of furrows hide light from themselves, which is not "
@@ -163,7 +167,17 @@ def _relief_errors(
             )
             for row in rows
         ],
+        caption="Every state against its truth; angles of normals in degrees",
     )  # fmt: skip
+
+
+def _worst(rows: Sequence[evaluation.ReliefError]) -> str:
+    """Return the state whose normals are worst, where there are more than one."""
+    told = [row for row in rows if math.isfinite(row.mean_deg)]
+    if len(told) < 2:
+        return ""
+    worst = max(told, key=lambda row: row.mean_deg)
+    return f"{_words(worst.state)}: {worst.mean_deg:.3g}°"
 
 
 def _strain(
@@ -181,7 +195,7 @@ def _strain(
         worst = max(true.values(), key=lambda row: abs(row.error))
         checks.append(
             page.Check(f"{name}: stretch of the skin, largest error", abs(worst.error),
-                       evaluation.STRAIN_LIMIT, "<=", "", worst.state)
+                       evaluation.STRAIN_LIMIT, "<=", "", worst=_words(worst.state))
         )  # fmt: skip
     rows = [
         (
@@ -200,6 +214,7 @@ def _strain(
         ("state", "jaws mm", "force N", "caliper's ratio", "skin's r", "standard error", "true r",
          "slip", "r across", "shear °", "rotation °", "windows", "measured"),
         rows,
+        caption="Stretch ratio r of the skin between the jaws, and what the caliper reads",
     )  # fmt: skip
 
 
@@ -216,21 +231,23 @@ def _histograms(appearance: SkinAppearance) -> str:
         side = len(count)
         cut = round(side * (1 - HISTOGRAM_REACH) / 2)
         # rows hold n across the jaws from -1: the page shows + at the top
-        small = np.sqrt(count)[::-1][cut : side - cut, cut : side - cut]
-        shown = np.kron(small, np.ones((4, 4)))
-        panels += page.scalar_picture(
-            _words(state["name"]), shown, low=0.0, high=top, scale="magma", width=WIDTH_PX
-        )
+        shown = np.sqrt(count)[::-1][cut : side - cut, cut : side - cut]
+        panels += map_pictures.scalar_picture(
+            _words(state["name"]), shown, low=0.0, high=top, scale="magma", width=WIDTH_PX,
+            of="histogram of normals",
+        )  # fmt: skip
     aliased = [state["name"] for state in states if state["aliased"]]
     note = (
-        f"<p class=note>Too few samples a bucket in {', '.join(aliased)}: distances between these "
-        "histograms show chance.</p>"
+        page.note(
+            f"Too few samples a bucket in {', '.join(aliased)}: distances between these "
+            "histograms show chance."
+        )
         if aliased
         else ""
     )
     return (
-        "<h3>Histograms of normals, root of share</h3><p class=note>Along the jaws to the right, "
-        f"across them up.</p><div class=maps>{panels}</div>{note}"
+        "<h3>Histograms of normals, root of share</h3><p class='note'>Along the jaws to the right, "
+        f"across them up.</p><div class='maps'>{panels}</div>{note}"
     )
 
 
@@ -248,7 +265,7 @@ def _variances(appearance: SkinAppearance) -> str:
     plot = figures.curves(
         "roughness along the jaws", "stretch ratio r of the skin", "variance of n", series
     )
-    return f"<div class=plots>{plot}</div>"
+    return f"<div class='plots'>{plot}</div>"
 
 
 def _kernels(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> str:
@@ -262,13 +279,15 @@ def _kernels(name: str, appearance: SkinAppearance, checks: list[page.Check]) ->
         checks.append(
             page.Check(f"{name}: histogram distance after the kernel over that before, worst state",
                        worst["distance"] / worst["distance_before"], evaluation.DISTANCE_LIMIT,
-                       "<=", "", worst["name"])
+                       "<=", "", worst=_words(worst["name"]))
         )  # fmt: skip
     untold = [fit["name"] for fit in fits if fit["valid"] and not _told(fit)]
     note = (
-        f"<p class=note>The patch is too small for {', '.join(untold)}: two histograms of one skin "
-        "of this size differ by more than half of what the strain changes, so that the distance "
-        "left by the kernel is not judged.</p>"
+        page.note(
+            f"The patch is too small for {', '.join(untold)}: two histograms of one skin of this "
+            "size differ by more than half of what the strain changes, so that the distance left "
+            "by the kernel is not judged."
+        )
         if untold
         else ""
     )
@@ -284,6 +303,7 @@ def _kernels(name: str, appearance: SkinAppearance, checks: list[page.Check]) ->
             )
             for fit in fits
         ],
+        caption="Kernels fitted to histograms of normals; distances before and after the kernel",
     )  # fmt: skip
     plots = ""
     for key, error, title in (
@@ -314,7 +334,7 @@ def _kernels(name: str, appearance: SkinAppearance, checks: list[page.Check]) ->
             )  # fmt: skip
         if series:
             plots += figures.curves(title, "stretch ratio r of the skin", title, series)
-    return body + f"<div class=plots>{plots}</div>" + _direction(document.get("direction"))
+    return body + f"<div class='plots'>{plots}</div>" + _direction(document.get("direction"))
 
 
 def _direction(found: Mapping[str, Any] | None) -> str:
@@ -330,9 +350,11 @@ def _direction(found: Mapping[str, Any] | None) -> str:
     return (
         "<h3>Kernels by the direction of stretch, less one table of all</h3>"
         + page.table(
-            ("jaws at °", "alpha", "standard error", "sigma um", "standard error um"), rows
+            ("jaws at °", "alpha", "standard error", "sigma um", "standard error um"),
+            rows,
+            caption="Offsets of each direction",
         )
-        + "<p class=note>Chance of such differences where the direction does not matter: alpha "
+        + "<p class='note'>Chance of such differences where the direction does not matter: alpha "
         f"{100 * _value(found['p_alpha']):.2g} %, sigma {100 * _value(found['p_sigma']):.2g} %."
         "</p>"
     )

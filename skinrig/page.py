@@ -1,20 +1,21 @@
-"""The pieces of the report page: checks, tables, map panels; text in, HTML out."""
+"""The pieces of the report page: checks, tables, the page itself; text in, HTML out."""
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import html
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
-
-from skinrig import png
 
 STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
+BAR_STOPS = 17
+"""Colors that a scale's bar runs through; between them it is straight in sRGB."""
 
 
 def escape(value: object) -> str:
@@ -32,11 +33,24 @@ class Check:
     sense: Literal["<=", ">="]
     unit: str = ""
     note: str = ""
+    masked: float = float("nan")
+    """Share of what was to be measured that has no estimate; NaN: does not apply."""
+    coverage: float = float("nan")
+    """Share of truths inside the 68 % intervals; NaN: not told."""
+    worst: str = ""
+    """Where it is worst, in words: a melanin band, a state, a channel."""
 
     @property
     def passed(self) -> bool:
         """Whether ``got`` keeps to ``bound``; NaN does not."""
         return self.got <= self.bound if self.sense == "<=" else self.got >= self.bound
+
+    @property
+    def used(self) -> float:
+        """Share of the limit that is used up: above 1 it is missed; NaN where it has no sense."""
+        if self.sense == ">=" or not self.bound > 0.0:
+            return float("nan")
+        return self.got / self.bound
 
 
 def number(value: float) -> str:
@@ -51,170 +65,175 @@ def checks_table(checks: Sequence[Check]) -> str:
         word, kind = ("kept", "good") if check.passed else ("missed", "bad")
         sign = "≤" if check.sense == "<=" else "≥"
         rows.append(
-            f"<tr><td>{escape(check.name)}</td>"
-            f"<td class=n>{number(check.got)} {escape(check.unit)}</td>"
-            f"<td class=n>{sign} {number(check.bound)} {escape(check.unit)}</td>"
-            f'<td class="{kind}">{word}</td><td>{escape(check.note)}</td></tr>'
+            f'<tr><td class="{kind}">{word}</td><th scope="row">{escape(check.name)}</th>'
+            f'<td class="n">{_with_unit(check.got, check.unit)}</td>'
+            f'<td class="n">{sign} {_with_unit(check.bound, check.unit)}</td>'
+            f'<td class="n">{_percent(check.used)}</td>'
+            f'<td class="n">{_percent(check.coverage)}</td>'
+            f'<td class="n">{_percent(check.masked)}</td><td>{escape(check.worst)}</td>'
+            f"<td>{escape(check.note)}</td></tr>"
         )
-    return (
-        "<table><thead><tr><th>check</th><th class=n>measured</th><th class=n>limit</th>"
-        "<th>verdict</th><th>remark</th></tr></thead><tbody>" + "".join(rows) + "</tbody></table>"
+    head = (
+        ("verdict", ""), ("check", ""), ("measured", "n"), ("limit", "n"), ("of the limit", "n"),
+        ("truths in 68 % intervals", "n"), ("masked", "n"), ("worst", ""), ("remark", ""),
+    )  # fmt: skip
+    caption = "What was promised and what was measured; missed checks stand first"
+    return _scrollable(_head(head, caption) + "".join(rows) + "</tbody></table>", caption)
+
+
+def _with_unit(value: float, unit: str) -> str:
+    return f"{number(value)} {escape(unit)}".rstrip()
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if np.isfinite(share) else ""
+
+
+def _head(head: Sequence[tuple[str, str]], caption: str) -> str:
+    cells = "".join(
+        f'<th scope="col"{f""" class="{kind}" """.rstrip() if kind else ""}>{escape(title)}</th>'
+        if title
+        else "<td></td>"
+        for title, kind in head
     )
+    return f"<table><caption>{escape(caption)}</caption><thead><tr>{cells}</tr></thead><tbody>"
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str = "") -> str:
-    """Return a table; numbers are set right-aligned with four digits."""
-
-    def cell(value: object) -> str:
-        if isinstance(value, (float, np.floating)):
-            return f"<td class=n>{number(float(value))}</td>"
-        if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
-            return f"<td class=n>{value}</td>"
-        return f"<td>{escape(value)}</td>"
-
-    body = "".join("<tr>" + "".join(cell(v) for v in row) + "</tr>" for row in rows)
-    title = f"<caption>{escape(caption)}</caption>" if caption else ""
-    header = "".join(f"<th>{escape(h)}</th>" for h in head)
-    return f"<table>{title}<thead><tr>{header}</tr></thead><tbody>{body}</tbody></table>"
+def _scrollable(body: str, name: str) -> str:
+    """Return what may be wider than the page, so that a keyboard reaches all of it."""
+    return f'<div class="scroll" tabindex="0" role="group" aria-label="{escape(name)}">{body}</div>'
 
 
-def folded(title: str, body: str) -> str:
-    """Return HTML that opens when its title is clicked; printed pages show the title only."""
-    return f"<details><summary>{escape(title)}</summary>{body}</details>"
-
-
-def facts(values: Mapping[str, object]) -> str:
-    """Return a two-column table of names and values."""
-    return table(("what", "value"), list(values.items()))
-
-
-def shrink(image: NDArray[np.generic], width: int) -> NDArray[np.generic]:
-    """Take every n-th pixel so that the image is at most ``width`` wide."""
-    step = max(1, -(-image.shape[1] // width))
-    return image[step // 2 :: step, step // 2 :: step]
-
-
-def _picture(
-    title: str,
-    values: NDArray[np.floating],
-    low: float,
-    high: float,
-    scale: str,
-    valid: NDArray[np.bool_] | None,
-    unit: str,
-    width: int,
-) -> str:
-    small = shrink(values, width)
-    mask = None if valid is None else shrink(valid, width).astype(bool)
-    shown = small[mask] if mask is not None and mask.any() else small
-    shown = shown[np.isfinite(shown)]
-    median = number(float(np.median(shown))) if shown.size else "–"
-    ramp = np.tile(np.linspace(low, high, 96)[None, :], (6, 1))
-    alt = f"{title}: scale {number(low)} to {number(high)} {unit}, median {median}"
-    return (
-        f'<figure><img alt="{escape(alt)}" src="'
-        f'{png.data_uri(png.colorize(small.astype(float), low, high, scale=scale, valid=mask))}">'
-        f"<figcaption>{escape(title)}</figcaption>"
-        f'<div class=scale><span>{number(low)}</span><img alt="" src="'
-        f'{png.data_uri(png.colorize(ramp, low, high, scale=scale))}"><span>{number(high)} '
-        f"{escape(unit)}</span></div></figure>"
-    )
-
-
-def color_picture(title: str, linear: NDArray[np.floating], *, width: int = 320) -> str:
-    """Return a figure of a linear sRGB image, (H, W, 3)."""
-    small = shrink(np.asarray(linear), width)
-    return plain_picture(title, png.srgb8(small.astype(float)))
-
-
-def plain_picture(title: str, image: NDArray[np.uint8]) -> str:
-    """Return a figure of an 8-bit image, (H, W) or (H, W, 3), shown as it is."""
-    return (
-        f'<figure><img alt="{escape(title)}" src="{png.data_uri(image)}">'
-        f"<figcaption>{escape(title)}</figcaption></figure>"
-    )
-
-
-def stored_picture(title: str, data: bytes) -> str:
-    """Return a figure of a PNG file's bytes, as they are."""
-    text = base64.b64encode(data).decode("ascii")
-    return (
-        f'<figure><img alt="{escape(title)}" src="data:image/png;base64,{text}">'
-        f"<figcaption>{escape(title)}</figcaption></figure>"
-    )
-
-
-def scalar_picture(
-    title: str,
-    values: NDArray[np.floating],
-    *,
-    low: float,
-    high: float,
-    scale: str = "viridis",
-    valid: NDArray[np.bool_] | None = None,
-    unit: str = "",
-    width: int = 280,
-) -> str:
-    """Return a figure of a map, (H, W), with its color scale; pixels not valid are gray."""
-    return _picture(title, values, low, high, scale, valid, unit, width)
-
-
-def map_panel(
-    name: str,
-    unit: str,
-    *,
-    estimate: NDArray[np.floating],
-    standard_error: NDArray[np.floating] | None = None,
-    truth: NDArray[np.floating] | None = None,
-    valid: NDArray[np.bool_] | None = None,
-    width: int = 280,
-) -> str:
-    """Return truth | estimate | error | standard error of a map, truth and estimate to one scale.
+def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str) -> str:
+    """Return a table; numbers are set right-aligned with four digits.
 
     Parameters
     ----------
-    name, unit
-        Of the map, for headings and scales.
-    estimate, standard_error, truth
-        (H, W); what is None is left out of the row.
-    valid
-        (H, W); other pixels are gray.
-    width
-        Pixels across; larger maps are thinned out.
+    head
+        Titles of columns; an empty one leaves its cell without a heading.
+    rows
+        Cells; the first of each row names it.
+    caption
+        What the table tells.
     """
-    mask = np.isfinite(estimate) if valid is None else np.asarray(valid, bool)
-    of_scale = [estimate[mask & np.isfinite(estimate)]]
-    if truth is not None:
-        of_scale.append(truth[mask & np.isfinite(truth)])
-    joined = np.concatenate(of_scale)
-    low, high = np.percentile(joined, [1, 99]) if joined.size else (0.0, 1.0)
-    parts = []
-    if truth is not None:
-        parts.append(_picture("truth", truth, low, high, "viridis", mask, unit, width))
-    parts.append(_picture("estimate", estimate, low, high, "viridis", mask, unit, width))
-    if truth is not None:
-        error = estimate - truth
-        inside = np.abs(error[mask & np.isfinite(error)])
-        reach = float(np.percentile(inside, 98)) if inside.size else 1.0
-        parts.append(
-            _picture("estimate − truth", error, -reach, reach, "RdBu_r", mask, unit, width)
-        )
-    if standard_error is not None:
-        inside = standard_error[mask & np.isfinite(standard_error)]
-        reach = float(np.percentile(inside, 98)) if inside.size else 1.0
-        parts.append(
-            _picture("standard error", standard_error, 0.0, reach, "magma", mask, unit, width)
-        )
-    return f"<h3>{escape(name)}</h3><div class=maps>{''.join(parts)}</div>"
+
+    def cell(value: object, first: bool) -> str:
+        if isinstance(value, (float, np.floating)):
+            kind, text = "n", number(float(value))
+        elif isinstance(value, (int, np.integer)) and not isinstance(value, bool):
+            kind, text = "n", str(value)
+        else:
+            kind, text = "", escape(value)
+        marked = f' class="{kind}"' if kind else ""
+        if first and text:
+            return f'<th scope="row"{marked}>{text}</th>'
+        return f"<td{marked}>{text}</td>"
+
+    numeric = [
+        bool(rows) and all(isinstance(row[k], (int, float, np.number)) for row in rows)
+        for k in range(len(head))
+    ]
+    body = "".join(
+        "<tr>" + "".join(cell(v, k == 0) for k, v in enumerate(row)) + "</tr>" for row in rows
+    )
+    titles = [(title, "n" if right else "") for title, right in zip(head, numeric, strict=True)]
+    return _scrollable(_head(titles, caption) + body + "</tbody></table>", caption)
 
 
-def document(title: str, body: str) -> str:
-    """Return the whole page; it makes no request and runs no script."""
+def folded(title: str, body: str) -> str:
+    """Return HTML that opens when its title is clicked, and is open when printed."""
+    return f"<details><summary>{escape(title)}</summary>{body}</details>"
+
+
+def facts(values: Mapping[str, object], *, caption: str) -> str:
+    """Return a two-column table of names and values."""
+    return table(("what", "value"), list(values.items()), caption=caption)
+
+
+def note(text: str) -> str:
+    """Return a remark of plain text."""
+    return f'<p class="note">{escape(text)}</p>'
+
+
+def document(title: str, lead: str, sections: str) -> str:
+    """Return the whole page; it makes no request and runs no script.
+
+    Parameters
+    ----------
+    title
+        Of the page.
+    lead
+        HTML of what stands first: the verdict.
+    sections
+        HTML of the rest; each ``<h2>`` begins a section of the table of contents.
+    """
+    head, contents, body = _in_sections(lead, sections)
+    style = STYLE + _bars()
+    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
+    policy = (
+        f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; base-uri 'none'; "
+        "form-action 'none'"
+    )
     return (
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
-        "img-src data:; style-src 'unsafe-inline'\">"
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head>"
-        f"<body><main>{body}</main></body></html>\n"
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
+        '<meta name="color-scheme" content="light dark">'
+        f"<title>{escape(title)}</title><style>{style}</style></head>"
+        '<body><a class="skip" href="#content">Skip to the verdict</a>'
+        f'<header><h1>{escape(title)}</h1></header><main id="content">{head}{contents}{body}'
+        "</main></body></html>\n"
     )
+
+
+def _in_sections(lead: str, sections: str) -> tuple[str, str, str]:
+    """Return lead, contents and body, with an id and a landmark for each second heading."""
+    taken: set[str] = {"content", "contents"}
+    entries: list[tuple[str, str]] = []
+
+    def wrapped(text: str) -> str:
+        pieces = re.split(r"<h2>(.*?)</h2>", text)
+        out = pieces[0]
+        for heading, body in zip(pieces[1::2], pieces[2::2], strict=True):
+            name = _anchor(heading, taken)
+            entries.append((name, heading))
+            out += (
+                f'<section aria-labelledby="{name}"><h2 id="{name}">{heading}</h2>{body}</section>'
+            )
+        return out
+
+    head, body = wrapped(lead), wrapped(sections)
+    links = "".join(f'<li><a href="#{name}">{heading}</a></li>' for name, heading in entries)
+    contents = (
+        f'<nav aria-labelledby="contents"><h2 id="contents">Contents</h2><ul>{links}</ul></nav>'
+    )
+    return head, contents if entries else "", body
+
+
+def _anchor(heading: str, taken: set[str]) -> str:
+    """Return an id for a heading that no other has.
+
+    Examples
+    --------
+    >>> taken = set()
+    >>> _anchor("Maps: flash II", taken), _anchor("Maps: flash-II", taken)
+    ('maps-flash-ii', 'maps-flash-ii-2')
+    """
+    plain = html.unescape(heading).casefold()
+    name = re.sub(r"[^a-z0-9]+", "-", plain).strip("-") or "section"
+    number_, free = 2, name
+    while free in taken:
+        free, number_ = f"{name}-{number_}", number_ + 1
+    taken.add(free)
+    return free
+
+
+def _bars() -> str:
+    """Return the style of the color scales' bars, of the same colors as the pictures."""
+    from skinrig import png
+
+    rules = []
+    for scale, name in png.SCALES.items():
+        stops = ",".join("#" + bytes(rgb).hex() for rgb in png.palette(scale, BAR_STOPS))
+        rules.append(f".bar.{name}{{background:linear-gradient(90deg,{stops})}}")
+    return "\n".join(rules)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from skinrig import page
+from skinrig import map_pictures, page
 
 DOCUMENTS = ("render.json", "analysis.json")
 """Files that tell a folder of pictures."""
@@ -53,13 +53,17 @@ def section(folder: Path, checks: list[page.Check]) -> str:
                 "light inside the skin": document.get("subsurface", ""),
                 "lobes": document.get("lobes", ""),
                 "unit": document.get("unit", ""),
-            }
+            },
+            caption="What was asked for",
         )
     for one in document.get("datasets", ()):
         body += _data_set(one)
     body += _pictures(folder)
     if document.get("assumed"):
-        body += "<h3>Assumed</h3>" + page.table(("assumption",), [[t] for t in document["assumed"]])
+        body += "<h3>Assumed</h3>" + page.table(
+            ("assumption",), [[t] for t in document["assumed"]],
+            caption="Taken for granted, not measured",
+        )  # fmt: skip
     return body
 
 
@@ -91,11 +95,15 @@ def _comparison(name: str, document: Mapping[str, Any], checks: list[page.Check]
             )
             for label, row in rows.items()
         ],
+        caption="Luminance of photographs that no fit has seen; parts of the model left out",
     )  # fmt: skip
     bands = [
         (band, row["pixels"], 100 * row["median"]) for band, row in document["by_band"].items()
     ]
-    return body + page.table(("skin", "pixels", "median error %"), bands)
+    return body + page.table(
+        ("skin", "pixels", "median error %"), bands,
+        caption="The full model by skin color, from the individual typology angle",
+    )  # fmt: skip
 
 
 def _data_set(one: Mapping[str, Any]) -> str:
@@ -107,7 +115,8 @@ def _data_set(one: Mapping[str, Any]) -> str:
         (rank, *(float("nan") if one[key][k] is None else one[key][k] for key in head))
         for k, rank in enumerate(ranks)
     ]
-    return page.table(("lobes", *head), rows, caption=str(one.get("name", "")))
+    name = one.get("name", "")
+    return page.table(("lobes", *head), rows, caption=f"Errors by number of lobes: {name}")
 
 
 def _pictures(folder: Path) -> str:
@@ -118,8 +127,6 @@ def _pictures(folder: Path) -> str:
         if len(data) > LARGEST_BYTES:
             kept.append(path.name)
             continue
-        figures.append(page.stored_picture(path.stem.replace("-", " "), data))
-    note = (
-        "" if not kept else f"<p class=note>Too large for here: {page.escape(', '.join(kept))}.</p>"
-    )
-    return f"<div class=maps>{''.join(figures)}</div>" + note
+        figures.append(map_pictures.stored_picture(path.stem.replace("-", " "), data))
+    note = page.note(f"Too large for here: {', '.join(kept)}.") if kept else ""
+    return f"<div class='maps'>{''.join(figures)}</div>" + note

@@ -41,7 +41,7 @@ def section(appearances: Mapping[str, SkinAppearance]) -> str:
     published = weyrich_2005()
     drawn = table(published.sample(PEOPLE, rng=np.random.default_rng(0)), sites=published.sites)
     body = "<h2>sigma_tr over people, 1/mm</h2>" + (
-        "<p class=note>Deviations are over people. The publication heads its second column "
+        "<p class='note'>Deviations are over people. The publication heads its second column "
         "“Var.”; as variances its numbers would contradict the extremes that it shows, so that "
         "they are read as standard deviations. The smallest sigma_tr is the most translucent "
         "skin.</p>"
@@ -62,7 +62,9 @@ def section(appearances: Mapping[str, SkinAppearance]) -> str:
         rows += _rows(f"measured here, {len(people)} sessions", found, published.sites)
     columns = [f"{site}, {word}" for site in published.sites for word in ("mean", "deviation")]
     head = ("who", "channel", *columns)
-    return body + page.table(head, rows)
+    return body + page.table(
+        head, rows, caption="Mean and standard deviation over people, red, green and blue light"
+    )
 
 
 def _rows(who: str, found: PopulationTable, sites: tuple[str, ...]) -> list[tuple[object, ...]]:

@@ -28,7 +28,7 @@ def section(appearance: SkinAppearance) -> str:
     if cycle_s is not None:
         phases = told["phases"]
         body += (
-            f"<p class=note>{phases['captures']} images meet {phases['distinct']} phases of a "
+            f"<p class='note'>{phases['captures']} images meet {phases['distinct']} phases of a "
             f"cycle of {cycle_s:g} s, {phases['interval_s']:g} s apart, one every "
             f"{told['shot_period_s']:g} s; ordered by the flash's true time.</p>"
         )
@@ -53,7 +53,7 @@ def _curves(told: Mapping[str, Any], cycle_s: float | None) -> str:
     plot = figures.curves(
         f"blood in {told['state']}", axis, "blood, % of the dermis' volume", curves
     )
-    return f"<div class=plots>{plot}</div>"
+    return f"<div class='plots'>{plot}</div>"
 
 
 def _table(told: Mapping[str, Any]) -> str:
@@ -73,9 +73,10 @@ def _table(told: Mapping[str, Any]) -> str:
         ("place", "level at the start, %", "at the end, %", "time constant", "transition seen",
          "between cycles, points"),
         rows,
+        caption="Levels and time constants by place; points are percent of the dermis' volume",
     )  # fmt: skip
     together = page.escape(told["fit_of_all"]["text"])
-    return body + f"<p class=note>Time constant, all places together: {together}.</p>"
+    return body + f"<p class='note'>Time constant, all places together: {together}.</p>"
 
 
 def _words(transition: Mapping[str, Any]) -> str:

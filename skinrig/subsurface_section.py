@@ -14,7 +14,7 @@ from reconstruction.probe_stages import (
     PROFILE_FILE,
     SUBSURFACE_FILE,
 )
-from skinrig import figures, page
+from skinrig import figures, map_pictures, page
 from skinrig import subsurface_evaluation as evaluation
 from skinrig.subsurface_evaluation import number, numbers
 
@@ -92,7 +92,7 @@ def _plots(appearance: SkinAppearance) -> str:
             "reflectance, 1/mm²", series, log_y=True,
         )  # fmt: skip
         plots += _residuals(entry, found, radius)
-    return f"<h3>Radial profiles</h3><div class=plots>{plots}</div>"
+    return f"<h3>Radial profiles</h3><div class='plots'>{plots}</div>"
 
 
 def _residuals(
@@ -147,9 +147,10 @@ def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
          "error %", "sigma_a", "sigma_s'", "their correlation", "chi²", "degrees", "fibres",
          "valid"),
         rows,
+        caption="Every fit, with what it says of itself",
     )  # fmt: skip
     note = (
-        "<p class=note>1/sigma_tr is the translucency: the smallest sigma_tr is the most "
+        "<p class='note'>1/sigma_tr is the translucency: the smallest sigma_tr is the most "
         "translucent skin. Of layered tissue the true sigma_tr is that of the homogeneous medium "
         "whose profile fits best.</p>"
     )
@@ -171,6 +172,7 @@ def _errors(
                  100 * row.bias, 100 * row.coverage)
                 for row in found
             ],
+            caption=f"By method, {kind} tissue",
         )  # fmt: skip
         body += _by_channel([row for row in rows if row.kind == kind])
         best = next((row for row in found if row.method == evaluation.RECOMMENDED), None)
@@ -192,6 +194,7 @@ def _errors(
                  100 * row.coverage)
                 for row in profiles
             ],
+            caption="Over fibres whose signal is ten times its standard error",
         )  # fmt: skip
     return body
 
@@ -205,7 +208,7 @@ def _by_channel(rows: Sequence[evaluation.FitError]) -> str:
         errors = {f"{r.name}, {r.channel}": r.relative for r in rows if r.method == method}
         series[words] = [100.0 * errors.get(label, float("nan")) for label in labels]
     short = [label.replace("_r0_a000.0", "").replace(", ", "\n") for label in labels]
-    return f"<div class=plots>{figures.bars('error of sigma_tr', short, series, unit='%')}</div>"
+    return f"<div class='plots'>{figures.bars('error of sigma_tr', short, series, unit='%')}</div>"
 
 
 def _anisotropy(appearance: SkinAppearance) -> str:
@@ -226,6 +229,7 @@ def _anisotropy(appearance: SkinAppearance) -> str:
         ("site", "repeat", "channel", "directions", "ratio", "standard error", "axis °",
          "standard error °", "chance if isotropic", "one direction is off by up to %", "valid"),
         rows,
+        caption="sigma_tr along the long axis over that across it",
     )  # fmt: skip
 
 
@@ -243,6 +247,7 @@ def _sites(appearance: SkinAppearance) -> str:
         ("site", "channel", "measurements", "sigma_tr 1/mm", "standard error",
          "translucency mm", "standard error"),
         rows,
+        caption="Mean of each site's measurements; translucency is 1/sigma_tr",
     )  # fmt: skip
 
 
@@ -257,21 +262,21 @@ def _map(appearance: SkinAppearance) -> str:
         inside = values if found.valid is None else values[found.valid]
         if not inside.size:
             continue
-        pictures += page.scalar_picture(
+        pictures += map_pictures.scalar_picture(
             f"translucency, {channel}", values, low=float(inside.min()), high=float(inside.max()),
             valid=found.valid, unit="mm", width=WIDTH_PX,
         )  # fmt: skip
         if found.stderr is not None:
             spread = found.stderr[..., c]
-            pictures += page.scalar_picture(
+            pictures += map_pictures.scalar_picture(
                 "standard error", spread, low=0.0, high=float(spread.max()), scale="magma",
                 valid=found.valid, unit="mm", width=WIDTH_PX,
             )  # fmt: skip
-    note = (
-        "<p class=note>1/sigma_tr over the face's texture, between the measured sites by kriging; "
-        "away from them the error grows to what people differ by.</p>"
+    note = page.note(
+        "1/sigma_tr over the face's texture, between the measured sites by kriging; away from "
+        "them the error grows to what people differ by."
     )
-    return f"<h3>Translucency map</h3>{note}<div class=maps>{pictures}</div>"
+    return f"<h3>Translucency map</h3>{note}<div class='maps'>{pictures}</div>"
 
 
 def _one_of_each_site(measurements: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

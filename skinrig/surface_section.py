@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from model.skin import SkinAppearance, SkinMap
-from skinrig import page, reflection_evaluation
+from skinrig import map_pictures, page, reflection_evaluation, skin_bands
 from skinrig import surface_evaluation as evaluation
 
 WIDTH_PX = 220
+SMALL_PX = 110
+"""Of earlier normals, lobes, samples and residuals: every second pixel of the others."""
 GRAY = 0.5
 FIRST = ("r_d", "normals_refined", "normals", "half_vector_normals")
 
@@ -96,7 +98,7 @@ def section(
     rows, columns = np.nonzero(_valid(place))
     points = place.values[rows, columns].astype(np.float64)
     if not len(points):
-        return "<p class=note>No texel of these maps is valid.</p>"
+        return "<p class='note'>No texel of these maps is valid.</p>"
     box = points.min(axis=0), points.max(axis=0)
     view = FrontView.of(points, box)
     true_view, known = None, np.zeros(0, np.intp)
@@ -108,23 +110,37 @@ def section(
             usable = usable & (truth.maps["mask"].values > 0.5)
         known = np.flatnonzero(usable)
         true_view = FrontView.of(true_place.values.reshape(-1, 3)[known].astype(float), box)
+    best = next((key for key in FIRST[1:] if key in appearance.maps), "")
+    large = {"r_d", best}
+    shown_truths: set[str] = set()
+    minor = ""
     for key, skin_map in sorted(appearance.maps.items(), key=lambda item: _rank(item[0])):
         if key == "position" or key.startswith("_"):
             continue
         values = skin_map.values[rows, columns]
         good = _valid(skin_map)[rows, columns]
+        width = WIDTH_PX if key in large else SMALL_PX
         figures = []
         true_name = "normals" if key in evaluation.NORMAL_MAPS else key
-        if truth is not None and true_view is not None and true_name in truth.maps:
-            flat = truth.maps[true_name].values
-            flat = flat.reshape(-1, *flat.shape[2:])[known]
-            figures.append(_shown("truth", true_name, *true_view.picture(flat)))
-        figures.append(_shown("estimate", key, *view.picture(values, valid=good)))
-        if truth is not None and (true_name in truth.maps):
-            figures.append(_error(key, appearance, truth, pairs, box))
+        known_truth = truth is not None and true_name in truth.maps
+        if truth is not None and true_view is not None and known_truth:
+            if true_name not in shown_truths:  # of all estimates of normals there is one truth
+                flat = truth.maps[true_name].values
+                flat = flat.reshape(-1, *flat.shape[2:])[known]
+                figures.append(_shown("truth", key, *true_view.picture(flat), width=width))
+                shown_truths.add(true_name)
+        figures.append(_shown("estimate", key, *view.picture(values, valid=good), width=width))
+        if truth is not None and known_truth:
+            figures.append(_error(key, appearance, truth, pairs, box, width=width))
         if skin_map.stderr is not None:
-            figures.append(_spread(key, skin_map, rows, columns, view, good))
-        body += f"<h3>{page.escape(key)}</h3><div class=maps>{''.join(figures)}</div>"
+            figures.append(_spread(key, skin_map, rows, columns, view, good, width=width))
+        if key in FIRST:
+            size = "maps" if key in large else "maps small"
+            body += f"<h3>{page.escape(key)}</h3><div class='{size}'>{''.join(figures)}</div>"
+        else:
+            minor += "".join(figures)
+    if minor:
+        body += f"<h3>Lobes, samples and residuals</h3><div class='maps small'>{minor}</div>"
     if truth is not None:
         body += _errors(name, appearance, truth, checks)
         body += _reflection(name, appearance, truth, checks)
@@ -136,16 +152,25 @@ def _rank(key: str) -> tuple[int, str]:
     return (FIRST.index(key) if key in FIRST else len(FIRST), key)
 
 
-def _shown(title: str, key: str, image: NDArray[np.float64], valid: NDArray[np.bool_]) -> str:
+def _shown(
+    title: str, key: str, image: NDArray[np.float64], valid: NDArray[np.bool_], *, width: int
+) -> str:
     if image.ndim == 2:
         inside = image[valid & np.isfinite(image)]
         low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
-        return page.scalar_picture(title, image, low=low, high=high, valid=valid)
+        return map_pictures.scalar_picture(
+            _title(title, key), image, low=low, high=high, valid=valid, of=key, width=width
+        )
     if "normals" in key:
-        picture = np.rint(255.0 * np.clip(0.5 + 0.5 * image, 0.0, 1.0)).astype(np.uint8)
-        picture[~valid] = 128
-        return page.plain_picture(title, picture)
-    return page.color_picture(title, np.where(valid[..., None], image, GRAY**2.2))
+        return map_pictures.normal_picture(title, image, valid=valid, of=key, width=width)
+    return map_pictures.color_picture(
+        title, np.where(valid[..., None], image, GRAY**2.2), of=f"{key}, linear sRGB"
+    )
+
+
+def _title(title: str, key: str) -> str:
+    """Return what stands below a picture: of maps that share a heading, which one it is."""
+    return title if key in FIRST else f"{key}, {title}"
 
 
 def _error(
@@ -154,19 +179,23 @@ def _error(
     truth: SkinAppearance,
     pairs: evaluation.Match,
     box: tuple[NDArray[np.floating], NDArray[np.floating]],
+    *,
+    width: int,
 ) -> str:
     error = evaluation.errors_at(key, appearance, truth, pairs)
     points = appearance.maps["position"].values[pairs.rows, pairs.columns].astype(np.float64)
     good = np.isfinite(error)
     image, valid = FrontView.of(points, box).picture(np.nan_to_num(error), valid=good)
-    reach = float(np.percentile(np.abs(error[good]), 95)) if good.any() else 1.0
+    reach = map_pictures.reach_of(error, good, 95)
     if key in evaluation.NORMAL_MAPS:
-        return page.scalar_picture(
-            "error", image, low=0.0, high=reach, scale="magma", valid=valid, unit="°"
-        )
-    return page.scalar_picture(
-        "estimate − truth", image, low=-reach, high=reach, scale="RdBu_r", valid=valid, unit="%"
-    )
+        return map_pictures.scalar_picture(
+            "error", image, low=0.0, high=reach, scale="magma", valid=valid, unit="°", of=key,
+            width=width,
+        )  # fmt: skip
+    return map_pictures.scalar_picture(
+        "estimate − truth", image, low=-reach, high=reach, scale="RdBu_r", valid=valid, unit="%",
+        of=key, width=width,
+    )  # fmt: skip
 
 
 def _spread(
@@ -176,6 +205,8 @@ def _spread(
     columns: NDArray[np.intp],
     view: FrontView,
     good: NDArray[np.bool_],
+    *,
+    width: int,
 ) -> str:
     if skin_map.stderr is None:
         return ""
@@ -186,17 +217,18 @@ def _spread(
     if key in evaluation.NORMAL_MAPS:
         stderr, unit = np.degrees(stderr), "°"
     image, valid = view.picture(stderr, valid=good)
-    inside = image[valid & np.isfinite(image)]
-    reach = float(np.percentile(inside, 98)) if inside.size else 1.0
-    return page.scalar_picture(
-        "standard error", image, low=0.0, high=reach, scale="magma", valid=valid, unit=unit
-    )
+    reach = map_pictures.reach_of(image, valid, 98)
+    return map_pictures.scalar_picture(
+        _title("standard error", key), image, low=0.0, high=reach, scale="magma", valid=valid,
+        unit=unit, of=key, width=width,
+    )  # fmt: skip
 
 
 def _errors(
     name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
 ) -> str:
     found = evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
+    banded = errors_by_band(appearance, truth)
     registration = appearance.parameters.get("registration")
     pixel_mm = registration.get("pixel_mm", 0.0) if isinstance(registration, dict) else 0.0
     coarse = float(pixel_mm) > evaluation.JUDGED_PIXEL_MM
@@ -207,12 +239,16 @@ def _errors(
             continue
         what, got, bound = row.judged
         unit = "°" if row.unit == "deg" else row.unit
-        remark = f"{100 * row.masked:.0f} % masked"
-        checks.append(page.Check(f"{name}: {row.name}, {what}", got, bound, "<=", unit, remark))
+        checks.append(
+            page.Check(
+                f"{name}: {row.name}, {what}", got, bound, "<=", unit,
+                masked=row.masked, coverage=row.coverage.share, worst=_worst(row.name, banded),
+            )
+        )  # fmt: skip
     note = ""
     if coarse:
         note = (
-            f"<p class=note>A pixel of these images is {pixel_mm:.1f} mm wide on the face; the "
+            f"<p class='note'>A pixel of these images is {pixel_mm:.1f} mm wide on the face; the "
             f"limit of {evaluation.NORMAL_LIMIT_DEG:g}° is promised for "
             f"{evaluation.JUDGED_PIXEL_MM:g} mm and finer, so normals are shown but not judged."
             "</p>"
@@ -228,7 +264,56 @@ def _errors(
             )
             for row in found
         ],
+        caption="Texel by texel against the nearest true point; angles in degrees",
+    ) + page.table(
+        ("map", "unit", "skin", "points", "masked %", "median |error|", "95th %"),
+        banded,
+        caption="By skin color: the individual typology angle of the true reflectance "
+        "(Chardon et al. 1991)",
     )  # fmt: skip
+
+
+Banded = tuple[str, str, str, int, float, float, float]
+"""Map, unit, band, points, masked %, median and 95th percentile of the absolute error."""
+LEAST_POINTS = 20
+
+
+def errors_by_band(appearance: SkinAppearance, truth: SkinAppearance) -> list[Banded]:
+    """Return errors of normals and R_d by skin color, from light to dark; R_d, mean of channels.
+
+    Parameters
+    ----------
+    appearance, truth
+        As for `section`; a truth without "r_d" has no color to tell bands by.
+    """
+    if "r_d" not in truth.maps:
+        return []
+    pairs = evaluation.match(appearance, truth)
+    true_color = truth.maps["r_d"].values.reshape(-1, 3)[pairs.truth].astype(np.float64)
+    bands = skin_bands.bands_of(skin_bands.typology_angle_deg(true_color))
+    rows: list[Banded] = []
+    for key in ("r_d", *evaluation.NORMAL_MAPS):
+        if key not in appearance.maps or (key != "r_d" and "normals" not in truth.maps):
+            continue
+        error = np.abs(evaluation.errors_at(key, appearance, truth, pairs))
+        for band in skin_bands.BANDS:
+            own = error[bands == band]
+            told = own[np.isfinite(own)]
+            if len(own) < LEAST_POINTS or not len(told):
+                continue
+            unit = "%" if key == "r_d" else "°"
+            masked = 100.0 * (1.0 - len(told) / len(own))
+            middle, high = np.percentile(told, [50, 95])
+            rows.append((key, unit, band, len(own), masked, float(middle), float(high)))
+    return rows
+
+
+def _worst(name: str, banded: list[Banded]) -> str:
+    own = [row for row in banded if row[0] == name.split()[0]]
+    if len(own) < 2:
+        return ""
+    worst = max(own, key=lambda row: row[5])
+    return f"{worst[2]} skin: {worst[5]:.3g} {worst[1]}"
 
 
 def _reflection(
@@ -245,7 +330,7 @@ def _reflection(
             100 * reflection_evaluation.HELD_OUT_LIMIT,
             "<=",
             "%",
-            f"{held_out.points} points x {held_out.directions} directions",
+            f"{held_out.points} points × {held_out.directions} directions",
         )
     )
     low, high = held_out.interval
@@ -253,15 +338,16 @@ def _reflection(
         ("points", "directions", "median error %", "68 % interval", "in highlights %"),
         [(held_out.points, held_out.directions, 100 * held_out.median,
           f"{100 * low:.3g} – {100 * high:.3g}", 100 * held_out.highlights)],
+        caption="Against the true reflection at points of the surface",
     )  # fmt: skip
     figures = []
     for site, true_image, image in reflection_evaluation.spheres(appearance, truth):
         bright = float(np.percentile(true_image.max(axis=-1), 99.5)) or 1.0
-        figures.append(page.color_picture(f"{site}: truth", true_image / bright))
+        figures.append(map_pictures.color_picture(f"{site}: truth", true_image / bright))
         if image is not None:
-            figures.append(page.color_picture(f"{site}: estimate", image / bright))
+            figures.append(map_pictures.color_picture(f"{site}: estimate", image / bright))
     if figures:
-        body += f"<h3>Reflection on spheres</h3><div class=maps>{''.join(figures)}</div>"
+        body += f"<h3>Reflection on spheres</h3><div class='maps'>{''.join(figures)}</div>"
     return body
 
 
