@@ -12,7 +12,8 @@ from typing import Final
 import numpy as np
 
 from rigsim import lateral, shading
-from rigsim.atlas import sample, spread
+from rigsim.atlas import spread
+from rigsim.bounce_color import BounceColor
 from rigsim.mesh import Float32Array
 from rigsim.render import Caster, visibility
 from rigsim.scenes.olat import Lamp
@@ -44,6 +45,8 @@ class SkinBleeding:
         Whether light spreads sideways.
     bounce
         How light goes from skin to skin; None leaves that out.
+    spectral
+        Whether that light is reflected wavelength by wavelength.
     """
 
     def __init__(
@@ -56,12 +59,16 @@ class SkinBleeding:
         light: str,
         subsurface: bool,
         bounce: SkinBounce | None,
+        spectral: bool = True,
     ) -> None:
         self._subject, self._surface, self._caster = subject, surface, caster
         self.subsurface = subsurface
         self._bounce = bounce
         if bounce is not None:
-            self._patch_r_d = bounce.coarsen(surface.r_d)
+            self._color = BounceColor(
+                bounce, subject, "neutral", surface.r_d, surface.reflectance,
+                camera=camera, light=light, spectral=spectral,
+            )  # fmt: skip
         if subsurface:
             blood = subject.hemoglobin("neutral")
             clear = skin_color(camera, light).rgb(np.zeros_like(subject.melanin), blood)
@@ -93,9 +100,7 @@ class SkinBleeding:
         if self._bounce is not None:
             point, normal = self._bounce.surface()
             direct = entering(self._caster, lamp, point, normal, normal)[0]
-            coarse = self._bounce.indirect(direct, self._patch_r_d)
-            filled = spread(coarse, self._bounce.atlas.covered, steps=2)
-            came = sample(filled, _texel_uv(atlas.size), np.ones(atlas.prim.shape, np.bool_))
+            came = self._color.on_texture(direct, atlas.size)
         if not self.subsurface:
             if came is None:
                 raise ValueError("glow: got neither subsurface nor bounce, expected one")
@@ -151,9 +156,3 @@ def entering(
     rs, rp = shading.fresnel_amplitudes(cosine, ETA)
     passed = 1.0 - 0.5 * (rs * rs + rp * rp)
     return np.asarray(seen * cosine * off**lamp.exponent * passed / squared, np.float32)
-
-
-def _texel_uv(size: int) -> Float32Array:
-    middle = (np.arange(size, dtype=np.float32) + np.float32(0.5)) / np.float32(size)
-    u, v = np.meshgrid(middle, middle[::-1])
-    return np.stack([u, v], axis=-1)

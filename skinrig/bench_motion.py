@@ -109,7 +109,7 @@ def simulate(
     motion = drawn(3, drift_mm=drift_mm, drift_deg=drift_mm / 3, twitch=twitch)
     times_s = sorted([*times_s, motion.twitch_start_s + 0.25] if twitch else times_s)
     subject = make_subject(preset, seed=0, size=texels)
-    scene = DomeScene(rig, subject, motion=motion)
+    scene = DomeScene(rig, subject, motion=motion, interreflections=False, subsurface=False)
     frames = []
     for t in times_s:
         pops = [LedPulse(k, 1.0, t, t + EXPOSURE_S) for k in range(len(rig.lights))]

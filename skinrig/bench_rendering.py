@@ -9,15 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.calibration.geometry import CameraPose
-from capture.rig import load_rig
+from capture.rig import Rig, load_rig
 from rigsim.render import Caster
 from rigsim.scenes.dome import DomeScene
 from rigsim.subject import make_subject
-from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure
+from skinrig.bench_resampling import tiled_rms
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, Timing, measure
 from skinrig.rendering import Rendering, Subsurface, render
 from skinrig.rendering_geometry import FittedSurface
 from skinrig.rendering_interior import Interior
 from skinrig.rendering_truth import true_light, true_model
+from skinrig.skin_bands import MELANIN_BANDS
 
 MEDIAN_ERROR: Final = 1.0
 SUM_ERROR: Final = 1.0
@@ -38,8 +40,9 @@ def model(*, toy: bool) -> StageBenchmark:
     rays = (1, 2) if toy else (1, 2, 3, 4)
     rig = load_rig("dome").resized(width + width % 2).subset(views=[VIEW])
     face = make_subject("III", seed=5, size=size)
-    scene = DomeScene(rig, face)
-    true = DomeScene(rig, face, subpixels=fine).radiance(VIEW, [LIGHT])[0]
+    direct = {"interreflections": False, "subsurface": False}  # as the model has it
+    scene = DomeScene(rig, face, **direct)
+    true = DomeScene(rig, face, subpixels=fine, **direct).radiance(VIEW, [LIGHT])[0]
     camera = CameraPose.nominal(rig.views[0])
     light = true_light(scene, LIGHT, VIEW)
     caster = Caster(face.mesh)
@@ -81,6 +84,10 @@ def model(*, toy: bool) -> StageBenchmark:
     two = [dataclasses.replace(light, name=n, intensity=_part(light.intensity, w))
            for n, w in (("a", 0.3), ("b", 0.7))]  # fmt: skip
     both = render(skin.model, laid[1], camera, two, subpixels=2, caster=caster).radiance
+    bands = {
+        name: _on_skin(band.preset, rig, size=128 if toy else 256, fine=fine)
+        for name, band in MELANIN_BANDS.items()
+    }
     return StageBenchmark(
         "render-model",
         "RMS error over the mean radiance of skin, %",
@@ -98,8 +105,22 @@ def model(*, toy: bool) -> StageBenchmark:
             ("a peer that renders these maps", "no renderer at hand reads tabulated mixtures"),
         ),
         condition=("vary",),
+        by_band=bands,
         interval_of="tiles of the picture",
     )  # fmt: skip
+
+
+def _on_skin(preset: str, rig: Rig, *, size: int, fine: int) -> BandError:
+    """Return the error of a face of a preset's melanin, at 4 rays a pixel."""
+    face = make_subject(preset, seed=5, size=size)
+    direct = {"interreflections": False, "subsurface": False}  # as the model has it
+    scene = DomeScene(rig, face, **direct)
+    true = DomeScene(rig, face, subpixels=fine, **direct).radiance(VIEW, [LIGHT])[0]
+    on = FittedSurface.of(true_model(scene, VIEW), face.mesh)
+    camera = CameraPose.nominal(rig.views[0])
+    light = true_light(scene, LIGHT, VIEW)
+    seen = render(on.model, on, camera, light, subpixels=2, caster=Caster(face.mesh))
+    return BandError(*_relative(seen.radiance, true))
 
 
 def _part(color: tuple[float, float, float], share: float) -> tuple[float, float, float]:
@@ -111,18 +132,9 @@ def _relative(
 ) -> tuple[float, tuple[float, float]]:
     """Return the RMS error over the mean on skin, %, with its interval over 16 x 16 tiles."""
     skin = true.mean(axis=-1) > 0.0
-    squared = np.mean((found.astype(np.float64) - true) ** 2, axis=-1)
-    mean = float(true[skin].mean())
-    rows, columns = np.nonzero(skin)
-    tile = rows // 16 * 10_000 + columns // 16
-    _, which = np.unique(tile, return_inverse=True)
-    sums, counts = np.bincount(which, squared[skin]), np.bincount(which)
-    rng = np.random.default_rng(0)
-    drawn = rng.integers(len(sums), size=(200, len(sums)))
-    roots = np.sqrt(sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1))
-    low, high = np.percentile(roots, [16, 84])
-    error = float(np.sqrt(squared[skin].mean()))
-    return 100.0 * error / mean, (100.0 * float(low) / mean, 100.0 * float(high) / mean)
+    to_percent = 100.0 / float(true[skin].mean())
+    told = tiled_rms((found.astype(np.float64) - true) * to_percent, skin)
+    return told.error, told.error_interval
 
 
 def _point(

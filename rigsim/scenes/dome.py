@@ -35,7 +35,10 @@ from rigsim.head_motion import HeadMotion
 from rigsim.led_light import lobe_exponent, white_intensity
 from rigsim.mesh import Float32Array
 from rigsim.render import Caster, GBuffer
+from rigsim.scene_needs import Noise, SceneNeeds
 from rigsim.scenes import olat
+from rigsim.scenes.dome_needs import dome_needs, noise_of
+from rigsim.scenes.flash_needs import BOUNCES, LATERAL, SPECTRAL
 from rigsim.scenes.olat import Hits, Lamp
 from rigsim.scenes.olat_vector import VectorLight
 from rigsim.sensor import Sensor, expose, sensor_of
@@ -120,9 +123,12 @@ class DomeScene:
     seed
         Seeds what differs from pulse to pulse.
     interreflections
-        Whether light goes from skin to skin.
+        Whether light goes from skin to skin. This and the next two: ``None`` decides by how much it
+        changes pixels, see `needs`.
     subsurface
         Whether light spreads sideways inside the skin.
+    spectral
+        Whether light that went from skin to skin is reflected wavelength by wavelength.
     subpixels
         Rays along each side of a pixel.
     choice
@@ -141,8 +147,9 @@ class DomeScene:
         conditions: Mapping[str, float] | None = None,
         sensor: Sensor | None = None,
         seed: int = 0,
-        interreflections: bool = False,
-        subsurface: bool = False,
+        interreflections: bool | None = None,
+        subsurface: bool | None = None,
+        spectral: bool | None = None,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
     ) -> None:
@@ -173,8 +180,6 @@ class DomeScene:
         self.movement = movement
         self.motion = motion
         self.seed = seed
-        self.interreflections = interreflections
-        self.subsurface = subsurface
         self.subpixels = subpixels
         self._illuminant = rig.lights[0].illuminant
         self._sensors = {
@@ -191,39 +196,26 @@ class DomeScene:
         )
         self._vector: dict[tuple[str, float], VectorLight] = {}
         self._frames: OrderedDict[tuple[str, int, float], Float32Array] = OrderedDict()
+        self.needs: SceneNeeds = dome_needs(
+            rig,
+            subject,
+            state,
+            caster=self._caster,
+            noise=noise_of([Noise.of(sensor) for sensor in self._sensors.values()]),
+            movement=movement,
+            motion=motion,
+            subsurface=subsurface,
+            interreflections=interreflections,
+            spectral=spectral,
+        )
+        """What is built, what is not, and why."""
+        self.interreflections = self.needs.builds(BOUNCES)
+        self.subsurface = self.needs.builds(LATERAL)
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
         """What this scene does not build, with the reason."""
-        out = [
-            ("depth of field and lens blur", "at f/8, 60 mm off focus: 1 to 2 pixels"),
-            ("ambient light", "the room is dark"),
-            ("light from the dome's frame and from other LEDs' lenses", "they are black"),
-        ]
-        if isinstance(self.subject, Subject):
-            out += [
-                ("eyes, teeth and hair on the head", "the eyes are closed; only skin is estimated"),
-                ("dependence of the boundary on its roughness", "light enters a smooth boundary"),
-            ]
-            if not self.movement:
-                out.append(("movement of the face with the state", "movement=False asks for it"))
-            elif self.subject.pose is not None:
-                out.append(("shadows of wrinkles", "they tilt the surface only"))
-            if not self.interreflections:
-                out.append(("light from skin to skin", "interreflections=False asks for it"))
-            else:
-                out.append(("highlights of skin on skin", "only light from inside goes on"))
-            if not self.subsurface:
-                out.append(("light spreading sideways in skin", "subsurface=False asks for it"))
-            else:
-                out.append(("kernels that vary over the face", "one profile, of its median skin"))
-            if self.motion is not None and (self.subsurface or self.interreflections):
-                out.append(("the twitch in light from inside", "it stays that of the still mouth"))
-            if self.motion is None:
-                out.append(("movement of the head", "motion=None asks for it"))
-            else:
-                out.append(("blur by movement within an exposure", "0.06 s move 0.05 mm"))
-        return out
+        return self.needs.left_out
 
     # light ------------------------------------------------------------------------------------
 
@@ -555,6 +547,7 @@ class DomeScene:
                 light=self._illuminant,
                 subsurface=self.subsurface,
                 bounce=self._bounce,
+                spectral=self.interreflections and self.needs.builds(SPECTRAL),
             )
         key = (camera, light, t_s)
         if key not in self._glow:

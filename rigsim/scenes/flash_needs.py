@@ -64,27 +64,24 @@ def flash_needs(
         `exchange_share` of the mesh, where it is known already.
     """
     view = rig.views[0]
-    films = [light.name for light in rig.lights if light.polarizer_axis_deg is not None]
-    made = [_polarization(rig, view, films), _bands(view)]
+    made = [polarization(rig, view), bands(view)]
     dark = [("ambient light", "the room is dark and the flash is short")]
     if isinstance(subject, Target):
         return SceneNeeds((*made, *_of_target(subject, caster), *absent(dark)))
-    skin = skin_color(view.spectral_sensitivity, rig.lights[0].illuminant)
-    covered = subject.atlas.covered
-    blood = subject.hemoglobin(state)
-    brightest = skin.rgb(subject.melanin[covered][::EVERY], blood[covered][::EVERY]).max(axis=0)
-    level = min(1.0, white_level * float(brightest.max()))
+    illuminant = rig.lights[0].illuminant
+    brightest = brightest_reflectance(subject, state, view, illuminant)
+    level = min(1.0, white_level * brightest)
     pixel_mm = view.distance_mm / view.focal_px
-    kernels = typical_kernels(subject, state, view.spectral_sensitivity, rig.lights[0].illuminant)
+    kernels = typical_kernels(subject, state, view.spectral_sensitivity, illuminant)
     lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
     share = exchange_share(caster) if share is None else share
-    more = level * bounced(share, float(brightest.max()))
+    more = level * bounced(share, brightest)
     unseen = more / float(noise.sigma(more))  # where nothing else shines
-    off = more * _color_error(subject, state, view, rig.lights[0].illuminant)
     bounces = decide(
         BOUNCES, unseen, interreflections, switch="interreflections",
         because=f"hollows get {100 * share:.0f} % of what their surroundings send out",
     )  # fmt: skip
+    off = unseen * color_error(subject, state, view, illuminant) if bounces.built else 0.0
     made += [
         Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0, level)),
         decide(
@@ -93,8 +90,7 @@ def flash_needs(
         ),
         bounces,
         decide(
-            SPECTRAL, off / float(noise.sigma(more)) if bounces.built else 0.0, spectral,
-            switch="spectral",
+            SPECTRAL, off, spectral, switch="spectral",
             because="a channel's mean of squares is not the square of its mean"
             if bounces.built else "there is no such light",
         ),
@@ -102,18 +98,30 @@ def flash_needs(
     return SceneNeeds((*made, *_movement(subject, movement), *absent(dark), *_limits(view)))
 
 
-def _polarization(rig: Rig, view: View, films: list[str]) -> Effect:
+def polarization(rig: Rig, view: View) -> Effect:
+    """Return whether light is kept as Stokes vectors: films alone tell polarized light apart."""
+    films = [light.name for light in rig.lights if light.polarizer_axis_deg is not None]
     if films or view.analyser_axis_deg is not None:
-        what = f"films before {', '.join(films) or 'no light'}"
-        return Effect(POLARIZATION, "built", f"{what}, and an analyser that turns")
-    return Effect(POLARIZATION, "absent", "the rig has no polarizing film")
+        reason = (
+            f"films before {len(films)} of {len(rig.lights)} lights, an analyser before {view.name}"
+        )
+        return Effect(POLARIZATION, "built", reason)
+    return Effect(POLARIZATION, "absent", "the rig has no polarizing film, and sensors see none")
 
 
-def _bands(view: View) -> Effect:
+def bands(view: View) -> Effect:
+    """Return how many colors are kept."""
     name = "bands of the camera"
     if view.cfa == "MONO":
         return Effect(name, "built", "one: the sensor has no filters")
     return Effect(name, "built", "three: those of the sensor's filters")
+
+
+def brightest_reflectance(subject: Subject, state: str, view: View, illuminant: str) -> float:
+    """Return the largest reflectance of a face's skin in any channel."""
+    covered = subject.atlas.covered
+    melanin, blood = subject.melanin[covered][::EVERY], subject.hemoglobin(state)[covered][::EVERY]
+    return float(skin_color(view.spectral_sensitivity, illuminant).rgb(melanin, blood).max())
 
 
 def _of_target(target: Target, caster: Caster) -> list[Effect]:
@@ -128,7 +136,7 @@ def _of_target(target: Target, caster: Caster) -> list[Effect]:
     ]
 
 
-def _color_error(subject: Subject, state: str, view: View, illuminant: str) -> float:
+def color_error(subject: Subject, state: str, view: View, illuminant: str) -> float:
     """Return by how much a channel's mean of R^2 is off the square of its mean, of typical skin."""
     table = SkinTable.load()
     weights = spectra.band_weights(view.spectral_sensitivity, illuminant, table.wavelength_nm)

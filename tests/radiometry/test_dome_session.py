@@ -26,7 +26,8 @@ class Pulse:
 
 lights, moving = int(sys.argv[1]), sys.argv[2] == "moving"
 rig = load_rig("dome")
-scene = DomeScene(rig, make_subject("III", size=1024), motion=head_motion(1) if moving else None)
+scene = DomeScene(rig, make_subject("III", size=1024), motion=head_motion(1) if moving else None,
+                  interreflections=False, subsurface=False)
 start = time.perf_counter()
 after_one = 0
 for k in range(lights):

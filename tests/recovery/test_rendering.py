@@ -19,7 +19,8 @@ LIGHTS = (20, 62)
 @pytest.fixture(scope="module")
 def scene():
     rig = load_rig("dome").resized(100).subset(views=["C03", "C07"])
-    return DomeScene(rig, make_subject("III", seed=5, size=256))
+    face = make_subject("III", seed=5, size=256)
+    return DomeScene(rig, face, interreflections=False, subsurface=False)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +72,7 @@ def test_a_face_that_smiles_is_rendered_with_its_neutral_normals_carried_along(s
     """
     view, light = "C07", LIGHTS[1]
     smiling = scene.subject.posed("happiness")
-    moved = DomeScene(scene.rig, smiling)
+    moved = DomeScene(scene.rig, smiling, interreflections=False, subsurface=False)
     true = moved.radiance(view, [light])[0]
     camera = CameraPose.nominal(scene.rig.view(view))
     carried = FittedSurface.of(model, smiling.mesh, rest=scene.subject.mesh)

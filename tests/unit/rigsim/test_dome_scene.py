@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -25,6 +26,9 @@ class Pulse:
     level: float
     t_on_s: float
     t_off_s: float
+
+
+direct = partial(DomeScene, interreflections=False, subsurface=False)
 
 
 @pytest.fixture(scope="module")
@@ -53,12 +57,12 @@ def face():
 
 @pytest.fixture(scope="module")
 def scene(rig, face):
-    return DomeScene(rig, face)
+    return direct(rig, face)
 
 
 @pytest.fixture(scope="module")
 def white(rig):
-    return DomeScene(rig, make_target("white"))
+    return direct(rig, make_target("white"))
 
 
 def test_white_tile_gets_what_intensity_lobe_cosine_and_distance_say(rig, white):
@@ -95,7 +99,7 @@ def test_a_dome_as_built_has_its_own_gains_dead_lights_and_wires(rig, white):
     built = BuiltDome(
         rig, rig, axes, gain={"C": 0.5}, dead=frozenset({"top"}), wiring=(1, 0, 2, 3, 4)
     )
-    scene = DomeScene(rig, make_target("white"), dome=built)
+    scene = direct(rig, make_target("white"), dome=built)
     every, plain = scene.radiance("C"), white.radiance("C")
     np.testing.assert_allclose(every[:3], 0.5 * plain[:3], rtol=1e-6)
     assert not every[3].any()
@@ -107,7 +111,7 @@ def test_a_dome_as_built_has_its_own_gains_dead_lights_and_wires(rig, white):
 def test_a_bent_image_shows_points_where_the_lens_puts_them(rig, face):
     """Tolerance: the middle of what a pixel of 3 mm covers, and rows kept as float32."""
     built = build(rig, seed=2, tolerances=Tolerances(distortion=0.2))
-    scene = DomeScene(rig, face, dome=built)
+    scene = direct(rig, face, dome=built)
     truth, view = scene.truth(), built.rig.views[0]
     rows, columns = np.nonzero(truth["mask"])
     offset = truth["position_mm"][rows, columns] - np.array(view.position_mm)
@@ -226,13 +230,13 @@ def test_no_pulse_gives_a_dark_frame_and_the_same_seed_the_same_frame(scene):
 
 
 def test_subpixels_change_edges_only(rig, face, scene):
-    fine = DomeScene(rig, face, subpixels=4).radiance("C", [0])[0]
+    fine = direct(rig, face, subpixels=4).radiance("C", [0])[0]
     coarse = scene.radiance("C", [0])[0]
     assert fine.sum() == pytest.approx(coarse.sum(), rel=5e-3)
 
 
 def test_head_stands_at_its_mesh_at_time_zero(rig, face, scene):
-    moving = DomeScene(rig, face, motion=head_motion(3))
+    moving = direct(rig, face, motion=head_motion(3))
     np.testing.assert_array_equal(moving.radiance("C", [0]), scene.radiance("C", [0]))
     assert (moving.radiance("C", [0], t_s=9.0) != scene.radiance("C", [0])).any()
 
@@ -255,7 +259,7 @@ def test_a_shifted_head_is_the_still_head_seen_by_a_shifted_rig(rig, face):
     """Moving the head by s is moving camera and lights by -s, apart from where LEDs point."""
     motion = head_motion(3, drift_mm=3.0, drift_deg=1.0, twitch=False)
     rotation, shift = motion.pose(7.0)
-    moved = DomeScene(rig, face, motion=motion).radiance("C", [0, 1], t_s=7.0)
+    moved = direct(rig, face, motion=motion).radiance("C", [0, 1], t_s=7.0)
 
     def carried(place, *, point=True):
         offset = shift if point else 0.0
@@ -272,7 +276,7 @@ def test_a_shifted_head_is_the_still_head_seen_by_a_shifted_rig(rig, face):
         dataclasses.replace(light, position_mm=carried(light.position_mm)) for light in rig.lights
     )
     other = dataclasses.replace(rig, views=(view,), lights=lights)
-    still = DomeScene(other, face).radiance("C", [0, 1])
+    still = direct(other, face).radiance("C", [0, 1])
     # The LED's axis is towards the origin, which the head has left by 3 mm: 0.25 degrees.
     assert moved.sum() == pytest.approx(still.sum(), rel=3e-3)
     bright = still > 0.2 * still.max()
@@ -284,7 +288,7 @@ def test_a_twitch_moves_the_mouth_for_half_a_second_and_nothing_else(rig, face, 
     start = motion.twitch_start_s
     assert motion.twitch(start) == motion.twitch(start + 0.51) == 0.0
     assert motion.twitch(start + 0.25) == pytest.approx(1.0)
-    moving = DomeScene(rig, face, motion=motion)
+    moving = direct(rig, face, motion=motion)
     rest = scene.radiance("C", [0])[0]
     np.testing.assert_array_equal(moving.radiance("C", [0], t_s=start - 0.01)[0], rest)
     image = moving.radiance("C", [0], t_s=start + 0.25)[0]
@@ -299,16 +303,16 @@ def test_a_twitch_moves_the_mouth_for_half_a_second_and_nothing_else(rig, face, 
 
 
 def test_a_target_stays_where_it_stands(rig, white):
-    moving = DomeScene(rig, make_target("white"), motion=head_motion(1))
+    moving = direct(rig, make_target("white"), motion=head_motion(1))
     np.testing.assert_array_equal(moving.radiance("C", [1], t_s=5.0), white.radiance("C", [1]))
-    assert not DomeScene(rig, make_target("dark")).radiance("C", [0]).any()
+    assert not direct(rig, make_target("dark")).radiance("C", [0]).any()
 
 
 def test_the_vectorized_kernel_and_the_plain_one_agree(rig, face, scene):
     """Two codes of one formula, two ray tracers; float32 against float64, and rays at edges."""
     if not choose_variant("rgb").is_vectorized:
         pytest.skip("no LLVM: there is one kernel only")
-    plain = DomeScene(rig, face, choice=VariantChoice("scalar_rgb", "asked for by the test", ""))
+    plain = direct(rig, face, choice=VariantChoice("scalar_rgb", "asked for by the test", ""))
     for light in (0, 1, 3):
         one, two = scene.radiance("C", [light])[0], plain.radiance("C", [light])[0]
         assert one.sum() == pytest.approx(two.sum(), rel=2e-3)
@@ -322,8 +326,8 @@ def test_both_kernels_agree_on_skin_under_a_coating(rig, face):
         pytest.skip("no LLVM: there is one kernel only")
     on = {"lotion": 0.8, "powder": 0.5}
     plain = VariantChoice("scalar_rgb", "asked for by the test", "")
-    scenes = [DomeScene(rig, face, conditions=on, choice=c) for c in (None, plain)]
-    bare = DomeScene(rig, face)
+    scenes = [direct(rig, face, conditions=on, choice=c) for c in (None, plain)]
+    bare = direct(rig, face)
     for light in (0, 3):
         one, two = (scene.radiance("C", [light])[0] for scene in scenes)
         assert one.sum() == pytest.approx(two.sum(), rel=2e-3)
@@ -332,7 +336,7 @@ def test_both_kernels_agree_on_skin_under_a_coating(rig, face):
 
 
 def test_a_condition_is_in_the_truth(rig, face):
-    scene = DomeScene(rig, face, conditions={"sweat": 0.5})
+    scene = direct(rig, face, conditions={"sweat": 0.5})
     truth, maps = scene.truth(), scene.truth_appearance()
     inside = truth["mask"]
     np.testing.assert_allclose(truth["film_eta"][inside], 1.333, atol=2e-3)
@@ -344,12 +348,12 @@ def test_a_condition_is_in_the_truth(rig, face):
     total, specular = scene.brdf(uv, up, up)
     assert np.all(total[:, 0] > specular)
     with pytest.raises(SceneError, match="conditions: got hot"):
-        DomeScene(rig, make_target("white"), conditions={"hot": 1.0})
+        direct(rig, make_target("white"), conditions={"hot": 1.0})
 
 
 def test_what_cannot_be_is_refused(rig, face, scene):
     with pytest.raises(SceneError, match="is no LED"):
-        DomeScene(load_rig("flash").resized(64), face)
+        direct(load_rig("flash").resized(64), face)
     with pytest.raises(SceneError, match="light: got 9"):
         scene.radiance("C", [9])
     with pytest.raises(SceneError, match="'X'"):
@@ -359,9 +363,9 @@ def test_what_cannot_be_is_refused(rig, face, scene):
     with pytest.raises(SceneError, match="end after"):
         scene.exposure("C", pops=[Pulse(0, 1.0, 0.02, 0.01)], exposure_s=0.1, seed=0)
     with pytest.raises(SceneError, match="expected a face"):
-        DomeScene(rig, make_target("white")).truth()
+        direct(rig, make_target("white")).truth()
     with pytest.raises(SceneError, match="subpixels"):
-        DomeScene(rig, face, subpixels=0)
+        direct(rig, face, subpixels=0)
     with pytest.raises(MotionError, match="drift_mm"):
         head_motion(0, drift_mm=50.0)
 
@@ -369,7 +373,7 @@ def test_what_cannot_be_is_refused(rig, face, scene):
 def test_what_is_not_built_is_named_and_what_is_built_is_not(rig, face, scene):
     names = {name for name, _ in scene.left_out}
     assert {"light from skin to skin", "movement of the head"} <= names
-    moving = {name for name, _ in DomeScene(rig, face, motion=head_motion(0)).left_out}
+    moving = {name for name, _ in direct(rig, face, motion=head_motion(0)).left_out}
     assert "movement of the head" not in moving
 
 

@@ -28,7 +28,8 @@ def face() -> Subject:
 
 
 def scene_of(rig: Rig, face: Subject, state: str, **kwargs) -> FlashScene:
-    return FlashScene(rig, face, state=state, **({"choice": EMBREE, "lateral": False} | kwargs))
+    plain = {"choice": EMBREE, "lateral": False, "interreflections": False}
+    return FlashScene(rig, face, state=state, **(plain | kwargs))
 
 
 @pytest.fixture(scope="module")

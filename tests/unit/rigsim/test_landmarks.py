@@ -31,7 +31,9 @@ def face() -> Subject:
 @pytest.fixture(scope="module")
 def scenes(rig: Rig, face: Subject) -> dict[str, FlashScene]:
     return {
-        state: FlashScene(rig, face, state=state, choice=EMBREE, lateral=False)
+        state: FlashScene(
+            rig, face, state=state, choice=EMBREE, lateral=False, interreflections=False
+        )
         for state in ("neutral", "smile", "surprise")
     }
 

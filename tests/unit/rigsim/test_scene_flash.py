@@ -41,8 +41,11 @@ def face() -> Subject:
     return make_subject("II", seed=4, size=256)
 
 
+PLAIN = {"choice": EMBREE, "subpixels": 1, "interreflections": False}
+
+
 def scene_of(rig: Rig, subject, **kwargs) -> FlashScene:
-    return FlashScene(rig, subject, **({"choice": EMBREE, "subpixels": 1} | kwargs))
+    return FlashScene(rig, subject, **(PLAIN | kwargs))
 
 
 @pytest.fixture(scope="module")

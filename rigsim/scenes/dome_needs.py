@@ -1,0 +1,163 @@
+"""What the dome's pictures of a face or a target must hold, and what they need not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from capture.rig import Rig, View
+from rigsim.effect_sizes import bounced, defocus_px, edge_loss, exchange_share
+from rigsim.head_motion import HeadMotion
+from rigsim.render import Caster
+from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
+from rigsim.scenes.flash_needs import (
+    BOUNCES,
+    LATERAL,
+    SHADOWS,
+    SPECTRAL,
+    bands,
+    brightest_reflectance,
+    color_error,
+    polarization,
+)
+from rigsim.scenes.skin_glow import typical_kernels
+from rigsim.subject import Subject
+from rigsim.targets import Target
+
+OFF_FOCUS_MM = 60.0
+"""How far a face's relief stands off the plane in focus."""
+
+
+def dome_needs(
+    rig: Rig,
+    subject: Subject | Target,
+    state: str,
+    *,
+    caster: Caster,
+    noise: Noise,
+    movement: bool,
+    motion: HeadMotion | None,
+    subsurface: bool | None,
+    interreflections: bool | None,
+    spectral: bool | None,
+) -> SceneNeeds:
+    """Decide what a scene in the dome builds.
+
+    Parameters
+    ----------
+    rig
+        The dome; of its cameras the first decides.
+    subject, state
+        Who stands there, in which state.
+    caster
+        The mesh.
+    noise
+        Of the sensors. Exposures are not known here: the brightest pixel is taken as full.
+    movement, motion
+        Whether the face moves with its state, and how the head does.
+    subsurface, interreflections, spectral
+        What is asked for; None lets the sizes decide.
+    """
+    view = rig.views[0]
+    made = [polarization(rig, view), bands(view)]
+    world = [
+        ("ambient light", "the room is dark"),
+        ("light from the dome's frame and from other LEDs' lenses", "they are black"),
+    ]
+    if isinstance(subject, Target):
+        size = 0.0 if exchange_share(caster) == 0.0 else float("inf")
+        because = "the target is flat" if size == 0.0 else "the target has hollows"
+        flat = decide(BOUNCES, size, None, switch="interreflections", because=because)
+        opaque = [(LATERAL, f"{subject.name} is opaque")]
+        return SceneNeeds((*made, flat, *absent([*opaque, *world])))
+    illuminant = rig.lights[0].illuminant
+    brightest = brightest_reflectance(subject, state, view, illuminant)
+    pixel_mm = view.distance_mm / view.focal_px
+    kernels = typical_kernels(subject, state, view.spectral_sensitivity, illuminant)
+    lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
+    share = exchange_share(caster)
+    more = bounced(share, brightest)
+    unseen = more / float(noise.sigma(more))  # where nothing else shines
+    bounces = decide(
+        BOUNCES, unseen, interreflections, switch="interreflections",
+        because=f"hollows get {100 * share:.0f} % of what their surroundings send out",
+    )  # fmt: skip
+    off = unseen * color_error(subject, state, view, illuminant) if bounces.built else 0.0
+    made += [
+        Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0)),
+        decide(
+            LATERAL, noise.share(lost), subsurface, switch="subsurface",
+            because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost:.1f} % at a shadow's edge",
+        ),
+        bounces,
+        decide(
+            SPECTRAL, off, spectral, switch="spectral",
+            because="a channel's mean of squares is not the square of its mean"
+            if bounces.built else "there is no such light",
+        ),
+    ]  # fmt: skip
+    made += _movement(subject, movement, motion, view)
+    made += absent(
+        [*world, ("open eyes, teeth and hair on the head", "the subject has brows alone")]
+    )
+    return SceneNeeds((*made, *_limits(view, made)))
+
+
+def _movement(
+    subject: Subject, movement: bool, motion: HeadMotion | None, view: View
+) -> list[Effect]:
+    name = "movement of the face with the state"
+    made = []
+    if not movement:
+        made.append(Effect(name, "asked", "movement=False asks for it", switch="movement"))
+    elif subject.pose is None:
+        made.append(Effect(name, "absent", "at rest nothing moves", switch="movement"))
+    else:
+        made.append(Effect(name, "built", "the state moves the face", switch="movement"))
+        made += unmodeled([("shadows of wrinkles", "they tilt the surface only")])
+    head = "movement of the head"
+    if motion is None:
+        return [*made, Effect(head, "absent", "motion=None: the head is held", switch="motion")]
+    pixel_mm = view.distance_mm / view.focal_px
+    blur = (
+        "blur by movement within an exposure",
+        f"0.06 s move 0.05 mm, a pixel {pixel_mm:.2f} mm",
+    )
+    made.append(Effect(head, "built", "the head drifts and twitches", switch="motion"))
+    return [
+        *made,
+        *unmodeled([("the twitch in light from inside", "it stays that of the still mouth"), blur]),
+    ]
+
+
+def _limits(view: View, made: list[Effect]) -> list[Effect]:
+    blur = defocus_px(
+        OFF_FOCUS_MM, f_number=view.f_number, focal_mm=view.focal_mm,
+        distance_mm=view.distance_mm, pixel_um=view.pixel_um,
+    )  # fmt: skip
+    out = [
+        (
+            "depth of field and lens blur",
+            f"at f/{view.f_number:g}, {OFF_FOCUS_MM:.0f} mm off focus: {blur:.1f} pixels",
+        ),
+        ("dependence of the boundary on its roughness", "light enters a smooth boundary"),
+    ]
+    built = {effect.name for effect in made if effect.built}
+    if BOUNCES in built:
+        out.append(("highlights of skin on skin", "only light from inside goes on"))
+    if LATERAL in built:
+        out.append(("lateral kernels that vary over the face", "one, of its median skin"))
+    return unmodeled(out)
+
+
+def noise_of(sensors: list[Noise]) -> Noise:
+    """Return the least noise of some sensors.
+
+    Examples
+    --------
+    >>> noise_of([Noise(1e-4, 2e-7), Noise(2e-4, 1e-7)])
+    Noise(scale=0.0001, offset=1e-07)
+    """
+    return Noise(
+        float(np.min([noise.scale for noise in sensors])),
+        float(np.min([noise.offset for noise in sensors])),
+    )
