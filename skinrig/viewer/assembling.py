@@ -9,8 +9,10 @@ from skinrig.viewer import (
     facial_color_assets,
     fitted_assets,
     microstructure_assets,
+    presets,
     scattering_assets,
     surface_assets,
+    wrinkle_assets,
 )
 from skinrig.viewer.scene import Assets, SceneSource, ViewerScene
 
@@ -19,6 +21,7 @@ BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
     scattering_assets.assets,
     surface_assets.assets,
     fitted_assets.assets,
+    wrinkle_assets.assets,
     microstructure_assets.assets,
 )
 """In the order in which their parts are listed; they do not see each other's."""
@@ -29,4 +32,4 @@ def assemble(source: SceneSource, *, provenance: dict[str, Any] | None = None) -
     scene = ViewerScene(mesh=source.mesh, provenance=provenance or {})
     for build in BUILDERS:
         scene = scene.with_assets(build(source))
-    return scene
+    return scene.with_assets(presets.assets(scene))

@@ -22,10 +22,17 @@ SCRIPTS: Final = (
     "color.js",
     "shading.js",
     "strain.js",
+    "wrinkles.js",
     "microstructure.js",
     "scattering.js",
     "reflectance.js",
     "display.js",
+    "costs.js",
+    "probes.js",
+    "drag.js",
+    "address.js",
+    "panel.js",
+    "controls.js",
     "main.js",
 )
 """Scripts in the order in which they run, all in one function; `main.js` comes last."""

@@ -302,6 +302,14 @@ float strainedVariance(vec2 uv) {
   return 0.5 * (both.r + both.g);
 }
 
+// From the frame in which the texture's map is symmetric (its rotation is the closest to the map)
+// to the surface's own, whose first axis runs along u.
+vec2 onSurface(SurfacePoint s, vec2 d) {
+  vec2 dv = vec2(dot(v_bitangent, s.tangent), dot(v_bitangent, s.bitangent));
+  vec2 turn = normalize(vec2(dot(v_tangent, s.tangent) + dv.y, -dv.x));
+  return vec2(turn.x * d.x - turn.y * d.y, turn.y * d.x + turn.x * d.y);
+}
+
 void adjustMicrostructure(inout SurfacePoint s) {
   float shown;
   vec4 both = microstructureAt(s.uv, shown);
@@ -316,7 +324,7 @@ void adjustMicrostructure(inout SurfacePoint s) {
     float drawn = shown * shown * p_microstructure_variance.y;
     total = (total - drawn) * (mode > 1.5 ? factor : 1.0);
   }
-  s.specularNormal = tilted(s, s.slope - derivatives);
+  s.specularNormal = tilted(s, s.slope - onSurface(s, derivatives));
   float m2 = s.roughness * s.roughness + 2.0 * (total - p_microstructure_variance.x);
   float least = min(s.roughness, LEAST_ROUGHNESS);
   s.roughness = sqrt(max(m2, least * least));

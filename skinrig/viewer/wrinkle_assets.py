@@ -1,0 +1,191 @@
+"""What the page needs to wrinkle: base derivatives, wrinkle maps, zones, and who moves them.
+
+Maps are those of `model.wrinkle_model`: fitted (`skinrig fit wrinkles`) where a folder has them,
+otherwise fitted to the simulated person's own expressions. The page adds them as
+`model.wrinkles.combine_layers` does.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.texture_resampling import resampled
+from model.wrinkle_expressions import as_table
+from model.wrinkle_model import FILE, WrinkleModel
+from model.wrinkles import Layer, mask_textures
+from skinrig.viewer.facial_color_assets import filled
+from skinrig.viewer.scene import Assets, SceneSource, Texture
+
+if TYPE_CHECKING:
+    from rigsim.subject import Subject
+
+Float32 = NDArray[np.float32]
+
+MAP_PX: Final = 512
+"""Side of wrinkle maps, at most: half a millimeter of a face; the paper has 256."""
+MASK_PX: Final = 64
+MOST_LAYERS: Final = 4
+"""Wrinkle maps that the shader has room for."""
+
+
+class WrinkleAssetError(ValueError):
+    """Wrinkle maps that the page cannot show."""
+
+
+def assets(source: SceneSource) -> Assets:
+    """Return the wrinkles of a scene, or why there are none."""
+    model, origin = model_of(source)
+    if model is None:
+        return Assets(left_out=(("wrinkles", origin),))
+    return from_model(model, source, origin=origin)
+
+
+def model_of(source: SceneSource) -> tuple[WrinkleModel | None, str]:
+    """Return the wrinkles of a scene and where they come from; None and the reason without."""
+    dynamic = source.appearances.get("dynamic")
+    if dynamic is not None and FILE in dynamic.files:
+        return WrinkleModel.from_maps(dynamic.maps, bytes(dynamic.files[FILE])), "fitted"
+    if source.subject is None:
+        return None, "no wrinkle maps in the appearance; `skinrig fit wrinkles` adds them"
+    found = simulated_model(source.subject, size=min(source.size, MAP_PX))
+    return found, "simulated: fitted to the person's own expressions"
+
+
+def simulated_model(subject: Subject, *, size: int) -> WrinkleModel:
+    """Return wrinkles fitted to the expressions of a simulated person.
+
+    Parameters
+    ----------
+    subject : Subject
+        At rest or posed; its mesh, seed and preset count.
+    size : int
+        Texels a side of the normals that are fitted and of the wrinkle map.
+    """
+    from reconstruction.wrinkle_fit import fit
+    from reconstruction.wrinkle_zones import amplitudes, fit_zones
+    from rigsim.expressions import EXPRESSIONS
+    from rigsim.subject import make_subject
+
+    rest = subject if subject.rest is None else subject.rest
+    if rest.size != size:
+        rest = make_subject(rest.preset, seed=rest.seed, size=size, mesh=rest.mesh)
+    neutral = rest.tangent_normal()
+    posed = {state: rest.posed(state).tangent_normal() for state in EXPRESSIONS}
+    few = min(MASK_PX, size)
+    zones = fit_zones(
+        amplitudes(neutral, posed, size=(few, few)), zones=8,
+        rng=np.random.default_rng(subject.seed),
+    )  # fmt: skip
+    return fit(neutral, posed, zones.masks, size=(size, size)).model()
+
+
+def from_model(model: WrinkleModel, source: SceneSource, *, origin: str) -> Assets:
+    """Return textures and facts of a wrinkle model on a scene's mesh.
+
+    A simulated face at rest keeps the relief that the surface's own assets bring: its base is left
+    to them. A fitted base replaces them.
+
+    Raises
+    ------
+    WrinkleAssetError
+        For more maps than the shader has room for.
+    """
+    if len(model.layers) > MOST_LAYERS:
+        raise WrinkleAssetError(
+            f"layers: got {len(model.layers)} wrinkle maps, expected at most {MOST_LAYERS}"
+        )
+    tables = [as_table(layer.table) for layer in model.layers]
+    driven = sorted({name for table in tables for name in table.rows} & set(source.mesh.shapes))
+    if not driven:
+        rows = ", ".join(tables[0].rows) if tables else "none"
+        return Assets(
+            left_out=(
+                ("wrinkles", f"none of their expressions ({rows}) is a blend shape of the mesh"),
+            )
+        )
+    shape = _map_shape(model)
+    maps = np.stack([_plane(layer.wrinkle, shape) for layer in model.layers])
+    textures = {
+        "wrinkle_maps": Texture(maps, "u16"),
+        "wrinkle_masks": Texture(_masks(model.layers), "u8"),
+    }
+    if origin == "fitted":
+        valid = np.ones(model.base.shape[:2], bool) if model.valid is None else model.valid
+        base = np.stack([filled(model.base[..., c], valid) for c in range(2)], axis=-1)
+        textures["wrinkle_base"] = Texture(base.astype(np.float32), "u8")
+    return Assets(
+        textures=textures,
+        facts={
+            "wrinkles": {
+                "expressions": driven,
+                "layers": [
+                    {
+                        "zones": list(table.zones),
+                        "rows": {name: list(table.rows[name]) for name in sorted(table.rows)},
+                    }
+                    for table in tables
+                ],
+                "clamp": model.clamp,
+                "origin": origin,
+                "slope_rms": retained_rms(model),
+            }
+        },
+    )
+
+
+def retained_rms(model: WrinkleModel) -> list[float]:
+    """Return the rms of slopes that pixels of 2^level texels still show, by level of the maps.
+
+    Of the wrinkle maps at full strength, over the texels where one has any: what a view loses by
+    leaving wrinkles out is at most this times the change of the reflection by a slope.
+    """
+    rows = [_level_rms(layer.wrinkle.astype(np.float64)) for layer in model.layers]
+    longest = max(len(row) for row in rows)
+    # a coarser map has its finest level where its texels are as large
+    shifted = [[row[0]] * (longest - len(row)) + row for row in rows]
+    return [float(np.sqrt(np.sum(np.square(level)))) for level in zip(*shifted, strict=True)]
+
+
+def _level_rms(derivatives: NDArray[np.float64]) -> list[float]:
+    side = derivatives.shape[0]
+    count = max(int(np.count_nonzero((derivatives != 0).any(axis=2))), 1)
+    share = count / derivatives[..., 0].size
+    found = []
+    while side >= 1:
+        found.append(float(np.sqrt(np.mean(np.sum(derivatives**2, axis=2)) / share)))
+        side //= 2
+        if side:
+            moved = np.moveaxis(derivatives, 2, 0)
+            derivatives = np.moveaxis(resampled(moved, (side, side)), 0, 2)
+    return found
+
+
+def _map_shape(model: WrinkleModel) -> tuple[int, int]:
+    shapes = [layer.wrinkle.shape for layer in model.layers]
+    return (
+        min(max(h for h, _, _ in shapes), MAP_PX),
+        min(max(w for _, w, _ in shapes), MAP_PX),
+    )
+
+
+def _plane(wrinkle: Any, shape: tuple[int, int]) -> Float32:
+    planes = resampled(np.moveaxis(np.asarray(wrinkle, np.float32), 2, 0), shape)
+    return np.ascontiguousarray(np.moveaxis(planes, 0, 2))
+
+
+def _masks(layers: tuple[Layer, ...]) -> Float32:
+    """Return two RGBA textures a layer, of one size."""
+    side = max(max(layer.masks.shape[1:]) for layer in layers)
+    out = []
+    for layer in layers:
+        if len(layer.masks) > 8:
+            raise WrinkleAssetError(f"masks: got {len(layer.masks)} zones, expected at most 8")
+        planes = resampled(np.asarray(layer.masks, np.float32), (side, side))
+        pair = mask_textures(planes)
+        if len(pair) == 1:
+            pair = np.concatenate([pair, np.zeros_like(pair)])
+        out.append(pair)
+    return np.concatenate(out).astype(np.float32)
