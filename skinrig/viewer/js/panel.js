@@ -1,0 +1,255 @@
+// What stands in the panel.
+V.has = (...names) => names.every(name => name in V.params);
+V.only = (...values) => values.filter(Boolean);
+
+V.BUFFERS = {
+  display: "Final picture", radiance: "Radiance before the tone map", irradiance: "Irradiance (depth in alpha)",
+  albedo: "Albedo", specular: "Specular reflection", normal: "Normals", inspect: "Texture coordinates, melanin",
+  hemoglobin_rig: "Hemoglobin: scale, bias", chromophores: "Melanin, hemoglobin", color: "Skin color",
+  scatter_source: "Light into the skin", albedo_factor: "Albedo traits: factor",
+};
+V.bufferLabel = name => {
+  const blur = /^scatter_(\d+)_([xy])$/.exec(name);
+  if (blur) return `Scattering: Gaussian ${Number(blur[1]) + 1} along ${blur[2]}`;
+  const shares = /^lobe_shares_(\d+)$/.exec(name);
+  if (shares) return `Lobe shares ${4 * shares[1] + 1} to ${4 * shares[1] + 4}`;
+  return V.BUFFERS[name] ?? V.capital(V.words(name));
+};
+
+// A range that shows a buffer: its 2nd to 98th percentile over what is not empty.
+V.rangeOf = name => {
+  if (name === "display") return {view_low: 0, view_high: 1};
+  const {values, channels} = V.readNow(name);
+  const kept = [];
+  const step = Math.max(1, Math.floor(values.length / channels / 20000)) * channels;
+  for (let i = 0; i < values.length; i += step) {
+    for (let c = 0; c < Math.min(channels, 3); c++) {
+      const value = values[i + c];
+      if (value !== 0 && Number.isFinite(value)) kept.push(value);
+    }
+  }
+  if (!kept.length) return {view_low: 0, view_high: 1};
+  kept.sort((a, b) => a - b);
+  const low = kept[Math.floor(0.02 * (kept.length - 1))];
+  const high = kept[Math.ceil(0.98 * (kept.length - 1))];
+  return {view_low: low < 0 ? low : 0, view_high: high > low ? high : low + 1};
+};
+
+V.weightNames = () => [...new Set([...Object.keys(V.scene.mesh.shapes), ...Object.keys(V.params.weights)])];
+V.globalStates = () => V.scene.facts.facial_color?.global_states ?? [];
+
+V.registerView = () => V.controls.push(
+  {group: "view", kind: "choice", path: ["view"], label: "Buffer",
+    help: "A buffer is spread from black to white over its own range.",
+    options: () => V.bufferNames(V.params).map(name => [name, V.bufferLabel(name)])
+      .sort(([a], [b]) => (b === "display") - (a === "display")),
+    change: name => ({view: name, ...V.rangeOf(name)})},
+  {group: "view", kind: "own", build: V.buildComparison},
+  {group: "view", kind: "choice", path: ["heads"], label: "Heads",
+    help: "Five heads at once are the paper's test of speed.",
+    options: () => [[1, "One"], [2, "Two"], [3, "Three"], [5, "Five"]]},
+  {group: "view", kind: "choice", path: ["resolution"], label: "Resolution",
+    help: "Automatic keeps a frame quick: fewer pixels where the processor draws.",
+    options: () => [[0, "Automatic"], [256, "256 pixels"], [384, "384 pixels"], [512, "512 pixels"],
+      [768, "768 pixels"], [1024, "1024 pixels"]]},
+);
+
+V.registerExpression = () => {
+  V.controls.push({group: "expression", kind: "own", build: V.buildPresets});
+  for (const name of V.weightNames().filter(one => !V.globalStates().includes(one))) {
+    V.controls.push({group: "expression", kind: "range", path: ["weights", name], min: 0, max: 1.5,
+      label: V.capital(V.words(name)), show: V.percent});
+  }
+};
+
+V.registerBlood = () => {
+  const why = {exercise: "Whole face, cheeks most: vessels open under load.",
+    alcohol: "Whole face, nose and cheeks most."};
+  for (const name of V.globalStates()) {
+    V.controls.push({group: "blood", kind: "range", path: ["weights", name], min: 0, max: 1.5,
+      label: V.capital(V.words(name)), show: V.percent, help: why[name]});
+  }
+  V.controls.push(
+    {group: "blood", kind: "range", path: ["hemoglobin_gain"], min: 0, max: 3, zero: 1, label: "Hemoglobin",
+      show: v => `× ${v.toFixed(2)}`, help: "Factor of the blood everywhere; the table is spaced by cube roots."},
+    {group: "blood", kind: "range", path: ["melanin_gain"], min: 0, max: 4, zero: 1, label: "Melanin",
+      show: v => `× ${v.toFixed(2)}`, help: "Factor of the pigment everywhere."},
+  );
+};
+
+V.registerReflection = () => {
+  const fitted = () => Boolean(V.surface.specular.fitted);
+  const told = V.scene.facts.reflectance;
+  const error = told ? ` The table of ${told.lobes} lobes is within ${(100 * told.rms_error).toFixed(2)} % ` +
+    `RMS of the fitted ones (${Math.round(told.table_bytes / 1024)} KB, ${told.lookups} look-ups).` : "";
+  const origin = told?.origin === "population" ? "the mean surface of simulated people"
+    : "the lobes fitted to this face";
+  V.controls.push(
+    {group: "reflection", kind: "choice", path: ["specular_model"], label: "Specular model", when: fitted,
+      help: `Kelemen and Szirmay-Kalos' formula, or ${origin}.${error}`,
+      options: () => [["analytic", "Analytic (Kelemen, Szirmay-Kalos)"], ["fitted", "Fitted lobes (Weyrich)"]]},
+    {group: "reflection", kind: "range", path: ["roughness"], min: 0.3, max: 2.5, zero: 1, label: "Roughness",
+      show: v => `× ${v.toFixed(2)}`, off: p => p.specular_model !== "analytic",
+      help: "Factor of the roughness map, of the analytic model alone."},
+    {group: "reflection", kind: "range", path: ["specular_intensity"], min: 0, max: 3, zero: 1, label: "Intensity",
+      show: v => `× ${v.toFixed(2)}`, help: "Factor of the intensity map."},
+    {group: "reflection", kind: "range", path: ["f0"], min: 0, max: 0.1, step: 0.001, zero: 0.028,
+      label: "Reflectance at normal incidence", show: v => v.toFixed(3),
+      off: p => p.specular_model !== "analytic", help: "0.028 is that of skin (index 1.4)."},
+  );
+};
+
+V.registerScattering = () => {
+  const profile = V.scene.facts.profile;
+  const edge = profile ? (100 * Math.max(...profile.edge_error)).toFixed(2) : "";
+  V.controls.push(
+    {group: "scattering", kind: "toggle", path: ["scattering"], label: "Subsurface scattering",
+      help: "Sum of Gaussians on the screen, as wide as depth and slant make them."},
+    {group: "scattering", kind: "range", path: ["scattering_scale"], min: 0, max: 3, zero: 1, label: "Width",
+      show: v => `× ${v.toFixed(2)}`, off: p => !p.scattering, help: "Factor of all widths."},
+    {group: "scattering", kind: "toggle", path: ["measured_translucency"], label: "Translucency of this face",
+      when: () => Boolean(profile), off: p => !p.scattering,
+      help: profile ? `Widths from 1/σtr: ${profile.told}. The Gaussians spread an edge of light within ` +
+        `${edge} % of the dipole.` : ""},
+    {group: "scattering", kind: "choice", path: ["texturing"], label: "Texturing", off: p => !p.scattering,
+      help: "A measured color map is blurred already: blurring it again loses detail that post-scatter texturing keeps.",
+      options: () => [["post", "Post-scatter: color after the blur"], ["pre", "Pre-scatter: color blurred twice"],
+        ["both", "Half before, half after"]]},
+  );
+};
+
+V.registerTraits = () => {
+  const surface = V.scene.facts.surface_traits?.traits ?? {};
+  const albedo = V.scene.facts.albedo_traits?.traits ?? {};
+  for (const name of Object.keys(V.scene.params.traits ?? {})) {
+    const said = V.only(
+      surface[name] && `surface: within ${V.percent(Math.max(...surface[name].held_error))} of the editor's`,
+      albedo[name] && `albedo: half a trait within ${(100 * albedo[name].between_error).toFixed(1)} % of R_d`,
+    );
+    V.controls.push({group: "traits", kind: "range", path: ["traits", name], min: -1, max: 1,
+      label: V.capital(name), show: V.signed, help: V.capital(said.join("; ")) + ".",
+      off: p => !albedo[name] && p.specular_model !== "fitted"});
+  }
+  if (Object.keys(surface).length) {
+    V.controls.push({group: "traits", kind: "own", build: box => {
+      const use = V.element("button", {type: "button"}, "Show with fitted lobes");
+      use.onclick = () => { V.set({specular_model: "fitted"}); V.say("Specular model: fitted lobes"); };
+      box.append(V.element("p", {className: "help"},
+        "Traits of the surface change fitted lobes: they show with that specular model."),
+      V.element("div", {className: "buttons"}, use));
+      return p => { box.hidden = p.specular_model === "fitted"; };
+    }});
+  }
+};
+
+V.registerRelief = () => V.controls.push(
+  {group: "relief", kind: "range", path: ["relief"], min: 0, max: 2, zero: 1, label: "Pores and lines at rest",
+    show: v => `× ${v.toFixed(2)}`, help: "Factor of the slopes of the static relief."},
+  {group: "relief", kind: "choice", path: ["microstructure"], label: "Microstructure",
+    help: "Ten-micrometer relief, and how strain sharpens or blurs it; look closely to see it.",
+    options: () => [[0, "None (mesostructure)"], [1, "Static"], [2, "Dynamic: follows the strain"],
+      [3, "Side by side: none, static, dynamic"]]},
+  {group: "relief", kind: "choice", path: ["microstructure_sampling"], label: "Sampling of the convolution",
+    options: () => [[0, "Bilinear"], [1, "Cubic"]]},
+);
+
+V.registerLight = () => V.controls.push(
+  {group: "light", kind: "range", path: ["light_azimuth_deg"], min: -180, max: 180, step: 1,
+    label: "Light: to the side", show: V.degrees, help: "Or drag with the tool Light."},
+  {group: "light", kind: "range", path: ["light_elevation_deg"], min: -89, max: 89, step: 1,
+    label: "Light: upwards", show: V.degrees},
+  {group: "light", kind: "range", path: ["light_intensity"], min: 0, max: 10, step: 0.1, label: "Light: strength"},
+  {group: "light", kind: "range", path: ["ambient"], min: 0, max: 1, label: "Even light"},
+  {group: "light", kind: "range", path: ["camera_distance_mm"], min: 45, max: 1200, step: 5, label: "Camera: distance",
+    show: v => `${Math.round(v)} mm`, help: "Or the wheel, two fingers, + and −."},
+  {group: "light", kind: "range", path: ["exposure"], min: 0.1, max: 4, zero: 1, label: "Exposure",
+    show: v => `× ${v.toFixed(2)}`},
+  {group: "light", kind: "toggle", path: ["filmic"], label: "Filmic tone map",
+    help: "Off: linear light in sRGB, clipped at white."},
+);
+
+V.buildPresets = box => {
+  const buttons = V.element("div", {className: "buttons", role: "group", "aria-label": "Presets"});
+  const same = (p, weights) => V.weightNames().every(name => (p.weights[name] ?? 0) === (weights[name] ?? 0));
+  const made = Object.entries(V.presetsInOrder()).map(([name, preset]) => {
+    const button = V.element("button", {type: "button", "aria-pressed": "false"}, V.capital(name));
+    button.onclick = () => {
+      const weights = Object.fromEntries(V.weightNames().map(one => [one, preset.weights?.[one] ?? 0]));
+      V.set({...preset, weights});
+      V.say(`Expression: ${name}`);
+    };
+    buttons.append(button);
+    return [button, preset.weights ?? {}];
+  });
+  box.append(buttons);
+  return p => made.forEach(([button, weights]) => button.setAttribute("aria-pressed", same(p, weights)));
+};
+// Packed without an order; people look for the neutral face first.
+V.presetsInOrder = () => {
+  const order = ["neutral", "happiness", "sadness", "surprise", "fear", "anger", "disgust", "smile", "sad smile",
+    "anger and surprise", "exercise", "after exercise", "alcohol"];
+  const rank = name => (order.indexOf(name) + 1 || order.length + 1);
+  return Object.fromEntries(Object.entries(V.scene.presets ?? {}).sort(([a], [b]) => rank(a) - rank(b)));
+};
+
+// Two sets of parameters side by side.
+V.buildComparison = box => {
+  const keep = V.element("button", {type: "button"}, "Keep this as B");
+  const swap = V.element("button", {type: "button"}, "Swap A and B");
+  const end = V.element("button", {type: "button"}, "End");
+  const slider = V.buildControl({kind: "range", path: ["split"], min: 0, max: 1, zero: 0, label: "Divider",
+    show: V.percent}, "split");
+  keep.onclick = () => {
+    V.set({compare: V.faceOf(V.params)});
+    V.say("B keeps what is shown; controls change A, left of the divider.");
+  };
+  swap.onclick = () => {
+    const held = V.params.compare;
+    V.set({...held, compare: V.faceOf(V.params)});
+    V.say("A and B are swapped.");
+  };
+  end.onclick = () => { V.set({compare: null}); V.say("The comparison has ended."); keep.focus(); };
+  box.append(V.element("p", {className: "label"}, "Compare A with B"),
+    V.element("div", {className: "buttons"}, keep, swap, end), slider.box,
+    V.element("p", {className: "help"}, "A, left of the divider, is what the controls change; B is held."));
+  return p => {
+    slider.update(p);
+    slider.box.hidden = swap.hidden = end.hidden = !p.compare;
+    const port = document.getElementById("port");
+    for (const badge of port.querySelectorAll(".badge")) badge.hidden = !p.compare;
+    V.placeDivider(p);
+  };
+};
+
+V.describeScene = () => {
+  const {provenance = {}, facts, left_out: leftOut = []} = V.scene;
+  const title = provenance.title ?? (provenance.kind === "procedural"
+    ? `Simulated head, phototype ${provenance.preset}` : (provenance.appearances ?? ["Face"]).join(", "));
+  document.title = `${title} — skin viewer`;
+  document.getElementById("title").textContent = title;
+  document.getElementById("source").textContent = provenance.source ?? "";
+  V.controls.push({group: "about", kind: "own", build: box => {
+    const list = V.element("ul", {className: "facts"});
+    const add = (name, text) => list.append(V.element("li", {}, V.element("b", {}, `${name}: `), text));
+    for (const [name, value] of Object.entries(provenance)) {
+      add(V.capital(V.words(name)), typeof value === "string" ? value : JSON.stringify(value));
+    }
+    const vertices = V.scene.mesh.positions.length / 3;
+    add("Mesh", `${vertices} vertices, ${V.scene.mesh.faces.length / 3} triangles, ` +
+      `${Object.keys(V.scene.mesh.shapes).length} blend shapes`);
+    const errors = Object.entries(V.scene.quantization_error ?? {}).filter(([name]) => !name.startsWith("shape "));
+    if (errors.length) {
+      add("Largest rounding of the packed maps", errors.map(([name, error]) =>
+        `${V.words(name)} ${V.plain(error)}`).join(", "));
+    }
+    if (facts.reflectance) {
+      add("Fitted lobes", `table of ${facts.reflectance.slabs} slabs, RMS error ` +
+        `${(100 * facts.reflectance.rms_error).toFixed(3)} %, 95 % of strong values within ` +
+        `${(100 * facts.reflectance.strong_error).toFixed(3)} %`);
+    }
+    leftOut.forEach(([what, why]) => add(`Left out: ${what}`, why));
+    box.append(list);
+  }});
+  [V.registerView, V.registerExpression, V.registerBlood, V.registerReflection, V.registerScattering,
+    V.registerTraits, V.registerRelief, V.registerLight].forEach(register => register());
+};
