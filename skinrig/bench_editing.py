@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
@@ -13,7 +14,8 @@ from reconstruction.common_parameterization import Chart
 from rigsim.population import Member, table_1
 from skinrig import editing_albedo, fitting_traits
 from skinrig.albedo_vectors import AlbedoTraits, VectorKind
-from skinrig.benchmark import Limit, Point, StageBenchmark, measure
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.skin_bands import MELANIN_BANDS
 from skinrig.trait_labels import Labels
 from skinrig.trait_truth import CommonFaces
 
@@ -43,6 +45,7 @@ def editing(*, toy: bool) -> StageBenchmark:
     before = [faces.albedo(p, noise=0.0, rng=rng) for p in edited]
     after = [faces.albedo(_tanned(p), noise=0.0, rng=rng) for p in edited]
     points, returns, kept = [], [], {}
+    bands: dict[str, BandError] = {}
     settings: list[tuple[VectorKind, int, float]] = [
         ("quantiles", 5, editing_albedo.NOISE), ("quantiles", 5, 0.0),
         ("histograms", 5, editing_albedo.NOISE),
@@ -65,6 +68,11 @@ def editing(*, toy: bool) -> StageBenchmark:
             partial(call, before[0].r_d, before[0].valid, 1.0), repeats=1 if toy else 3,
             memory=not toy,
         )  # fmt: skip
+        if not bands:
+            bands = {
+                name: _on_skin(call, faces, band.melanin, people[0])
+                for name, band in MELANIN_BANDS.items()
+            }
         mean = float(np.mean(errors))
         off = float(np.std(errors, ddof=1) / np.sqrt(len(errors)))
         knobs: dict[str, Any] = {"vectors": kind, "iterations": iterations, "noise": noise}
@@ -94,8 +102,35 @@ def editing(*, toy: bool) -> StageBenchmark:
             Limit("tan and its opposite, what is left", returned, RETURN, "<=", "%"),
             Limit("tan of amount 0, largest change", zero, 1e-5, "<="),
         ),
-        interval_of="faces",
+        interval_of="faces; by band, regions of one",
+        by_band=bands,
     )
+
+
+def _on_skin(
+    edit: Callable[..., NDArray[np.float32]], faces: CommonFaces, melanin: float, person: Member
+) -> BandError:
+    """Return the error of a tan put on one face of so much melanin, %."""
+    here = dataclasses.replace(person, melanin=melanin)
+    rng = np.random.default_rng(2)
+    one, truth = (faces.albedo(p, noise=0.0, rng=rng) for p in (here, _tanned(here)))
+    new = edit(one.r_d, one.valid, 1.0)
+    good = one.valid & truth.valid
+    sizes = 100 * np.abs(new / truth.r_d - 1)
+    # neighbors err alike: the face is cut into squares
+    step = max(len(good) // 8, 1)
+    squares = [
+        float(np.median(sizes[i : i + step, j : j + step][at]))
+        for i in range(0, len(good), step)
+        for j in range(0, len(good), step)
+        if (at := good[i : i + step, j : j + step]).any()
+    ]
+    return BandError(float(np.median(sizes[good])), _around(np.median(sizes[good]), squares))
+
+
+def _around(middle: float, squares: list[float]) -> tuple[float, float]:
+    half = 1.2533 * float(np.std(squares)) / np.sqrt(len(squares))
+    return float(middle) - half, float(middle) + half
 
 
 def _tanned(person: Member) -> Member:

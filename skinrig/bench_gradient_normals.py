@@ -21,7 +21,8 @@ from rigsim.microrelief import make_micro_skin
 from rigsim.scenes.gradient import GradientScene
 from rigsim.sphere_build import BuiltSphere, as_drawn
 from rigsim.taped_skin import GripState
-from skinrig.benchmark import Limit, Point, StageBenchmark, measure
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
+from skinrig.skin_bands import MELANIN_BANDS
 
 Floats = NDArray[np.float64]
 Images = Mapping[tuple[str, str], NDArray[np.floating]]
@@ -78,10 +79,11 @@ def pixel_geometry(rig: Rig) -> dict[str, Any]:
     return {"points_mm": points, "view": way / np.linalg.norm(way, axis=-1, keepdims=True)}
 
 
-def skin_patch(side: int, *, smooth: bool, seed: int = 5) -> Patch:
+def skin_patch(side: int, *, smooth: bool, seed: int = 5, preset: str = "III") -> Patch:
     """Picture a patch of cheek, as it is or smoothed, by all sixteen conditions."""
     rig = load_rig("gradient").cropped(side)
-    skin = make_micro_skin("cheek", seed=seed, size_mm=max(0.006 * side + 0.8, 1.2))
+    size_mm = max(0.006 * side + 0.8, 1.2)
+    skin = make_micro_skin("cheek", seed=seed, size_mm=size_mm, preset=preset)
     if smooth:
         height = gaussian_filter(skin.height_um, SMOOTH_PX, mode="wrap").astype(np.float32)
         skin = dataclasses.replace(skin, height_um=height)
@@ -152,6 +154,7 @@ def normals(*, toy: bool) -> StageBenchmark:
         def run() -> NormalMaps:
             return from_patterns(images, **options)
 
+        knobs = {"noise": "the sensor's"} | knobs
         timing = measure(run, repeats=1 if toy else 3)
         found = run()
         error, interval = _judged(found.normals, found.valid, patch.seen)
@@ -185,6 +188,9 @@ def normals(*, toy: bool) -> StageBenchmark:
         wiener=True)  # fmt: skip
     add({"patterns": "16", "noise": "none"}, patch.images, **told)
     add({"patterns": "16", "noise": "none", "lights": "ideal"}, patch.images)
+    bands = {
+        name: _on_skin(band.preset, side if toy else 128) for name, band in MELANIN_BANDS.items()
+    }
     limits = () if toy else _limits(worst, rng)
     return StageBenchmark(
         "gradient-normals",
@@ -195,7 +201,18 @@ def normals(*, toy: bool) -> StageBenchmark:
         limits,
         condition=("noise",),
         interval_of="blocks of pixels",
+        by_band=bands,
     )
+
+
+def _on_skin(preset: str, side: int) -> BandError:
+    """Return the error on skin of a preset's melanin: 16 patterns, all corrections."""
+    patch = skin_patch(side, smooth=False, preset=preset)
+    found = from_patterns(
+        exposed(patch, np.random.default_rng(0)), lights=patch.lights, variance=patch.noise,
+        wiener=True, **patch.geometry,
+    )  # fmt: skip
+    return BandError(*_judged(found.normals, found.valid, patch.seen))
 
 
 def _limits(worst: float, rng: np.random.Generator) -> tuple[Limit, ...]:

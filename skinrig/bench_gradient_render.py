@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 
+from skinrig import resident_memory
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
 
 TIMES_FASTER = 25.0
@@ -39,9 +40,11 @@ def render(*, toy: bool) -> StageBenchmark:
     reference, _ = traced(plain, pixels, subpixels=2 if toy else 4)
     points: list[Point] = []
 
-    def add(knobs: dict[str, str | int | float], seconds: float, error: float) -> None:
+    def add(
+        knobs: dict[str, str | int | float], seconds: float, error: float, memory: float | None
+    ) -> None:
         spread = error / math.sqrt(2.0 * len(pixels))
-        timing = Timing(seconds, (seconds, seconds), seconds, 0.0)
+        timing = Timing(seconds, (seconds, seconds), seconds, memory, "resident")
         interval = (100.0 * (error - spread), 100.0 * (error + spread))
         points.append(Point(knobs, timing, 100.0 * error, interval))
 
@@ -54,26 +57,29 @@ def render(*, toy: bool) -> StageBenchmark:
         scene = plain_scene(
             skin, width_px=width, subpixels=subpixels, sectors=sectors, table_size=table
         )
-        begin = time.process_time()
-        scene.lighting()
-        found = picture(scene, pixels)
-        spent = time.process_time() - begin
+        with resident_memory.watched() as rise:
+            begin = time.process_time()
+            scene.lighting()
+            found = picture(scene, pixels)
+            spent = time.process_time() - begin
         way = judge(found, reference, spent)
         ours[subpixels, sectors, table] = way
         knobs: dict[str, str | int | float] = {"way": "moments"}
-        add(knobs | {"subpixels": subpixels, "sectors": sectors, "table": table}, spent, way.error)
+        knobs |= {"subpixels": subpixels, "sectors": sectors, "table": table}
+        add(knobs, spent, way.error, rise.mb)
     without = judge(picture(plain_scene(skin, width_px=width, shadows=False), pixels), reference, 0)
     theirs = {}
     for samples in (4,) if toy else (16, 64):
         ways = []
         for number, pattern in enumerate(("full", "x")):
-            image, seconds = rendered(plain, pattern, samples=samples, seed=number)
+            with resident_memory.watched() as rise:
+                image, seconds = rendered(plain, pattern, samples=samples, seed=number)
             wanted = reference @ np.array(PATTERN_WEIGHTS[pattern])
             ways.append(judge(image.reshape(-1)[pixels].astype(np.float64), wanted, seconds))
         error = math.sqrt(sum(way.error**2 for way in ways) / 2.0)
         seconds = LIT_CONDITIONS * sum(way.seconds for way in ways) / 2.0
         theirs[samples] = (seconds, error, ways)
-        add({"way": "Mitsuba", "samples": samples}, seconds, error)
+        add({"way": "Mitsuba", "samples": samples}, seconds, error, rise.mb)
     best = ours[2, 32, 65]
     samples = max(theirs)
     peer_s, peer_error, ways = theirs[samples]

@@ -15,15 +15,18 @@ from model import store
 from reconstruction import pipeline
 from reconstruction.probe_stages import METHODS
 from skinrig import subsurface_evaluation as evaluation
-from skinrig.benchmark import Limit, Point, StageBenchmark, measure
+from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.calibrating import calibrate
 from skinrig.simulation import simulate_session, truth_folder
+from skinrig.skin_bands import MELANIN_BANDS
 
 MEDIA = 8
 SEED = 40
 SIGMA_TR_PER_MM = (0.3, 3.0)
 SIGMA_S_PRIME_PER_MM = (0.7, 3.0)
 G = (0.7, 0.9)
+BAND_G = 0.8
+"""g of the media that stand for bands of skin."""
 DIPOLE_BIAS = 0.05
 """The paper's fit must show its own bias: a truth made by the dipole would not."""
 
@@ -33,16 +36,19 @@ def session(*, toy: bool) -> StageBenchmark:
     with _bench() as folder:
         simulate_session("probe", folder / "session-phantom", target="phantom", seed=SEED)
         calibrate("fibre", [folder / "session-phantom"], folder / "calibration")
-        rows: list[evaluation.FitError] = []
-        last = folder
-        for seed in range(SEED, SEED + (1 if toy else MEDIA)):
-            last = folder / f"session-{seed}"
-            sigma_a, sigma_s_prime, g = medium(seed)
-            simulate_session(
-                "probe", last, subject=f"homogeneous:{sigma_a:.6g},{sigma_s_prime:.6g},{g:.3g}",
-                sites=("cheek",), seed=seed,
-            )  # fmt: skip
+        like_skin = {
+            name: _captured(
+                folder, name, (band.sigma_a_per_mm, band.sigma_s_prime_per_mm, BAND_G), seed
+            )
+            for seed, (name, band) in enumerate(MELANIN_BANDS.items())
+        }
+        of_bands = {name: _invert(folder, place) for name, place in like_skin.items()}
+        rows = [row for some in of_bands.values() for row in some] if toy else []
+        last = like_skin["dark"]
+        for seed in () if toy else range(SEED, SEED + MEDIA):
+            last = _captured(folder, f"{seed}", medium(seed), seed)
             rows += _invert(folder, last)
+        bands = {name: _best(some) for name, some in of_bands.items()}
         timing = measure(lambda: _invert(folder, last, "again"), repeats=1, memory=False)
     by_method = {row.method: row for row in evaluation.by_method(rows)}
     points = []
@@ -65,7 +71,8 @@ def session(*, toy: bool) -> StageBenchmark:
         tuple(points),
         () if toy else _limits(by_method),
         condition=("channel",),
-        interval_of="media",
+        interval_of="media and channels; by band, channels",
+        by_band=bands,
     )
 
 
@@ -108,6 +115,22 @@ def _limits(by_method: Mapping[str, evaluation.MethodError]) -> tuple[Limit, ...
         Limit("fits that are valid", best.fits, 3.0 * MEDIA, ">="),
         Limit("the dipole's median error", 100 * dipole.median, 100 * DIPOLE_BIAS, ">=", "%"),
     )  # fmt: skip
+
+
+def _captured(folder: Path, name: str, coefficients: tuple[float, float, float], seed: int) -> Path:
+    """Return a session of a medium by its sigma_a, sigma_s' and g."""
+    sigma_a, sigma_s_prime, g = coefficients
+    simulate_session(
+        "probe", folder / f"session-{name}", subject=f"homogeneous:{sigma_a:.6g},{sigma_s_prime:.6g},{g:.3g}",
+        sites=("cheek",), seed=seed,
+    )  # fmt: skip
+    return folder / f"session-{name}"
+
+
+def _best(rows: list[evaluation.FitError]) -> BandError:
+    """Return the error of the usual method over the channels of one medium, %."""
+    sizes = [abs(row.relative) for row in rows if row.method == METHODS[0] and row.valid]
+    return BandError(100 * float(np.median(sizes)), _interval(sizes))
 
 
 def _interval(sizes: list[float]) -> tuple[float, float]:

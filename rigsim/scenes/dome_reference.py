@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from capture.rig import Rig, View, load_rig
 from rigsim.atlas import BoolArray, spread
@@ -37,6 +38,8 @@ class Way:
     """Root mean square error over all images, relative to their mean."""
     mean_ratio: float
     """Mean of its images over that of the reference."""
+    squared_by_tile: NDArray[np.float64]
+    """Squared relative error of each tile of 16 x 16 pixels that shows skin, for its scatter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +63,24 @@ def plain_face(preset: str = "III", *, seed: int = 0, size: int = 512) -> Subjec
     return dataclasses.replace(face, normal=face.atlas.normal)
 
 
-class MattScene(DomeScene):
+class DirectScene(DomeScene):
+    """A dome where light goes from an LED to the skin and to the camera, unless asked otherwise."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        subject: Subject,
+        *,
+        interreflections: bool = False,
+        subsurface: bool = False,
+        **settings: Any,
+    ) -> None:
+        super().__init__(
+            rig, subject, interreflections=interreflections, subsurface=subsurface, **settings
+        )
+
+
+class MattScene(DirectScene):
     """A dome whose skin does not shine: the diffuse term behind the boundary alone."""
 
     def surface(self, view: View) -> SkinSurface:
@@ -69,7 +89,7 @@ class MattScene(DomeScene):
         return dataclasses.replace(surface, bare=np.zeros_like(surface.bare))
 
 
-class PlainScene(DomeScene):
+class PlainScene(DirectScene):
     """A dome whose skin has no vellus hair and no brows."""
 
     def surface(self, view: View) -> SkinSurface:
@@ -153,9 +173,22 @@ def compare(
         found = np.stack(images[name])
         difference = (found - reference).astype(np.float64)
         error = float(np.sqrt(np.mean(difference**2)) / reference.mean())
-        return Way(best[name], error, float(found.mean() / reference.mean()))
+        squared = _by_tile(difference / reference.mean(), reference > 0.0)
+        return Way(best[name], error, float(found.mean() / reference.mean()), squared)
 
     return Comparison(way("ours"), way("path"), way("direct"))
+
+
+def _by_tile(
+    difference: NDArray[np.float64], shown: NDArray[np.bool_], side: int = 16
+) -> NDArray[np.float64]:
+    """Return the mean square of each tile of images (L, H, W, 3), those without skin left out."""
+    squared = np.mean(difference**2, axis=(0, 3))
+    seen = shown.any(axis=(0, 3))
+    rows, columns = (n // side * side for n in squared.shape)
+    tiles = (rows // side, side, columns // side, side)
+    mean = squared[:rows, :columns].reshape(tiles).mean(axis=(1, 3))
+    return np.asarray(mean[seen[:rows, :columns].reshape(tiles).any(axis=(1, 3))])
 
 
 def _per_steradian(scene: PlainScene, light: int) -> Float32Array:
