@@ -21,6 +21,7 @@ from skinrig import (
     cli_reflectance,
     cli_rendering,
     cli_report,
+    cli_view,
     errors,
 )
 from skinrig.cli_help import Commands
@@ -390,6 +391,7 @@ app.command()(cli_planning.plan)
 app.command()(cli_rendering.render)
 app.command()(cli_editing.edit)
 app.command()(cli_report.report)
+app.command()(cli_view.view)
 app.command()(cli_export.export)
 cli_dynamic.fit_app.command("traits")(cli_editing.fit_traits)
 app.add_typer(cli_importing.import_app, name="import")

@@ -1,0 +1,95 @@
+"""From what a user names to a page on disk or on a port of this machine."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from skinrig.viewer import page, packing
+from skinrig.viewer.scene import SceneError, ViewerScene
+
+if TYPE_CHECKING:
+    from skinrig.console import Console
+
+
+def compose(
+    appearances: Sequence[Path],
+    *,
+    mesh: Path | None = None,
+    landmarks: Path | None = None,
+    preset: str = "III",
+    seed: int = 0,
+    size: int = 2048,
+    progress: Callable[[str], None] | None = None,
+) -> ViewerScene:
+    """Return the scene that a user asked for.
+
+    Parameters
+    ----------
+    appearances
+        Fitted folders of one face; none: a simulated head.
+    mesh, landmarks, preset, seed, size
+        As `skinrig.viewer.procedural.scene` and `skinrig.viewer.from_appearance.scene` take them.
+    progress
+        Called with one line a step.
+
+    Raises
+    ------
+    SceneError
+        For landmarks without a picture, and what the sources refuse.
+    """
+    from skinrig.viewer import from_appearance, procedural
+
+    if progress is not None:
+        progress("making textures and tables")
+    if appearances:
+        return from_appearance.scene(appearances, mesh=mesh, landmarks=landmarks, size=size)
+    if landmarks is not None:
+        raise SceneError(
+            "landmarks: got a table but no appearance whose picture it belongs to; name the folder"
+        )
+    return procedural.scene(preset=preset, size=size, seed=seed, mesh=mesh)
+
+
+def write(scene: ViewerScene, out: Path) -> dict[str, Any]:
+    """Write the page of a scene, whole or not at all, and return what it holds.
+
+    Parameters
+    ----------
+    scene
+        What it shows.
+    out
+        File to write or replace.
+
+    Returns
+    -------
+    dict
+        JSON values: path, bytes, textures, blend shapes, quantization errors, what is left out.
+    """
+    packed = packing.pack(scene)
+    text = page.render(packed).encode("utf-8")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    part = out.with_name(f".{out.name}.part")
+    try:
+        part.write_bytes(text)
+        os.replace(part, out)
+    finally:
+        part.unlink(missing_ok=True)
+    return {
+        "path": out,
+        "bytes": len(text),
+        "payload_bytes": len(packed.payload),
+        "textures": len(scene.textures),
+        "blend_shapes": len(scene.mesh.shapes),
+        "triangles": len(scene.mesh.faces),
+        "quantization_error": packed.errors,
+        "provenance": dict(scene.provenance),
+        "left_out": [list(row) for row in scene.left_out],
+    }
+
+
+def serve(scene: ViewerScene, port: int, appearances: Sequence[Path], *, console: Console) -> None:
+    """Serve the page of a scene on this machine until it is interrupted."""
+    raise SceneError("port: this build serves no pages yet; write one with -o page.html")
