@@ -17,7 +17,7 @@ V.groups = [
   ["traits", "Traits", "Directions in which faces of a population differ: more or less of each.", false],
   ["relief", "Fine surface", "Pores, wrinkles and microstructure that no mesh holds.", false],
   ["light", "Light and tone", "One distant light and an even one; how light becomes screen.", false],
-  ["cost", "Cost", "Passes, texture reads, bytes and time of a frame.", false],
+  ["cost", "Size and cost", "Passes, texture reads, bytes and time of a frame.", false],
   ["about", "About this face", "Where it comes from, stated errors, and what the page lacks.", false],
 ];
 V.controls = [];

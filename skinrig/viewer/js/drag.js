@@ -52,23 +52,23 @@ V.speakPlace = () => {
       `${Math.round(p.camera_distance_mm)} millimeters away`);
 };
 
-// The canvas as large as its place, within what a frame may cost.
+// The canvas as large as its place, within what a frame may cost. A size that another hand set
+// stays until a resolution is chosen.
 V.fitCanvas = () => {
   const port = document.getElementById("port");
   const [width, height] = [port.clientWidth, port.clientHeight];
+  const {resolution} = V.params;
+  const last = V.fitted;
   if (!width || !height) return false;
-  const most = V.params.resolution || (V.software() ? 448 : 1280);
-  const scale = Math.min(window.devicePixelRatio || 1, most / Math.max(width, height));
-  const size = V.params.resolution
-    ? [width, height].map(side => side * most / Math.max(width, height))
-    : [width, height].map(side => side * scale);
-  const [w, h] = size.map(side => Math.max(16, Math.round(side)));
-  const key = `${width},${height},${V.params.resolution}`;
-  if (V.fitted === key) return false;
-  V.fitted = key;
-  if (V.canvas.width === w && V.canvas.height === h) return false;
-  V.canvas.width = w;
-  V.canvas.height = h;
+  if (last && last.resolution === resolution && (last.width === width && last.height === height
+    || V.canvas.width !== last.size[0] || V.canvas.height !== last.size[1])) return false;
+  const most = resolution || (V.software() ? 448 : 1280);
+  const dense = resolution ? Infinity : window.devicePixelRatio || 1;
+  const scale = Math.min(dense, most / Math.max(width, height));
+  const size = [width, height].map(side => Math.max(16, Math.round(side * scale)));
+  V.fitted = {width, height, resolution, size};
+  if (V.canvas.width === size[0] && V.canvas.height === size[1]) return false;
+  [V.canvas.width, V.canvas.height] = size;
   return true;
 };
 

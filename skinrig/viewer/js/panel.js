@@ -45,10 +45,13 @@ V.registerView = () => V.controls.push(
       .sort(([a], [b]) => (b === "display") - (a === "display")),
     change: name => ({view: name, ...V.rangeOf(name)})},
   {group: "view", kind: "own", build: V.buildComparison},
-  {group: "view", kind: "choice", path: ["heads"], label: "Heads",
+);
+
+V.registerSize = () => V.controls.push(
+  {group: "cost", kind: "choice", path: ["heads"], label: "Heads",
     help: "Five heads at once are the paper's test of speed.",
     options: () => [[1, "One"], [2, "Two"], [3, "Three"], [5, "Five"]]},
-  {group: "view", kind: "choice", path: ["resolution"], label: "Resolution",
+  {group: "cost", kind: "choice", path: ["resolution"], label: "Resolution",
     help: "Automatic keeps a frame quick: fewer pixels where the processor draws.",
     options: () => [[0, "Automatic"], [256, "256 pixels"], [384, "384 pixels"], [512, "512 pixels"],
       [768, "768 pixels"], [1024, "1024 pixels"]]},
@@ -251,5 +254,5 @@ V.describeScene = () => {
     box.append(list);
   }});
   [V.registerView, V.registerExpression, V.registerBlood, V.registerReflection, V.registerScattering,
-    V.registerTraits, V.registerRelief, V.registerLight].forEach(register => register());
+    V.registerTraits, V.registerRelief, V.registerLight, V.registerSize].forEach(register => register());
 };

@@ -54,7 +54,8 @@ V.start.push(() => {
       ])),
       draw: ctx => ctx.full(V.program(["full_vertex"], ["lobe_share_pass"],
         {SHARE_COUNT: 4 * layers, SWEEPS: sweeps}), {
-        u_gram: padded.gram, u_scale: padded.scale, u_pull: V.traitPull(ctx.p),
+        u_gram: Array.from(padded.gram), u_scale: Array.from(padded.scale),
+        u_pull: Array.from(V.traitPull(ctx.p)),
         u_active: active(ctx.p),
       }),
       cost: () => ({taps: layers * width * height, bytes: 8 * layers * width * height}),
