@@ -220,6 +220,47 @@ def build(
     return ColorTable(camera, illuminant, rgb, anisotropy=anisotropy)
 
 
+def spectral_reflectance(c_m: ArrayLike, c_hd: ArrayLike, *, anisotropy: float = 0.0) -> FloatArray:
+    """Return the spectra that the color tables average, by their splines.
+
+    Parameters
+    ----------
+    c_m, c_hd
+        Volume fractions, Jimenez 2010, Table 1: 0 to 0.5 and 0 to 0.32; broadcast together.
+    anisotropy
+        See :func:`build`; a g that is not stored takes seconds.
+
+    Returns
+    -------
+    ndarray, shape (*fractions, 31)
+        Diffuse reflectance at normal incidence without the specular part, at
+        `model.spectra.WAVELENGTH_NM`.
+
+    Raises
+    ------
+    ColorTableError
+        For fractions outside the table, or not finite.
+
+    Examples
+    --------
+    >>> spectral_reflectance(0.02, 0.02)[[5, 15, 25]].round(2).tolist()
+    [0.17, 0.2, 0.34]
+    """
+    melanin, blood = np.broadcast_arrays(np.asarray(c_m, float), np.asarray(c_hd, float))
+    for name, values, most in (("c_m", melanin, C_M_MAX), ("c_hd", blood, C_HD_MAX)):
+        if values.size and not (values.min() >= 0.0 and values.max() <= most):
+            raise ColorTableError(
+                f"{name}: got {values.min():g} to {values.max():g}, expected 0 to {most:g}"
+            )
+    log_reflectance = _log_spectra(anisotropy, BETA_M, OXYGENATION, ETA_SKIN)
+    axes = spectral_axes(log_reflectance.shape[0])
+    place = np.cbrt(melanin).reshape(-1), np.cbrt(blood).reshape(-1)
+    found = np.empty((melanin.size, log_reflectance.shape[2]))
+    for band in range(found.shape[1]):
+        found[:, band] = RectBivariateSpline(*axes, log_reflectance[..., band], s=0).ev(*place)
+    return np.exp(found).reshape(*melanin.shape, -1)
+
+
 def spectral_axes(nodes: int) -> tuple[FloatArray, FloatArray]:
     """Return the cube roots of C_m and of C_hd along the axes, from 0 to Table 1's ends."""
     u = np.linspace(0.0, np.cbrt(C_M_MAX), nodes)  # eq. (7)

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from skinrig.cli_options import Json, Out
 from skinrig.console import Console
+
+NEXT: Final[Mapping[str, str]] = {
+    "maps": "read maps.json: units, ranges and frames; maps.mtlx holds the color spaces",
+    "mtlx": "load skin.mtlx on skin.obj; material.json has the scene unit and what was assumed",
+    "gltf": "open skin.glb, for example in Blender by File, Import, glTF 2.0",
+    "usd": "open skin.usdc, for example by usdview; usd.json has what was assumed",
+    "spectral": "read spectral.json: what is measured and what is modelled",
+    "metahuman": "read delta_maps.json: layout and coding of the deltas",
+    "lp": "skinrig import lp DIR --out SESSION reads the folder back",
+}
+"""What to do with each format."""
 
 
 def export(
@@ -16,8 +28,8 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            help="Of an appearance: maps, mtlx, gltf, merl, rgl. "
-            "Of a session: mhl, frames, event-model."
+            help="Of an appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. "
+            "Of a session: mhl, frames, event-model, lp."
         ),
     ],
     out: Out,
@@ -38,11 +50,18 @@ def export(
         bool, typer.Option("--with-errors", help="Standard errors and masks beside the values.")
     ] = False,
     only: Annotated[
-        str | None, typer.Option(help="Names of maps (maps), joined by commas.")
+        str | None, typer.Option(help="Names of maps (maps), or of up to three states (metahuman).")
     ] = None,
     mesh: Annotated[
         Path | None,
         typer.Option(help="Mesh with the maps' texture coordinates and blend shapes, in mm."),
+    ] = None,
+    onto: Annotated[
+        Path | None, typer.Option(help="Dome's maps whose texture gets the colors (metahuman).")
+    ] = None,
+    landmarks: Annotated[
+        list[Path] | None,
+        typer.Option(help="Tables name,x,y of the flash picture, then of that texture."),
     ] = None,
     at: Annotated[
         str | None, typer.Option(help="Place on the skin, U,V in 0 to 1: its BRDF too (merl, rgl).")
@@ -51,6 +70,12 @@ def export(
     without_diffuse: Annotated[
         bool, typer.Option("--without-diffuse", help="The place's surface alone.")
     ] = False,
+    camera: Annotated[
+        str | None, typer.Option(help="Whose pictures (lp); default: the one in front.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="CALIBRATION/ folder of lights and cameras (lp).")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Hand a session or an appearance on to other programs, within the subject's consent.
@@ -59,7 +84,7 @@ def export(
 
     Example: skinrig export appearance --to gltf --out delivery
     """
-    from skinrig.exporting import appearances, brdfs, sessions
+    from skinrig.exporting import appearances, brdfs, light_lists, sessions
     from skinrig.exporting.options import Delivery
 
     console = Console(json)
@@ -69,16 +94,29 @@ def export(
     elif to in appearances.FORMATS:
         names = () if only is None else tuple(name.strip() for name in only.split(","))
         delivery = Delivery(
-            unit=unit, normal_y=normal_y, udim=udim, with_errors=with_errors, only=names, mesh=mesh
+            unit=unit,
+            normal_y=normal_y,
+            udim=udim,
+            with_errors=with_errors,
+            only=names,
+            mesh=mesh,
+            onto=onto,
+            landmarks=tuple(landmarks or ()),
         )
         done = appearances.export_appearance(source, out, to=to, delivery=delivery, use=use)
+    elif to == light_lists.NAME:
+        done = light_lists.export_light_list(
+            source, out, use=sessions.named(use), camera=camera, calibration=calibration
+        )
     else:
         done = sessions.export_session(source, out, to=to, use=sessions.named(use))
+    after = NEXT.get(to, "hand the folder on; `ascmhl verify` tells whether it is still whole")
     for what, why in done.left_out:
         console.say(f"left out: {what}: {why}")
     console.say(f"{done.path}: {done.files} files, listed in {done.manifest}")
+    console.say(f"next: {after}")
     console.document(
         "skinrig.export/1",
-        {"path": done.path, "files": done.files, "manifest": done.manifest, "to": to,
+        {"path": done.path, "files": done.files, "manifest": done.manifest, "to": to, "next": after,
          "left_out": [list(row) for row in done.left_out]},
     )  # fmt: skip

@@ -41,12 +41,26 @@ def _usd() -> Write:
     return usd.write
 
 
+def _spectral() -> Write:
+    from skinrig.exporting import spectral
+
+    return spectral.write
+
+
+def _metahuman() -> Write:
+    from skinrig.exporting import delta_maps
+
+    return delta_maps.write
+
+
 # each format imports its own libraries only
 FORMATS: Final[Mapping[str, Callable[[], Write]]] = {
     "maps": _maps,
     "mtlx": _materialx,
     "gltf": _gltf,
     "usd": _usd,
+    "spectral": _spectral,
+    "metahuman": _metahuman,
 }
 
 
@@ -97,8 +111,10 @@ def export_appearance(
         raise ExportError(f"to: got {to!r}, expected one of {', '.join(FORMATS)}")
     target = fresh(out)
     appearance = allowed(appearance_path, use, today=today)
-    write = FORMATS[to]()
     order = delivery or Delivery()
+    if order.onto is not None:
+        allowed(order.onto, use, today=today)  # its maps are handed on, too
+    write = FORMATS[to]()
     return sealed(target, lambda part: write(appearance, part, order), now)
 
 

@@ -27,6 +27,7 @@ from skinrig.errors import UsageError
 from skinrig.exporting.images import Image, ImageFolder, coded
 from skinrig.exporting.material import COLOR_NOTE, NOTES, Material
 from skinrig.exporting.options import Delivery
+from skinrig.exporting.provenance import provenance
 from skinrig.exporting.sealing import write_json
 
 FILE, DOCUMENT = "skin.glb", "glb.json"
@@ -101,8 +102,6 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     ValueError
         See :meth:`skinrig.exporting.material.Material.of`.
     """
-    from skinrig.exporting.maps import provenance
-
     for option, value, only in (
         ("--unit", delivery.unit_or("m"), "m"),
         ("--normal-y", delivery.normal_y, "gl"),

@@ -12,6 +12,7 @@ from model.skin import SkinAppearance, SkinMap
 from skinrig.exporting import materialx
 from skinrig.exporting.images import CAMERA, DATA, SRGB, Image, ImageFolder, png_range
 from skinrig.exporting.options import NORMAL_Y, Delivery
+from skinrig.exporting.provenance import ORIENTATION, provenance
 from skinrig.exporting.sealing import ExportError, write_json
 from skinrig.rendering_geometry import MESH_FILES
 
@@ -21,9 +22,6 @@ PACKED: Final = "chromophores"
 """Melanin in R, hemoglobin in G, as texture suppliers deliver them."""
 LINEAR_SRGB: Final = ("picture", "specular_picture", "color")
 CAMERA_RGB: Final = ("diffuse", "specular", "r_d", "reflectance", "albedo", "crossed")
-ORIENTATION: Final = (
-    "row 0 of every image is its top; of a texture that is v = 1, with (0, 0) bottom left"
-)
 
 
 def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[tuple[str, str]]:
@@ -86,19 +84,6 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         (folder / "files" / name).write_bytes(data)
     write_json(folder / DOCUMENT, _document(appearance, delivery, out.records, left_out))
     return left_out
-
-
-def provenance(appearance: SkinAppearance) -> dict[str, Any]:
-    """Return where an appearance is from, as JSON values that every export's document holds."""
-    told = appearance.parameters
-    return {
-        "source": appearance.source,
-        "inputs": dict(appearance.inputs),
-        "versions": dict(appearance.versions),
-        "seed": appearance.seed,
-        "assumed": told.get("assumed", []),
-        "consent": told.get("consent", []),
-    }
 
 
 def _document(

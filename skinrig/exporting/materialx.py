@@ -14,6 +14,7 @@ from skinrig.exporting import obj
 from skinrig.exporting.images import Image, ImageFolder
 from skinrig.exporting.material import COLOR_NOTE, NOTES, Material
 from skinrig.exporting.options import NORMAL_Y, UNITS_M, Delivery
+from skinrig.exporting.provenance import ORIENTATION, provenance
 from skinrig.exporting.sealing import write_json
 
 VERSION: Final = "1.39"
@@ -47,8 +48,6 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     ValueError
         See :meth:`skinrig.exporting.material.Material.of`.
     """
-    from skinrig.exporting.maps import ORIENTATION, provenance
-
     material = Material.of(appearance, delivery.mesh)
     unit = delivery.unit_or("m")
     out = ImageFolder(folder, delivery)
@@ -138,10 +137,8 @@ def openpbr_document(material: Material, radius_mm: float, delivery: Delivery) -
             shader, "input", name=name, type=kind, nodegraph="NG_skin", output=f"{output}_out"
         )
 
-    def fixed(name: str, value: float, **more: str) -> None:
-        ElementTree.SubElement(
-            shader, "input", name=name, type="float", value=f"{value:.9g}", **more
-        )
+    def fixed(name: str, value: float) -> None:
+        ElementTree.SubElement(shader, "input", name=name, type="float", value=f"{value:.9g}")
 
     linked("base_color", "color3", "base_color")
     linked("specular_weight", "float", "specular_weight")
@@ -199,8 +196,9 @@ def _image(
     graph: ElementTree.Element, name: str, kind: str, file: str, space: str | None
 ) -> ElementTree.Element:
     node = ElementTree.SubElement(graph, "image", name=name, type=kind)
-    more = {} if space is None else {"colorspace": space}
-    ElementTree.SubElement(node, "input", name="file", type="filename", value=file, **more)
+    entry = ElementTree.SubElement(node, "input", name="file", type="filename", value=file)
+    if space is not None:
+        entry.set("colorspace", space)
     return node
 
 

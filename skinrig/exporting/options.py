@@ -41,6 +41,10 @@ class Delivery:
     mesh
         A mesh with the maps' texture coordinates, perhaps with blend shapes, instead of the
         appearance's own.
+    onto
+        APPEARANCE/ of a dome whose texture facial color is put on.
+    landmarks
+        Tables ``name,x,y`` of the flash picture and of that texture, px.
     """
 
     unit: str | None = None
@@ -49,6 +53,8 @@ class Delivery:
     with_errors: bool = False
     only: tuple[str, ...] = ()
     mesh: Path | None = None
+    onto: Path | None = None
+    landmarks: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse words that mean nothing."""

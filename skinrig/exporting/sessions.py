@@ -54,13 +54,19 @@ def export_session(
     """
     if to not in FORMATS:
         raise ExportError(f"to: got {to!r}, expected one of {', '.join(FORMATS)}")
-    session = Session.open(session_path)
-    session.require_consent(use, today=today)
     target = fresh(out)
-    found = verify(session_path)
-    if not found.ok:
-        raise ExportError(f"{session_path}: is damaged, nothing was copied: {found.problems[0]}")
+    session = allowed(session_path, use, today=today)
     return sealed(target, lambda part: FORMATS[to](session, part), now)
+
+
+def allowed(path: str | Path, use: str, *, today: date | None = None) -> Session:
+    """Open an undamaged session whose subject agreed to a use; see :func:`export_session`."""
+    session = Session.open(path)
+    session.require_consent(use, today=today)
+    found = verify(path)
+    if not found.ok:
+        raise ExportError(f"{path}: is damaged, nothing was copied: {found.problems[0]}")
+    return session
 
 
 def named(use: str | None) -> str:

@@ -142,8 +142,8 @@ def to_tangent(normals: ArrayLike, axes: Floats, covered: Bools) -> NDArray[np.f
     good = covered & (np.abs(np.linalg.det(axes)) > 1e-6) & np.isfinite(given).all(axis=-1)
     whole = np.where(good[..., None, None], axes, np.eye(3))
     # n is along n' A with the axes as rows of A: the inverse, as renderers interpolate A
-    found = np.linalg.solve(np.swapaxes(whole, -1, -2), np.nan_to_num(given)[..., None])[..., 0]
-    found = _unit(found)
+    solved = np.linalg.solve(np.swapaxes(whole, -1, -2), np.nan_to_num(given)[..., None])
+    found = _unit(np.asarray(solved[..., 0], np.float64))
     found[..., 2] = np.maximum(found[..., 2], 1e-3)
     found[~good] = (0.0, 0.0, 1.0)
     return _unit(found).astype(np.float32)

@@ -23,6 +23,7 @@ from skinrig.exporting import materialx
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.material import COLOR_NOTE, NOTES, Material
 from skinrig.exporting.options import NORMAL_Y, UNITS_M, Delivery
+from skinrig.exporting.provenance import ORIENTATION, provenance
 from skinrig.exporting.sealing import write_json
 
 FILE, DOCUMENT = "skin.usdc", "usd.json"
@@ -55,8 +56,6 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     ValueError
         See :meth:`skinrig.exporting.material.Material.of`.
     """
-    from skinrig.exporting.maps import ORIENTATION, provenance
-
     try:
         from pxr import Usd
     except ImportError as error:

@@ -1,0 +1,242 @@
+"""Base color on a pack's layout, and how expressions change it, from the hemoglobin rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import fresnel, store
+from model.skin import SkinAppearance
+from model.texture_resampling import resampled
+from skinrig import applying
+from skinrig.exporting.images import CAMERA, SRGB, Image, ImageFolder
+from skinrig.exporting.options import Delivery
+from skinrig.exporting.sealing import ExportError
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+COLOR_SIZE, MOST = 512, 3
+NEUTRAL: Final = "neutral"
+LANDMARK_STDERR_PX: Final = 1.0
+LEAST_SHARE: Final = 0.5
+"""Share of a pixel that must be known for it to count."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Colors:
+    """Base colors on one layout.
+
+    Attributes
+    ----------
+    base
+        (N, N, 3), linear.
+    deltas
+        State to its color less the neutral one, (N, N, 3).
+    valid
+        (N, N).
+    layout
+        What the pixels lie on, for people.
+    space
+        Of `base`, see :mod:`skinrig.exporting.images`.
+    """
+
+    base: Floats
+    deltas: Mapping[str, Floats]
+    valid: Bools
+    layout: str
+    space: str
+
+
+def write(
+    appearance: SkinAppearance, out: ImageFolder, delivery: Delivery,
+    left_out: list[tuple[str, str]],
+) -> tuple[dict[str, Any], list[str]]:  # fmt: skip
+    """Write base color and color deltas.
+
+    Parameters
+    ----------
+    appearance
+        With the part facial_color.
+    out
+        Where to.
+    delivery
+        States by `only`; `onto` and `landmarks`.
+    left_out
+        Grows by what is left out, and why.
+
+    Returns
+    -------
+    told : dict
+        JSON values: layout, states by map, largest deltas.
+    states : list of str
+        All that the rig has.
+    """
+    rig = applying.hemoglobin_rig(appearance)
+    have = sorted(rig.states)
+    states = chosen(have, delivery, "color", left_out)
+    colors = _colors(appearance, rig, states, delivery, left_out)
+    names = {f"cm{k}": state for k, state in enumerate(states, start=1)}
+    base = Image(
+        name="base_color", values=_filled(colors.base, colors.valid), unit="1", space=SRGB,
+        what=f"neutral base color on {colors.layout}; {colors.space}; holes filled", valid=colors.valid,
+    )  # fmt: skip
+    out.exr(base)
+    out.png(base)
+    largest = {}
+    for name, state in names.items():
+        delta = colors.deltas[state]
+        image = Image(
+            name=f"{name}_delta", values=delta, unit="1", low=-1.0, high=1.0, valid=colors.valid,
+            what=f"color of {state} at full strength less neutral, linear, on {colors.layout}",
+        )  # fmt: skip
+        out.exr(image)
+        out.png(image)
+        shown = np.abs(delta[colors.valid])
+        largest[name] = float(shown.max()) if shown.size else 0.0
+    if delivery.with_errors:
+        out.exr(Image(name="color_mask", values=colors.valid.astype(float), unit="1"))
+    return {
+        "size": COLOR_SIZE, "layout": colors.layout, "space": colors.space, "maps": names,
+        "largest_delta": largest, "valid_share": float(colors.valid.mean()),
+    }, have  # fmt: skip
+
+
+def _filled(base: Floats, valid: Bools) -> Floats:
+    """Return colors with the holes filled from around, as a texture must have them."""
+    from reconstruction.texture_fill import push_pull
+
+    return np.asarray(push_pull(base, valid.astype(np.float32)).values, np.float64)
+
+
+def _colors(
+    appearance: SkinAppearance, rig: Any, states: list[str], delivery: Delivery,
+    left_out: list[tuple[str, str]],
+) -> Colors:  # fmt: skip
+    melanin = appearance.maps["melanin"]
+    seen = np.ones(melanin.values.shape, bool) if melanin.valid is None else melanin.valid.copy()
+    blends = {}
+    for state in (NEUTRAL, *states):
+        blends[state] = rig.evaluate({state: 1.0})
+        seen &= blends[state].valid
+    shown = {
+        state: applying.colors(melanin.values, blend.hemoglobin, seen).astype(np.float64)
+        for state, blend in blends.items()
+    }
+    neutral = shown[NEUTRAL]
+    if delivery.onto is None:
+        left_out.append(
+            ("colors on the face's texture", "they lie on the flash camera's picture; name the "
+             "dome's maps with --onto, and two tables of landmarks")
+        )  # fmt: skip
+        base, valid = sized(neutral, seen, COLOR_SIZE)
+        deltas = {s: sized(shown[s] - neutral, seen, COLOR_SIZE)[0] for s in states}
+        height, width = seen.shape
+        layout = f"the flash camera's picture, {width} x {height}, stretched to a square"
+        return Colors(base, deltas, valid, layout, SRGB)
+    return _on_texture(delivery, shown, seen, states)
+
+
+def _on_texture(
+    delivery: Delivery, shown: Mapping[str, Floats], seen: Bools, states: list[str]
+) -> Colors:
+    """Return colors on another appearance's texture: its albedo, and changes carried over."""
+    if delivery.onto is None or len(delivery.landmarks) != 2:
+        raise ExportError(
+            f"--landmarks: got {len(delivery.landmarks)} tables, expected two with --onto: of the "
+            "flash picture, then of the texture"
+        )
+    other = store.read(delivery.onto)
+    albedo = other.maps.get("r_d")
+    if albedo is None:
+        raise ExportError(
+            f"{delivery.onto}: got maps {', '.join(sorted(other.maps)) or 'none'}, expected r_d "
+            "among them"
+        )
+    known = np.asarray(np.isfinite(albedo.values).all(axis=-1), np.bool_)
+    if albedo.valid is not None:
+        known &= albedo.valid
+    inside = 1.0 - fresnel.diffuse_external(fresnel.ETA_SKIN)
+    base, valid = sized(inside * albedo.values.astype(np.float64), known, COLOR_SIZE)
+    source = _places(delivery, albedo.values.shape[:2])
+    neutral = shown[NEUTRAL]
+    deltas: dict[str, Floats] = {}
+    for state in states:
+        # a ratio of colors is the skin's own; a difference would be that of another exposure
+        ratio = np.divide(shown[state], neutral, out=np.ones_like(neutral), where=neutral > 1e-3)
+        carried, told = _looked_up(ratio - 1.0, seen, source)
+        deltas[state] = base * carried
+        deltas[state][~told] = 0.0
+        valid &= told
+    layout = f"the texture of {delivery.onto.name}, by landmarks"
+    return Colors(base, deltas, valid, layout, CAMERA)
+
+
+def _places(delivery: Delivery, shape: tuple[int, int]) -> Floats:
+    """Return the flash picture's pixel under each pixel of the pack, column and row, (N, N, 2)."""
+    from reconstruction import landmark_field, landmark_table
+
+    own, onto = (landmark_table.read(path) for path in delivery.landmarks)
+    names = sorted(set(own) & set(onto))
+    try:
+        field = landmark_field.fit(
+            [onto[n] for n in names], [own[n] for n in names], stderr_px=LANDMARK_STDERR_PX
+        )
+    except landmark_field.LandmarkFieldError as error:
+        raise ExportError(f"--landmarks: {error}") from error
+    rows, columns = np.mgrid[0:COLOR_SIZE, 0:COLOR_SIZE] + 0.5
+    texel = np.stack(
+        [columns * shape[1] / COLOR_SIZE - 0.5, rows * shape[0] / COLOR_SIZE - 0.5], axis=-1
+    )
+    # the field is smooth: every eighth pixel, and linearly between
+    step = texel[::8, ::8].reshape(-1, 2)
+    moved = field.at(step)[0].reshape(*texel[::8, ::8].shape)
+    fine = np.moveaxis(_refined(np.moveaxis(moved, -1, 0)), 0, -1)
+    return texel + fine
+
+
+def _refined(coarse: Floats) -> Floats:
+    """Return every eighth sample, (C, n, n), at each, linearly; extrapolated past the last."""
+    for axis in (1, 2):
+        n = coarse.shape[axis]
+        at = np.arange(COLOR_SIZE) / 8.0
+        low = np.minimum(at.astype(int), n - 2)
+        part = np.expand_dims(at - low, tuple(k for k in range(3) if k != axis))
+        coarse = (1.0 - part) * np.take(coarse, low, axis) + part * np.take(coarse, low + 1, axis)
+    return coarse
+
+
+def _looked_up(values: Floats, seen: Bools, source: Floats) -> tuple[Floats, Bools]:
+    """Return values at places of a picture, bilinearly among what is known."""
+    from scipy.ndimage import map_coordinates
+
+    at = [source[..., 1], source[..., 0]]
+    share = map_coordinates(seen.astype(np.float64), at, order=1, cval=0.0)
+    layers = [
+        map_coordinates(np.where(seen, values[..., c], 0.0), at, order=1, cval=0.0)
+        for c in range(values.shape[-1])
+    ]
+    told = share >= LEAST_SHARE
+    return np.stack(layers, axis=-1) / np.where(told, share, 1.0)[..., None], told
+
+
+def chosen(have: list[str], delivery: Delivery, what: str, left_out: Any) -> list[str]:
+    """Return up to three states, those asked for first of all."""
+    asked = [name for name in delivery.only if name in have]
+    names = asked if delivery.only else have
+    for name in names[MOST:]:
+        left_out.append((f"{what} of {name}", f"a face has {MOST}; choose with --only"))
+    return names[:MOST]
+
+
+def sized(values: Floats, valid: Bools, size: int) -> tuple[Floats, Bools]:
+    """Return values at another size, means among what is known; 0 where nothing is."""
+    layers = np.moveaxis(np.where(valid[..., None], values, 0.0), -1, 0)
+    share = resampled(valid.astype(np.float64), (size, size))
+    found = np.moveaxis(resampled(layers, (size, size)), 0, -1)
+    good = share >= LEAST_SHARE
+    return np.where(good[..., None], found / np.where(good, share, 1.0)[..., None], 0.0), good
