@@ -32,8 +32,8 @@ over a face than this."""
 ENDS: Final = (-1, 1)
 HALF: Final = 0.5
 ITERATIONS: Final = 1
-"""Of matching. `skinrig edit` makes five: one is off those by 0.2 % of R_d for an edit by 24 % (tan,
-the demo's dome), and takes a third of the time."""
+"""Of matching. `skinrig edit` makes five: one is off those by 0.2 % of R_d for an edit by 24 %
+(tan, the demo's dome), and takes a third of the time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -41,7 +41,9 @@ ACTION_UNITS: Final[Mapping[str, tuple[tuple[str, float], ...]]] = MappingProxyT
         # 1 + 4 + 15
         "sadness": (("browInnerUp", 1.0), ("browDown", 0.3), ("mouthFrown", 0.9)),
         # 1 + 2 + 5 + 26
-        "surprise": (("browInnerUp", 1.0), ("browOuterUp", 1.0), ("eyeWide", 0.9), ("jawOpen", 0.5)),
+        "surprise": (
+            ("browInnerUp", 1.0), ("browOuterUp", 1.0), ("eyeWide", 0.9), ("jawOpen", 0.5),
+        ),
         # 1 + 2 + 4 + 5 + 20
         "fear": (
             ("browInnerUp", 1.0), ("browOuterUp", 0.4), ("browDown", 0.4), ("eyeWide", 1.0),

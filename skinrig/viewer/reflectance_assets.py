@@ -1,8 +1,8 @@
 """Fitted reflectance for the page: lobes as one table, their shares, a profile of scattering.
 
 Names in the page: textures `lobe_atlas` (see `compact_brdf.atlas`), `lobe_shares` (layers of four
-lobes) and `translucency` (how much wider than the profile light spreads at a texel); facts `reflectance` and
-`profile` (variances and weights of the Gaussians, stated errors).
+lobes) and `translucency` (how much wider than the profile light spreads at a texel); facts
+`reflectance` and `profile` (variances and weights of the Gaussians, stated errors).
 """
 
 from __future__ import annotations

@@ -59,7 +59,8 @@ V.buildControl = (control, number) => {
   if (control.kind === "toggle") {
     const input = V.element("input", {type: "checkbox", id, ...described});
     const label = V.element("label", {className: "toggle", for: id}, input, control.label);
-    input.onchange = () => { change(input.checked); V.say(`${control.label}: ${input.checked ? "on" : "off"}`); };
+    const kept = on => typeof V.at(V.initial, control.path) === "number" ? Number(on) : on;
+    input.onchange = () => { change(kept(input.checked)); V.say(`${control.label}: ${input.checked ? "on" : "off"}`); };
     return {box: V.element("div", {className: "control"}, label, ...(help ? [help] : [])), input,
       update: p => { input.checked = Boolean(value(p)); }};
   }
@@ -144,7 +145,7 @@ V.SHARED = ["camera_yaw_deg", "camera_pitch_deg", "camera_distance_mm", "camera_
   "exposure", "background", "view", "view_low", "view_high", "split", "compare", "heads"];
 
 // Parameters that passes keep for themselves.
-V.transient = name => /^microstructure_(place|virtual_px|margin_px|variance|split_px)$/.test(name);
+V.transient = name => /^(microstructure_(place|virtual_px|margin_px|variance|split_px)|detail_wrinkles)$/.test(name);
 
 V.faceOf = p => JSON.parse(JSON.stringify(Object.fromEntries(
   Object.entries(p).filter(([name]) => !V.SHARED.includes(name) && !V.transient(name)))));

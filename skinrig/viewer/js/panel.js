@@ -148,12 +148,22 @@ V.registerTraits = () => {
 V.registerRelief = () => V.controls.push(
   {group: "relief", kind: "range", path: ["relief"], min: 0, max: 2, zero: 1, label: "Pores and lines at rest",
     show: v => `× ${v.toFixed(2)}`, help: "Factor of the slopes of the static relief."},
+  {group: "relief", kind: "range", path: ["wrinkles"], min: 0, max: 2, zero: 1, label: "Wrinkles",
+    show: v => `× ${v.toFixed(2)}`, when: () => Boolean(V.scene.facts.wrinkles),
+    help: "Eight zones, each the sum of the expressions' signed weights."},
+  {group: "relief", kind: "choice", path: ["wrinkle_clamp"], label: "Weights of the zones",
+    when: () => Boolean(V.scene.facts.wrinkles),
+    options: () => [["unit", "Held in 0 to 1"], ["signed", "Held in −1 to 1: some smooth the skin"]]},
+  {group: "relief", kind: "toggle", path: ["hybrid_normals"], label: "Hybrid normals",
+    help: "Diffuse normals softened for each color by how far its light spreads; sharp ones for the highlight."},
   {group: "relief", kind: "choice", path: ["microstructure"], label: "Microstructure",
     help: "Ten-micrometer relief, and how strain sharpens or blurs it; look closely to see it.",
     options: () => [[0, "None (mesostructure)"], [1, "Static"], [2, "Dynamic: follows the strain"],
       [3, "Side by side: none, static, dynamic"]]},
   {group: "relief", kind: "choice", path: ["microstructure_sampling"], label: "Sampling of the convolution",
     options: () => [[0, "Bilinear"], [1, "Cubic"]]},
+  {group: "relief", kind: "toggle", path: ["detail"], label: "Level of detail",
+    help: "From afar, wrinkles and microstructure are left out where that changes no pixel visibly."},
 );
 
 V.registerLight = () => V.controls.push(

@@ -1,0 +1,248 @@
+"""Fitted reflectance for the page: compact lobes, Gaussians of a dipole, traits, presets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from model import brdf_tables, dipole, fresnel, lobe_edits, trait_storage
+from skinrig.viewer import (
+    compact_brdf,
+    gaussian_profiles,
+    presets,
+    reflectance_assets,
+    trait_assets,
+)
+from skinrig.viewer.reflectance_assets import PageLobes
+from skinrig.viewer.scene import SceneSource
+
+
+@pytest.fixture(scope="module")
+def face() -> PageLobes:
+    """Three lobes of two materials each over a 6 x 8 texture, some shares 0 as fits have them."""
+    rng = np.random.default_rng(12345)
+    materials = brdf_tables.default()
+    mix = np.zeros((3, materials.size))
+    for row in mix:
+        row[rng.choice(materials.size, 2, replace=False)] = rng.uniform(0.2, 0.8, 2)
+    mix /= mix.sum(axis=1, keepdims=True)
+    shares = np.maximum(rng.normal(0.25, 0.25, (6, 8, 3)), 0.0).astype(np.float32)
+    return PageLobes(materials.mixed(mix), shares, mix, materials.names, "fitted")
+
+
+@pytest.fixture(scope="module")
+def forms(face):
+    """All forms of its lobes."""
+    return compact_brdf.measured(face.lobes)
+
+
+@pytest.fixture(scope="module")
+def traits(face):
+    """Its surface traits."""
+    found = trait_assets.surface_traits(face)
+    assert found is not None
+    return found
+
+
+def test_the_chosen_table_is_within_its_bound_and_the_next_coarser_one_is_not(face, forms):
+    found = compact_brdf.chosen(face.lobes)
+    assert max(found.rms_error, found.strong_error) <= compact_brdf.GOOD_ENOUGH
+    every = {(one.form, one.detail): max(one.rms_error, one.strong_error) for one in forms}
+    coarser = compact_brdf.SLABS[compact_brdf.SLABS.index(found.detail) - 1]
+    assert every["table", coarser] > compact_brdf.GOOD_ENOUGH
+
+
+def test_factors_as_good_as_the_table_need_more_look_ups(face, forms):
+    found = compact_brdf.chosen(face.lobes)
+    factors = [one for one in forms if one.form != "table" and one.lookups <= found.lookups]
+    assert all(one.rms_error > found.rms_error for one in factors)
+    more = [one for one in forms if one.form == "factors"]
+    assert min(one.lookups for one in more) > found.lookups
+
+
+def test_errors_of_factors_fall_with_their_rank(forms):
+    by_rank = {one.detail: one.rms_error for one in forms if one.form == "factors"}
+    assert by_rank[8] < by_rank[2] < by_rank[1]
+
+
+def test_an_atlas_holds_each_lobe_at_its_place(face):
+    found = compact_brdf.chosen(face.lobes)
+    image = compact_brdf.atlas(found)
+    assert image.shape == (found.detail * 32, 90, 4)
+    slab, d, h = 5, 17, 40
+    expected = face.lobes.table[d, slab * 12 // found.detail, h, :3]
+    np.testing.assert_allclose(image[slab * 32 + d, h, :3], expected, rtol=1e-3)
+    assert not image[..., 3].any()
+
+
+def test_lambertian_lobes_need_no_slabs():
+    flat = brdf_tables.tabulate({"flat": lambda light, view: 0.25 + 0.0 * light[..., 2]})
+    assert compact_brdf.chosen(flat).detail == 1
+
+
+def test_slabs_that_do_not_divide_the_nodes_are_refused(face):
+    with pytest.raises(ValueError, match="slabs: got 5"):
+        compact_brdf.in_slabs(face.lobes.table.astype(np.float64), 5)
+
+
+R_D = np.array([0.45, 0.30, 0.20])
+SIGMA_TR = np.array([0.6, 1.07, 1.67])
+
+
+def _dipole_edge(x_mm: float, channel: int) -> float:
+    """Light at a distance from an edge, by brute force over the lit half-plane."""
+    sigma_a, sigma_s = dipole.coefficients(
+        dipole.invert_to_deficit(R_D, fresnel.ETA_SKIN), SIGMA_TR
+    )
+    u = np.linspace(-1.0, 1.0, 801) ** 3 * 25.0
+    y = 0.5 * (u[1:] + u[:-1])
+    dy = np.diff(u)
+    x = x_mm - y  # lit where the source lies at more than 0
+    lit = x > 0.0
+    radius = np.hypot(y[lit][:, None], y[None, :])
+    values = dipole.reflectance(radius, sigma_a[channel], sigma_s[channel], fresnel.ETA_SKIN)
+    return float((dy[lit] @ values @ dy) / R_D[channel])
+
+
+def test_gaussians_spread_an_edge_of_light_as_the_dipole_does():
+    found = gaussian_profiles.fit(R_D, SIGMA_TR)
+    for x in (0.0, 0.3, 1.0, 3.0):
+        for channel in range(3):
+            expected = _dipole_edge(x, channel)
+            assert abs(found.edge([x])[0, channel] - expected) < 0.004, (x, channel)
+
+
+def test_one_gaussian_misses_the_edge_by_far_more_than_four():
+    one, four = (gaussian_profiles.fit(R_D, SIGMA_TR, count=n) for n in (1, 4))
+    assert one.edge_error.max() > 0.05
+    assert four.edge_error.max() < 0.002
+
+
+def test_even_light_stays_as_it_is_and_red_spreads_farther_than_blue():
+    found = gaussian_profiles.fit(R_D, SIGMA_TR)
+    np.testing.assert_allclose(found.weights.sum(axis=0), 1.0, atol=1e-12)
+    assert (found.weights >= 0.0).all()
+    spread = found.variances_mm2 @ found.weights
+    assert spread[0] > spread[1] > spread[2]
+
+
+def test_a_profile_scales_with_the_translucency():
+    fine, coarse = gaussian_profiles.fit(R_D, SIGMA_TR), gaussian_profiles.fit(R_D, SIGMA_TR / 2)
+    ratio = (coarse.variances_mm2 @ coarse.weights) / (fine.variances_mm2 @ fine.weights)
+    np.testing.assert_allclose(ratio, 4.0, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("r_d", "sigma_tr"), [([0.0, 0.3, 0.3], [1, 1, 1]), ([0.3, 0.3, 0.3], [1, 0, 1])]
+)
+def test_skin_that_cannot_be_is_refused(r_d, sigma_tr):
+    with pytest.raises(gaussian_profiles.ProfileError, match="above 0"):
+        gaussian_profiles.fit(r_d, sigma_tr)
+
+
+def test_traits_bring_lobes_and_leave_the_face_s_own_bit_for_bit(face, traits):
+    found = traits
+    assert found.lobes.lobes.size > 3
+    np.testing.assert_array_equal(found.lobes.lobes.table[..., :3], face.lobes.table[..., :3])
+    np.testing.assert_array_equal(found.lobes.shares[..., :3], face.shares)
+    assert not found.lobes.shares[..., 3:].any()
+
+
+def test_no_trait_leaves_shares_alone(traits):
+    found = traits
+    rows = found.lobes.shares.reshape(-1, found.lobes.lobes.size)
+    np.testing.assert_array_equal(found.projected(rows, {}), rows)
+
+
+@pytest.mark.parametrize("name", ["lotion", "powder", "sweat"])
+def test_the_page_s_traits_are_the_editor_s_within_the_stated_error(traits, name):
+    found = traits
+    space = trait_storage.default().spaces["surface"]
+    rows = found.lobes.shares.reshape(-1, found.lobes.lobes.size).astype(np.float64)
+    edited = lobe_edits.edit_weights(rows, found.lobes.mix, space, {name: 0.5})
+    strength = brdf_tables.default().strength()
+    page = found.projected(rows, {name: 0.5}).astype(np.float64) @ found.lobes.mix @ strength
+    wanted = edited.weights @ edited.mix @ strength
+    asked = np.abs(wanted - rows @ found.lobes.mix @ strength)
+    bound = max(found.held_error[name])
+    # half a trait is missed by no more than a whole one may be, in the same unit
+    assert np.sqrt(np.mean((page - wanted) ** 2)) < 2.0 * bound * np.sqrt(np.mean(asked**2))
+    still = rows @ found.lobes.mix @ strength
+    assert np.sqrt(np.mean((still - wanted) ** 2)) > 5.0 * np.sqrt(np.mean((page - wanted) ** 2))
+
+
+def test_two_traits_can_each_bring_a_lobe(face):
+    space = trait_storage.default().spaces["surface"]
+    rows = face.shares.reshape(-1, 3).astype(np.float64)
+    edited = lobe_edits.edit_weights(rows, face.mix, space, {"lotion": 1.0, "sweat": 1.0})
+    assert len(edited.mix) >= 3
+    assert np.all(edited.weights >= 0.0)
+
+
+def test_traits_of_other_materials_are_left_out(face):
+    others = PageLobes(
+        face.lobes, face.shares, face.mix[:, :5], ("a", "b", "c", "d", "e"), "fitted"
+    )
+    assert trait_assets.surface_traits(others) is None
+
+
+def test_opposite_traits_have_one_slider_and_chance_has_none():
+    traits = trait_storage.default().spaces["albedo"].traits
+    names = trait_assets.told_from_chance(traits)
+    assert "caucasian" not in names
+    assert "freckles" not in names  # p = 1 in the packaged population
+    assert "tan" in names
+
+
+def test_a_face_without_fits_shows_the_population_and_says_so(procedural_source):
+    found = reflectance_assets.lobes_of(procedural_source)
+    assert found.origin == "population"
+    assets = reflectance_assets.assemble(procedural_source, found)
+    assert {what for what, _ in assets["left_out"]} == {
+        "lobes of this face",
+        "translucency of this face",
+    }
+    assert "translucency" not in assets["textures"]
+
+
+@pytest.fixture(scope="module")
+def procedural_source() -> SceneSource:
+    """A source of which nothing was measured."""
+    from skinrig.viewer.scene import ViewerMesh
+
+    mesh = ViewerMesh(
+        np.eye(3, dtype=np.float32), np.eye(3, dtype=np.float32), np.zeros((3, 2), np.float32),
+        np.array([[0, 1, 2]], np.int32),
+    )  # fmt: skip
+    return SceneSource("procedural", mesh, 64)
+
+
+def test_filling_keeps_what_is_known_and_continues_it():
+    values = np.zeros((16, 16, 1), np.float32)
+    valid = np.zeros((16, 16), bool)
+    valid[:, :8], values[:, :8] = True, 3.0
+    np.testing.assert_allclose(reflectance_assets.filled(values, valid, 16), 3.0, rtol=1e-5)
+    coarse = reflectance_assets.filled(values, valid, 4)
+    assert coarse.shape == (4, 4, 1)
+    np.testing.assert_allclose(coarse, 3.0, rtol=1e-5)
+
+
+def test_presets_name_only_what_a_face_has():
+    found = presets.presets(["anger", "surprise", "exercise"])
+    assert list(found) == [
+        "neutral", "surprise", "anger", "anger and surprise", "after exercise", "exercise",
+    ]  # fmt: skip
+    assert found["after exercise"] == {"anger": 1.0, "surprise": 1.0, "exercise": 1.0}
+
+
+def test_shapes_of_single_muscles_make_the_six_emotions():
+    names = [
+        f"{unit}_{side}"
+        for unit in ("mouthSmile", "cheekSquint", "browInnerUp", "browOuterUp", "browDown",
+                     "eyeWide", "noseSneer", "mouthFrown", "mouthStretch")
+        for side in "LR"
+    ] + ["jawOpen", "mouthPucker"]  # fmt: skip
+    found = presets.presets(names)
+    assert set(presets.EMOTIONS) <= set(found)
+    assert all(0.0 < w <= 1.0 for weights in found.values() for w in weights.values())
+    assert "after exercise" not in found  # no blood, no exercise
