@@ -27,8 +27,11 @@ from rigsim.lobe_moments import Surface
 from rigsim.mesh import Float32Array
 from rigsim.microrelief import MicroSkin
 from rigsim.patch_motion import PatchMotion, Pose, shifted
+from rigsim.scene_needs import Noise, SceneNeeds
+from rigsim.scenes.flash_needs import BOUNCES, LATERAL, SHADOWS
 from rigsim.scenes.glass_ball import ball_center_mm, ball_stokes
 from rigsim.scenes.gradient_lighting import Lighting, light_skin
+from rigsim.scenes.gradient_needs import OPTICS, gradient_needs
 from rigsim.scenes.gradient_patch import SHADOW_MARGIN_PX, Grip, PatchSurface, sample_grid, stand
 from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.skin_layers import ETA
@@ -56,6 +59,9 @@ KEPT_BYTES: Final = 2**29
 
 KEPT_LIGHTINGS: Final = 2
 """Tables of light that are kept: LEDs may change by gains and failures."""
+
+FURROW_SECTORS: Final = 16
+"""Directions in which the sky is looked for, for light from furrow to furrow."""
 
 KEPT_RELIEFS: Final = 4
 """Stretched patches that are kept."""
@@ -116,9 +122,12 @@ class GradientScene:
     seed
         Seeds what differs from exposure to exposure.
     shadows
-        Whether the relief hides LEDs from itself.
+        Whether the relief hides LEDs from itself. This and the next three: None decides by how much
+        it changes pixels, see `needs`.
     lateral
         Whether light spreads inside the skin.
+    interreflections
+        Whether light goes from furrow to furrow.
     optics
         Whether lens and pixels blur; without, every pixel is the mean of its samples.
     sectors
@@ -140,9 +149,10 @@ class GradientScene:
         motion: PatchMotion | None = None,
         sensor: Sensor | None = None,
         seed: int = 0,
-        shadows: bool = True,
-        optics: bool = True,
-        lateral: bool = True,
+        shadows: bool | None = None,
+        optics: bool | None = None,
+        lateral: bool | None = None,
+        interreflections: bool | None = None,
         sectors: int = 32,
         subpixels: int = 1,
         table_size: int | None = None,
@@ -159,7 +169,6 @@ class GradientScene:
         self.films = films_of(rig) if films is None else films
         self.sphere = as_drawn(rig) if sphere is None else sphere
         self.motion, self.seed = motion, seed
-        self.shadows, self.optics, self.lateral = shadows, optics, lateral
         self.sectors, self.subpixels, self.table_size = sectors, subpixels, table_size
         self._view = rig.views[0]
         self._sensor = sensor_of(self._view) if sensor is None else sensor
@@ -171,33 +180,27 @@ class GradientScene:
         self._pictures: OrderedDict[tuple[object, ...], Float32Array] = OrderedDict()
         self._reliefs: OrderedDict[tuple[float, float], StretchedSkin] = OrderedDict()
         self._frames: dict[tuple[float, int], tuple[Float32Array, Float32Array]] = {}
+        self.needs: SceneNeeds = gradient_needs(
+            rig,
+            subject,
+            self.sphere,
+            self.lens,
+            noise=Noise.of(self._sensor),
+            moving=motion is not None,
+            shadows=shadows,
+            lateral=lateral,
+            interreflections=interreflections,
+            optics=optics,
+        )
+        """What is built, what is not, and why."""
+        self.shadows, self.optics = self.needs.builds(SHADOWS), self.needs.builds(OPTICS)
+        self.lateral = self.needs.builds(LATERAL)
+        self.interreflections = self.needs.builds(BOUNCES)
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
         """What this scene does not build, with the reason."""
-        out = [
-            ("aberrations of the lens", "a macro lens at f/16 is near diffraction's limit"),
-            ("ambient light", "the room is dark"),
-            ("light from the sphere's frame and between its LEDs", "they are black"),
-        ]
-        if isinstance(self.subject, MicroSkin):
-            out += [
-                ("light from furrow to furrow", "0.3 % of the reflection; diffuse not measured"),
-                ("shadows of the caliper's jaws", "they are thin"),
-                ("hidden views", "the camera looks down within 1.2 degrees of the vertical"),
-                ("polarized single scattering", "light from inside is taken as depolarized"),
-                ("a lateral kernel that varies over the patch", "one, of its mean pigment"),
-                ("blur by movement within an exposure", "30 ms move less than 0.1 um"),
-            ]
-            if not self.shadows:
-                out.append(("shadows of the relief on itself", "shadows=False asks for it"))
-            if not self.lateral:
-                out.append(("light spreading sideways in skin", "lateral=False asks for it"))
-            if self.motion is None:
-                out.append(("movement of the patch", "motion=None asks for it"))
-        if not self.optics:
-            out.append(("diffraction and defocus", "optics=False asks for it"))
-        return out
+        return self.needs.left_out
 
     @property
     def lens(self) -> Lens:
@@ -481,7 +484,7 @@ class GradientScene:
         self, grip: Grip, jump_mm: tuple[float, float], shares: tuple[float, ...]
     ) -> Float32Array:
         s = self.subpixels
-        margin = SHADOW_MARGIN_PX if self.shadows else 0
+        margin = SHADOW_MARGIN_PX if self.shadows or self.interreflections else 0
         wide = self.surface(grip, subpixels=s, border_px=DRIFT_MARGIN_PX + margin, jump_mm=jump_mm)
         patch = wide.inner(s * margin)
         raw = self.lighting(shares).stokes(
@@ -514,6 +517,7 @@ class GradientScene:
                 sectors=self.sectors if self.shadows else 0,
                 table_size=self.table_size,
                 lateral=self.lateral,
+                furrow_sectors=FURROW_SECTORS if self.interreflections else 0,
             )
         self._lighting.move_to_end(shares)
         return self._lighting[shares]

@@ -15,6 +15,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from rigsim import shading
+from rigsim.furrow_light import hidden_share
 from rigsim.hidden_lights import remove_hidden
 from rigsim.lobe_moments import MomentTable, Surface, build_table, direct_moments
 from rigsim.mesh import Float32Array
@@ -55,6 +56,8 @@ class Lighting:
     """Widths of the lateral kernel of light in skin; none: light leaves where it entered."""
     weights: FloatArray
     """Their shares, sum 1."""
+    furrow_sectors: int = 0
+    """Directions in which the sky is looked for, for light from furrow to furrow; 0: none."""
 
     def stokes(
         self, patch: PatchSurface, height_um: Float32Array, *, margin: int, pitch_um: float
@@ -87,6 +90,12 @@ class Lighting:
             self._remove_hidden(patch, height_um, margin, pitch_um, packed)
         packed[:12, ~patch.skin] = 0.0
         entering = self._spread(packed[12:], patch.skin, 1e-3 * pitch_um)
+        if self.furrow_sectors:
+            hidden = hidden_share(
+                height_um, patch.normals, margin=margin, pixel_um=pitch_um,
+                sectors=self.furrow_sectors,
+            )  # fmt: skip
+            entering += self._from_furrows(hidden, entering, patch, 1e-3 * pitch_um)
         right = self.surface.image_right
         eye = np.asarray(self.surface.eye_mm, np.float32)
         scale = np.float32(shading.interior_scale(ETA) / math.pi)
@@ -143,6 +152,19 @@ class Lighting:
             horizon = (tangents[pair[0]], tangents[pair[1]], float(where[led]) - int(where[led]))
             remove_hidden(packed, patch, horizon, self.sphere, led, self.surface)
 
+    def _from_furrows(
+        self, hidden: Float32Array, entering: Float32Array, patch: PatchSurface, pitch_mm: float
+    ) -> Float32Array:
+        """Return what enters by way of other walls of the relief, shape (4, H, W)."""
+        if not patch.skin.any():
+            return np.zeros_like(entering)
+        # out of one wall and into another, each at all angles alike
+        crossed = shading.interior_scale(ETA) * shading.average_transmittance(ETA) ** 2
+        once = crossed * float(patch.albedo[patch.skin].mean()) * hidden * patch.skin
+        further = 1.0 / (1.0 - float(once[patch.skin].mean()))
+        return self._spread(np.float32(further) * once.astype(np.float32) * entering, patch.skin,
+                            pitch_mm)  # fmt: skip
+
     def _spread(self, entering: Float32Array, skin: BoolArray, pitch_mm: float) -> Float32Array:
         """Spread light inside the skin; beyond the picture it goes on mirrored."""
         if not self.sigmas_mm.size:
@@ -174,6 +196,7 @@ def light_skin(
     sectors: int,
     table_size: int | None,
     lateral: bool = True,
+    furrow_sectors: int = 0,
 ) -> Lighting:
     """Tabulate the light on a patch of skin.
 
@@ -194,6 +217,8 @@ def light_skin(
         Nodes along each axis of the normals; None chooses by roughness.
     lateral
         Whether light spreads inside the skin.
+    furrow_sectors
+        Directions in which the sky is looked for, for light from furrow to furrow; 0: none.
     """
     leds = tuple(k for k, (_, _, z) in enumerate(sphere.position_mm) if not sectors or z > 0.0)
     alphas = (float(skin.alpha.min()), float(skin.alpha.max()))
@@ -206,12 +231,12 @@ def light_skin(
         fields=2 if half_field_mm < 1.6 else 3,
         leds=leds,
     )
-    sigmas, weights = _lateral(skin) if lateral else (np.zeros(0), np.zeros(0))
-    return Lighting(sphere, surface, table, leds, sectors, sigmas, weights)
+    sigmas, weights = lateral_kernel(skin) if lateral else (np.zeros(0), np.zeros(0))
+    return Lighting(sphere, surface, table, leds, sectors, sigmas, weights, furrow_sectors)
 
 
-def _lateral(skin: MicroSkin) -> tuple[FloatArray, FloatArray]:
-    """Return the lateral kernel of the camera's band as a sum of Gaussians."""
+def lateral_kernel(skin: MicroSkin) -> tuple[FloatArray, FloatArray]:
+    """Return widths in mm and weights of the Gaussians of the camera's band, shape (K,) each."""
     table = SkinTable.load()
     band = (table.wavelength_nm >= BAND_NM[0]) & (table.wavelength_nm <= BAND_NM[1])
     weights = (band / band.sum())[:, None]

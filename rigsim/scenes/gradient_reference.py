@@ -88,6 +88,7 @@ def plain_scene(
         sectors=sectors,
         table_size=table_size,
         shadows=shadows,
+        interreflections=False,
     )
 
 

@@ -21,6 +21,8 @@ from model import spectra
 from rigsim.probe_build import ProbeBuild, build_probe, unit_images
 from rigsim.probe_profile import Profile, Profiles
 from rigsim.probe_tissue import ProbedTissue, TissueError
+from rigsim.scene_needs import Noise, SceneNeeds
+from rigsim.scenes.probe_needs import probe_needs
 from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.suction import HeadState
 
@@ -45,6 +47,9 @@ HOT_SHARE, HOT_E_PER_S = 1e-3, 10.0
 
 ROOM_R_F_PER_MM2: Final = 1e-3
 """What the room's light on a head in the air is worth in reflectance at full level."""
+
+LONGEST_S: Final = 30.0
+"""The longest of the usual exposures, s."""
 
 CAP: Final = "cap"
 """Site at which the head's fibres look into the dark."""
@@ -124,30 +129,20 @@ class ProbeScene:
         images = unit_images(self.build, self._view)
         self._images = np.ascontiguousarray(images.reshape(len(images), -1).T)
         self._hot_e_per_s = _hot_pixels(self._sensor, images.shape[1:])
+        full_e = self._sensor.gain_e_per_dn * (self._sensor.white - self._sensor.black)
+        self.needs: SceneNeeds = probe_needs(
+            rig,
+            tissue,
+            self.build,
+            noise=Noise.of(self._sensor),
+            hot=float(self._hot_e_per_s.max()) * LONGEST_S / full_e,
+        )
+        """What is built, what is not, and why."""
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
         """What this scene does not build, with the reason."""
-        out = [
-            ("light that fibres pass on at angles of their own", "the camera takes all of it"),
-            ("bends and drift of the fibres' transmission", "they lie still in one head"),
-            ("warming of the skin by light and contact", "1 mW for seconds"),
-            ("movement of the head on the skin", "suction holds it; its coming off is told"),
-            ("pulse and breath in the skin's blood", "a percent of the blood, averaged by series"),
-            ("a lens's color error", "spots are summed"),
-            ("reflections between the head's face and the skin", "the head is black"),
-        ]
-        if self.tissue.kind == "layered":
-            out += [
-                ("another spot of skin at each repeat", "where a head lands again is not known"),
-                ("pressure's effect on scattering and oxygen", "blood's outweighs them"),
-                ("hair, pores and veins under the head", "layers are even within a centimeter"),
-            ]
-        if self.tissue.kind == "anisotropic":
-            out.append(("color of anisotropic tissue", "its direction is what is looked for"))
-        if self.tissue.kind == "homogeneous":
-            out.append(("layers, sites, pressure", "the tissue was asked for as homogeneous"))
-        return out
+        return self.needs.left_out
 
     def sensor(self, view_name: str | None = None, *, camera_c: float = DARK_C) -> Sensor:
         """Return the camera's sensor at a temperature in degrees Celsius."""

@@ -183,7 +183,8 @@ def light_skin(
         )  # fmt: skip
         covered = subject.atlas.covered
         sums = bounce.coarsen(np.dstack([surface.entered, covered]).astype(np.float32))
-        came = color.on_texture(sums[:, 0] / np.maximum(sums[:, 1], 1e-6), subject.size)
+        direct = np.asarray(sums[:, 0] / np.maximum(sums[:, 1], 1e-6), np.float32)
+        came = color.on_texture(direct, subject.size)
         within = within + np.where(covered[..., None], came, np.float32(0.0))
     sharp = scale * within * reflectance
     kernels = typical_kernels(subject, state, camera, illuminant)

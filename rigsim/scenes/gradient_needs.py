@@ -1,0 +1,149 @@
+"""What the gradient sphere's pictures of a patch of skin must hold, and what they need not."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from capture.rig import Rig
+from rigsim.effect_sizes import bounced, edge_loss, steepest_slope
+from rigsim.furrow_light import hidden_share
+from rigsim.lens_blur import Lens
+from rigsim.microrelief import MicroSkin
+from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
+from rigsim.scenes.flash_needs import BOUNCES, LATERAL, SHADOWS, bands, polarization
+from rigsim.scenes.gradient_lighting import lateral_kernel
+from rigsim.sphere_build import BuiltSphere
+
+OPTICS: Final = "diffraction and defocus"
+RELIEF: Final = "relief of the skin"
+
+STEEPER: Final = 1.6
+"""How much compression steepens the relief at most: the skin buckles at 0.66 of its length."""
+
+LOOKED_AT: Final = 384
+"""Texels along one side of the part of the patch that is looked at."""
+
+SECTORS: Final = 8
+
+
+def gradient_needs(
+    rig: Rig,
+    subject: MicroSkin | str,
+    sphere: BuiltSphere,
+    lens: Lens,
+    *,
+    noise: Noise,
+    moving: bool,
+    shadows: bool | None,
+    lateral: bool | None,
+    interreflections: bool | None,
+    optics: bool | None,
+) -> SceneNeeds:
+    """Decide what a scene in the gradient sphere builds.
+
+    Parameters
+    ----------
+    rig, sphere, lens
+        The rig, its LEDs as they stand, and the lens.
+    subject
+        A patch of skin, or the name of a target.
+    noise
+        Of the sensor. Exposures are not known here: the brightest pixel is taken as full.
+    moving
+        Whether the patch moves.
+    shadows, lateral, interreflections, optics
+        What is asked for; None lets the sizes decide.
+    """
+    view = rig.views[0]
+    world = [
+        ("ambient light", "the room is dark"),
+        ("light from the sphere's frame and between its LEDs", "they are black"),
+    ]
+    made = [polarization(rig, view), bands(view), _optics(lens, optics, noise)]
+    limits = [("aberrations of the lens", "a macro lens at f/16 is near diffraction's limit")]
+    if not isinstance(subject, MicroSkin):
+        flat = "a ball bulges" if subject == "ball" else "the target is flat"
+        for name, switch in ((SHADOWS, "shadows"), (BOUNCES, "interreflections")):
+            made.append(decide(name, 0.0, None, switch=switch, because=flat))
+        made.append(Effect(LATERAL, "absent", f"{subject} is glass, gray or nothing"))
+        return SceneNeeds((*made, *absent(world), *unmodeled(limits)))
+    made += _of_skin(subject, sphere, lens, noise, shadows, lateral, interreflections)
+    if moving:
+        made.append(Effect("movement of the patch", "built", "it drifts and jumps", None, "motion"))
+        pixel_um = lens.pixel_on_subject_um
+        limits.append(
+            (
+                "blur by movement within an exposure",
+                f"30 ms move 0.1 um; a pixel: {pixel_um:.1f} um",
+            )
+        )
+    else:
+        made.append(Effect("movement of the patch", "absent", "motion=None", switch="motion"))
+    limits += [
+        ("shadows of the caliper's jaws", "they are thin"),
+        ("hidden views", "the camera looks down within 1.2 degrees of the vertical"),
+        ("highlights of skin on skin", "only light from inside goes on to other walls"),
+        ("polarized single scattering", "light from inside is taken as depolarized"),
+        ("a lateral kernel that varies over the patch", "one, of its mean pigment"),
+    ]
+    return SceneNeeds((*made, *absent(world), *unmodeled(limits)))
+
+
+def _optics(lens: Lens, asked: bool | None, noise: Noise) -> Effect:
+    nyquist_per_mm = 500.0 / lens.pixel_on_subject_um
+    kept = float(lens.transfer(np.array([nyquist_per_mm]))[0])
+    return decide(
+        OPTICS, noise.share(1.0 - kept), asked, switch="optics",
+        because=f"the lens passes {100 * kept:.0f} % of a pattern as fine as the pixels",
+    )  # fmt: skip
+
+
+def _of_skin(
+    skin: MicroSkin,
+    sphere: BuiltSphere,
+    lens: Lens,
+    noise: Noise,
+    shadows: bool | None,
+    lateral: bool | None,
+    interreflections: bool | None,
+) -> list[Effect]:
+    middle = skin.height_um.shape[0] // 2
+    half = min(middle, LOOKED_AT // 2)
+    part = np.ascontiguousarray(
+        skin.height_um[middle - half : middle + half, middle - half : middle + half]
+    )
+    down, right = (np.asarray(slope) for slope in np.gradient(part, skin.texel_um))
+    steepest = STEEPER * steepest_slope(right, down)
+    place = sphere.position_mm[sphere.position_mm[:, 2] > 0.0]
+    lowest = float((place[:, 2] / np.hypot(place[:, 0], place[:, 1])).min())
+    length = np.sqrt(1.0 + right**2 + down**2)
+    normals = np.stack([-right / length, down / length, 1.0 / length], axis=-1)
+    hidden = hidden_share(
+        part, normals.astype(np.float32), margin=0, pixel_um=skin.texel_um, sectors=SECTORS
+    )
+    share = min(STEEPER * float(np.quantile(hidden, 0.999)), 0.9)
+    brightest = float(skin.albedo.max())
+    more = bounced(share, brightest)
+    sigmas, weights = lateral_kernel(skin)
+    pixel_mm = 1e-3 * lens.pixel_on_subject_um
+    lost = edge_loss(sigmas, weights[None], pixel_mm)
+    deg = (math.degrees(math.atan(steepest)), math.degrees(math.atan(lowest)))
+    return [
+        Effect(RELIEF, "built", f"pixels of {1e3 * pixel_mm:.1f} um resolve it"),
+        decide(
+            SHADOWS, noise.share(1.0) if steepest > lowest else 0.0, shadows, switch="shadows",
+            because=f"slopes up to {deg[0]:.0f} degrees, LEDs down to {deg[1]:.0f}",
+        ),
+        decide(
+            LATERAL, noise.share(lost), lateral, switch="lateral",
+            because=f"pixels of {1e3 * pixel_mm:.1f} um lose {100 * lost:.0f} % at a shadow's edge",
+        ),
+        decide(
+            BOUNCES, noise.share(more, min(1.0, brightest)), interreflections,
+            switch="interreflections",
+            because=f"furrows hide up to {100 * share:.0f} % of the sky from their walls",
+        ),
+    ]  # fmt: skip
