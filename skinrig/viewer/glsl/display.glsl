@@ -3,9 +3,12 @@ vec3 srgb(vec3 linear) {
   vec3 c = clamp(linear, 0.0, 1.0);
   return mix(12.92 * c, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c));
 }
-vec3 filmic(vec3 x) {
-  vec3 a = max(x - 0.004, 0.0);
-  return (a * (6.2 * a + 0.5)) / (a * (6.2 * a + 1.7) + 0.06);
+// Hable's operator, model.tone_mapping.filmic
+vec3 filmicCurve(vec3 x) {
+  return (x * (0.15 * x + 0.05) + 0.004) / (x * (0.15 * x + 0.5) + 0.06) - 0.02 / 0.3;
+}
+vec3 filmic(vec3 linear) {
+  return filmicCurve(2.0 * max(linear, 0.0)) / filmicCurve(vec3(11.2));
 }
 //@chunk display_fragment
 in vec2 v_uv;
@@ -13,7 +16,7 @@ layout(location = 0) out vec4 o_display;
 void main() {
   vec4 radiance = texel_radiance(ivec2(gl_FragCoord.xy));
   vec3 exposed = p_exposure * radiance.rgb;
-  vec3 shown = p_filmic > 0.5 ? filmic(exposed) : srgb(exposed);
+  vec3 shown = srgb(p_filmic > 0.5 ? filmic(exposed) : exposed);
   o_display = vec4(mix(p_background, shown, radiance.a), 1.0);
 }
 //@chunk show_fragment

@@ -5,11 +5,11 @@ layout(location = 0) out vec4 o_source;
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);
   vec3 light = texel_irradiance(at).rgb;
-  o_source = vec4(light * pow(texel_albedo(at).rgb, vec3(u_pre)), 1.0);
+  o_source = vec4(light * pow(texel_albedo(at).rgb, vec3(u_pre)), texel_albedo(at).a);
 }
 //@chunk scatter_fragment
 // One direction of one Gaussian, as model.screen_scattering defines it: taps are as far apart as
-// the slant of the surface makes them on the screen, and count by their distance in space.
+// the slant of the surface makes them on the screen, and count less where they leave its plane.
 uniform sampler2D u_source;
 uniform ivec2 u_axis;     // one pixel along the direction
 uniform float u_sigma_mm;
@@ -25,14 +25,15 @@ void main() {
   if (depth <= 0.0) { o_scattered = vec4(0.0); return; }
   float before = depthAt(at - u_axis);
   float after = depthAt(at + u_axis);
-  float slant = SLANT_LIMIT * depth;
+  float pixel_mm = depth / u_pixels;
+  float slant = SLANT_LIMIT * pixel_mm;
   if (before > 0.0) slant = min(slant, abs(depth - before));
   if (after > 0.0) slant = min(slant, abs(after - depth));
   if (before <= 0.0 && after <= 0.0) slant = 0.0;
-  float pixel_mm = depth / u_pixels;
   float sigma_mm = u_sigma_mm * texel_specular(at).a;
-  float sigma = sigma_mm / sqrt(pixel_mm * pixel_mm + min(slant * slant, SLANT_LIMIT * SLANT_LIMIT
-    * pixel_mm * pixel_mm));
+  float wide = sigma_mm / length(vec2(pixel_mm, slant));
+  // taps are interpolated between pixels, which blurs by itself
+  float sigma = wide * wide / sqrt(sqrt(wide * wide * wide * wide + INTERPOLATION));
   vec3 sum = texelFetch(u_source, at, 0).rgb;
   float weight = 1.0;
   vec2 texel = 1.0 / vec2(textureSize(u_source, 0));
@@ -41,11 +42,13 @@ void main() {
     float t = REACH * float(i) / float(TAPS);
     for (int side = -1; side <= 1; side += 2) {
       vec2 there = middle + float(side) * t * sigma * vec2(u_axis);
-      float other = depthAt(ivec2(floor(there)));
-      float flat_mm = t * sigma * pixel_mm;
-      float away = (flat_mm * flat_mm + (other - depth) * (other - depth)) / (sigma_mm * sigma_mm);
-      float w = other > 0.0 ? exp(-0.5 * away) : 0.0;
-      sum += w * texture(u_source, there * texel).rgb;
+      ivec2 nearest = ivec2(floor(there));
+      float other = depthAt(nearest);
+      float steps = abs(float((nearest.x - at.x) * u_axis.x + (nearest.y - at.y) * u_axis.y));
+      float off = max(abs(other - depth) - slant * steps, 0.0) / sigma_mm;
+      vec4 found = texture(u_source, there * texel);
+      float w = other > 0.0 && found.a > 1e-3 ? exp(-0.5 * (t * t + off * off)) : 0.0;
+      sum += w * found.rgb / max(found.a, 1e-3);
       weight += w;
     }
   }

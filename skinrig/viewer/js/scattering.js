@@ -3,7 +3,7 @@ Object.assign(V.defaults, {scattering: true, texturing: "post", scattering_scale
 
 // Powers of the albedo before and behind the blur; "both" is what blurs a measured map twice.
 V.POWERS = {post: [0, 1], pre: [1, 0], both: [0.5, 0.5]};
-V.SCATTER = {taps: 6, reach: 3, slantLimit: 4};
+V.SCATTER = {taps: 4, reach: 2.5, slantLimit: 4, interpolation: 0.75 ** 4};
 
 // Profiles {variances_mm2, weights: [[r, g, b], ...]} by name; other scripts may add their own and
 // a function that chooses: V.profileName = p => name.
@@ -43,8 +43,9 @@ V.buildScattering = () => {
       {u_pre: V.POWERS[ctx.p.texturing][0]}),
     cost: () => ({taps: 2 * pixels(), bytes: 8 * pixels()}),
   });
-  const {taps, reach, slantLimit} = V.SCATTER;
-  const defines = {TAPS: taps, REACH: reach.toFixed(4), SLANT_LIMIT: slantLimit.toFixed(4)};
+  const {taps, reach, slantLimit, interpolation} = V.SCATTER;
+  const defines = {TAPS: taps, REACH: reach.toFixed(4), SLANT_LIMIT: slantLimit.toFixed(4),
+    INTERPOLATION: interpolation.toFixed(8)};
   const widening = V.scatterWidening();
   let source = "scatter_source";
   for (let i = 0; i < most; i++) {
