@@ -2,7 +2,8 @@
 
 Each Gaussian is blurred from the one before, along rows and along columns. Taps lie as far apart
 as the slant of the surface makes them on the screen, and count less where they leave its plane:
-light neither leaks across depths nor spreads further where the surface turns away.
+light hardly leaks across depths (taps between pixels let a tenth reach the first two), and spreads
+no further where the surface turns away.
 
 References
 ----------
