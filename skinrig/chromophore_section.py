@@ -14,24 +14,42 @@ from skinrig import evaluation, figures, map_pictures, page
 
 NOISE_OF_IDENTIFIABILITY = 0.005
 """Relative noise of each channel that the identifiability plots are drawn for."""
+SMALL_PX = 200
+"""Largest width of maps that stand alone."""
 
 
 def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
     """Return each map of a single channel beside its truth, to one scale."""
-    body = ""
+    body, alone = "", ""
     for key, skin_map in sorted(appearance.maps.items()):
         if skin_map.values.ndim != 2 or key.startswith("_") or key.endswith(NOISE_STDERR):
             continue
         true_map = truth.maps.get(key) if truth is not None else None
+        if true_map is None and skin_map.stderr is None:
+            alone += _alone(key, skin_map)
+            continue
         body += map_pictures.map_panel(
             key,
-            "" if skin_map.unit == "1" else skin_map.unit,
+            page.short_unit(skin_map.unit),
             estimate=skin_map.values,
             standard_error=skin_map.stderr,
             truth=None if true_map is None else true_map.values,
             valid=_shown(skin_map, true_map),
         )
+    if alone:
+        body += f"<h3>Maps without standard errors</h3><div class='maps small'>{alone}</div>"
     return body
+
+
+def _alone(key: str, skin_map: SkinMap) -> str:
+    """Return the picture of a map that there is nothing to set beside."""
+    mask = _shown(skin_map, None)
+    inside = skin_map.values[np.isfinite(skin_map.values) if mask is None else mask]
+    low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
+    return map_pictures.scalar_picture(
+        key, skin_map.values, low=low, high=high, valid=mask,
+        unit=page.short_unit(skin_map.unit), width=SMALL_PX,
+    )  # fmt: skip
 
 
 def _shown(estimate: SkinMap, truth: SkinMap | None) -> NDArray[np.bool_] | None:
@@ -58,12 +76,14 @@ def errors(
     for row in blurred:
         if row.band is None:
             own = [r for r in blurred if r.name == row.name and r.band is not None]
+            worst, worst_got = _worst(own)
             checks.append(
                 page.Check(
                     f"{name}: {row.name}, median error",
                     100 * row.median_relative, 100 * evaluation.limit(row), "<=", "%",
                     f"Cramér-Rao bound {100 * evaluation.bound(row):.1f} %",
-                    masked=row.masked, coverage=row.coverage.share, worst=_worst(own),
+                    masked=row.masked, coverage=row.coverage.share, worst=worst,
+                    worst_got=worst_got,
                 )
             )  # fmt: skip
     body = "<h3>Errors by melanin band</h3>" + page.table(
@@ -85,13 +105,15 @@ def errors(
     return body + _bars([row for row in blurred if row.band is not None])
 
 
-def _worst(banded: Iterable[evaluation.MapError]) -> str:
-    """Return the melanin band of the largest error, where there is more than one."""
+def _worst(banded: Iterable[evaluation.MapError]) -> tuple[str, float]:
+    """Return the melanin band of the largest error and its lower end, where there are several."""
     told = [row for row in banded if np.isfinite(row.median_relative)]
     if len(told) < 2:
-        return ""
+        return "", float("nan")
     worst = max(told, key=lambda row: row.median_relative)
-    return f"{worst.band_name}: {100 * worst.median_relative:.3g} %"
+    low, high = (100 * end for end in worst.interval)
+    text = f"{worst.band_name}: {100 * worst.median_relative:.3g} % ({low:.3g} – {high:.3g} %)"
+    return text, low
 
 
 def _bars(banded: list[evaluation.MapError]) -> str:

@@ -309,3 +309,52 @@ def sensitivity(
         f"{100 * float(np.mean(shown > 100)):.0f} % of the plane"
     )
     return _svg(figure, alt)
+
+
+def compared_fronts(
+    stage: str, a: tuple[str, Mapping[str, Any]], b: tuple[str, Mapping[str, Any]]
+) -> str:
+    """Draw one stage of two benchmarks: error against seconds of all settings, log-log.
+
+    Parameters
+    ----------
+    stage
+        Name, for the title.
+    a, b
+        Label and stage's entry of a ``skinrig.bench/2`` document.
+
+    Returns
+    -------
+    str
+        An image with a name, as SVG. Settings that both measured are joined by thin lines.
+    """
+    figure, axes = _figure(5.2, 3.4)
+    places: list[dict[str, tuple[float, float]]] = []
+    told = []
+    for number, (label, document) in enumerate((a, b)):
+        points = [p for p in document["points"] if p["error"] > 0.0]
+        seconds = np.array([p["seconds"] for p in points], float)
+        error = np.array([p["error"] for p in points], float)
+        axes.plot(
+            seconds, error, "os"[number], mfc="none" if number else None, ms=5,
+            color=_COLORS[number], label=label,
+        )  # fmt: skip
+        places.append(
+            {
+                str(p["knobs"]): (s, e)
+                for p, s, e in zip(points, seconds.tolist(), error.tolist(), strict=True)
+            }
+        )
+        told.append(f"{label}: errors {_span(error)} in {_span(seconds)} seconds")
+    for knobs in sorted(places[0].keys() & places[1].keys()):
+        (s0, e0), (s1, e1) = places[0][knobs], places[1][knobs]
+        axes.plot([s0, s1], [e0, e1], "-", color="0.5", lw=0.6, zorder=0)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.margins(x=0.15, y=0.2)
+    _plain_numbers(axes.xaxis, axes.yaxis)
+    axes.set_xlabel("seconds, warm, median")
+    axes.set_ylabel("\n".join(textwrap.wrap(a[1]["error_name"], 36)))
+    axes.set_title(stage, fontsize=10)
+    axes.legend(fontsize=7, frameon=False)
+    return _svg(figure, f"{stage}: {'; '.join(told)}")

@@ -67,7 +67,7 @@ def _pictures(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
             if skin_map is not None:
                 row += _shown(f"{title}, {_words(state)}", skin_map, appearance)
         if row:
-            series.append(f"<div class='maps'>{row}</div>")
+            series.append(f"<div class='maps small'>{row}</div>")
     if len(one) > 1:
         body += "<h3>From compressed to stretched</h3>" + "".join(series)
     return body
@@ -141,11 +141,13 @@ def _relief_errors(
     if not rows:
         return ""
     neutral = [row for row in rows if row.state.endswith("_n0")]
+    where, worst_got = _worst(rows)
     for row in neutral:
         checks.append(
             page.Check(f"{name}: specular normals at the lens's resolution, mean error",
                        row.mean_deg, evaluation.NORMAL_LIMIT_DEG, "<=", "°", row.state,
-                       masked=row.masked, coverage=row.coverage, worst=_worst(rows))
+                       masked=row.masked, coverage=row.coverage, worst=where,
+                       worst_got=worst_got)
         )  # fmt: skip
     note = (
         "<p class='note'>Errors are told at the lens's resolution; the unblurred truth has detail "
@@ -171,13 +173,13 @@ def _relief_errors(
     )  # fmt: skip
 
 
-def _worst(rows: Sequence[evaluation.ReliefError]) -> str:
-    """Return the state whose normals are worst, where there are more than one."""
+def _worst(rows: Sequence[evaluation.ReliefError]) -> tuple[str, float]:
+    """Return the state whose normals are worst and their error, where there are several."""
     told = [row for row in rows if math.isfinite(row.mean_deg)]
     if len(told) < 2:
-        return ""
+        return "", math.nan
     worst = max(told, key=lambda row: row.mean_deg)
-    return f"{_words(worst.state)}: {worst.mean_deg:.3g}°"
+    return f"{_words(worst.state)}: {worst.mean_deg:.3g}°", worst.mean_deg
 
 
 def _strain(
@@ -247,7 +249,7 @@ def _histograms(appearance: SkinAppearance) -> str:
     )
     return (
         "<h3>Histograms of normals, root of share</h3><p class='note'>Along the jaws to the right, "
-        f"across them up.</p><div class='maps'>{panels}</div>{note}"
+        f"across them up.</p><div class='maps small'>{panels}</div>{note}"
     )
 
 

@@ -14,6 +14,8 @@ from typing import Literal
 import numpy as np
 
 STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
+SHORT = 22
+"""Characters up to which a cell's text is not broken over lines."""
 BAR_STOPS = 17
 """Colors that a scale's bar runs through; between them it is straight in sRGB."""
 
@@ -39,6 +41,8 @@ class Check:
     """Share of truths inside the 68 % intervals; NaN: not told."""
     worst: str = ""
     """Where it is worst, in words: a melanin band, a state, a channel."""
+    worst_got: float = float("nan")
+    """As large as it surely is there, in ``unit``; NaN where that is no number like ``got``."""
 
     @property
     def passed(self) -> bool:
@@ -56,6 +60,17 @@ class Check:
 def number(value: float) -> str:
     """Return a number with four significant digits, or a dash where there is none."""
     return "–" if value is None or not np.isfinite(value) else f"{value:.4g}"
+
+
+def short_unit(unit: str) -> str:
+    """Return a unit as tables and scales have room for; none where it is a plain number.
+
+    Examples
+    --------
+    >>> short_unit("volume fraction of the epidermis"), short_unit("1"), short_unit("mm")
+    ('volume fraction', '', 'mm')
+    """
+    return "" if unit == "1" else unit.split(" of ")[0]
 
 
 def checks_table(checks: Sequence[Check]) -> str:
@@ -123,7 +138,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str
         elif isinstance(value, (int, np.integer)) and not isinstance(value, bool):
             kind, text = "n", str(value)
         else:
-            kind, text = "", escape(value)
+            text = escape(value)
+            kind = "k" if len(text) <= SHORT else ""
         marked = f' class="{kind}"' if kind else ""
         if first and text:
             return f'<th scope="row"{marked}>{text}</th>'

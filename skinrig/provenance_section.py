@@ -46,7 +46,7 @@ def section(appearance: SkinAppearance) -> str:
             ("what", "why"), appearance.left_out, caption="Stages that were not run"
         )
     origin = page.facts(
-        {"source": appearance.source, "seed": appearance.seed}
+        {"source": appearance.source, "seed": str(appearance.seed)}
         | {f"input {k}": short(v) for k, v in sorted(appearance.inputs.items())}
         | {f"version of {k}": v for k, v in sorted(appearance.versions.items())},
         caption=f"Inputs by the first {DIGEST_SHOWN} digits of their SHA-256",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from skinrig import (
     bench_section,
     calibration_section,
     chromophore_section,
+    comparison_section,
     dynamic_section,
     extremes_section,
     map_pictures,
@@ -20,6 +22,7 @@ from skinrig import (
     pictures_section,
     population_section,
     provenance_section,
+    run_comparison,
     sequence_section,
     session_section,
     subsurface_section,
@@ -30,7 +33,22 @@ from skinrig import (
 from skinrig.dynamic_appearance import parts_of
 from skinrig.report_folders import Findings, ReportError, discover, read_json
 
-__all__ = ["ReportError", "build", "sections"]
+__all__ = ["Report", "ReportError", "build", "make"]
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A page, and what it says first."""
+
+    html: str
+    checks: tuple[page.Check, ...]
+    compared: tuple[str, str] | None
+    """Labels of the two runs that it compares; None: it is about one collection."""
+
+    @property
+    def verdict(self) -> str:
+        """Whether the checks kept their limits, in a sentence."""
+        return verdict_section.headline(self.checks)
 
 
 def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
@@ -49,9 +67,62 @@ def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
     ReportError
         When a path does not exist, or nothing is found at all.
     """
-    checks: list[page.Check] = []
-    body = sections(discover([Path(p) for p in paths]), checks)
-    return page.document(title, verdict_section.section(checks), body)
+    return make(paths, title=title, compare=False).html
+
+
+def make(
+    paths: Sequence[str | Path], *, title: str = "skinrig report", compare: bool | None = None
+) -> Report:
+    """Return the report on a collection, or on two runs beside each other.
+
+    Parameters
+    ----------
+    paths
+        As for `build`.
+    title
+        Heading of the page.
+    compare
+        Whether two runs are compared; None: by the rule of `skinrig.run_comparison.sides`.
+
+    Raises
+    ------
+    ReportError
+        When a path does not exist, nothing is found, or a comparison is asked of what are not two
+        runs.
+    """
+    places = [Path(p) for p in paths]
+    both = run_comparison.sides(places, insist=compare)
+    if both is not None:
+        for run in both:
+            judge(run.found, run.checks)
+        pairs = run_comparison.compared(*both)
+        html = page.document(
+            title, comparison_section.lead(*both, pairs), comparison_section.sections(*both, pairs)
+        )
+        checks = tuple(both[0].checks + both[1].checks)
+        return Report(html, checks, (both[0].label, both[1].label))
+    checks_of_all: list[page.Check] = []
+    found = discover(places)
+    body = sections(found, checks_of_all)
+    html = page.document(title, verdict_section.section(checks_of_all, found.words()), body)
+    return Report(html, tuple(checks_of_all), None)
+
+
+def judge(found: Findings, checks: list[page.Check]) -> None:
+    """Judge all that was found as its report does, without what the report only shows.
+
+    Parameters
+    ----------
+    found
+        What lies at the paths of a report.
+    checks
+        Judgements are added to it.
+    """
+    appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
+    _maps(found, appearances, checks)
+    _documents(found, checks)
+    sessions = session_section.facts_of(found.sessions)
+    calibration_section.section(found.calibrations, appearances, sessions, checks)
 
 
 def sections(found: Findings, checks: list[page.Check]) -> str:
@@ -66,33 +137,37 @@ def sections(found: Findings, checks: list[page.Check]) -> str:
     """
     appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
     sessions = session_section.facts_of(found.sessions)
-    parts: list[str] = []
+    body = _maps(found, appearances, checks)
+    body += chromophore_section.identifiability(appearances.values())
+    body += population_section.section(appearances)
+    body += _documents(found, checks)
+    body += calibration_section.section(found.calibrations, appearances, sessions, checks)
+    return body + session_section.section(sessions)
+
+
+def _maps(
+    found: Findings, appearances: Mapping[str, SkinAppearance], checks: list[page.Check]
+) -> str:
+    body = ""
     for name, appearance in appearances.items():
         if dynamic_section.is_dynamic(appearance):
-            parts.append(_dynamic_section(name, appearance, found, checks))
-            continue
-        truth = truth_of(appearance, found)
-        parts.append(_appearance_section(name, appearance, truth, checks))
-    parts += [pictures_section.section(folder, checks) for folder in found.pictures]
-    parts.append(chromophore_section.identifiability(appearances.values()))
-    parts.append(population_section.section(appearances))
+            body += _dynamic_section(name, appearance, found, checks)
+        else:
+            body += _appearance_section(name, appearance, found.truth_of(appearance), checks)
+    return body + "".join(pictures_section.section(folder, checks) for folder in found.pictures)
+
+
+def _documents(found: Findings, checks: list[page.Check]) -> str:
+    body = ""
     for path in found.documents:
         document = read_json(path)
         if bench_section.is_bench(document):
-            parts.append(bench_section.section(document, checks))
+            body += bench_section.section(document, checks)
         elif document["schema"] == extremes_section.SCHEMA:
-            parts.append(extremes_section.section(document, checks))
+            body += extremes_section.section(document, checks)
         else:
-            parts.append(_document_section(document))
-    parts.append(calibration_section.section(found.calibrations, appearances, sessions, checks))
-    parts.append(session_section.section(sessions))
-    return "".join(parts)
-
-
-def truth_of(appearance: SkinAppearance, found: Findings) -> SkinAppearance | None:
-    """Return the truth that an appearance names, where it was found."""
-    path = found.truths.get(str(appearance.parameters.get("truth", "")))
-    return store.read(path) if path else None
+            body += _document_section(document)
+    return body
 
 
 def _appearance_section(

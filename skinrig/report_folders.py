@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from model import store
+from model.skin import SkinAppearance
 from skinrig import pictures_section
 
 
@@ -33,6 +35,34 @@ class Findings:
     def empty(self) -> bool:
         """Whether there is nothing to tell of."""
         return not (self.appearances or self.sessions or self.documents or self.pictures)
+
+    def words(self) -> str:
+        """Return what there is, in a sentence.
+
+        Examples
+        --------
+        >>> Findings(sessions=[Path("one")], truths={"truth": Path("truth")}).words()
+        'About 1 truth and 1 session.'
+        """
+        kinds = (
+            ("set of maps", "sets of maps", len(self.appearances)),
+            ("truth", "truths", len(self.truths)),
+            ("folder of pictures", "folders of pictures", len(self.pictures)),
+            ("calibration", "calibrations", len(self.calibrations)),
+            ("session", "sessions", len(self.sessions)),
+            ("document", "documents", len(self.documents)),
+        )
+        told = [f"{n} {one if n == 1 else many}" for one, many, n in kinds if n]
+        return (
+            "About "
+            + (" and ".join([", ".join(told[:-1]), told[-1]]) if told[1:] else told[0])
+            + "."
+        )
+
+    def truth_of(self, appearance: SkinAppearance) -> SkinAppearance | None:
+        """Return the truth that an appearance names, where it was found."""
+        path = self.truths.get(str(appearance.parameters.get("truth", "")))
+        return store.read(path) if path else None
 
 
 def discover(paths: Sequence[Path]) -> Findings:
@@ -92,3 +122,14 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or not isinstance(document.get("schema"), str):
         raise ReportError(f'{path}: got no "schema", expected a document of a skinrig command')
     return document
+
+
+def write_page(path: Path, text: str) -> None:
+    """Write a page that is there whole or not at all."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise

@@ -213,7 +213,7 @@ def _spread(
     stderr = skin_map.stderr[rows, columns].astype(np.float64)
     if stderr.ndim == 2:
         stderr = stderr.mean(axis=-1)
-    unit = "" if skin_map.unit == "1" else skin_map.unit
+    unit = page.short_unit(skin_map.unit)
     if key in evaluation.NORMAL_MAPS:
         stderr, unit = np.degrees(stderr), "°"
     image, valid = view.picture(stderr, valid=good)
@@ -239,10 +239,11 @@ def _errors(
             continue
         what, got, bound = row.judged
         unit = "°" if row.unit == "deg" else row.unit
+        where, worst_got = _worst(row.name, banded)
         checks.append(
             page.Check(
                 f"{name}: {row.name}, {what}", got, bound, "<=", unit,
-                masked=row.masked, coverage=row.coverage.share, worst=_worst(row.name, banded),
+                masked=row.masked, coverage=row.coverage.share, worst=where, worst_got=worst_got,
             )
         )  # fmt: skip
     note = ""
@@ -308,12 +309,13 @@ def errors_by_band(appearance: SkinAppearance, truth: SkinAppearance) -> list[Ba
     return rows
 
 
-def _worst(name: str, banded: list[Banded]) -> str:
+def _worst(name: str, banded: list[Banded]) -> tuple[str, float]:
+    """Return the skin color of the largest error and that error, where there are several."""
     own = [row for row in banded if row[0] == name.split()[0]]
     if len(own) < 2:
-        return ""
+        return "", float("nan")
     worst = max(own, key=lambda row: row[5])
-    return f"{worst[2]} skin: {worst[5]:.3g} {worst[1]}"
+    return f"{worst[2]} skin: {worst[5]:.3g} {worst[1]}", worst[5]
 
 
 def _reflection(

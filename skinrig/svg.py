@@ -54,7 +54,7 @@ def simplified(drawn: str, *, alt: str) -> str:
     text = _joined(_unnested(text))
     named = (
         f'<svg role="img" aria-label="{html.escape(alt, quote=True)}" font-family="{_FAMILY}" '
-        'stroke-linejoin="round" '
+        'fill="currentColor" stroke-linejoin="round" '
     )
     return text.replace("<svg ", named, 1)
 

@@ -71,7 +71,7 @@ def _spread(name: str, one: SkinMap) -> tuple[object, ...] | None:
     size = np.abs(values[good])
     relative = stderr[size > 0] / size[size > 0]
     return (
-        name, "" if one.unit == "1" else one.unit, share, float(np.median(values[good])),
+        name, page.short_unit(one.unit), share, float(np.median(values[good])),
         float(np.median(stderr)),
         100.0 * float(np.median(relative)) if relative.size else float("nan"),
         float(np.percentile(stderr, 95)),
@@ -83,7 +83,7 @@ def _residual(name: str, one: SkinMap) -> tuple[object, ...] | None:
     if not good.any():
         return None
     low, middle, high = np.percentile(np.abs(values[good]), [50, 68.27, 95])
-    return (name, "" if one.unit == "1" else one.unit, float(low), float(middle), float(high))
+    return (name, page.short_unit(one.unit), float(low), float(middle), float(high))
 
 
 def _by_band(appearance: SkinAppearance) -> str:

@@ -35,10 +35,12 @@ def headline(checks: Sequence[page.Check]) -> str:
     return f"All {len(checks)} checks kept their limits."
 
 
-def section(checks: Sequence[page.Check]) -> str:
-    """Return the verdict, where it is worst, and all checks."""
+def section(checks: Sequence[page.Check], about: str = "") -> str:
+    """Return the verdict, where it is worst, and all checks; ``about`` says of what, as text."""
     kind = "bad" if any(not check.passed for check in checks) else "good"
     body = f'<p class="verdict {kind if checks else ""}">{page.escape(headline(checks))}</p>'
+    if about:
+        body += f"<p>{page.escape(about)}</p>"
     weak = weaknesses(checks)
     if weak:
         items = "".join(f"<li>{page.escape(text)}</li>" for text in weak)
@@ -51,8 +53,9 @@ def section(checks: Sequence[page.Check]) -> str:
 def weaknesses(checks: Sequence[page.Check]) -> list[str]:
     """Return what a reader should look at first, in sentences.
 
-    Missed limits; what comes closest to its limit; intervals that hold far too few or too many
-    truths; maps with many pixels that have no value.
+    Missed limits; skin or states whose own error lies beyond the limit that the whole keeps; what
+    comes closest to its limit; intervals that hold far too few or too many truths; maps with many
+    pixels that have no value.
 
     Examples
     --------
@@ -68,6 +71,15 @@ def weaknesses(checks: Sequence[page.Check]) -> list[str]:
         out.append(f"missed: {check.name}, {_measured(check)}, {sign} {_bound(check)}{_at(check)}")
     if len(missed) > MISSED_NAMED:
         out.append(f"missed: {len(missed) - MISSED_NAMED} more, in the table below")
+    told: set[str] = set()
+    for check in checks:
+        beyond = check.passed and check.sense == "<=" and check.worst_got > check.bound
+        if beyond and check.worst not in told:  # channels of a map share their worst place
+            told.add(check.worst)
+            out.append(
+                f"beyond the limit of the whole: {check.name}, {check.worst} where at most "
+                f"{_bound(check)} is allowed over all, and {_measured(check)} found"
+            )
     close = sorted(
         (check for check in checks if check.passed and np.isfinite(check.used)),
         key=lambda check: -check.used,
