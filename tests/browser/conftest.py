@@ -57,9 +57,24 @@ class ViewerPage:
         """Return the names of the buffers."""
         return list(self.page.evaluate("() => window.viewer.buffers()"))
 
-    def bench(self, frames: int) -> dict[str, Any]:
-        """Draw whole frames; milliseconds of each, and work by pass."""
-        return dict(self.page.evaluate("n => window.viewer.bench(n)", frames))
+    def bench(self, frames: int, *, light: bool = False) -> dict[str, Any]:
+        """Draw frames, whole or as the light turns; milliseconds of each, and work by pass."""
+        asked = [frames, {"light": light}]
+        return dict(self.page.evaluate("a => window.viewer.bench(a[0], a[1])", asked))
+
+    def mesh(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the moved vertices, mm, and their normals, (V, 3) each."""
+        found = self.page.evaluate("() => window.viewer.mesh()")
+        positions, normals = (
+            np.frombuffer(base64.b64decode(found[name]), "<f4").reshape(-1, 3)
+            for name in ("positions", "normals")
+        )
+        return positions, normals
+
+    def draws(self) -> dict[str, int]:
+        """Return how often each pass was drawn so far."""
+        found = self.page.evaluate("() => window.viewer.statistics.passes")
+        return {name: int(record["draws"]) for name, record in found.items()}
 
     def resize(self, width: int, height: int) -> None:
         """Change the size of the canvas in pixels."""

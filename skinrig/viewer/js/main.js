@@ -58,11 +58,15 @@ V.readNow = name => {
   return V.read(V.sideA, name);
 };
 
-// Draw n frames with every pass drawn anew; milliseconds of each.
-V.bench = n => {
+// Draw n frames; milliseconds of each, and what every pass costs. All passes are drawn anew, or,
+// with `light`, those that a turn of the light asks for.
+V.bench = (n, {light = false} = {}) => {
+  const azimuth = V.params.light_azimuth_deg;
   const frames = [];
+  const before = {draws: V.statistics.draws, skipped: V.statistics.skipped};
   for (let i = 0; i < n; i++) {
-    V.sideA.keys.clear();
+    if (light) V.params.light_azimuth_deg += 1;
+    else V.sideA.keys.clear();
     const begun = performance.now();
     V.drawFrame();
     V.finish();
@@ -73,7 +77,10 @@ V.bench = n => {
     if (!V.sideA.targets.has(pass.name)) continue;
     passes[pass.name] = pass.cost ? pass.cost(V.params) : {taps: 0, bytes: 0};
   }
-  return {frames_ms: frames, passes};
+  const draws = (V.statistics.draws - before.draws) / n;
+  const skipped = (V.statistics.skipped - before.skipped) / n;
+  V.params.light_azimuth_deg = azimuth;
+  return {frames_ms: frames, draws, skipped, passes};
 };
 
 window.viewer = {
@@ -85,6 +92,10 @@ window.viewer = {
     return {width, height, channels, data: V.base64(values)};
   },
   bench: V.bench,
+  mesh: () => {
+    const {positions, normals} = V.movedMesh(V.sideA, V.params);
+    return {positions: V.base64(positions), normals: V.base64(normals)};
+  },
   resize: V.resize,
   get scene() { return V.scene; },
   statistics: V.statistics,
