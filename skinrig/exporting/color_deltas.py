@@ -83,7 +83,8 @@ def write(
     names = {f"cm{k}": state for k, state in enumerate(states, start=1)}
     base = Image(
         name="base_color", values=_filled(colors.base, colors.valid), unit="1", space=SRGB,
-        what=f"neutral base color on {colors.layout}; {colors.space}; holes filled", valid=colors.valid,
+        what=f"neutral base color on {colors.layout}; {colors.space}; holes filled",
+        valid=colors.valid,
     )  # fmt: skip
     out.exr(base)
     out.png(base)

@@ -104,16 +104,23 @@ def _write(
     places = in_camera_frame(dome.table.position_mm[good], pose.rotation)
     toward = places / np.linalg.norm(places, axis=1, keepdims=True)
     names = [f"{images.lights[k]}.tif" for k in good]
+
+    def picture(light: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        if "light_list" in session.manifest.extra:
+            return _imported(session, images.views[view], images.lights[light])
+        found = dome.image(view, _capture(images, light))
+        return found.rgb, found.valid
+
     # twice through the pictures instead of all of them in memory
-    top = max(_top(dome.image(view, _capture(images, k))) for k in good)
+    top = max(_top(*picture(k)) for k in good)
     scale = (TOP - 1) / top if top > 0.0 else 1.0
     clipped: dict[str, float] = {}
     for k, name in zip(good, names, strict=True):
-        image = dome.image(view, _capture(images, k))
-        codes, clipped[name] = _coded(image.rgb, image.valid, scale)
+        codes, clipped[name] = _coded(*picture(k), scale)
         tifffile.imwrite(
-            folder / name, codes, photometric="rgb", compression=None, metadata=None, software=False
-        )
+            folder / name, codes, photometric="minisblack" if codes.ndim == 2 else "rgb",
+            compression=None, metadata=None, software=False,
+        )  # fmt: skip
     rows = [f"{n} {x:.9f} {y:.9f} {z:.9f}" for n, (x, y, z) in zip(names, toward, strict=True)]
     (folder / LIST).write_text(f"{len(rows)}\n" + "\n".join(rows) + "\n", encoding="ascii")
     near = "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in places)
@@ -123,8 +130,8 @@ def _write(
         {
             "schema": SCHEMA,
             "frame": "x right, y up, z towards the camera; directions from the rig's origin",
-            "encoding": f"linear camera RGB: fraction of full scale per second of light = code "
-            f"/ {scale:.9g}; {TOP} is saturated",
+            "encoding": f"linear camera values: fraction of full scale, per second of light where "
+            f"the exposure is known, = code / {scale:.9g}; {TOP} is saturated",
             "code_per_rate": scale,
             "clipped_share": clipped,
             "camera": images.views[view],
@@ -174,15 +181,34 @@ def _capture(images: Any, light: int) -> int:
     return int(images.captures.index((images.lights[light], -1)))
 
 
-def _top(image: Any) -> float:
-    shown = image.rgb[image.valid]
+def _imported(
+    session: Session, view: str, light: str
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return a picture that came with a light list, which need not say its exposure."""
+    from capture import raw
+
+    record = next(one for one in session.frames("olat", light=light) if one.camera == view)
+    frame = session.read(record)
+    time = float(record.settings.get("exposure_s", 0.0)) * float(record.settings.get("iso", 100.0))
+    per_time = np.float32(1.0 / time if time > 0.0 else 1.0)
+    if frame.pattern == "MONO":
+        (black,) = frame.black
+        values = (frame.cfa.astype(np.float32) - black) / np.float32(frame.white - black)
+        return values * per_time, frame.cfa < frame.white
+    image = raw.linear_rgb(frame, demosaic="superpixel")
+    return image.rgb * per_time, image.valid
+
+
+def _top(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
+    shown = values[valid]
     return float(np.quantile(shown, 1.0 - BRIGHT_SHARE)) if shown.size else 0.0
 
 
 def _coded(
-    rgb: NDArray[np.float32], valid: NDArray[np.bool_], scale: float
+    values: NDArray[np.float32], valid: NDArray[np.bool_], scale: float
 ) -> tuple[NDArray[np.uint16], float]:
-    codes = np.rint(np.nan_to_num(rgb.astype(np.float64)) * scale)
-    beyond = (codes > TOP - 1).any(axis=-1) | ~valid
+    codes = np.rint(np.nan_to_num(values.astype(np.float64)) * scale)
+    beyond = codes > TOP - 1
+    beyond = (beyond if codes.ndim == 2 else beyond.any(axis=-1)) | ~valid
     codes[beyond] = TOP
     return np.clip(codes, 0, TOP).astype(np.uint16), float(beyond.mean())

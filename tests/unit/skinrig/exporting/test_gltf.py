@@ -1,0 +1,177 @@
+"""The binary glTF file by independent readers: pygltflib, trimesh, the Khronos validator, ours."""
+
+import io
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from skinrig import blend_shapes
+from skinrig.errors import UsageError
+from skinrig.exporting import gltf
+from skinrig.exporting.images import srgb_curve
+from skinrig.exporting.material import Material
+from skinrig.exporting.options import Delivery
+
+MM = 0.001
+
+
+@pytest.fixture(scope="module")
+def material(simulated_face, shapes_file):
+    return Material.of(simulated_face, shapes_file)
+
+
+@pytest.fixture(scope="module")
+def folder(simulated_face, shapes_file, tmp_path_factory):
+    out = tmp_path_factory.mktemp("glb")
+    left_out = gltf.write(simulated_face, out, Delivery(mesh=shapes_file, with_errors=True))
+    assert [what for what, _ in left_out] == ["subsurface light"]
+    return out
+
+
+@pytest.fixture(scope="module")
+def parsed(folder):
+    pygltflib = pytest.importorskip("pygltflib")
+    return pygltflib.GLTF2().load(str(folder / "skin.glb"))
+
+
+def accessor(parsed, number):
+    entry = parsed.accessors[number]
+    view = parsed.bufferViews[entry.bufferView]
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[entry.type]
+    kind = {5126: "<f4", 5125: "<u4"}[entry.componentType]
+    blob = parsed.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
+    return np.frombuffer(blob, kind).reshape(entry.count, width)
+
+
+def picture(parsed, number):
+    view = parsed.bufferViews[parsed.images[number].bufferView]
+    blob = parsed.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
+    return cv2.imdecode(np.frombuffer(blob, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def test_lengths_are_metres_and_texture_coordinates_grow_downwards(parsed, material):
+    attributes = parsed.meshes[0].primitives[0].attributes
+    points = accessor(parsed, attributes.POSITION)
+    np.testing.assert_allclose(points, material.mesh.vertices_mm * MM, atol=1e-9)
+    assert np.ptp(points[:, 0]) == pytest.approx(0.1, abs=1e-6)
+    st = accessor(parsed, attributes.TEXCOORD_0)
+    top = points[:, 1].argmax()
+    assert st[top, 1] == pytest.approx(0.0, abs=1e-6)
+    faces = accessor(parsed, parsed.meshes[0].primitives[0].indices)
+    assert np.array_equal(faces.reshape(-1, 3), material.mesh.faces)
+
+
+def test_tangents_follow_growing_u_and_bitangents_point_up_the_picture(parsed):
+    attributes = parsed.meshes[0].primitives[0].attributes
+    normal, tangent = accessor(parsed, attributes.NORMAL), accessor(parsed, attributes.TANGENT)
+    middle = len(normal) // 2
+    bitangent = tangent[middle, 3] * np.cross(normal[middle], tangent[middle, :3])
+    np.testing.assert_allclose(tangent[middle, :3], [1, 0, 0], atol=1e-3)
+    np.testing.assert_allclose(bitangent, [0, 1, 0], atol=1e-3)
+
+
+def test_morph_targets_have_their_names_and_move_by_metres(parsed, material):
+    mesh = parsed.meshes[0]
+    assert mesh.extras["targetNames"] == ["jawOpen", "smile left"]
+    for target, name in zip(mesh.primitives[0].targets, mesh.extras["targetNames"], strict=True):
+        moved = accessor(parsed, target["POSITION"])
+        np.testing.assert_allclose(moved, material.shapes[name] * MM, atol=1e-9)
+    assert mesh.weights == [0.0, 0.0]
+
+
+def test_pictures_decode_to_color_roughness_normals_and_weight(parsed, material):
+    told = parsed.materials[0]
+    color = picture(parsed, told.pbrMetallicRoughness.baseColorTexture.index)[..., ::-1] / 255.0
+    np.testing.assert_allclose(color, srgb_curve(material.base_color), atol=0.51 / 255)
+    rough = picture(parsed, told.pbrMetallicRoughness.metallicRoughnessTexture.index)
+    np.testing.assert_allclose(rough[..., 1] / 255.0, material.surface.roughness, atol=0.51 / 255)
+    assert rough[..., 0].max() == 0  # blue, metalness; OpenCV has it first
+    normal = picture(parsed, told.normalTexture.index)[..., ::-1] / 127.5 - 1.0
+    np.testing.assert_allclose(normal, material.normals, atol=1.01 / 255)
+    extension = told.extensions["KHR_materials_specular"]
+    weight = picture(parsed, extension["specularTexture"]["index"])[..., 3] / 255.0
+    np.testing.assert_allclose(weight, material.specular_weight, atol=0.51 / 255)
+    # u = 0 is red-poor and v = 1 green-poor: row 0 is the top
+    assert color[32, 60, 0] > color[32, 2, 0] + 0.05
+    assert color[60, 32, 1] > color[8, 32, 1] + 0.05
+
+
+def test_what_gltf_has_no_place_for_is_in_extras(parsed, material):
+    told = parsed.materials[0]
+    assert told.extensions["KHR_materials_ior"]["ior"] == pytest.approx(1.4)
+    sigma = told.extras["subsurface"]["sigma_tr_per_mm"]
+    depth = np.median(material.translucency_mm[material.valid], axis=0)
+    np.testing.assert_allclose(sigma, 1.0 / depth, rtol=1e-6)
+
+
+def test_our_own_reader_gets_the_mesh_back_in_mm(folder, material):
+    read = blend_shapes.load(folder / "skin.glb")
+    np.testing.assert_allclose(read.vertices_mm, material.mesh.vertices_mm, atol=1e-4)
+    np.testing.assert_allclose(read.uv, material.mesh.uv, atol=1e-6)
+    np.testing.assert_allclose(read.shapes["jawOpen"], material.shapes["jawOpen"], atol=1e-4)
+
+
+def test_trimesh_sees_the_same_surface(folder, material):
+    import trimesh
+
+    data = io.BytesIO((folder / "skin.glb").read_bytes())
+    read = trimesh.load(data, file_type="glb", force="mesh", process=False)
+    own = trimesh.Trimesh(material.mesh.vertices_mm * MM, material.mesh.faces, process=False)
+    assert read.area == pytest.approx(own.area, rel=1e-5)
+    np.testing.assert_allclose(read.bounds, own.bounds, atol=1e-7)
+    # trimesh turns v up again, as we have it
+    np.testing.assert_allclose(read.visual.uv, material.mesh.uv, atol=1e-6)
+
+
+def validator():
+    """Return the folder of the npm package gltf-validator, None where it is not installed."""
+    told = os.environ.get("GLTF_VALIDATOR")
+    for place in filter(None, (told, Path(__file__).parents[4] / "node_modules/gltf-validator")):
+        if (Path(place) / "package.json").is_file() and shutil.which("node"):
+            return Path(place)
+    return None
+
+
+def validated(path):
+    script = (
+        "const v=require(process.argv[1]),fs=require('fs');"
+        "v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2])))"
+        ".then(r=>console.log(JSON.stringify(r)));"
+    )
+    done = subprocess.run(
+        ["node", "-e", script, str(validator()), str(path)],
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    return json.loads(done.stdout)
+
+
+@pytest.mark.skipif(validator() is None, reason="GLTF_VALIDATOR names no npm gltf-validator")
+def test_khronos_finds_nothing_to_say(folder, tmp_path):
+    report = validated(folder / "skin.glb")
+    assert report["issues"]["messages"] == []
+    assert report["info"]["totalVertexCount"] == 169
+    blob = bytearray((folder / "skin.glb").read_bytes())
+    place = blob.index(b'"type":"VEC4"')
+    blob[place : place + 13] = b'"type":"VEC3"'  # tangents without their sign
+    (tmp_path / "broken.glb").write_bytes(blob)
+    assert validated(tmp_path / "broken.glb")["issues"]["numErrors"] > 0
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"unit": "mm"}, {"normal_y": "dx"}, {"udim": "dot"}], ids=lambda one: next(iter(one))
+)
+def test_what_gltf_fixes_cannot_be_asked_for(simulated_face, tmp_path, wrong):
+    with pytest.raises(UsageError, match="glTF knows"):
+        gltf.write(simulated_face, tmp_path, Delivery(**wrong))
+
+
+def test_a_mesh_without_shapes_has_no_targets_and_that_is_told(simulated_face, tmp_path):
+    left_out = dict(gltf.write(simulated_face, tmp_path, Delivery()))
+    assert "--mesh" in left_out["morph targets"]
+    assert json.loads((tmp_path / "glb.json").read_text())["morph_targets"] == []
