@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,17 +17,20 @@ from model.metrics import angular_error_rad
 from reconstruction.gradient_normals import SensorNoise, SphereLights, from_patterns
 from reconstruction.normal_maps import NormalMaps
 from rigsim.microrelief import make_micro_skin
+from rigsim.pigment import MELANIN_PRESETS
 from rigsim.scenes.gradient import GradientScene
 from rigsim.sphere_build import BuiltSphere, as_drawn
 from rigsim.taped_skin import GripState
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
-from skinrig.skin_bands import MELANIN_BANDS
+from skinrig.skin_bands import MELANIN_BANDS, MelaninBand
 
 Floats = NDArray[np.float64]
 Images = Mapping[tuple[str, str], NDArray[np.floating]]
 
 NEUTRAL = GripState(0.0, 0, 8.0, 1.0, True, False)
 EXPOSURE_S = 0.03
+PRESET = "III"
+"""Of the skin's melanin."""
 NAMES = ("full", "x", "y", "z", "-x", "-y", "-z", "dark")
 READINGS = {"parallel": 0.0, "crossed": 90.0}
 SMOOTH_PX = 8.0
@@ -79,14 +81,14 @@ def pixel_geometry(rig: Rig) -> dict[str, Any]:
     return {"points_mm": points, "view": way / np.linalg.norm(way, axis=-1, keepdims=True)}
 
 
-def skin_patch(side: int, *, smooth: bool, seed: int = 5, preset: str = "III") -> Patch:
+def skin_patch(side: int, *, smooth: bool, seed: int = 5) -> Patch:
     """Picture a patch of cheek, as it is or smoothed, by all sixteen conditions."""
     rig = load_rig("gradient").cropped(side)
     size_mm = max(0.006 * side + 0.8, 1.2)
-    skin = make_micro_skin("cheek", seed=seed, size_mm=size_mm, preset=preset)
+    skin = make_micro_skin("cheek", seed=seed, size_mm=size_mm, preset=PRESET)
     if smooth:
         height = gaussian_filter(skin.height_um, SMOOTH_PX, mode="wrap").astype(np.float32)
-        skin = dataclasses.replace(skin, height_um=height)
+        skin = replace(skin, height_um=height)
     sphere = as_drawn(rig)
     scene = GradientScene(rig, skin, sphere=sphere)
     images = {
@@ -188,9 +190,7 @@ def normals(*, toy: bool) -> StageBenchmark:
         wiener=True)  # fmt: skip
     add({"patterns": "16", "noise": "none"}, patch.images, **told)
     add({"patterns": "16", "noise": "none", "lights": "ideal"}, patch.images)
-    bands = {
-        name: _on_skin(band.preset, side if toy else 128) for name, band in MELANIN_BANDS.items()
-    }
+    bands = {name: _on_skin(patch, band) for name, band in MELANIN_BANDS.items()}
     limits = () if toy else _limits(worst, rng)
     return StageBenchmark(
         "gradient-normals",
@@ -205,11 +205,21 @@ def normals(*, toy: bool) -> StageBenchmark:
     )
 
 
-def _on_skin(preset: str, side: int) -> BandError:
-    """Return the error on skin of a preset's melanin: 16 patterns, all corrections."""
-    patch = skin_patch(side, smooth=False, preset=preset)
+def _on_skin(patch: Patch, band: MelaninBand) -> BandError:
+    """Return the error on the same relief with a band's pigment: 16 patterns, all corrections.
+
+    Crossed pictures hold half of the diffuse light and no specular; parallel ones hold the other
+    half besides: with another albedo both change by so much of the crossed one.
+    """
+    usual = replace(band, melanin=MELANIN_PRESETS[PRESET]).reflectance()
+    share = float((band.reflectance() / usual)[1])
+    images = {
+        (name, way): image - np.float32(1.0 - share) * patch.images[name, "crossed"]
+        for (name, way), image in patch.images.items()
+    }
+    seen = replace(patch, images=images)
     found = from_patterns(
-        exposed(patch, np.random.default_rng(0)), lights=patch.lights, variance=patch.noise,
+        exposed(seen, np.random.default_rng(0)), lights=patch.lights, variance=patch.noise,
         wiener=True, **patch.geometry,
     )  # fmt: skip
     return BandError(*_judged(found.normals, found.valid, patch.seen))

@@ -121,8 +121,8 @@ def _captured(folder: Path, name: str, coefficients: tuple[float, float, float],
     """Return a session of a medium by its sigma_a, sigma_s' and g."""
     sigma_a, sigma_s_prime, g = coefficients
     simulate_session(
-        "probe", folder / f"session-{name}", subject=f"homogeneous:{sigma_a:.6g},{sigma_s_prime:.6g},{g:.3g}",
-        sites=("cheek",), seed=seed,
+        "probe", folder / f"session-{name}", sites=("cheek",), seed=seed,
+        subject=f"homogeneous:{sigma_a:.6g},{sigma_s_prime:.6g},{g:.3g}",
     )  # fmt: skip
     return folder / f"session-{name}"
 
