@@ -77,7 +77,7 @@ FULL_S: Final[dict[str, float]] = {
     "expression-alignment": 90, "dome-geometry": 90, "normal-integration": 90,
     "subsurface-gather": 90, "editing": 90, "traits": 90, "photon-transport": 120,
     "sphere-lights": 120, "render-model": 120, "skin-stretch": 150, "microstructure": 150,
-    "displacement-synthesis": 200, "kernel-fit": 300,
+    "displacement-synthesis": 200, "kernel-fit": 300, "intervals": 900,
 }  # fmt: skip
 """At most about how many seconds each takes at full size on two cores that do nothing else: of the
 first nineteen their processor seconds, of the others a careful guess. A guess that is too low makes

@@ -26,6 +26,7 @@ STAGES = {
     "color-table": "bench_tissue.table",
     "expression-alignment": "bench_alignment.aligned",
     "efficiency": "bench_efficiency.efficiency",
+    "intervals": "bench_intervals.intervals",
     "misalignment": "bench_alignment.misaligned",
     "shared-melanin": "bench_shared_melanin.inversion",
     "facial-color": "bench_facial_color.rig",
