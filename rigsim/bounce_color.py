@@ -13,7 +13,7 @@ import numpy as np
 
 from model import spectra
 from rigsim.mesh import Float32Array
-from rigsim.skin_bounce import SkinBounce
+from rigsim.skin_bounce import ENOUGH, SkinBounce
 from rigsim.skin_table import SkinTable
 from rigsim.subject import Subject
 
@@ -38,6 +38,8 @@ class BounceColor:
         Names known to `model.spectra`.
     spectral
         Whether wavelengths are told apart; without, each channel is taken as one.
+    enough
+        Share of the first bounce below which further ones are left out.
     """
 
     def __init__(
@@ -51,8 +53,9 @@ class BounceColor:
         camera: str,
         light: str,
         spectral: bool = True,
+        enough: float = ENOUGH,
     ) -> None:
-        self._bounce = bounce
+        self._bounce, self._enough = bounce, enough
         covered = subject.atlas.covered.astype(np.float32)
         blood = subject.hemoglobin(state)
         factor = r_d / np.maximum(reflectance, np.float32(LEAST))
@@ -86,8 +89,8 @@ class BounceColor:
             in a channel it gives what leaves in that channel.
         """
         if self._weights is None:
-            return self._bounce.indirect(direct, self._r_d)
-        each = self._bounce.indirect(direct, self._spectrum)
+            return self._bounce.indirect(direct, self._r_d, enough=self._enough)
+        each = self._bounce.indirect(direct, self._spectrum, enough=self._enough)
         covered = self._bounce.atlas.covered
         out = np.zeros((*covered.shape, self._weights.shape[1]), np.float32)
         out[covered] = ((each[covered] * self._spectrum) @ self._weights) / self._channel

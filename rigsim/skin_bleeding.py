@@ -47,6 +47,8 @@ class SkinBleeding:
         How light goes from skin to skin; None leaves that out.
     spectral
         Whether that light is reflected wavelength by wavelength.
+    enough
+        Share of the first bounce below which further ones are left out.
     """
 
     def __init__(
@@ -60,6 +62,7 @@ class SkinBleeding:
         subsurface: bool,
         bounce: SkinBounce | None,
         spectral: bool = True,
+        enough: float = 1e-3,
     ) -> None:
         self._subject, self._surface, self._caster = subject, surface, caster
         self.subsurface = subsurface
@@ -67,7 +70,7 @@ class SkinBleeding:
         if bounce is not None:
             self._color = BounceColor(
                 bounce, subject, "neutral", surface.r_d, surface.reflectance,
-                camera=camera, light=light, spectral=spectral,
+                camera=camera, light=light, spectral=spectral, enough=enough,
             )  # fmt: skip
         if subsurface:
             blood = subject.hemoglobin("neutral")

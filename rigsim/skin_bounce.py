@@ -77,7 +77,9 @@ class SkinBounce:
             self.atlas.normal[self._covered][None],
         )
 
-    def indirect(self, entered: Float32Array, r_d: Float32Array) -> Float32Array:
+    def indirect(
+        self, entered: Float32Array, r_d: Float32Array, *, enough: float = ENOUGH
+    ) -> Float32Array:
         """Return what enters by way of other skin.
 
         Parameters
@@ -86,6 +88,8 @@ class SkinBounce:
             Light that enters each patch directly, shape (P,).
         r_d
             Factor of the diffuse term, shape (P, C).
+        enough
+            Share of the first bounce below which further ones are left out.
 
         Returns
         -------
@@ -95,7 +99,7 @@ class SkinBounce:
         """
         latest = self.exchange @ (r_d * entered[:, None])
         total = latest.copy()
-        least = ENOUGH * float(np.abs(latest).max(initial=0.0))
+        least = enough * float(np.abs(latest).max(initial=0.0))
         for _ in range(MOST_BOUNCES):
             if not float(np.abs(latest).max(initial=0.0)) > least:
                 break

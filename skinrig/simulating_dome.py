@@ -17,7 +17,15 @@ from model import store
 from model.skin import SkinAppearance
 from skinrig.light_safety import light_figures, light_lines
 from skinrig.reflection_evaluation import TEST_FILE, make_test
-from skinrig.simulation import Order, Simulated, SimulationError, drive, open_session, truth_folder
+from skinrig.simulation import (
+    Order,
+    Simulated,
+    SimulationError,
+    drive,
+    effects_of,
+    open_session,
+    truth_folder,
+)
 
 if TYPE_CHECKING:
     from rigsim.population import Member
@@ -64,12 +72,14 @@ def simulate_dome(order: Order) -> Simulated:
     }  # fmt: skip
     if order.target is None:
         asked |= {"subsurface": order.subsurface, "interreflections": order.interreflections}
-    elif order.subsurface or order.interreflections:
+        if order.leave_out:
+            asked["leave_out"] = list(order.leave_out)
+    elif order.subsurface or order.interreflections or order.leave_out:
         raise SimulationError("subsurface, interreflections: are of a face; a target has neither")
     if conditions:
         asked["conditions"] = conditions
     scene = _scene(rig, order)
-    session = open_session(order, plan, rig, asked)
+    session = open_session(order, plan, rig, asked, scene)
     try:
         scan = _attach_scan(session, scene, order) if order.target is None else {}
     except BaseException:
@@ -96,8 +106,8 @@ def simulate_dome(order: Order) -> Simulated:
                 "kind": "truth",
                 "state": state,
                 "movement": order.movement,
-                "subsurface": order.subsurface,
-                "interreflections": order.interreflections,
+                "subsurface": scene.subsurface,
+                "interreflections": scene.interreflections,
                 **appearance.parameters,
                 **scan,
                 "landmarks_mm": _landmarks(scene.subject),
@@ -108,8 +118,9 @@ def simulate_dome(order: Order) -> Simulated:
         )
         store.write(truth, appearance)
     return Simulated(
-        order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures
-    )
+        order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures,
+        effects=effects_of(scene),
+    )  # fmt: skip
 
 
 def _state(order: Order) -> str:
@@ -318,9 +329,23 @@ def _scene(rig: Rig, order: Order) -> Any:
     motion = head_motion(order.seed) if order.move else None
     return DomeScene(
         rig, person, dome=built, motion=motion, state=order.states[0], movement=order.movement,
-        seed=order.seed, subsurface=order.subsurface, interreflections=order.interreflections,
+        seed=order.seed, **_light_of_skin(order),
         conditions=conditions,
     )  # fmt: skip
+
+
+def _light_of_skin(order: Order) -> dict[str, bool | None]:
+    """Return which light from inside and from other skin is built; None: what changes pixels."""
+    asked: dict[str, bool | None] = {
+        "subsurface": order.subsurface or None, "interreflections": order.interreflections or None
+    }  # fmt: skip
+    for name in order.leave_out:
+        if name not in asked:
+            raise SimulationError(f"leave_out: got {name!r}, expected one of {', '.join(asked)}")
+        if asked[name]:
+            raise SimulationError(f"leave_out: {name} was asked for, too")
+        asked[name] = False
+    return asked
 
 
 def _attach_scan(session: Any, scene: Any, order: Order) -> dict[str, Any]:

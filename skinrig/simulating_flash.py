@@ -12,7 +12,15 @@ from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.rig import Rig, load_rig
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
-from skinrig.simulation import Order, Simulated, SimulationError, drive, open_session, truth_folder
+from skinrig.simulation import (
+    Order,
+    Simulated,
+    SimulationError,
+    drive,
+    effects_of,
+    open_session,
+    truth_folder,
+)
 
 WIDTHS_PX = {"small": 768, "full": 3024}
 TARGETS = ("white", "chart", "flat", "dark", "malus")
@@ -49,12 +57,12 @@ def simulate_flash(order: Order) -> Simulated:
     # what cannot be built must fail before a folder is made
     scenes = _scenes(rig, order)
     plan = order.plan or _plan(rig, target, states, order.repeats)
-    session = open_session(order, plan, rig, asked)
+    first = next(iter(scenes.values()))
+    session = open_session(order, plan, rig, asked, first)
 
     def prompt(world: Any, state: str) -> None:
         world.scene = scenes[state]
 
-    first = next(iter(scenes.values()))
     rig_seconds = drive(session, rig, first, seed, prompt, order.progress)
     truth = None
     if target is None:
@@ -65,7 +73,10 @@ def simulate_flash(order: Order) -> Simulated:
             store.write(folder, appearance)
     blur = () if target else tuple(float(width) for width in first.resolution_mm())
     left_out = tuple(first.left_out)
-    return Simulated(order.out, truth, len(session.frames()), rig_seconds, left_out, blur)
+    return Simulated(
+        order.out, truth, len(session.frames()), rig_seconds, left_out, blur,
+        effects=effects_of(first),
+    )  # fmt: skip
 
 
 def _plan(rig: Rig, target: str | None, states: tuple[str, ...], repeats: int) -> Plan:
@@ -179,5 +190,6 @@ def truth_of(scene: Any, seed: int, session: str, state: str) -> SkinAppearance:
             "landmarks_px": landmarks_at_superpixels(scene.landmarks_px()),
         },
         inputs={"session": session},
+        left_out=tuple(scene.left_out),
         seed=seed,
     )

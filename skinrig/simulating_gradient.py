@@ -20,7 +20,15 @@ from capture.rig import Rig, load_rig
 from capture.session import Session
 from model import store
 from skinrig.light_safety import light_figures, light_lines
-from skinrig.simulation import Order, Simulated, SimulationError, drive, open_session, truth_folder
+from skinrig.simulation import (
+    Order,
+    Simulated,
+    SimulationError,
+    drive,
+    effects_of,
+    open_session,
+    truth_folder,
+)
 
 WIDTHS_PX = {"small": 256, "full": 2048}
 ANGLES_DEG: dict[str, tuple[float, ...] | None] = {"small": (0.0,), "full": None}
@@ -63,7 +71,7 @@ def simulate_gradient(order: Order) -> Simulated:
     scene = make_scene(
         rig, order.target, site=order.site, preset=order.subject, seed=order.seed, plan=plan
     )
-    session = open_session(order, plan, rig, asked)
+    session = open_session(order, plan, rig, asked, scene)
     try:
         log = GripLog(scene, truth_folder(order.out), resume=order.resume, session=session)
     except BaseException:
@@ -86,8 +94,9 @@ def simulate_gradient(order: Order) -> Simulated:
         store.write(truth, appearance)
     log.remove()
     return Simulated(
-        order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures
-    )
+        order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures,
+        effects=effects_of(scene),
+    )  # fmt: skip
 
 
 def plan_of(rig: Rig, order: Order) -> Plan:

@@ -23,7 +23,15 @@ from capture.session import Session
 from model import store
 from skinrig.acquisition import directions_of
 from skinrig.light_safety import light_figures, light_lines
-from skinrig.simulation import Order, Simulated, SimulationError, drive, open_session, truth_folder
+from skinrig.simulation import (
+    Order,
+    Simulated,
+    SimulationError,
+    drive,
+    effects_of,
+    open_session,
+    truth_folder,
+)
 
 PHOTONS = {"small": 60_000, "full": 2_000_000}
 """Of each site and angle of skin: about two percent in the far fibres, or a third of one."""
@@ -61,7 +69,7 @@ def simulate_probe(order: Order) -> Simulated:
     if order.progress is not None:
         for line in light_lines(plan, rig):
             order.progress(line)
-    session = open_session(order, plan, rig, asked)
+    session = open_session(order, plan, rig, asked, scene)
     try:
         log = HeadLog(scene, truth_folder(order.out), resume=order.resume, session=session)
     except BaseException:
@@ -88,8 +96,9 @@ def simulate_probe(order: Order) -> Simulated:
         store.write(truth, appearance)
     log.remove()
     return Simulated(
-        order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures
-    )
+        order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures,
+        effects=effects_of(scene),
+    )  # fmt: skip
 
 
 def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:

@@ -22,7 +22,15 @@ from skinrig.simulating_flash import (
     to_superpixels,
     truth_of,
 )
-from skinrig.simulation import Order, Simulated, SimulationError, drive, open_session, truth_folder
+from skinrig.simulation import (
+    Order,
+    Simulated,
+    SimulationError,
+    drive,
+    effects_of,
+    open_session,
+    truth_folder,
+)
 
 COURSE_FILE = "perfusion_course.json"
 """In the truth: the blood of each frame at its own time."""
@@ -81,16 +89,18 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
     if order.progress is not None:
         for line in sequence_lines(plan):
             order.progress(line)
-    session = open_session(order, plan, rig, asked)
     truth = truth_folder(order.out)
-    log = _Log(truth.with_name(f"{truth.name}.flashes.jsonl"), fresh=not order.resume)
+    log: _Log | None = None
 
     def note(flash: FlashTime) -> None:
-        log.add(dataclasses.asdict(flash))
+        if log is not None:  # nothing flashes before the session is open
+            log.add(dataclasses.asdict(flash))
 
     scene = FlashCourseScene(
         rig, person, course, seed=seed, movement=order.movement, on_flash=note
     )  # fmt: skip
+    session = open_session(order, plan, rig, asked, scene)
+    log = _Log(truth.with_name(f"{truth.name}.flashes.jsonl"), fresh=not order.resume)
     before_s = _event_s(session)
     begun_s = time.time() if before_s is None else _last_s(session) + RESUMED_AFTER_S
     if before_s is not None and not sequence.prompted:
@@ -109,7 +119,9 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
     _write_truth(truth, scene, session, sequence, log.read(), seed)
     log.remove()
     left_out = tuple(scene.left_out)
-    return Simulated(order.out, truth, len(session.frames()), rig_seconds, left_out)
+    return Simulated(
+        order.out, truth, len(session.frames()), rig_seconds, left_out, effects=effects_of(scene)
+    )
 
 
 class _Log:

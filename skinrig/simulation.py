@@ -54,6 +54,8 @@ class Simulated:
     """Width from 10 to 90 % of an edge that light spreading in the skin blurs, R, G, B, mm."""
     light: Mapping[str, float | str] = field(default_factory=dict)
     """Figures of the LEDs' light, see `skinrig.light_safety`; empty for the flash rig."""
+    effects: tuple[Mapping[str, Any], ...] = ()
+    """What the scene built and what not, with reasons, see `rigsim.scene_needs.Effect`."""
 
     def document(self) -> Mapping[str, Any]:
         """Return this as JSON values."""
@@ -65,6 +67,7 @@ class Simulated:
             "left_out": self.left_out,
             "blur_mm": self.blur_mm,
             "light": dict(self.light),
+            "effects": [dict(effect) for effect in self.effects],
         }
 
 
@@ -126,6 +129,7 @@ class Order:
     interreflections: bool = False
     conditions: Mapping[str, float] = field(default_factory=dict)
     plan: Plan | None = None
+    leave_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.size not in SIZES:
@@ -183,6 +187,7 @@ def simulate_session(
     interreflections: bool = False,
     conditions: Mapping[str, float] | None = None,
     plan: Plan | None = None,
+    leave_out: Sequence[str] = (),
 ) -> Simulated:
     """Simulate a capture into SESSION/, and write its truth beside it.
 
@@ -249,12 +254,15 @@ def simulate_session(
     relaxation_s
         Time constant of its blood, s; None: of the state, see `rigsim.perfusion_course`.
     subsurface, interreflections
-        Whether light in the dome spreads sideways inside the skin, and goes from skin to skin.
+        True: light in the dome spreads sideways inside the skin, and goes from skin to skin, even
+        where that changes no pixel; False: where it does, see `rigsim.scene_needs`.
     conditions
         Conditions of the face in the dome with their amounts, see `rigsim.skin_conditions`.
     plan
         What is captured of the subject instead of the rig's own plan; of the dome its lights and
         cameras are those of targets, too.
+    leave_out
+        "subsurface", "interreflections": what the dome does not build although it changes pixels.
 
     Raises
     ------
@@ -271,10 +279,12 @@ def simulate_session(
         movement=movement, wrapped=wrapped, created=created, person=person, progress=progress,
         sequence=sequence, relaxation_s=relaxation_s, subsurface=subsurface,
         interreflections=interreflections, conditions=dict(conditions or {}),
-        plan=plan,
+        plan=plan, leave_out=tuple(leave_out),
     )  # fmt: skip
     if rig_name != "dome":
-        order.refuse(rig_name, subsurface=False, interreflections=False, conditions={})
+        order.refuse(
+            rig_name, subsurface=False, interreflections=False, conditions={}, leave_out=()
+        )
         order.check_plan(rig_name)
     if sequence is not None and rig_name != "flash":
         raise SimulationError(f"sequence: the {rig_name} rig knows nothing of it; leave it out")
@@ -297,7 +307,14 @@ def simulate_session(
     return simulate_flash(order)
 
 
-def open_session(order: Order, plan: Plan, rig: Rig, asked: Mapping[str, Any]) -> Session:
+def effects_of(scene: Any) -> tuple[Mapping[str, Any], ...]:
+    """Return what a scene builds and what not, as its manifest and `Simulated` hold it."""
+    return tuple(scene.needs.document())
+
+
+def open_session(
+    order: Order, plan: Plan, rig: Rig, asked: Mapping[str, Any], scene: Any
+) -> Session:
     """Begin the session of an order, or go on with it where it was begun with the same settings."""
     if order.resume:
         session = Session.resume(order.out)
@@ -321,7 +338,7 @@ def open_session(order: Order, plan: Plan, rig: Rig, asked: Mapping[str, Any]) -
         subject=order.person or Subject(pseudonym(order.subject, order.seed), USES),
         source="simulated",
         seed=order.seed,
-        extra={"simulation": dict(asked)},
+        extra={"simulation": dict(asked), "effects": [dict(one) for one in effects_of(scene)]},
         now=None if created is None else (lambda: created),
     )
 

@@ -36,7 +36,7 @@ from rigsim.led_light import lobe_exponent, white_intensity
 from rigsim.mesh import Float32Array
 from rigsim.render import Caster, GBuffer
 from rigsim.scene_needs import Noise, SceneNeeds
-from rigsim.scenes import olat
+from rigsim.scenes import flash_needs, olat
 from rigsim.scenes.dome_needs import dome_needs, noise_of
 from rigsim.scenes.flash_needs import BOUNCES, LATERAL, SPECTRAL
 from rigsim.scenes.olat import Hits, Lamp
@@ -129,6 +129,8 @@ class DomeScene:
         Whether light spreads sideways inside the skin.
     spectral
         Whether light that went from skin to skin is reflected wavelength by wavelength.
+    last_bounce
+        Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
     subpixels
         Rays along each side of a pixel.
     choice
@@ -150,6 +152,7 @@ class DomeScene:
         interreflections: bool | None = None,
         subsurface: bool | None = None,
         spectral: bool | None = None,
+        last_bounce: float | None = None,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
     ) -> None:
@@ -210,6 +213,8 @@ class DomeScene:
         )
         """What is built, what is not, and why."""
         self.interreflections = self.needs.builds(BOUNCES)
+        summed = flash_needs.last_bounce(self.needs[BOUNCES].over_noise or 0.0)
+        self._last_bounce = summed if last_bounce is None else last_bounce
         self.subsurface = self.needs.builds(LATERAL)
 
     @property
@@ -548,6 +553,7 @@ class DomeScene:
                 subsurface=self.subsurface,
                 bounce=self._bounce,
                 spectral=self.interreflections and self.needs.builds(SPECTRAL),
+                enough=self._last_bounce,
             )
         key = (camera, light, t_s)
         if key not in self._glow:

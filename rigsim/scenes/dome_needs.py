@@ -17,6 +17,7 @@ from rigsim.scenes.flash_needs import (
     bands,
     brightest_reflectance,
     color_error,
+    further_bounces,
     polarization,
 )
 from rigsim.scenes.skin_glow import typical_kernels
@@ -94,6 +95,7 @@ def dome_needs(
             because="a channel's mean of squares is not the square of its mean"
             if bounces.built else "there is no such light",
         ),
+        further_bounces(bounces, share * brightest),
     ]  # fmt: skip
     made += _movement(subject, movement, motion, view)
     made += absent(

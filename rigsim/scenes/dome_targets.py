@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from capture.rig import Rig, RigError, View
 from rigsim.dome_build import BuiltDome, build, image_of, pixel_corner_rays
 from rigsim.led_light import lobe_exponent, white_intensity
+from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
 from rigsim.scenes import mirror_ball, printed_plate
 from rigsim.scenes.dome import Pulse
 from rigsim.scenes.printed_plate import CELL_MM, Plate
@@ -28,6 +29,8 @@ Kind: TypeAlias = Literal["charuco", "mirror", "white"]
 BALL_RADIUS_MM: Final = 50.0
 WHITE_SLOPE_DEG: Final = 0.05
 """RMS slope of the white plate's surface in each direction."""
+LED_SIZES: Final = 2e-4
+"""By how much light of an LED's disc differs from that of its middle, relative, at most."""
 POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of an LED's energy from pulse to pulse."""
 
@@ -99,14 +102,6 @@ class TargetScene:
         RMS slope of the white plate's surface, degrees.
     """
 
-    left_out: Final = (
-        ("light from the cloth on boards and plates", "0.1 % of the direct light"),
-        ("the stand of the ball", "the ball floats"),
-        ("sizes of the LEDs in the light on plates", "0.02 % of the light"),
-        ("LEDs seen past boards and plates", "the dome behind them is dark"),
-        ("blur of the lenses", "every pixel averages over its own square"),
-    )
-
     def __init__(
         self, kind: Kind, dome: BuiltDome, *, seed: int, slope_deg: float = WHITE_SLOPE_DEG
     ) -> None:
@@ -128,6 +123,42 @@ class TargetScene:
         lights = self.rig.lights
         self._lamp_mm = np.array([light.position_mm for light in lights])
         self._exponent = np.array([lobe_exponent(light) for light in lights])
+
+    @property
+    def needs(self) -> SceneNeeds:
+        """What is built, what is not, and why."""
+        noise = Noise.of(sensor_of(self.rig.views[0]))
+        sizes = noise.share(LED_SIZES)
+        mirror = self.kind == "mirror"
+        effects = [
+            Effect(
+                "images of the LEDs in the target",
+                "built" if mirror else "absent",
+                "the ball mirrors them" if mirror else "paper is matt",
+            ),
+            decide(
+                "sizes of the LEDs in the light on plates", sizes, None, switch="",
+                because=f"{100 * LED_SIZES:g} % of the light",
+            ),
+            *absent(
+                [
+                    ("the stand of the ball", "the ball floats"),
+                    ("LEDs seen past boards and plates", "the dome behind them is dark"),
+                ]
+            ),
+            *unmodeled(
+                [
+                    ("light from the cloth on boards and plates", "0.1 % of the direct light"),
+                    ("blur of the lenses", "every pixel averages over its own square"),
+                ]
+            ),
+        ]  # fmt: skip
+        return SceneNeeds(tuple(effects))
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """What this scene does not build, with the reason."""
+        return self.needs.left_out
 
     def show(self, pose: int) -> None:
         """Put the target into its place number ``pose``."""

@@ -28,7 +28,8 @@ from rigsim.lateral import line_spread_mm
 from rigsim.mesh import Float32Array, Mesh
 from rigsim.render import Caster, camera_rays
 from rigsim.scene_needs import Noise, SceneNeeds
-from rigsim.scenes.flash_needs import BOUNCES, LATERAL, SPECTRAL, flash_needs
+from rigsim.scenes import flash_needs
+from rigsim.scenes.flash_needs import BOUNCES, LATERAL, SPECTRAL
 from rigsim.scenes.picture import Look, Picture
 from rigsim.scenes.skin_glow import SkinGlow, SurfaceLight, light_skin, light_surface
 from rigsim.sensor import Sensor, expose, sensor_of
@@ -145,6 +146,8 @@ class FlashScene:
         Whether light goes from skin to skin.
     spectral
         Whether that light is reflected wavelength by wavelength.
+    last_bounce
+        Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
     subpixels
         Rays along each side of a pixel.
     choice
@@ -164,6 +167,7 @@ class FlashScene:
         lateral: bool | None = None,
         interreflections: bool | None = None,
         spectral: bool | None = None,
+        last_bounce: float | None = None,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
     ) -> None:
@@ -194,7 +198,7 @@ class FlashScene:
         self._glow: dict[str, SkinGlow] = {}
         self._pictures: dict[str, Picture] = {}
         self._blurs: dict[str, Mapping[str, Float32Array]] = {}
-        self.needs: SceneNeeds = flash_needs(
+        self.needs: SceneNeeds = flash_needs.flash_needs(
             rig,
             subject,
             state,
@@ -210,6 +214,8 @@ class FlashScene:
         """What is built, what is not, and why."""
         self.lateral = self.needs.builds(LATERAL)
         self.interreflections = self.needs.builds(BOUNCES)
+        summed = flash_needs.last_bounce(self.needs[BOUNCES].over_noise or 0.0)
+        self._last_bounce = summed if last_bounce is None else last_bounce
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
@@ -425,6 +431,7 @@ class FlashScene:
                 lateral_transport=self.lateral,
                 bounce=self._stage.exchange() if self.interreflections else None,
                 spectral=self.interreflections and self.needs.builds(SPECTRAL),
+                enough=self._last_bounce,
             )
         return self._glow[camera]
 

@@ -18,6 +18,7 @@ from capture.rig import Rig
 from rigsim import landmarks
 from rigsim.mesh import Float32Array
 from rigsim.perfusion_course import Course, with_blood
+from rigsim.scene_needs import SceneNeeds, unmodeled
 from rigsim.scenes.flash import POWER_DEVIATION, FlashScene, SceneError
 from rigsim.sensor import expose
 from rigsim.subject import Subject
@@ -56,7 +57,7 @@ class FlashCourseScene:
     movement
         Whether the face moves with the expression, or only its blood changes.
     lateral
-        Whether light spreads inside the skin.
+        Whether light spreads inside the skin; None: where it changes pixels.
     subpixels
         Rays along each side of a pixel.
     on_flash
@@ -71,7 +72,7 @@ class FlashCourseScene:
         *,
         seed: int = 0,
         movement: bool = True,
-        lateral: bool = True,
+        lateral: bool | None = None,
         subpixels: int = 2,
         on_flash: Callable[[FlashTime], None] | None = None,
     ) -> None:
@@ -101,10 +102,16 @@ class FlashCourseScene:
         return self._scenes[key]
 
     @property
+    def needs(self) -> SceneNeeds:
+        """What is built, what is not, and why."""
+        name = "the movement between two expressions"
+        between = unmodeled([(name, "the face is in one or the other")])
+        return SceneNeeds((*self.at(self.course.state, 1.0).needs, *between))
+
+    @property
     def left_out(self) -> list[tuple[str, str]]:
         """What the scene does not build, with the reason."""
-        out = self.at(self.course.state, 1.0).left_out
-        return [*out, ("the movement between two expressions", "the face is in one or the other")]
+        return self.needs.left_out
 
     def radiance(
         self,

@@ -18,6 +18,7 @@ from rigsim.targets import Target
 LATERAL = "light spreading sideways in skin"
 BOUNCES = "light from skin to skin"
 SPECTRAL = "color of light from skin to skin, wavelength by wavelength"
+FURTHER = "bounces after the last that is summed"
 POLARIZATION = "polarization"
 SHADOWS = "shadows"
 
@@ -26,6 +27,12 @@ OFF_FOCUS_MM = 60.0
 
 EVERY = 16
 """Of the texels whose reflectance is looked at."""
+
+LAST_BOUNCE = 1e-3
+"""The last bounce that is summed is at most this share of the first."""
+
+REST = 0.05
+"""Of the noise: what further bounces may add at most, about."""
 
 
 def flash_needs(
@@ -94,6 +101,7 @@ def flash_needs(
             because="a channel's mean of squares is not the square of its mean"
             if bounces.built else "there is no such light",
         ),
+        further_bounces(bounces, share * brightest),
     ]  # fmt: skip
     return SceneNeeds((*made, *_movement(subject, movement), *absent(dark), *_limits(view)))
 
@@ -122,6 +130,28 @@ def brightest_reflectance(subject: Subject, state: str, view: View, illuminant: 
     covered = subject.atlas.covered
     melanin, blood = subject.melanin[covered][::EVERY], subject.hemoglobin(state)[covered][::EVERY]
     return float(skin_color(view.spectral_sensitivity, illuminant).rgb(melanin, blood).max())
+
+
+def last_bounce(over_noise: float) -> float:
+    """Return the share of the first bounce at which summing ends, by what bounces change at most.
+
+    Examples
+    --------
+    >>> last_bounce(0.5), last_bounce(500.0)
+    (0.001, 0.0001)
+    """
+    return min(LAST_BOUNCE, REST / max(over_noise, 1e-9))
+
+
+def further_bounces(bounces: Effect, once: float) -> Effect:
+    """Return what is left of light from skin to skin; ``once`` is the share that bounces on."""
+    if not bounces.built:
+        return Effect(FURTHER, "negligible", "there is no such light", 0.0, "last_bounce")
+    over_noise = float(bounces.over_noise or 0.0)
+    last = last_bounce(over_noise)
+    because = f"summing ends at {last:.1g} of the first"
+    left = over_noise * last / (1.0 - once)
+    return decide(FURTHER, left, None, switch="last_bounce", because=because)
 
 
 def _of_target(target: Target, caster: Caster) -> list[Effect]:

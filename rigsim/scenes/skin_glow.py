@@ -144,6 +144,7 @@ def light_skin(
     lateral_transport: bool,
     bounce: SkinBounce | None = None,
     spectral: bool = True,
+    enough: float = 1e-3,
 ) -> SkinGlow:
     """Let the light on a face into its skin and out again.
 
@@ -161,6 +162,8 @@ def light_skin(
         How light goes from skin to skin; None leaves that out.
     spectral
         Whether that light is reflected wavelength by wavelength.
+    enough
+        Share of the first bounce below which further ones are left out.
 
     Returns
     -------
@@ -179,7 +182,7 @@ def light_skin(
         outside = scale * ((1.0 - hair) * reflectance + covering)
         color = BounceColor(
             bounce, subject, state, outside, reflectance,
-            camera=camera, light=illuminant, spectral=spectral,
+            camera=camera, light=illuminant, spectral=spectral, enough=enough,
         )  # fmt: skip
         covered = subject.atlas.covered
         sums = bounce.coarsen(np.dstack([surface.entered, covered]).astype(np.float32))
