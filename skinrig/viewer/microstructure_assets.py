@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,8 @@ CELL_PX: Final = 56
 STRETCHES: Final = 33
 """Stretch ratios a side of the table of variances, evenly from 0.5 to 1.5."""
 STRETCH_RANGE: Final = (0.5, 1.5)
+FEWEST_PX: Final = 6
+"""Pixels a side of the coarsest level whose slopes are counted."""
 MOST_BREAKS: Final = 8
 """Lines of alpha that the shader has room for, less one."""
 MOST_REACH_PX: Final = 64
@@ -214,7 +216,6 @@ def from_relief(relief: MicroRelief, mesh: ViewerMesh, *, seed: int = 0) -> Asse
             f"{MOST_REACH_PX}: lengths differ too much over its texture"
         )
     below, above = table.sigma_lines_um()
-    slopes = slope_variances(growth)
     return Assets(
         textures={"relief_patch": Texture(growth.patch[..., None], "u16", "nearest")},
         tables={
@@ -236,8 +237,7 @@ def from_relief(relief: MicroRelief, mesh: ViewerMesh, *, seed: int = 0) -> Asse
                 "stretch_range": list(table.stretch_range),
                 "alpha_limits": list(ALPHA_LIMITS),
                 "variance_stretch_range": list(STRETCH_RANGE),
-                "slope_variance": slopes["variance"],
-                "largest_slope": slopes["largest"],
+                "slope_rms": slope_rms(growth),
                 "source": relief.source,
                 "table": table.source,
             }
@@ -263,21 +263,23 @@ def largest_sigma_um(table: KernelTable) -> float:
     return float(kernel_parameters(ends, table)[1].max())
 
 
-def slope_variances(growth: GrownRelief) -> dict[str, Any]:
-    """Return the variance of slopes and the largest slope at each level of a relief.
+def slope_rms(growth: GrownRelief) -> list[float]:
+    """Return the rms of slopes that pixels of 2^level px still show, by level of a relief.
 
-    A slope is the central difference of heights over two pixels of the level, as the page's
-    normals are, along x and y; the variance is the mean of both.
+    A slope is the gradient by central differences over two pixels of the level, as the page's
+    normals are; levels end where less than six pixels a side are left.
     """
-    variance, largest = [], []
-    for level in range(relief_growth.LEVELS):
-        step = growth.pixel_um * 2.0**level
-        height = growth.level(level).astype(np.float64)
+    found = []
+    height = growth.patch.astype(np.float64)
+    step = growth.pixel_um
+    while height.shape[0] >= FEWEST_PX:
         dx = (height[1:-1, 2:] - height[1:-1, :-2]) / (2.0 * step)
         dy = (height[2:, 1:-1] - height[:-2, 1:-1]) / (2.0 * step)
-        variance.append(float(0.5 * (np.mean(dx**2) + np.mean(dy**2))))
-        largest.append(float(np.sqrt(dx**2 + dy**2).max()))
-    return {"variance": variance, "largest": largest}
+        found.append(float(np.sqrt(np.mean(dx**2 + dy**2))))
+        side = height.shape[0] // 2
+        height = height[: 2 * side, : 2 * side].reshape(side, 2, side, 2).mean(axis=(1, 3))
+        step *= 2.0
+    return found
 
 
 def strained_variance(growth: GrownRelief, table: KernelTable) -> Floats:

@@ -23,6 +23,7 @@ SCRIPTS: Final = (
     "shading.js",
     "strain.js",
     "wrinkles.js",
+    "detail.js",
     "microstructure.js",
     "scattering.js",
     "reflectance.js",

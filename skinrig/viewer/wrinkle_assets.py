@@ -27,6 +27,8 @@ Float32 = NDArray[np.float32]
 MAP_PX: Final = 512
 """Side of wrinkle maps, at most: half a millimeter of a face; the paper has 256."""
 MASK_PX: Final = 64
+ZONES: Final = 8
+"""Of each wrinkle map, in two RGBA textures."""
 MOST_LAYERS: Final = 4
 """Wrinkle maps that the shader has room for."""
 
@@ -76,7 +78,7 @@ def simulated_model(subject: Subject, *, size: int) -> WrinkleModel:
     posed = {state: rest.posed(state).tangent_normal() for state in EXPRESSIONS}
     few = min(MASK_PX, size)
     zones = fit_zones(
-        amplitudes(neutral, posed, size=(few, few)), zones=8,
+        amplitudes(neutral, posed, size=(few, few)), zones=ZONES,
         rng=np.random.default_rng(subject.seed),
     )  # fmt: skip
     return fit(neutral, posed, zones.masks, size=(size, size)).model()
@@ -130,37 +132,50 @@ def from_model(model: WrinkleModel, source: SceneSource, *, origin: str) -> Asse
                 ],
                 "clamp": model.clamp,
                 "origin": origin,
-                "slope_rms": retained_rms(model),
+                "slope_rms": retained_rms(model, shape),
             }
         },
     )
 
 
-def retained_rms(model: WrinkleModel) -> list[float]:
-    """Return the rms of slopes that pixels of 2^level texels still show, by level of the maps.
+def retained_rms(model: WrinkleModel, shape: tuple[int, int]) -> list[list[float]]:
+    """Return the rms of slopes that pixels of 2^level texels still show, by zone and level.
 
-    Of the wrinkle maps at full strength, over the texels where one has any: what a view loses by
-    leaving wrinkles out is at most this times the change of the reflection by a slope.
+    Of each zone's part of its wrinkle map at a weight of 1, over the texels where the map has
+    anything: what a view loses by leaving wrinkles out is at most the zones' strengths times these
+    times the largest change of the reflection by a slope.
+
+    Parameters
+    ----------
+    model : WrinkleModel
+    shape : (int, int)
+        Of the page's maps: level 0.
+
+    Returns
+    -------
+    list of list of float
+        Eight zones a layer, layer by layer; levels down to one texel.
     """
-    rows = [_level_rms(layer.wrinkle.astype(np.float64)) for layer in model.layers]
-    longest = max(len(row) for row in rows)
-    # a coarser map has its finest level where its texels are as large
-    shifted = [[row[0]] * (longest - len(row)) + row for row in rows]
-    return [float(np.sqrt(np.sum(np.square(level)))) for level in zip(*shifted, strict=True)]
+    found = []
+    for layer in model.layers:
+        wrinkle = _plane(layer.wrinkle, shape).astype(np.float64)
+        count = max(int(np.count_nonzero((wrinkle != 0).any(axis=2))), 1)
+        masks = resampled(np.asarray(layer.masks, np.float64), shape)
+        rows = [_level_rms(mask[..., None] * wrinkle, count) for mask in masks]
+        found += rows + [[0.0] * len(rows[0])] * (ZONES - len(rows))
+    return found
 
 
-def _level_rms(derivatives: NDArray[np.float64]) -> list[float]:
-    side = derivatives.shape[0]
-    count = max(int(np.count_nonzero((derivatives != 0).any(axis=2))), 1)
+def _level_rms(derivatives: NDArray[np.float64], count: int) -> list[float]:
+    """Return the rms at each level over so many texels of the finest; others are 0."""
     share = count / derivatives[..., 0].size
     found = []
-    while side >= 1:
-        found.append(float(np.sqrt(np.mean(np.sum(derivatives**2, axis=2)) / share)))
-        side //= 2
-        if side:
-            moved = np.moveaxis(derivatives, 2, 0)
-            derivatives = np.moveaxis(resampled(moved, (side, side)), 0, 2)
-    return found
+    planes = np.moveaxis(derivatives, 2, 0)
+    while True:
+        found.append(float(np.sqrt(np.mean(np.sum(planes**2, axis=0)) / share)))
+        if min(planes.shape[1:]) == 1:
+            return found
+        planes = resampled(planes, (planes.shape[1] // 2, planes.shape[2] // 2))
 
 
 def _map_shape(model: WrinkleModel) -> tuple[int, int]:
@@ -181,8 +196,10 @@ def _masks(layers: tuple[Layer, ...]) -> Float32:
     side = max(max(layer.masks.shape[1:]) for layer in layers)
     out = []
     for layer in layers:
-        if len(layer.masks) > 8:
-            raise WrinkleAssetError(f"masks: got {len(layer.masks)} zones, expected at most 8")
+        if len(layer.masks) > ZONES:
+            raise WrinkleAssetError(
+                f"masks: got {len(layer.masks)} zones, expected at most {ZONES}"
+            )
         planes = resampled(np.asarray(layer.masks, np.float32), (side, side))
         pair = mask_textures(planes)
         if len(pair) == 1:

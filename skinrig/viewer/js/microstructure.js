@@ -9,8 +9,8 @@
 //
 // Drawn again only where weights or the window changed. The window follows what the middle of the
 // canvas shows, in steps of an eighth of its side, at the level whose pixels are as large as the
-// screen's; where those are larger than the coarsest level's, nothing is drawn and all variance of
-// the slopes is in the roughness.
+// screen's, or the coarsest; where detail.js proves that nobody would see it, nothing is drawn and
+// all variance of the slopes is in the roughness.
 V.microstructure = {};
 Object.assign(V.defaults, {
   microstructure: 2,          // 0 none, 1 static, 2 dynamic, 3 all three side by side
@@ -75,9 +75,13 @@ V.microstructure.place = p => {
     const found = V.microstructure.aim(p);
     if (!found) return [0, 0, 0, 0];
     aim = found.uv;
+    const error = V.detail.microstructureError(p, found.mm);
+    const left = p.detail > 0.5 && error < p.detail_tolerance;
+    V.detail.state.microstructure = {pixel_mm: found.mm, error, left_out: left};
+    if (left) return [0, 0, facts.levels - 1, 0];
     // a pixel of the window at least three quarters of the screen's: finer ones would be averaged
     level = Math.max(0, Math.ceil(Math.log2(0.75e3 * found.mm / facts.pixel_um)));
-    if (level >= facts.levels) return [0, 0, facts.levels - 1, 0];
+    level = Math.min(level, facts.levels - 1);
   }
   const whole = Math.floor(p.microstructure_virtual_px / 2 ** level);
   const corner = u => {
@@ -171,8 +175,11 @@ V.start.push(() => {
   V.drawGraph = (side, p, demand) => {
     p.microstructure_place = V.microstructure.place(p);
     const [, , level, shown] = p.microstructure_place;
-    p.microstructure_variance = [facts.slope_variance[0],
-      shown ? facts.slope_variance[level] : 0];
+    // what pixels larger than the window's average is not shown either
+    const seen = p.microstructure_at ? level : Math.max(level,
+      Math.log2(0.75e3 * (V.microstructure.aim(p)?.mm ?? 1) / facts.pixel_um));
+    p.microstructure_variance = [facts.slope_rms[0] ** 2 / 2,
+      shown ? V.detail.between(facts.slope_rms, seen) ** 2 / 2 : 0];
     p.microstructure_split_px = V.screen()[0];
     drawGraph(side, p, demand);
   };
