@@ -16,7 +16,7 @@ from capture.calibration.sensor import SensorCalibration
 from capture.calibration.sphere_lights import SphereFilms, SphereLightTable
 from capture.session import Session
 from model.skin import UNITS, SkinMap
-from reconstruction import stages
+from reconstruction import relief_errors, stages
 from reconstruction.dome_images import SensorNoise
 from reconstruction.evidence import Evidence
 from reconstruction.gradient_images import GradientImages, Patterns, SkinState
@@ -283,7 +283,9 @@ def _normals(rig: Rig, state: SkinState, **made: Any) -> Mapping[str, Any]:
     known = (sharp.valid | smooth.valid) & skin
     restored = restore(normals, lens=rig.lens, valid=known)
     return {
-        f"normals_{state.name}": _normal_map(smooth, skin, "of the surface's reflection"),
+        f"normals_{state.name}": _normal_map(
+            smooth, skin, "of the surface's reflection", relief=True
+        ),
         f"_restored_{state.name}": (restored, known, smooth.stderr_rad),
     }
 
@@ -297,10 +299,12 @@ def _diffuse(rig: Rig) -> Mapping[str, SkinMap]:
     return {f"diffuse_normals_{state.name}": _normal_map(found, skin, what)}
 
 
-def _normal_map(found: NormalMaps, skin: Bools, what: str) -> SkinMap:
+def _normal_map(found: NormalMaps, skin: Bools, what: str, *, relief: bool = False) -> SkinMap:
     valid = found.valid & skin
     # of each of the two directions across the normal, as everywhere
     stderr = np.where(valid, found.stderr_rad / math.sqrt(2.0), np.pi).astype(np.float32)
+    if relief:
+        stderr = relief_errors.of_normals(found.normals, stderr, valid)
     return SkinMap(
         np.asarray(found.normals, np.float32),
         UNITS["normals"],
@@ -323,7 +327,8 @@ def _height(rig: Rig, state: SkinState, **made: Any) -> Mapping[str, SkinMap]:
     }  # fmt: skip
     found = integrate_map(restored.normals, valid=valid, **settings)
     height = high_pass(found.height, pixel=rig.pixel_um, cutoff=CUTOFF_UM, valid=found.valid)
-    stderr = _height_stderr(restored, found.valid, settings)
+    by_noise = _height_stderr(restored, found.valid, settings)
+    stderr = relief_errors.of_height(height, by_noise, found.valid)
     return {
         f"height_{state.name}": SkinMap(
             height.astype(np.float32), "um", stderr, found.valid,

@@ -30,7 +30,9 @@ ANY_BAND: Final = "any"
 RAYLEIGH_68: Final = float(np.sqrt(-2.0 * np.log(1.0 - 0.6827)))
 """Of an error with the same deviation in two directions, the length that 68.27 % stay below."""
 BLOOD_STATES: Final = ("smile", "anger", "fear", "exercise")
-FACTORS_95: Final[Mapping[str, float]] = {"melanin": 2.7, "hemoglobin": 2.7}
+FACTORS_95: Final[Mapping[str, float]] = {
+    "melanin": 2.7, "hemoglobin": 2.7, "height": 2.1, "normals of the gradient sphere": 1.9,
+}  # fmt: skip
 """Half width of a 95 % interval over that of the 68 % one where tails are heavier than a
 Gaussian's, to 0.1, set on seeds 0 to 19, which are not judged; others are `GAUSSIAN_95`, of angles
 `RAYLEIGH_95`."""
