@@ -125,7 +125,9 @@ def scatter(
             "ones above 0 and three weights each"
         )
     how = Sampling() if sampling is None else sampling
-    factor = np.broadcast_to(np.asarray(width, np.float64), z.shape)
+    factor = np.where(z > 0.0, np.broadcast_to(np.asarray(width, np.float64), z.shape), 1.0)
+    if not np.all(factor > 0.0):
+        raise ScreenScatteringError(f"width: got {factor.min():g}, expected above 0 on the surface")
     blurred, out = np.where(z[..., None] > 0.0, E, 0.0), np.zeros_like(E)
     for variance, weight in zip(np.diff(variances, prepend=0.0), share, strict=True):
         sigma = how.widening * np.sqrt(variance) * factor
