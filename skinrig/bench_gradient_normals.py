@@ -156,7 +156,7 @@ def normals(*, toy: bool) -> StageBenchmark:
         def run() -> NormalMaps:
             return from_patterns(images, **options)
 
-        knobs = {"noise": "the sensor's"} | knobs
+        knobs.setdefault("noise", "the sensor's")
         timing = measure(run, repeats=1 if toy else 3)
         found = run()
         error, interval = _judged(found.normals, found.valid, patch.seen)

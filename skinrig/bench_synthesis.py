@@ -209,7 +209,7 @@ def _judged(
     site = layout.sites[0]
     held = site.sources.heights.nbytes * 2 + site.sources.filled.nbytes
     held += site.cells.nbytes + site.across.nbytes + site.down.nbytes
-    memory_gb = (held + 1e6 * THREADS * timing.peak_memory_mb + 4.0 * LARGEST_PX**2) / 1e9
+    memory_gb = (held + 1e6 * THREADS * (timing.peak_memory_mb or 0.0) + 4.0 * LARGEST_PX**2) / 1e9
     part = layout.draw((0, 2 * rows), (0, 2 * columns))
     cuts = layout.at_cuts((0, 2 * rows), (0, 2 * columns))
     slope_x, slope_y, _ = normal_histogram.slopes(part, pixel=PIXEL_UM)

@@ -184,7 +184,7 @@ def _by_tile(
 ) -> NDArray[np.float64]:
     """Return the mean square of each tile of images (L, H, W, 3), those without skin left out."""
     squared = np.mean(difference**2, axis=(0, 3))
-    seen = shown.any(axis=(0, 3))
+    seen = np.asarray(shown.any(axis=(0, 3)))
     rows, columns = (n // side * side for n in squared.shape)
     tiles = (rows // side, side, columns // side, side)
     mean = squared[:rows, :columns].reshape(tiles).mean(axis=(1, 3))
