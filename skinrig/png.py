@@ -15,13 +15,16 @@ GRAY = 128
 """Of pixels without a value."""
 
 
-def encode(image: NDArray[np.generic]) -> bytes:
+def encode(image: NDArray[np.generic], *, quick: bool = False) -> bytes:
     r"""Encode an image as PNG.
 
     Parameters
     ----------
     image
-        (H, W) gray or (H, W, 3) RGB, uint8 or uint16, row 0 at the top.
+        (H, W) gray, (H, W, 3) RGB or (H, W, 4) RGB and opacity, uint8 or uint16, row 0 at the top.
+    quick
+        Take the first filter that is good enough instead of the smallest file: for large textures,
+        a tenth of the time and a few percent more bytes.
 
     Returns
     -------
@@ -41,17 +44,21 @@ def encode(image: NDArray[np.generic]) -> bytes:
     pixels = np.asarray(image)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"image: got dtype {pixels.dtype}, expected uint8 or uint16")
-    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
-        raise ValueError(f"image: got shape {pixels.shape}, expected (H, W) or (H, W, 3)")
+    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):
+        raise ValueError(
+            f"image: got shape {pixels.shape}, expected (H, W), (H, W, 3) or (H, W, 4)"
+        )
     height, width = pixels.shape[:2]
     if not height or not width:
         raise ValueError(f"image: got shape {pixels.shape}, expected at least one pixel")
     depth = 8 * pixels.dtype.itemsize
-    color_type = 0 if pixels.ndim == 2 else 2
+    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+    color_type = {1: 0, 3: 2, 4: 6}[channels]
     big_endian = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">")))
     row_bytes = big_endian.reshape(height, -1).view(np.uint8).reshape(height, -1)
-    step = pixels.dtype.itemsize * (1 if pixels.ndim == 2 else 3)
-    return _file(width, height, depth, color_type, _smallest(row_bytes, step))
+    step = pixels.dtype.itemsize * channels
+    packed = _quick(row_bytes, step) if quick else _smallest(row_bytes, step)
+    return _file(width, height, depth, color_type, packed)
 
 
 def encode_indexed(index: NDArray[np.uint8], palette: NDArray[np.uint8]) -> bytes:
@@ -114,6 +121,15 @@ def _file(
         + chunk(b"IDAT", data)
         + chunk(b"IEND", b"")
     )
+
+
+def _quick(rows: NDArray[np.uint8], step: int) -> bytes:
+    """Compress rows of bytes by the differences to the left."""
+    filtered = np.empty((rows.shape[0], rows.shape[1] + 1), np.uint8)
+    filtered[:, 0] = 1
+    filtered[:, 1 : step + 1] = rows[:, :step]
+    np.subtract(rows[:, step:], rows[:, :-step], out=filtered[:, step + 1 :])  # modulo 256
+    return zlib.compress(filtered.tobytes(), 4)
 
 
 def _smallest(rows: NDArray[np.uint8], step: int) -> bytes:

@@ -226,29 +226,12 @@ def _pictures(material: Material) -> list[tuple[str, bytes]]:
 
     rough = codes(material.image("specular_roughness", delivery))
     zero = np.zeros_like(rough)
-    return [
-        ("base_color", png.encode(codes(material.image("base_color", delivery)))),
-        ("roughness in G, metallic 0 in B", png.encode(np.stack([zero, rough, zero], axis=-1))),
-        ("normal", png.encode(codes(material.image("normal", delivery)))),
-        ("specular in A", _with_alpha(codes(material.image("specular_weight", delivery)))),
-    ]
-
-
-def _with_alpha(alpha: NDArray[np.uint8]) -> bytes:
-    """Return a white PNG whose alpha is given: KHR_materials_specular reads that channel."""
-    import zlib
-
-    height, width = alpha.shape
-    rows = np.zeros((height, 1 + 4 * width), np.uint8)
-    rows[:, 1:] = 255
-    rows[:, 4::4] = alpha
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        body = kind + data
-        return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(rows.tobytes(), 9)) + chunk(b"IEND", b"")
-    )  # fmt: skip
+    weight = codes(material.image("specular_weight", delivery))
+    white = np.full_like(weight, 255)
+    pictures = {
+        "base_color": codes(material.image("base_color", delivery)),
+        "roughness in G, metallic 0 in B": np.stack([zero, rough, zero], axis=-1),
+        "normal": codes(material.image("normal", delivery)),
+        "specular in A": np.stack([white, white, white, weight], axis=-1),
+    }
+    return [(name, png.encode(image, quick=True)) for name, image in pictures.items()]

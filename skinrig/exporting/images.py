@@ -105,7 +105,7 @@ class ImageFolder:
         """
         file = self._place(folder, image.name, "png")
         codes, told = coded(image, depth=depth)
-        (self.root / file).write_bytes(png.encode(codes))
+        (self.root / file).write_bytes(png.encode(codes, quick=True))
         self._record(file, image, told)
         return file
 

@@ -19,7 +19,7 @@ def test_a_16_bit_gray_image_reads_back_equal():
 
 
 @pytest.mark.parametrize(
-    "image", [np.zeros((2, 2)), np.zeros((0, 2), np.uint8), np.zeros((2, 2, 4), np.uint8)]
+    "image", [np.zeros((2, 2)), np.zeros((0, 2), np.uint8), np.zeros((2, 2, 5), np.uint8)]
 )
 def test_an_image_that_png_cannot_hold_is_refused(image):
     with pytest.raises(ValueError, match="image: got"):

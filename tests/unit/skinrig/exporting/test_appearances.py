@@ -1,0 +1,211 @@
+"""Exports of appearances: within the consent, whole or not at all, the same bytes again."""
+
+import dataclasses
+from datetime import UTC, date, datetime
+
+import numpy as np
+import pytest
+
+from capture.session import ConsentError
+from model import store
+from model.skin import SkinAppearance, SkinMap
+from skinrig import consent
+from skinrig.errors import UsageError
+from skinrig.exporting.appearances import FORMATS, export_appearance, export_brdfs
+from skinrig.exporting.options import Delivery
+from skinrig.exporting.sealing import ExportError
+
+NOW, DAY = datetime(2029, 5, 1, tzinfo=UTC), date(2029, 5, 1)
+LAST = date(2030, 1, 1)
+
+
+@pytest.fixture
+def measured(patch, tmp_path):
+    face = patch.face(source="measured", parameters={consent.KEY: [patch.consent]})
+    return store.write(tmp_path / "measured", face)
+
+
+@pytest.mark.parametrize("to", ["maps", "mtlx", "gltf", "merl"])
+def test_maps_of_a_person_leave_only_as_agreed_and_only_in_time(measured, tmp_path, to):
+    def export(**more):
+        one = export_brdfs if to == "merl" else export_appearance
+        return one(measured, tmp_path / "out", to=to, now=NOW, **more)
+
+    with pytest.raises(UsageError, match="--use: got none"):
+        export(today=DAY)
+    for use, today in (("publication", DAY), ("research", date(2030, 1, 2)), ("any", DAY)):
+        with pytest.raises(ConsentError, match="P042 has not agreed"):
+            export(use=use, today=today)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["measured"]
+    assert export(use="research", today=LAST).files > 0
+
+
+def test_what_was_simulated_needs_no_consent(face_folder, tmp_path):
+    assert export_appearance(face_folder, tmp_path / "out", to="mtlx").files > 5
+
+
+def test_measured_maps_that_do_not_tell_the_consent_do_not_leave(patch, tmp_path):
+    silent = store.write(tmp_path / "old", patch.face(source="measured"))
+    with pytest.raises(ConsentError, match="does not record") as error:
+        export_appearance(silent, tmp_path / "out", to="maps", use="research")
+    assert "skinrig reconstruct" in str(error.value)
+
+
+def test_consent_of_every_part_of_a_moving_face_counts():
+    told = {"pseudonym": "a", "consent_scope": ["research", "film"], "consent_expires": None}
+    other = {"pseudonym": "b", "consent_scope": ["research"], "consent_expires": None}
+    parts = {
+        "facial_color": {"source": "measured", consent.KEY: [told]},
+        "wrinkles": {"source": "measured", consent.KEY: [other]},
+    }
+    face = SkinAppearance({}, "measured", {"kind": "dynamic", "parts": parts})
+    assert consent.recorded(face) == [told, other]
+    consent.require(face, "research", where="x")
+    with pytest.raises(ConsentError, match="subject b has not agreed"):
+        consent.require(face, "film", where="x")
+    del parts["wrinkles"][consent.KEY]  # one part of a simulated face that was measured silently
+    mixed = SkinAppearance({}, "simulated", {"kind": "dynamic", "parts": parts})
+    with pytest.raises(ConsentError, match="does not record"):
+        consent.require(mixed, "research", where="x")
+
+
+def test_what_is_made_of_silent_measurements_agrees_to_nothing():
+    made = SkinAppearance(
+        {}, "simulated", {consent.KEY: consent.carried(SkinAppearance({}, "measured"))}
+    )
+    with pytest.raises(ConsentError, match="unknown has not agreed"):
+        consent.require(made, "research", where="x")
+
+
+def test_a_damaged_date_is_no_consent(patch):
+    told = {**patch.consent, "consent_expires": "soon"}
+    face = SkinAppearance({}, "measured", {consent.KEY: [told]})
+    with pytest.raises(ConsentError, match="got 'soon'"):
+        consent.require(face, "research", where="x")
+
+
+def test_the_texture_that_colors_are_put_on_must_be_free_too(measured, face_folder, tmp_path):
+    order = Delivery(onto=measured)
+    with pytest.raises(ConsentError, match="P042"):
+        export_appearance(face_folder, tmp_path / "out", to="maps", delivery=order, use="film",
+                          today=DAY)  # fmt: skip
+
+
+@pytest.mark.parametrize("to", ["maps", "mtlx", "gltf", "usd"])
+def test_the_same_appearance_gives_the_same_bytes(face_folder, tmp_path, to):
+    if to == "usd":
+        pytest.importorskip("pxr")
+    for name in ("a", "b"):
+        order = Delivery(with_errors=True)
+        export_appearance(face_folder, tmp_path / name / "out", to=to, delivery=order, now=NOW)
+    files = [p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file()]
+    assert len(files) > 4
+    for file in files:
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+
+
+def test_a_failure_on_the_way_leaves_nothing(patch, tmp_path):
+    face = patch.face()
+    without = dataclasses.replace(
+        face, files={n: d for n, d in face.files.items() if "obj" not in n}
+    )
+    folder = store.write(tmp_path / "face", without)
+    with pytest.raises(ValueError, match=r"holds no mesh\.obj"):
+        export_appearance(folder, tmp_path / "out", to="mtlx")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["face"]
+
+
+def test_an_existing_folder_and_an_unknown_format_are_refused(face_folder, tmp_path):
+    with pytest.raises(ExportError, match="exists"):
+        export_appearance(face_folder, tmp_path, to="maps")
+    with pytest.raises(ExportError, match=", ".join(FORMATS)):
+        export_appearance(face_folder, tmp_path / "out", to="fbx")
+
+
+def test_the_manifest_lists_every_file(face_folder, tmp_path):
+    done = export_appearance(face_folder, tmp_path / "out", to="mtlx", now=NOW)
+    text = done.manifest.read_text()
+    listed = [p for p in done.path.rglob("*") if p.is_file() and "ascmhl" not in p.parts]
+    assert done.files == len(listed)
+    for path in listed:
+        assert f">{path.relative_to(done.path).as_posix()}<" in text
+
+
+# consent on its way ---------------------------------------------------------------------------
+
+
+def test_maps_of_a_captured_session_bear_its_consent_and_older_ones_are_brought_up_to_date(
+    tmp_path,
+):
+    from capture import raw
+    from capture.plan import flash_plan
+    from capture.rig import load_rig
+    from capture.session import Session, Subject
+    from reconstruction.pipeline import reconstruct
+
+    rig = load_rig("flash").resized(16)
+    with Session.create(
+        tmp_path / "s", plan=flash_plan(rig, darks=2), rig=rig, devices={},
+        subject=Subject("P042", ("research",), LAST), source="measured",
+    ) as made:  # fmt: skip
+        for number, (step, camera) in enumerate(made.todo()):
+            blob = raw.encode_dng(
+                np.full((10, 16), 600 + 300 * number, np.uint16), pattern="RGGB", black=512,
+                white=16383, step_id=step.id, session_id=made.id, exposure_s=0.01, iso=100,
+                noise_profile=(1e-5, 1e-8),
+            )  # fmt: skip
+            made.commit(
+                step.id, camera, blob, settings=step.settings, t_host_s=1.0 + number,
+                actual={"light": "flash", "iso": 100},
+            )  # fmt: skip
+        made.close()
+
+    def told():
+        return store.read(tmp_path / "maps").parameters.get(consent.KEY)
+
+    reconstruct(tmp_path / "s", want=["diffuse"], out=tmp_path / "maps")
+    expected = {"pseudonym": "P042", "consent_scope": ["research"], "consent_expires": "2030-01-01"}
+    assert told() == [expected]
+    found = store.read(tmp_path / "maps")
+    old = {k: v for k, v in found.parameters.items() if k != consent.KEY}
+    store.write(tmp_path / "maps", dataclasses.replace(found, parameters=old))
+    assert told() is None
+    outcome = reconstruct(tmp_path / "s", want=["diffuse"], out=tmp_path / "maps")
+    assert not outcome.ran  # nothing was computed again
+    assert told() == [expected]
+
+
+def test_a_fitted_model_bears_the_consent_of_what_it_is_made_of(measured, tmp_path):
+    from skinrig.fitting_reflectance import fit_reflectance
+
+    fit_reflectance(measured, out=tmp_path / "model")
+    read = store.read(tmp_path / "model")
+    assert [one["pseudonym"] for one in consent.recorded(read)] == ["P042"]
+
+
+def test_an_expression_bears_the_consent_of_both_faces(tmp_path, rng):
+    from model.facial_color import HemoglobinRig
+    from skinrig import applying
+
+    neutral = 0.05 + 0.01 * rng.random((16, 16))
+    rig = HemoglobinRig.from_maps(neutral, {"smile": 1.2 * neutral}, radius_px=4.0)
+    maps, document = rig.to_maps()
+    maps["melanin"] = SkinMap(np.full((16, 16), 0.04), "volume fraction of the epidermis")
+    told = {"consent_scope": ["research"], "consent_expires": None}
+    part = {
+        "maps": sorted(maps), "files": ["facial_color.json"], "source": "measured",
+        consent.KEY: [{"pseudonym": "rig", **told}],
+    }  # fmt: skip
+    made = SkinAppearance(
+        maps, "measured", {"kind": "dynamic", "parts": {"facial_color": part}},
+        files={"facial_color.json": document},
+    )  # fmt: skip
+    store.write(tmp_path / "moving", made)
+    onto = SkinAppearance(
+        {"hemoglobin": maps["hemoglobin"], "melanin": maps["melanin"]}, "measured",
+        {consent.KEY: [{"pseudonym": "other", **told}]},
+    )  # fmt: skip
+    expression = applying.Expression({"smile": 1.0}, onto=applying.OtherFace(onto))
+    applying.apply_expression(tmp_path / "moving", expression, out=tmp_path / "shown")
+    shown = consent.recorded(store.read(tmp_path / "shown"))
+    assert [one["pseudonym"] for one in shown] == ["rig", "other"]
