@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skinrig import check_comparison, map_pictures, page, truth_errors
 from skinrig import comparison_conditions as conditions
-from skinrig import map_pictures, page, truth_errors
+from skinrig.front_view import FrontView
 from skinrig.map_comparison import MapDifference
 from skinrig.run_comparison import Pair, Run, alone
-from skinrig.surface_section import FrontView
 
 WIDTH_PX = 200
+MOST_NAMED = 10
+"""Maps that are named first."""
 MOST_SHOWN = 4
 """Maps of a pair that are drawn: of those with standard errors the ones that disagree most."""
 SIGMAS_SHOWN = 5.0
@@ -24,7 +25,7 @@ SIGMAS_SHOWN = 5.0
 
 def lead(a: Run, b: Run, found: Sequence[Pair]) -> str:
     """Return what changed in sentences, and the checks of both."""
-    rows = _checks(a, b)
+    rows = check_comparison.rows_of(a, b)
     changed = [row for row in rows if row.changed]
     disagree = [(pair.name, one) for pair in found for one in pair.differences if one.disagree]
     told = sum(bool(one.beyond) for pair in found for one in pair.differences)
@@ -32,8 +33,9 @@ def lead(a: Run, b: Run, found: Sequence[Pair]) -> str:
     sentences = []
     if rows:
         worse = sum(row.changed == "worse" for row in changed)
+        common = sum(row.a is not None and row.b is not None for row in rows)
         sentences.append(
-            f"{len(changed)} of {len(rows)} checks changed their verdict"
+            f"{len(changed)} of {common} checks of both changed their verdict"
             + (f", {worse} for the worse." if changed else ".")
         )
     if same:
@@ -53,84 +55,28 @@ def lead(a: Run, b: Run, found: Sequence[Pair]) -> str:
     worst = sorted(disagree, key=lambda item: -item[1].beyond[-1])
     if worst:
         items = "".join(
-            f"<li>{page.escape(f'{name}: {_in_words(one)}')}</li>" for name, one in worst
+            f"<li>{page.escape(f'{name}: {_in_words(one)}')}</li>"
+            for name, one in worst[:MOST_NAMED]
         )
-        body += f'<h2>Where they disagree</h2><ul class="worst">{items}</ul>'
-    return body + _checks_table(a, b, rows)
+        body += "<h2>Where they disagree</h2>" + page.note(
+            "Shares of pixels that lie more than three combined standard errors apart; chance "
+            f"leaves 0.27 %. The {min(len(worst), MOST_NAMED)} farthest of {len(worst)}."
+        )
+        body += f'<ul class="worst">{items}</ul>'
+    return body + check_comparison.table(a, b, rows)
 
 
 def _in_words(one: MapDifference) -> str:
     by = page.number(one.median if one.unit == "°" else one.bias)
     return (
-        f"{one.name} by {by} {one.unit}".rstrip() + f" in the median, {100 * one.beyond[-1]:.3g} % "
-        "of pixels by more than three combined standard errors (0.27 % by chance)"
+        f"{one.name} by {by} {one.unit}".rstrip()
+        + f" in the median, {100 * one.beyond[-1]:.3g} % of pixels"
     )
 
 
 def _where(run: Run) -> str:
     """Return a run by the end of its path: the whole of it is nobody else's business."""
     return "/".join(run.path.resolve().parts[-2:])
-
-
-@dataclass(frozen=True, slots=True)
-class _CheckRow:
-    name: str
-    a: page.Check | None
-    b: page.Check | None
-
-    @property
-    def changed(self) -> str:
-        if self.a is None or self.b is None or self.a.passed == self.b.passed:
-            return ""
-        return "better" if self.b.passed else "worse"
-
-    @property
-    def difference(self) -> float:
-        return float("nan") if self.a is None or self.b is None else self.b.got - self.a.got
-
-
-def _checks(a: Run, b: Run) -> list[_CheckRow]:
-    by_a = {_common_name(check, a, b): check for check in a.checks}
-    by_b = {_common_name(check, b, a): check for check in b.checks}
-    rows = [_CheckRow(name, by_a.get(name), by_b.get(name)) for name in {**by_a, **by_b}]
-    return sorted(rows, key=lambda row: (row.changed != "worse", row.changed != "better"))
-
-
-def _common_name(check: page.Check, run: Run, other: Run) -> str:
-    """Return a check's name without the folder's where the two folders are named differently."""
-    if len(run.appearances) == len(other.appearances) == 1:
-        return check.name.removeprefix(f"{next(iter(run.appearances))}: ")
-    return check.name
-
-
-def _checks_table(a: Run, b: Run, rows: Sequence[_CheckRow]) -> str:
-    if not rows:
-        return ""
-
-    def told(check: page.Check | None) -> str:
-        if check is None:
-            return "not checked"
-        return f"{page.number(check.got)} {check.unit}".rstrip() + (
-            ", kept" if check.passed else ", missed"
-        )
-
-    def limit(row: _CheckRow) -> str:
-        bounds = [
-            f"{'≤' if c.sense == '<=' else '≥'} {page.number(c.bound)} {c.unit}".rstrip()
-            for c in (row.a, row.b)
-            if c is not None
-        ]
-        return " and ".join(dict.fromkeys(bounds))
-
-    return "<h2>Checks of both</h2>" + page.table(
-        ("check", a.label, b.label, "difference", "limit", "changed"),
-        [
-            (row.name, told(row.a), told(row.b), row.difference, limit(row),
-             row.changed or "no")
-            for row in rows
-        ],
-        caption="Verdicts that changed stand first; limits that follow a bound may differ",
-    )  # fmt: skip
 
 
 def sections(a: Run, b: Run, found: Sequence[Pair]) -> str:
@@ -309,7 +255,16 @@ def _errors(a: Run, b: Run, pair: Pair) -> str:
         )  # fmt: skip
     if not rows:
         return ""
-    return "<h3>Errors against the truths</h3>" + page.table(
+    body = "<h3>Errors against the truths</h3>"
+    if any(
+        not np.array_equal(one.values, truths[1].maps[key].values)
+        for key, one in truths[0].maps.items()
+        if key in truths[1].maps
+    ):
+        body += page.note(
+            "The truths differ, too: part of what differs between the maps is the skin's own."
+        )
+    return body + page.table(
         ("error", "skin", "unit", "A", "B", "difference", "68 % intervals apart",
          "68 % coverage % A", "B"),
         rows, caption="Each against its own truth",

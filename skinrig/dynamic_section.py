@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import microstructure
-from model.facial_color import HemoglobinRig
 from model.microstructure import KernelTable
 from model.skin import SkinAppearance, SkinMap
 from model.wrinkle_expressions import clamped, zone_sums
 from model.wrinkle_model import FILE as WRINKLE_FILE
 from model.wrinkle_model import WrinkleModel
-from skinrig import facial_color_evaluation as evaluation
-from skinrig import figures, map_pictures, page
-from skinrig.applying import colors, hemoglobin_rig
+from skinrig import facial_color_section, figures, map_pictures, page
 from skinrig.dynamic_appearance import FACIAL_COLOR, KIND, MICROSTRUCTURE, WRINKLES, parts_of
 
 SHOWN = 4
@@ -57,163 +54,12 @@ def section(
     parts = parts_of(appearance)
     body = ""
     if FACIAL_COLOR in parts:
-        body += _facial_color(name, appearance, parts[FACIAL_COLOR], truths, checks)
+        body += facial_color_section.section(name, appearance, parts[FACIAL_COLOR], truths, checks)
     if WRINKLES in parts:
         body += _wrinkles(appearance, parts[WRINKLES])
     if MICROSTRUCTURE in parts:
         body += _microstructure(appearance, parts[MICROSTRUCTURE])
     return body
-
-
-def _facial_color(
-    name: str,
-    appearance: SkinAppearance,
-    part: Mapping[str, Any],
-    truths: Mapping[str, SkinAppearance],
-    checks: list[page.Check],
-) -> str:
-    rig = hemoglobin_rig(appearance)
-    body = (
-        "<h3>Hemoglobin rig</h3><p class='note'>Each state is a scale and a bias of the neutral "
-        f"map, over discs of {rig.radius_px:.1f} px; a blend is an affine combination.</p>"
-    )
-    body += _blends(appearance, rig)
-    rows = []
-    for state, maps in rig.states.items():
-        placed = [row for row in part["alignment"] if row["state"] == state]
-        rms, largest = part["storage_error"][state]
-        change = appearance.maps.get(f"change_{state}")
-        rows.append(
-            (
-                state, _mean(change), float(np.median(maps.scale[maps.valid])),
-                100 * rms, 100 * largest,
-                placed[0]["median_error_px"] if placed else "",
-                placed[0]["by"] if placed else "",
-            )
-        )  # fmt: skip
-    body += page.table(
-        ("state", "mean change of blood, points", "median scale",
-         "lost by storing small, rms, points", "largest, points", "error of place, px",
-         "placed by"),
-        rows,
-        caption="States; points are percent of the dermis' volume",
-    )  # fmt: skip
-    body += _repeats(part.get("repeatability"))
-    if truths:
-        states, changes = evaluation.compare(appearance, rig, truths, rng=np.random.default_rng(0))
-        body += _errors(name, states, changes, checks)
-    for state in list(rig.states)[:SHOWN]:
-        measured = appearance.maps.get(f"hemoglobin_{state}")
-        true = evaluation.true_blood(truths[state]) if state in truths else None
-        if measured is None:
-            continue
-        blend = rig.evaluate({state: 1.0})
-        seen = blend.valid if true is None or true.valid is None else blend.valid & true.valid
-        body += map_pictures.map_panel(
-            f"blood of {state}, by the rig", "volume fraction",
-            estimate=np.where(blend.valid, blend.hemoglobin, 0.0),
-            standard_error=np.where(blend.valid, blend.stderr, 0.0),
-            truth=None if true is None else true.values, valid=seen,
-        )  # fmt: skip
-    return body
-
-
-def _repeats(told: Mapping[str, Any] | None) -> str:
-    """Return how far states repeat, and whether melanin drifts."""
-    if not told:
-        return ""
-    drifts = {row["region"]: row for row in told["melanin_drift"]}
-    rows = []
-    for row in told["hemoglobin"]:
-        drift = drifts.get(row["region"])
-        slope = "" if drift is None else (
-            f"{100 * drift['slope_per_minute']:+.4f} ({100 * drift['slope_stderr']:.4f})"
-        )  # fmt: skip
-        rows.append(
-            (
-                row["region"], 100 * row["within"], 100 * row["between"],
-                float("nan") if row["correlation"] is None else row["correlation"],
-                "yes" if row["scatters"] else "no", slope,
-                "" if drift is None else f"{drift['p_value']:.2g}",
-            )
-        )  # fmt: skip
-    return page.table(
-        ("region", "between repeats, points", "between states, points", "intraclass correlation",
-         "more than noise", "melanin's drift a minute, points", "p"),
-        rows,
-        caption="Repeats: standard deviations of blood",
-    )  # fmt: skip
-
-
-def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> str:
-    """Draw the face's color in each state and in the first two together."""
-    melanin = appearance.maps.get("melanin")
-    if melanin is None:
-        return ""
-    names = list(rig.states)
-    asked: dict[str, dict[str, float]] = {"neutral": {"neutral": 1.0}}
-    asked |= {state: {state: 1.0} for state in names[:SHOWN]}
-    if len(names) > 1:
-        asked[f"{names[0]} + {names[1]}"] = {names[0]: 1.0, names[1]: 1.0, "neutral": -1.0}
-    pictures = ""
-    for title, weights in asked.items():
-        blend = rig.evaluate(weights)
-        seen = blend.valid if melanin.valid is None else blend.valid & melanin.valid
-        color = colors(melanin.values, np.where(seen, blend.hemoglobin, 0.0), seen)
-        pictures += map_pictures.color_picture(title, color, width=WIDTH_PX)
-    return (
-        f"<div class='maps'>{pictures}</div><p class='note'>Diffuse color without shading, linear "
-        "sRGB under D65.</p>"
-    )
-
-
-def _errors(
-    name: str,
-    states: list[evaluation.StateError],
-    changes: list[evaluation.ChangeError],
-    checks: list[page.Check],
-) -> str:
-    if not states:
-        return ""
-    by_rig = [row for row in states if row.way == evaluation.WAYS[1]]
-    for row in by_rig:
-        checks.append(
-            page.Check(
-                f"{name}: blood of {row.state} by the rig, median error",
-                100 * row.median_relative, 100 * evaluation.LEVEL_LIMIT, "<=", "%",
-            )
-        )  # fmt: skip
-    body = "<h3>Blood of each state: error by way</h3>" + page.table(
-        ("state", "way", "median |error| %", "68 % interval", "rms, points", "bias %",
-         "68 % coverage %", "pixels"),
-        [
-            (row.state, row.way, 100 * row.median_relative,
-             f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}", 100 * row.rms,
-             100 * row.bias, 100 * row.coverage, row.pixels)
-            for row in states
-        ],
-        caption="Against the true blood of each state, by way of getting it",
-    )  # fmt: skip
-    body += page.table(
-        ("state", "true change, points", "found, points", "rms of the map, points",
-         "68 % coverage %"),
-        [
-            (row.state, 100 * row.true, 100 * row.found, 100 * row.rms, 100 * row.coverage)
-            for row in changes
-        ],
-        caption="Change of blood from the neutral state, one melanin for all states",
-    )  # fmt: skip
-    labels = list(dict.fromkeys(row.state for row in states))
-    series = {
-        way: [
-            next((100 * r.median_relative for r in states if (r.state, r.way) == (label, way)),
-                 float("nan"))
-            for label in labels
-        ]
-        for way in evaluation.WAYS
-    }  # fmt: skip
-    plot = figures.bars("median error of a state's blood", labels, series, unit="%")
-    return body + f"<div class='plots'>{plot}</div>"
 
 
 def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
@@ -293,13 +139,6 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> str:
             caption="Sites with microstructure",
         )
     )
-
-
-def _mean(skin_map: SkinMap | None) -> float:
-    if skin_map is None:
-        return float("nan")
-    good = _valid(skin_map)
-    return 100 * float(skin_map.values[good].mean()) if good.any() else float("nan")
 
 
 def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:

@@ -59,12 +59,13 @@ def scalar_picture(
     data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=LEVELS)
     named = f"{of}, {title}" if of else title
     alt = f"{named}: {_told(small, mask, unit)}; color scale {number(low)} to {_with(high, unit)}"
+    of_unit = f"<span>{escape(unit)}</span>" if unit else ""
     return (
         f'<figure><img alt="{escape(alt)}" width="{small.shape[1]}" height="{small.shape[0]}" '
         f'src="{png.address(data)}"><figcaption>{escape(title)}</figcaption>'
         f'<div class="scale" aria-hidden="true"><span>{number(low)}</span>'
         f'<span class="bar {png.SCALES[scale]}"></span>'
-        f"<span>{escape(_with(high, unit))}</span></div></figure>"
+        f"<span>{number(high)}</span>{of_unit}</div></figure>"
     )
 
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.gradient_stages import HISTOGRAM_FILE, KERNEL_FILE, STRAIN_FILE
-from skinrig import figures, map_pictures, page
+from reconstruction.gradient_stages import HISTOGRAM_FILE, STRAIN_FILE
+from skinrig import figures, kernel_section, map_pictures, page
 from skinrig import microrelief_evaluation as evaluation
+from skinrig.kernel_section import state_words
 
 WIDTH_PX = 200
 SHOWN = 7
@@ -48,7 +48,7 @@ def section(
     body += _strain(name, appearance, truth, checks)
     body += _histograms(appearance)
     body += _variances(appearance)
-    body += _kernels(name, appearance, checks)
+    body += kernel_section.section(name, appearance, checks)
     return body
 
 
@@ -65,7 +65,7 @@ def _pictures(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
         for state in chosen:
             skin_map = appearance.maps.get(f"{kind}_{state}")
             if skin_map is not None:
-                row += _shown(f"{title}, {_words(state)}", skin_map, appearance)
+                row += _shown(f"{title}, {state_words(state)}", skin_map, appearance)
         if row:
             series.append(f"<div class='maps small'>{row}</div>")
     if len(one) > 1:
@@ -93,15 +93,15 @@ def _beside_truth(state: str, appearance: SkinAppearance, truth: SkinAppearance 
         if normals.stderr is not None:
             spread = np.degrees(normals.stderr[..., 0])
             parts.append(_angle_picture("standard error", spread, _valid(normals), state))
-        body += f"<h3>normals, {_words(state)}</h3><div class='maps'>{''.join(parts)}</div>"
+        body += f"<h3>normals, {state_words(state)}</h3><div class='maps'>{''.join(parts)}</div>"
     height = appearance.maps.get(f"height_{state}")
     if height is not None:
         relief = None
         if truth is not None:
             relief = evaluation.true_relief(appearance, truth, state)
         body += map_pictures.map_panel(
-            f"height, {_words(state)}", "um", estimate=height.values, standard_error=height.stderr,
-            truth=relief, valid=_valid(height), width=280,
+            f"height, {state_words(state)}", "um", estimate=height.values,
+            standard_error=height.stderr, truth=relief, valid=_valid(height), width=280,
         )  # fmt: skip
     return body
 
@@ -121,7 +121,7 @@ def _shown(title: str, skin_map: SkinMap, appearance: SkinAppearance) -> str:
 
 def _normal_picture(title: str, skin_map: SkinMap, state: str) -> str:
     return map_pictures.normal_picture(
-        title, skin_map.values, valid=_valid(skin_map), of=f"normals, {_words(state)}"
+        title, skin_map.values, valid=_valid(skin_map), of=f"normals, {state_words(state)}"
     )
 
 
@@ -130,7 +130,7 @@ def _angle_picture(
 ) -> str:
     return map_pictures.scalar_picture(
         title, degrees, low=0.0, high=map_pictures.reach_of(degrees, valid, 98), scale="magma",
-        valid=valid, unit="°", of=f"normals, {_words(state)}",
+        valid=valid, unit="°", of=f"normals, {state_words(state)}",
     )  # fmt: skip
 
 
@@ -179,7 +179,7 @@ def _worst(rows: Sequence[evaluation.ReliefError]) -> tuple[str, float]:
     if len(told) < 2:
         return "", math.nan
     worst = max(told, key=lambda row: row.mean_deg)
-    return f"{_words(worst.state)}: {worst.mean_deg:.3g}°", worst.mean_deg
+    return f"{state_words(worst.state)}: {worst.mean_deg:.3g}°", worst.mean_deg
 
 
 def _strain(
@@ -197,7 +197,7 @@ def _strain(
         worst = max(true.values(), key=lambda row: abs(row.error))
         checks.append(
             page.Check(f"{name}: stretch of the skin, largest error", abs(worst.error),
-                       evaluation.STRAIN_LIMIT, "<=", "", worst=_words(worst.state))
+                       evaluation.STRAIN_LIMIT, "<=", "", worst=state_words(worst.state))
         )  # fmt: skip
     rows = [
         (
@@ -235,7 +235,7 @@ def _histograms(appearance: SkinAppearance) -> str:
         # rows hold n across the jaws from -1: the page shows + at the top
         shown = np.sqrt(count)[::-1][cut : side - cut, cut : side - cut]
         panels += map_pictures.scalar_picture(
-            _words(state["name"]), shown, low=0.0, high=top, scale="magma", width=WIDTH_PX,
+            state_words(state["name"]), shown, low=0.0, high=top, scale="magma", width=WIDTH_PX,
             of="histogram of normals",
         )  # fmt: skip
     aliased = [state["name"] for state in states if state["aliased"]]
@@ -268,116 +268,6 @@ def _variances(appearance: SkinAppearance) -> str:
         "roughness along the jaws", "stretch ratio r of the skin", "variance of n", series
     )
     return f"<div class='plots'>{plot}</div>"
-
-
-def _kernels(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> str:
-    document = evaluation.document_of(appearance, KERNEL_FILE)
-    if document is None or not document["fits"]:
-        return ""
-    fits: Sequence[Mapping[str, Any]] = sorted(document["fits"], key=lambda fit: fit["stretch_s"])
-    judged = [fit for fit in fits if fit["valid"] and _told(fit)]
-    if judged:
-        worst = max(judged, key=lambda fit: fit["distance"] / fit["distance_before"])
-        checks.append(
-            page.Check(f"{name}: histogram distance after the kernel over that before, worst state",
-                       worst["distance"] / worst["distance_before"], evaluation.DISTANCE_LIMIT,
-                       "<=", "", worst=_words(worst["name"]))
-        )  # fmt: skip
-    untold = [fit["name"] for fit in fits if fit["valid"] and not _told(fit)]
-    note = (
-        page.note(
-            f"The patch is too small for {', '.join(untold)}: two histograms of one skin of this "
-            "size differ by more than half of what the strain changes, so that the distance left "
-            "by the kernel is not judged."
-        )
-        if untold
-        else ""
-    )
-    body = "<h3>Convolution kernels</h3>" + note + page.table(
-        ("state", "r", "alpha", "sigma um", "distance before", "after", "other skin of this size",
-         "nearly as good", "fitted"),
-        [
-            (
-                fit["name"], fit["stretch_s"], _value(fit["alpha"]), _value(fit["sigma_um"]),
-                _value(fit["distance_before"]), _value(fit["distance"]),
-                _value(fit.get("noise_floor")), fit.get("near_best_count", 0),
-                "yes" if fit["valid"] else "no",
-            )
-            for fit in fits
-        ],
-        caption="Kernels fitted to histograms of normals; distances before and after the kernel",
-    )  # fmt: skip
-    plots = ""
-    for key, error, title in (
-        ("alpha", "alpha_stderr", "kernel strength alpha"),
-        ("sigma_um", "sigma_stderr_um", "kernel width sigma, um"),
-    ):
-        points: dict[float, list[tuple[float, float, float]]] = {}
-        for fit in fits:
-            if fit["valid"]:
-                points.setdefault(fit["angle_deg"], []).append(
-                    (fit["stretch_s"], _value(fit[key]), _value(fit[error]))
-                )
-        series = [
-            figures.Curve(
-                f"jaws at {angle:.0f}°",
-                [row[0] for row in rows],
-                [row[1] for row in rows],
-                [row[2] for row in rows],
-                line=False,
-            )
-            for angle, rows in points.items()
-        ]
-        for table in document.get("tables", []):
-            line = table["lines"]
-            series.append(
-                figures.Curve(f"lines, {table['name']}", line["stretch"],
-                              [_value(v) for v in line[key]], marks=False)
-            )  # fmt: skip
-        if series:
-            plots += figures.curves(title, "stretch ratio r of the skin", title, series)
-    return body + f"<div class='plots'>{plots}</div>" + _direction(document.get("direction"))
-
-
-def _direction(found: Mapping[str, Any] | None) -> str:
-    if not found:
-        return ""
-    rows = [
-        (angle, _value(alpha), _value(alpha_error), _value(sigma), _value(sigma_error))
-        for angle, alpha, alpha_error, sigma, sigma_error in zip(
-            found["angle_deg"], found["alpha_offset"], found["alpha_stderr"],
-            found["sigma_offset_um"], found["sigma_stderr_um"], strict=True,
-        )
-    ]  # fmt: skip
-    return (
-        "<h3>Kernels by the direction of stretch, less one table of all</h3>"
-        + page.table(
-            ("jaws at °", "alpha", "standard error", "sigma um", "standard error um"),
-            rows,
-            caption="Offsets of each direction",
-        )
-        + "<p class='note'>Chance of such differences where the direction does not matter: alpha "
-        f"{100 * _value(found['p_alpha']):.2g} %, sigma {100 * _value(found['p_sigma']):.2g} %."
-        "</p>"
-    )
-
-
-def _told(fit: Mapping[str, Any]) -> bool:
-    """Return whether a strain changes the histogram by more than twice what chance does."""
-    return _value(fit["distance_before"]) > 2.0 * _value(fit["noise_floor"])
-
-
-def _words(state: str) -> str:
-    """Return a state's name in words.
-
-    Examples
-    --------
-    >>> _words("a045_m2"), _words("a000_n0")
-    ('45°, compressed 2', '0°, neutral')
-    """
-    angle, step = state.split("_")
-    kinds = {"n": "neutral", "m": f"compressed {step[1:]}", "p": f"stretched {step[1:]}"}
-    return f"{int(angle[1:])}°, {kinds[step[0]]}"
 
 
 def _by_step(state: str) -> tuple[str, int]:

@@ -2,79 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from model.skin import SkinAppearance, SkinMap
-from skinrig import map_pictures, page, reflection_evaluation, skin_bands
+from skinrig import map_pictures, page, reflection_evaluation
 from skinrig import surface_evaluation as evaluation
+from skinrig.front_view import WIDTH_PX, FrontView
+from skinrig.surface_bands import Banded, errors_by_band
 
-WIDTH_PX = 220
 SMALL_PX = 110
 """Of earlier normals, lobes, samples and residuals: every second pixel of the others."""
 GRAY = 0.5
 FIRST = ("r_d", "normals_refined", "normals", "half_vector_normals")
-
-
-@dataclass(frozen=True, slots=True)
-class FrontView:
-    """Points of a surface as they lie in a picture from the front, without perspective.
-
-    Attributes
-    ----------
-    shape
-        Rows and columns of the picture.
-    rows, columns
-        Where each point falls, shape (N,); -1 outside the picture.
-    order
-        Points from the back to the front, shape (N,).
-    """
-
-    shape: tuple[int, int]
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
-    order: NDArray[np.intp]
-
-    @staticmethod
-    def of(
-        position_mm: NDArray[np.floating], box: tuple[NDArray[np.floating], NDArray[np.floating]]
-    ) -> FrontView:
-        """Look along -z at points, shape (N, 3), inside a box given by its two corners."""
-        low, high = box
-        pixel = max(float(high[0] - low[0]) / WIDTH_PX, 1e-9)
-        height = max(int(np.ceil(float(high[1] - low[1]) / pixel)), 1)
-        columns = np.floor((position_mm[:, 0] - low[0]) / pixel).astype(np.intp)
-        rows = np.floor((high[1] - position_mm[:, 1]) / pixel).astype(np.intp)
-        inside = (columns >= 0) & (columns < WIDTH_PX) & (rows >= 0) & (rows < height)
-        return FrontView(
-            (height, WIDTH_PX),
-            np.where(inside, rows, -1),
-            np.where(inside, columns, -1),
-            np.argsort(position_mm[:, 2], kind="stable"),
-        )
-
-    def picture(
-        self, values: NDArray[np.floating], *, valid: NDArray[np.bool_] | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the picture of a value at each point, (N,) or (N, 3), and where there is one.
-
-        The frontmost point of a pixel is shown; gaps of up to two pixels between points take the
-        nearest one's value.
-        """
-        chosen = self.order[(self.rows[self.order] >= 0)]
-        image = np.zeros((*self.shape, *values.shape[1:]))
-        hit = np.zeros(self.shape, bool)
-        good = np.zeros(self.shape, bool)
-        at = self.rows[chosen], self.columns[chosen]
-        image[at] = values[chosen]
-        hit[at] = True
-        good[at] = True if valid is None else valid[chosen]
-        distance, nearest = ndimage.distance_transform_edt(~hit, return_indices=True)
-        image, good = image[tuple(nearest)], good[tuple(nearest)]
-        return image, good & (distance <= 2.0)
 
 
 def section(
@@ -272,41 +212,6 @@ def _errors(
         caption="By skin color: the individual typology angle of the true reflectance "
         "(Chardon et al. 1991)",
     )  # fmt: skip
-
-
-Banded = tuple[str, str, str, int, float, float, float]
-"""Map, unit, band, points, masked %, median and 95th percentile of the absolute error."""
-LEAST_POINTS = 20
-
-
-def errors_by_band(appearance: SkinAppearance, truth: SkinAppearance) -> list[Banded]:
-    """Return errors of normals and R_d by skin color, from light to dark; R_d, mean of channels.
-
-    Parameters
-    ----------
-    appearance, truth
-        As for `section`; a truth without "r_d" has no color to tell bands by.
-    """
-    if "r_d" not in truth.maps:
-        return []
-    pairs = evaluation.match(appearance, truth)
-    true_color = truth.maps["r_d"].values.reshape(-1, 3)[pairs.truth].astype(np.float64)
-    bands = skin_bands.bands_of(skin_bands.typology_angle_deg(true_color))
-    rows: list[Banded] = []
-    for key in ("r_d", *evaluation.NORMAL_MAPS):
-        if key not in appearance.maps or (key != "r_d" and "normals" not in truth.maps):
-            continue
-        error = np.abs(evaluation.errors_at(key, appearance, truth, pairs))
-        for band in skin_bands.BANDS:
-            own = error[bands == band]
-            told = own[np.isfinite(own)]
-            if len(own) < LEAST_POINTS or not len(told):
-                continue
-            unit = "%" if key == "r_d" else "°"
-            masked = 100.0 * (1.0 - len(told) / len(own))
-            middle, high = np.percentile(told, [50, 95])
-            rows.append((key, unit, band, len(own), masked, float(middle), float(high)))
-    return rows
 
 
 def _worst(name: str, banded: list[Banded]) -> tuple[str, float]:

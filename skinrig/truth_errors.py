@@ -8,7 +8,7 @@ import numpy as np
 
 from model.skin import SkinAppearance
 from skinrig import evaluation, microrelief_evaluation, subsurface_evaluation, surface_evaluation
-from skinrig import surface_section as surface
+from skinrig.surface_bands import errors_by_band
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def _surface(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthErr
         )
         for row in found
     ]  # fmt: skip
-    for name, unit, band, _, _, middle, _ in surface.errors_by_band(appearance, truth):
+    for name, unit, band, _, _, middle, _ in errors_by_band(appearance, truth):
         rows.append(TruthError(f"{name}, median error", f"{band} skin", unit, middle))
     return rows
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from model import store
 from model.skin import SkinAppearance
 from skinrig import png
-from skinrig.surface_section import FrontView
+from skinrig.front_view import FrontView
 
 TARGET = Path(__file__).resolve().parents[1] / "docs/images/dome-maps.png"
 GRAY = 0.5

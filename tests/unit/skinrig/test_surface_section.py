@@ -5,7 +5,8 @@ import pytest
 
 from model.skin import SkinAppearance, SkinMap
 from skinrig import page
-from skinrig.surface_section import FrontView, section
+from skinrig.front_view import FrontView
+from skinrig.surface_section import section
 
 BOX = np.array([0.0, 0.0, 0.0]), np.array([10.0, 20.0, 5.0])
 
