@@ -141,10 +141,10 @@ def surface_traits(found: PageLobes, space: TraitSpace | None = None) -> LobeTra
     height, width, count = found.shares.shape
     shares = np.zeros((height, width, len(mix)), np.float32)
     shares[..., :count] = found.shares
-    widened = materials.mixed(mix)
-    table = np.array(widened.table)
+    mixed = materials.mixed(mix)
+    table = np.array(mixed.table)
     table[..., :count] = found.lobes.table[..., :count]  # the face's own, bit for bit
-    basis = BrdfBasis(table, widened.names, found.lobes.light_radius_rad)
+    basis = BrdfBasis(table, mixed.names, found.lobes.light_radius_rad)
     made = LobeTraits(
         dataclasses.replace(found, lobes=basis, shares=shares, mix=mix),
         cosines.astype(np.float32),

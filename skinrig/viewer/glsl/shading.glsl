@@ -87,9 +87,6 @@ void main() {
   vec3 irradiance = p_light_intensity * cosines + p_ambient * (0.6 + 0.4 * s.normal.y);
   o_irradiance = vec4(irradiance, v_depth);
   o_albedo = vec4(skinAlbedo(v_uv), 1.0);
-#ifdef HAS_albedo_factor
-  o_albedo.rgb *= buffer_albedo_factor(v_uv).rgb;
-#endif
   float facing = clamp(dot(s.specularNormal, s.toLight), 0.0, 1.0);
   o_specular = vec4(PI * p_light_intensity * facing * s.intensity * surfaceSpecular(s),
     surfaceWidth(v_uv));

@@ -77,6 +77,5 @@ V.start.push(() => {
         bytes: 8 * width * height,
       }),
     });
-    V.surface.after.push("albedo_traits");
   }
 });
