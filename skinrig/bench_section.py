@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from skinrig import bench_table, figures, page
+from skinrig import bench_figures, bench_table, page
 from skinrig.bench_document import SCHEMA
 
 FAMILY = SCHEMA.split("/")[0]
@@ -42,7 +42,7 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
                 )
             )  # fmt: skip
     plots = [
-        figures.error_against_seconds(name, stage)
+        bench_figures.error_against_seconds(name, stage)
         for name, stage in document["stages"].items()
         if stage["points"]
     ]

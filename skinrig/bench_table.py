@@ -98,7 +98,7 @@ def write(document: Mapping[str, Any], out: Path) -> None:
     out
         Folder; made if it is missing. It gets ``bench.csv``, ``bench-bands.csv``, ``NAME.svg``.
     """
-    from skinrig import figures
+    from skinrig import bench_figures
 
     out.mkdir(parents=True, exist_ok=True)
     rows = [
@@ -113,7 +113,7 @@ def write(document: Mapping[str, Any], out: Path) -> None:
     write_whole(out / "bench-bands.csv", _csv(BAND_COLUMNS, bands(document)))
     for name, stage in document["stages"].items():
         if stage["points"]:
-            plot = figures.error_against_seconds(name, stage)
+            plot = bench_figures.error_against_seconds(name, stage)
             write_whole(out / f"{name}.svg", plot + "\n")
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from capture.calibration import store as calibrations
 from capture.calibration.record import CalibrationError
-from skinrig import figures, page, report_folders
+from skinrig import bench_figures, page, report_folders
 from skinrig import provenance_section as provenance
 from skinrig.bench_document import SCHEMA
 from skinrig.run_comparison import Pair, Run
@@ -61,7 +61,7 @@ def benchmarks(a: Run, b: Run) -> str:
             continue
         rows += _settings_of_stage(name, stage, other)
         if stage["points"] and other["points"]:
-            plots += figures.compared_fronts(name, (a.label, stage), (b.label, other))
+            plots += bench_figures.compared_fronts(name, (a.label, stage), (b.label, other))
     if not rows:
         return ""
     machines = _unequal(

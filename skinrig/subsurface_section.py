@@ -22,11 +22,7 @@ WIDTH_PX = 200
 SHOWN = 3
 """Measurements drawn; the tables list all."""
 COLORS = {"red": "#c8402f", "green": "#3f8f4f", "blue": "#2a78b8"}
-METHOD_NAMES = {
-    "photon_table": "photon table",
-    "diffusion": "diffusion",
-    "dipole": "dipole",
-}
+METHOD_NAMES = {"photon_table": "photon table", "diffusion": "diffusion", "dipole": "dipole"}
 
 
 def is_probe(appearance: SkinAppearance) -> bool:
@@ -149,10 +145,9 @@ def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
         rows,
         caption="Every fit, with what it says of itself",
     )  # fmt: skip
-    note = (
-        "<p class='note'>1/sigma_tr is the translucency: the smallest sigma_tr is the most "
-        "translucent skin. Of layered tissue the true sigma_tr is that of the homogeneous medium "
-        "whose profile fits best.</p>"
+    note = page.note(
+        "1/sigma_tr is the translucency: the smallest sigma_tr is the most translucent skin. The "
+        "true sigma_tr of layers is that of the homogeneous medium whose profile fits best."
     )
     return f"<h3>sigma_tr by method</h3>{note}" + page.folded(f"{len(rows)} fits", table)
 
