@@ -9,6 +9,7 @@ import typer
 
 from skinrig.cli_options import Json
 from skinrig.console import Console
+from skinrig.errors import UsageError
 
 
 def view(
@@ -41,6 +42,13 @@ def view(
             "any free one, in place of writing it."
         ),
     ] = None,
+    displacement: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --port: heights of microstructure, um, in the mesh's texture: a .npy file, "
+            "4096 or 16384 px a side, as `skinrig apply microstructure` writes."
+        ),
+    ] = None,
     preset: Annotated[
         str, typer.Option(help="Skin type of a simulated head: I to VI, palest or darkest.")
     ] = "III",
@@ -59,6 +67,8 @@ def view(
     from skinrig.viewer.writing import compose, serve, write
 
     console = Console(json)
+    if displacement is not None and port is None:
+        raise UsageError("displacement: a page in a file cannot fetch it; add --port 0")
     scene = compose(
         appearance or [],
         mesh=mesh,
@@ -80,4 +90,4 @@ def view(
     if port is None:
         console.document("skinrig.view/1", document)
     else:
-        serve(scene, port, appearance or [], console=console)
+        serve(scene, port, appearance or [], console=console, displacement=displacement)

@@ -10,7 +10,7 @@ the stretch of the skin.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -25,7 +25,8 @@ from model.microstructure import (
 )
 from skinrig.viewer import relief_growth
 from skinrig.viewer.relief_growth import GrownRelief
-from skinrig.viewer.scene import Assets, SceneSource, Texture, ViewerMesh
+from skinrig.viewer.scene import Assets, SceneSource, Texture, ViewerMesh, ViewerScene
+from skinrig.viewer.tiles import TILE_PX, Pyramid
 
 if TYPE_CHECKING:
     from model.skin import SkinAppearance
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
+SAMPLE_PX: Final = 512
+"""Side of the part of a displacement that its slopes are known from."""
 PATCH_PX: Final = 256
 """Side of the patch in the page: 3 to 4 mm of skin; some 80 kB."""
 CELL_PX: Final = 56
@@ -207,14 +210,7 @@ def from_relief(relief: MicroRelief, mesh: ViewerMesh, *, seed: int = 0) -> Asse
     virtual = round(1e3 / (relief.pixel_um * float(np.median(scale))))
     virtual = max(relief_growth.STEP_PX, virtual // relief_growth.STEP_PX * relief_growth.STEP_PX)
     virtual = min(virtual, relief_growth.LARGEST_PX // 2)
-    largest = largest_sigma_um(table)
-    # the finest 1 % of a texture is slivers: kernels there are held at the window's margin
-    reach = math.ceil(4.0 * largest * 1e-3 * virtual * float(np.percentile(scale, 99.0)) + 0.5) + 2
-    if reach > MOST_REACH_PX:
-        raise MicrostructureAssetError(
-            f"mesh: got kernels of {reach} px at the texture's finest places, expected at most "
-            f"{MOST_REACH_PX}: lengths differ too much over its texture"
-        )
+    reach = reach_px(table, scale, virtual)
     below, above = table.sigma_lines_um()
     return Assets(
         textures={"relief_patch": Texture(growth.patch[..., None], "u16", "nearest")},
@@ -243,6 +239,77 @@ def from_relief(relief: MicroRelief, mesh: ViewerMesh, *, seed: int = 0) -> Asse
             }
         },
     )
+
+
+def reach_px(table: KernelTable, scale: Floats, virtual_px: int) -> int:
+    """Return how many pixels of the displacement a kernel reaches, and two for its samples.
+
+    Parameters
+    ----------
+    table : KernelTable
+    scale : ndarray
+        Texture units per mm of skin, see `px_per_mm`.
+    virtual_px : int
+        Side of the displacement.
+
+    Raises
+    ------
+    MicrostructureAssetError
+        For more than `MOST_REACH_PX`.
+    """
+    # the finest 1 % of a texture is slivers: kernels there are held at the window's margin
+    finest = float(np.percentile(scale, 99.0))
+    reach = math.ceil(4.0 * largest_sigma_um(table) * 1e-3 * virtual_px * finest + 0.5) + 2
+    if reach > MOST_REACH_PX:
+        raise MicrostructureAssetError(
+            f"mesh: got kernels of {reach} px at the texture's finest places, expected at most "
+            f"{MOST_REACH_PX}: lengths differ too much over its texture"
+        )
+    return reach
+
+
+def with_displacement(
+    scene: ViewerScene, pyramid: Pyramid, *, table: KernelTable = FOREHEAD
+) -> ViewerScene:
+    """Return a scene that fetches its relief as tiles in place of growing it from a patch.
+
+    Parameters
+    ----------
+    scene : ViewerScene
+        Its own relief, where it has one, is left out.
+    pyramid : Pyramid
+        Of the displacement, in the texture of the scene's mesh.
+    table : KernelTable
+        Of that skin.
+
+    Raises
+    ------
+    MicrostructureAssetError
+        As of `from_relief`.
+    """
+    scale = px_per_mm(scene.mesh)
+    pixel_um = 1e3 / (pyramid.size * float(np.median(scale)))
+    source = pyramid.levels[0]
+    first = (pyramid.size - SAMPLE_PX) // 2
+    middle = np.asarray(source[first : first + SAMPLE_PX, first : first + SAMPLE_PX], np.float32)
+    made = from_relief(MicroRelief(middle, pixel_um, table, "displacement"), scene.mesh)
+    facts = dict(made["facts"]["microstructure"])
+    for unused in ("patch_px", "cell_px", "choices", "seed"):
+        del facts[unused]
+    facts |= {
+        "virtual_px": pyramid.size,
+        "levels": len(pyramid.levels),
+        "reach_px": reach_px(table, scale, pyramid.size),
+        "tiles": {"tile_px": TILE_PX, "low": pyramid.low, "high": pyramid.high},
+    }
+    bare = replace(
+        scene,
+        textures={k: v for k, v in scene.textures.items() if k != "relief_patch"},
+        tables={k: v for k, v in scene.tables.items() if k not in made["tables"]},
+        facts={k: v for k, v in scene.facts.items() if k != "microstructure"},
+        left_out=tuple(row for row in scene.left_out if row[0] != "microstructure"),
+    )
+    return bare.with_assets(Assets(tables=made["tables"], facts={"microstructure": facts}))
 
 
 def px_per_mm(mesh: ViewerMesh) -> Floats:

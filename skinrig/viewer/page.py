@@ -25,6 +25,7 @@ SCRIPTS: Final = (
     "wrinkles.js",
     "detail.js",
     "microstructure.js",
+    "tiles.js",
     "scattering.js",
     "reflectance.js",
     "display.js",

@@ -170,7 +170,7 @@ def _level_rms(derivatives: NDArray[np.float64], count: int) -> list[float]:
     """Return the rms at each level over so many texels of the finest; others are 0."""
     share = count / derivatives[..., 0].size
     found = []
-    planes = np.moveaxis(derivatives, 2, 0)
+    planes: NDArray[np.floating[Any]] = np.moveaxis(derivatives, 2, 0)
     while True:
         found.append(float(np.sqrt(np.mean(np.sum(planes**2, axis=0)) / share)))
         if min(planes.shape[1:]) == 1:

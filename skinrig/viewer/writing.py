@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from skinrig.viewer import page, packing
+from skinrig.viewer import packing, page
 from skinrig.viewer.scene import SceneError, ViewerScene
 
 if TYPE_CHECKING:
@@ -90,6 +90,61 @@ def write(scene: ViewerScene, out: Path) -> dict[str, Any]:
     }
 
 
-def serve(scene: ViewerScene, port: int, appearances: Sequence[Path], *, console: Console) -> None:
-    """Serve the page of a scene on this machine until it is interrupted."""
-    raise SceneError("port: this build serves no pages yet; write one with -o page.html")
+def serve(
+    scene: ViewerScene,
+    port: int,
+    appearances: Sequence[Path],
+    *,
+    console: Console,
+    displacement: Path | None = None,
+    seconds: float | None = None,
+) -> None:
+    """Serve the page of a scene on this machine until it is interrupted.
+
+    Parameters
+    ----------
+    scene
+        What it shows.
+    port
+        0: any free one.
+    appearances
+        Folders that it was made of.
+    console
+        Is told the address.
+    displacement
+        A .npy file of heights, um, in the texture of the mesh: fetched as tiles, in place of relief
+        that is grown in the page.
+    seconds
+        How long; None serves until Ctrl-C.
+
+    Raises
+    ------
+    skinrig.viewer.server.ServerError, skinrig.viewer.tiles.TileError
+        A port that is taken; a file that is no displacement.
+    """
+    import tempfile
+
+    from skinrig.viewer import microstructure_assets, server, tiles
+
+    with tempfile.TemporaryDirectory(prefix="skinrig-view-") as name:
+        pyramid = None
+        if displacement is not None:
+            console.progress(f"cutting {displacement.name} into tiles")
+            pyramid = tiles.open_displacement(displacement, Path(name) / "levels")
+            scene = microstructure_assets.with_displacement(scene, pyramid)
+        text = page.build(scene, connect=pyramid is not None).encode("utf-8")
+        with server.serve(text, pyramid=pyramid, port=port) as served:
+            document = {
+                "url": served.url,
+                "bytes": len(text),
+                "appearances": [str(path) for path in appearances],
+                "displacement": None if displacement is None else str(displacement),
+                "displacement_px": None if pyramid is None else pyramid.size,
+                "left_out": [list(row) for row in scene.left_out],
+            }
+            console.say(f"{served.url}: open it in a browser on this machine; Ctrl-C ends it")
+            console.document("skinrig.view-served/1", document)
+            try:
+                served.wait(seconds)
+            except KeyboardInterrupt:
+                console.progress("no longer served")

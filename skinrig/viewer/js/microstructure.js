@@ -163,9 +163,9 @@ V.start.push(() => {
       {u_pixels: ctx.size}),
     cost: p => ({taps: 2 * p.strain_px ** 2, bytes: 16 * p.strain_px ** 2}),
   });
-  if (!V.scene.textures.relief_patch || !V.scene.facts.microstructure) return;
+  if (!V.scene.facts.microstructure) return;
   const facts = V.microstructure.facts = V.scene.facts.microstructure;
-  const patch = V.microstructure.patch();
+  const patch = facts.tiles ? null : V.microstructure.patch();
   const table = V.microstructure.table();
   Object.assign(V.params, {
     microstructure_virtual_px: facts.virtual_px, microstructure_margin_px: 2 * facts.reach_px,
@@ -199,9 +199,10 @@ V.start.push(() => {
     cost: p => ({taps: taps(p), bytes: 4 * n2(p)}),
   });
   V.passes.push({
-    name: "relief", after: [], key: windowKey, enabled: drawn,
+    name: "relief", after: [], key: p => [windowKey(p), V.tiles.arrived].join(), enabled: drawn,
     targets: p => ({relief: map("R32F", side(p))}),
     draw: ctx => {
+      if (facts.tiles) { V.tiles.fill(ctx); return; }
       const [x, y, level] = ctx.p.microstructure_place;
       const whole = Math.floor(ctx.p.microstructure_virtual_px / 2 ** level);
       ctx.full(V.program(["full_vertex"], ["relief_fragment"]), {

@@ -1,0 +1,156 @@
+"""The page and its tiles on a port of this machine, for nobody else.
+
+Bound to the loopback address. A page of another origin cannot ask through this browser either: a
+request whose Host is not this server's is refused (a name that was rebound to 127.0.0.1), answers
+are not readable across origins, and nothing but two kinds of paths is answered. No path names a
+file.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Final
+
+from skinrig.viewer.tiles import Pyramid, TileError
+
+LOOPBACK: Final = "127.0.0.1"
+PATH: Final = re.compile(r"/tiles/([0-9]{1,2})/([0-9]{1,4})/([0-9]{1,4})")
+TIMEOUT_S: Final = 30.0
+"""A connection that says nothing for so long is closed."""
+
+
+class ServerError(ValueError):
+    """A port that cannot be served on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """A running server.
+
+    Attributes
+    ----------
+    url
+        Of the page.
+    port
+        It was given, or found free.
+    requests
+        Paths answered so far, in order.
+    """
+
+    url: str
+    port: int
+    requests: list[str]
+    _ended: threading.Event
+
+    def wait(self, seconds: float | None = None) -> None:
+        """Wait until the server is closed, or for so long."""
+        self._ended.wait(seconds)
+
+
+@contextmanager
+def serve(html: bytes, *, pyramid: Pyramid | None = None, port: int = 0) -> Iterator[Served]:
+    """Serve a page, and the tiles of a displacement, until the block ends.
+
+    Parameters
+    ----------
+    html : bytes
+        The page.
+    pyramid : Pyramid, optional
+        Answered at ``/tiles/LEVEL/ROW/COLUMN``.
+    port : int
+        0 chooses a free one.
+
+    Raises
+    ------
+    ServerError
+        The port is no number of one, or taken.
+    """
+    if not 0 <= port <= 65535:
+        raise ServerError(f"port: got {port}, expected 0 to 65535")
+    requests: list[str] = []
+
+    class Handler(_Handler):
+        pass
+
+    Handler.html, Handler.pyramid, Handler.requests = html, pyramid, requests
+    try:
+        server = ThreadingHTTPServer((LOOPBACK, port), Handler)
+    except OSError as error:
+        raise ServerError(
+            f"port: {port} cannot be used ({error.strerror}); choose another, or 0 for a free one"
+        ) from error
+    server.daemon_threads = True
+    number = int(server.server_address[1])
+    Handler.hosts = frozenset(f"{name}:{number}" for name in (LOOPBACK, "localhost"))
+    ended = threading.Event()
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1})
+    thread.start()
+    try:
+        yield Served(f"http://{LOOPBACK}:{number}/", number, requests, ended)
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+        ended.set()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answer for the page and its tiles alone."""
+
+    html: bytes
+    pyramid: Pyramid | None
+    requests: list[str]
+    hosts: frozenset[str]
+    protocol_version = "HTTP/1.1"
+    server_version = "skinrig"
+    sys_version = ""
+    timeout = TIMEOUT_S
+
+    def do_GET(self) -> None:
+        """Answer with the body."""
+        self._answer(body=True)
+
+    def do_HEAD(self) -> None:
+        """Answer without the body."""
+        self._answer(body=False)
+
+    def _answer(self, *, body: bool) -> None:
+        status, kind, content = self._content()
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+        self.send_header("Cross-Origin-Opener-Policy", "same-origin")
+        self.send_header("Referrer-Policy", "no-referrer")
+        self.send_header("X-Frame-Options", "DENY")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        if body:
+            self.wfile.write(content)
+
+    def _content(self) -> tuple[HTTPStatus, str, bytes]:
+        text = "text/plain; charset=utf-8"
+        if self.headers.get("Host") not in self.hosts:
+            return HTTPStatus.FORBIDDEN, text, b"this server answers to its own address only\n"
+        if self.path == "/":
+            self.requests.append(self.path)
+            return HTTPStatus.OK, "text/html; charset=utf-8", self.html
+        found = PATH.fullmatch(self.path)
+        if found is not None and self.pyramid is not None:
+            try:
+                tile = self.pyramid.tile(*(int(part) for part in found.groups()))
+            except TileError as error:
+                return HTTPStatus.NOT_FOUND, text, f"{error}\n".encode()
+            self.requests.append(self.path)
+            return HTTPStatus.OK, "application/octet-stream", tile
+        return HTTPStatus.NOT_FOUND, text, b"there is nothing at this path\n"
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing: the page's own address was told already."""

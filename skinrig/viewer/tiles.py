@@ -1,0 +1,194 @@
+"""A displacement too large for a page or a graphics card: levels that halve, cut into tiles.
+
+Level 0 is the file itself, read where it lies; coarser levels are means of two by two pixels,
+written once into a folder of their own. A tile is 16-bit words over the range of the whole map, so
+that its error is known before it is fetched.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+
+TILE_PX: Final = 256
+LEAST_PX: Final = 512
+"""Side of the smallest map, and of the coarsest level at least."""
+MOST_LEVELS: Final = 8
+ROWS: Final = 512
+"""Rows of a level that are read at a time."""
+WORDS: Final = 65535
+
+
+class TileError(ValueError):
+    """A displacement that cannot be cut into tiles, or a tile that is not there."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pyramid:
+    """Levels of a displacement.
+
+    Attributes
+    ----------
+    levels : tuple of ndarray or memory map, shape (S / 2^level,) * 2
+        Heights, um, row 0 at the top (v = 1).
+    low, high : float
+        Range of level 0, um; coarser levels lie within.
+    """
+
+    levels: tuple[Any, ...]
+    low: float
+    high: float
+
+    @property
+    def size(self) -> int:
+        """Pixels a side of level 0."""
+        return int(self.levels[0].shape[0])
+
+    @property
+    def step_um(self) -> float:
+        """Height between two words of a tile; the largest error of a tile is half of it."""
+        return (self.high - self.low) / WORDS
+
+    def tile(self, level: int, row: int, column: int) -> bytes:
+        """Return a tile as little-endian words, `TILE_PX` squared, row 0 at the top.
+
+        Parameters
+        ----------
+        level
+            0 is the finest.
+        row, column
+            Of the tile, from the upper left.
+
+        Returns
+        -------
+        bytes
+            Word 0 stands for `low`, 65535 for `high`.
+
+        Raises
+        ------
+        TileError
+            There is no such tile.
+        """
+        if not 0 <= level < len(self.levels):
+            raise TileError(f"level: got {level}, expected 0 to {len(self.levels) - 1}")
+        source = self.levels[level]
+        count = source.shape[0] // TILE_PX
+        if not (0 <= row < count and 0 <= column < count):
+            raise TileError(f"tile: got row {row}, column {column}, expected 0 to {count - 1}")
+        part = np.asarray(
+            source[row * TILE_PX : (row + 1) * TILE_PX, column * TILE_PX : (column + 1) * TILE_PX],
+            np.float64,
+        )
+        spread = self.high - self.low or 1.0
+        words = np.rint(np.clip((part - self.low) / spread, 0.0, 1.0) * WORDS)
+        return words.astype("<u2").tobytes()
+
+
+def build(source: Any, folder: Path) -> Pyramid:
+    """Cut a displacement into levels.
+
+    Parameters
+    ----------
+    source : array or memory map, shape (S, S)
+        Heights, um, finite; S is `LEAST_PX` times a power of two.
+    folder : Path
+        For the coarser levels; made, and replaced where one is there. A third of the file's size.
+
+    Raises
+    ------
+    TileError
+        For another shape, or heights that are not finite.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as name:
+    ...     made = build(np.ones((1024, 1024), np.float32), Path(name) / "levels")
+    ...     made.size, len(made.levels), len(made.tile(1, 0, 1))
+    (1024, 2, 131072)
+    """
+    shape = tuple(int(side) for side in np.shape(source))
+    if len(shape) != 2 or shape[0] != shape[1] or not _fits(shape[0]):
+        raise TileError(
+            f"displacement: got shape {shape}, expected a square with sides of {LEAST_PX} px times "
+            "a power of two (such as 4096 or 16384)"
+        )
+    low, high = _range(source)
+    part = folder.with_name(f".{folder.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    try:
+        level, number = source, 1
+        while level.shape[0] > LEAST_PX and number < MOST_LEVELS:
+            level = _halved(level, part / f"level_{number}.npy")
+            number += 1
+        shutil.rmtree(folder, ignore_errors=True)
+        os.replace(part, folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    coarser = [
+        np.load(folder / f"level_{k}.npy", mmap_mode="r", allow_pickle=False)
+        for k in range(1, number)
+    ]
+    return Pyramid((source, *coarser), low, high)
+
+
+def open_displacement(path: Path, folder: Path) -> Pyramid:
+    """Return the levels of a displacement file.
+
+    Parameters
+    ----------
+    path : Path
+        A .npy file of float32, um, as `skinrig apply microstructure` writes; it is not read whole.
+    folder : Path
+        As of `build`.
+
+    Raises
+    ------
+    TileError
+        For a file of another kind, and as of `build`.
+    """
+    try:
+        source = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise TileError(f"{path}: not a .npy file of heights: {error}") from error
+    if not isinstance(source, np.ndarray) or source.dtype.kind != "f":
+        kind = getattr(source, "dtype", type(source).__name__)
+        raise TileError(f"{path}: got {kind}, expected an array of float32 heights, um")
+    return build(source, folder)
+
+
+def _fits(side: int) -> bool:
+    return side >= LEAST_PX and side % LEAST_PX == 0 and (side & (side - 1)) == 0
+
+
+def _range(source: Any) -> tuple[float, float]:
+    low, high = np.inf, -np.inf
+    for top in range(0, source.shape[0], ROWS):
+        rows = np.asarray(source[top : top + ROWS])
+        if not np.isfinite(rows).all():
+            raise TileError(
+                f"displacement: got NaN or infinity in rows {top} to {top + len(rows) - 1}, "
+                "expected finite heights; fill holes first"
+            )
+        low, high = min(low, float(rows.min())), max(high, float(rows.max()))
+    return low, high
+
+
+def _halved(source: Any, path: Path) -> Any:
+    side = source.shape[0] // 2
+    target = np.lib.format.open_memmap(path, "w+", np.float32, (side, side))
+    for top in range(0, side, ROWS):
+        rows = np.asarray(source[2 * top : 2 * (top + ROWS)], np.float64)
+        blocks = rows.reshape(rows.shape[0] // 2, 2, side, 2)
+        target[top : top + ROWS] = blocks.mean(axis=(1, 3))
+    target.flush()
+    return target
