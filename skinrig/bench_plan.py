@@ -1,7 +1,7 @@
 """Which stages fit into a budget at full size, once all were measured at their small one.
 
-Without names `skinrig bench` measures every stage: first at its small size, which takes about a
-second each, so that none is missing; then, the quickest first, at full size as long as the
+Without names `skinrig bench` measures every stage: first at its small size, which takes
+1 to 18 seconds, so that none is missing; then, the quickest first, at full size as long as the
 budget lasts. Limits are promises about full sizes and are judged at no other.
 """
 
@@ -51,6 +51,19 @@ class Pace:
         return SPARE * self.factor * told_s <= left_s
 
 
+def in_order(names: Iterable[str]) -> list[str]:
+    """Return stages in the order of their small sizes, those that take about a second first.
+
+    Then a budget that is too small for all leaves the fewest out.
+
+    Examples
+    --------
+    >>> in_order(["traits", "hdr", "normals"])
+    ['hdr', 'normals', 'traits']
+    """
+    return sorted(names, key=lambda name: SMALL_S.get(name, 1.0))
+
+
 def quickest_first(names: Iterable[str], seconds: Mapping[str, float]) -> list[tuple[str, float]]:
     """Return stages with what each should take at full size, the quickest first.
 
@@ -63,6 +76,17 @@ def quickest_first(names: Iterable[str], seconds: Mapping[str, float]) -> list[t
         ((name, seconds.get(name, UNKNOWN_S)) for name in names), key=lambda pair: pair[1]
     )
 
+
+SMALL_S: Final[dict[str, float]] = {
+    "brdf": 2, "brdf-space": 2, "dome-lights": 2, "perfusion-curves": 2, "photon-transport": 2,
+    "subsurface-fit": 2, "texture-fill": 2, "wrinkles": 2, "chromophores": 3, "efficiency": 3,
+    "expression-alignment": 3, "fibre-readings": 3, "microstructure": 3, "render-flash": 3,
+    "texture-matching": 3, "reflectance": 4, "shared-melanin": 4, "head-motion": 6,
+    "normal-integration": 7, "dome-geometry": 8, "render-model": 8, "sphere-lights": 8,
+    "render-dome": 9, "editing": 10, "traits": 10, "gradient-normals": 13, "probe-session": 14,
+    "render-gradient": 18,
+}  # fmt: skip
+"""Processor seconds at small size of the stages that take more than about one."""
 
 FULL_S: Final[dict[str, float]] = {
     "light-order": 1, "wrinkle-weights": 3, "anisotropy": 4, "translucency": 6,

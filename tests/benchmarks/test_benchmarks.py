@@ -127,7 +127,7 @@ def slower_and_worse(stage):
         (lambda s: s["points"][0].update(error_interval=[0.0, 0.0]), "outside interval"),
         (lambda s: s.update(by_band=[]), "neither bands of skin nor a reason"),
         (lambda s: s["by_band"].reverse(), "bands "),
-        (lambda s: s["points"][0].update(efficiency=1.0), "efficiency without bound"),
+        (lambda s: s["points"][0].update(efficiency=None), "efficiency without bound"),
     ],
 )
 def test_the_check_finds_what_is_spoiled(sound, spoil, expected):
