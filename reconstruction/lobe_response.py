@@ -193,13 +193,17 @@ def frame_of(view: ArrayLike) -> Floats:
 def normal_at(place: Floats) -> Floats:
     """Return the unit normals (..., 3) at places (..., 2), in the frame of the view.
 
+    The horizon is at a length of sqrt(2); places beyond it have the normal of the horizon there.
+
     Examples
     --------
     >>> normal_at(np.array([1.0, 0.0])).round(4).tolist()
     [0.866, 0.0, 0.5]
     """
-    square = np.minimum(np.sum(place**2, axis=-1, keepdims=True), 2.0)
-    return np.concatenate([place * np.sqrt(1.0 - square / 4.0), 1.0 - square / 2.0], axis=-1)
+    length = np.hypot(place[..., :1], place[..., 1:])
+    seen = place * np.minimum(1.0, np.sqrt(2.0) / np.maximum(length, 1e-9))
+    square = np.minimum(length, np.sqrt(2.0)) ** 2
+    return np.concatenate([seen * np.sqrt(1.0 - square / 4.0), 1.0 - square / 2.0], axis=-1)
 
 
 def place_of(normal: Floats) -> Floats:

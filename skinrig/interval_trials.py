@@ -189,13 +189,8 @@ def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Ite
         _forget(folder, done)
 
 
-def dome(
-    folder: Path, subjects: Mapping[int, str], *, width_px: int, lights: int, views: int
-) -> Iterator[Trial]:
-    """Yield trials of normals and diffuse albedo of faces.
-
-    Parameters as of `flash`; `lights` and `views` say how many of the dome's are used.
-    """
+def dome(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterator[Trial]:
+    """Yield trials of normals and diffuse albedo of faces; parameters as of `flash`."""
     from skinrig import surface_evaluation
 
     for target in ("charuco", "mirror", "white"):
@@ -205,8 +200,6 @@ def dome(
             target=target,
             seed=900,
             width_px=width_px,
-            lights=lights,
-            views=views,
         )
     calibrate("geometry", [folder / "session-charuco"], folder / "calibration")
     calibrate(
@@ -220,8 +213,6 @@ def dome(
             subject=preset,
             seed=seed,
             width_px=width_px,
-            lights=lights,
-            views=views,
         )
         pipeline.reconstruct(
             done.session, want=["normals", "r_d"], out=folder / "maps",

@@ -1,0 +1,347 @@
+"""Spectra, color tables, chromophores, lobes and error measures over their declared domains."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from model import color_table, merl, metrics, microfacet, skin_reflectance, spectra
+from model.tissue_optics import ANISOTROPY_SKIN
+from reconstruction import (
+    chromophore_posterior,
+    chromophores,
+    detectability,
+    lobe_response,
+    polarization,
+    relief_errors,
+    shading_prior,
+    tsumura,
+)
+
+CHEAP = settings(derandomize=True, deadline=None, max_examples=40, database=None)
+FEW = settings(CHEAP, max_examples=10)
+
+SHARE = st.floats(0.0, 1.0)
+ANY_FLOAT = st.floats(allow_nan=True, allow_infinity=True)
+FINITE = st.floats(-1e100, 1e100)
+VECTOR = st.tuples(*[st.floats(-1.0, 1.0)] * 3)
+
+
+@pytest.fixture(scope="module")
+def table():
+    return color_table.build("Nikon 5100 (NPL)", "D55", size=32, anisotropy=ANISOTROPY_SKIN)
+
+
+def unit(vector):
+    length = np.linalg.norm(vector)
+    assume(length > 1e-3)
+    return np.asarray(vector) / length
+
+
+@CHEAP
+@given(a=VECTOR, b=VECTOR, scale=st.floats(1e-100, 1e100))
+def test_an_angle_knows_no_length_and_no_order(a, b, scale):
+    assume(np.linalg.norm(a) > 1e-3)
+    assume(np.linalg.norm(b) > 1e-3)
+    found = metrics.angular_error_rad(a, b)
+    assert 0.0 <= found <= np.pi
+    assert metrics.angular_error_rad(b, a) == pytest.approx(float(found), abs=1e-9)
+    longer = metrics.angular_error_rad(scale * np.asarray(a), b)
+    assert longer == pytest.approx(float(found), abs=1e-9)
+    assert np.isnan(metrics.angular_error_rad([0, 0, 0], b))
+
+
+@CHEAP
+@given(first=st.tuples(st.floats(0, 100), *[st.floats(-120, 120)] * 2),
+       second=st.tuples(st.floats(0, 100), *[st.floats(-120, 120)] * 2))  # fmt: skip
+def test_a_color_difference_is_none_to_itself_and_alike_both_ways(first, second):
+    there = metrics.delta_e_2000(first, second)
+    assert np.isfinite(there)
+    assert there >= 0.0
+    assert metrics.delta_e_2000(second, first) == pytest.approx(float(there), rel=1e-6, abs=1e-9)
+    assert metrics.delta_e_2000(first, first) == 0.0
+
+
+@CHEAP
+@given(lightness=st.floats(0.0, 100.0), b_star=st.floats(1e-300, 100.0))
+def test_the_typology_angle_rises_with_lightness(lightness, b_star):
+    angle = metrics.individual_typology_angle_deg([lightness, lightness + 1.0], b_star)
+    assert np.all((angle >= -90.0) & (angle <= 90.0))
+    assert angle[1] >= angle[0]
+
+
+@CHEAP
+@given(values=st.lists(ANY_FLOAT, max_size=30), level=st.floats(0.01, 0.99))
+def test_coverage_counts_finite_trials_only_and_lies_in_its_interval(values, level):
+    found = metrics.coverage(values, 1.0, 0.0, level=level)
+    assert found.count == int(np.isfinite(values).sum())
+    if found.count:
+        assert 0.0 <= found.interval[0] <= found.share <= found.interval[1] <= 1.0
+    else:
+        assert np.isnan(found.share)
+
+
+@CHEAP
+@given(values=st.lists(ANY_FLOAT, max_size=30), seed=st.integers(0, 99))
+def test_a_median_lies_in_its_interval_and_among_the_values(values, seed):
+    finite = [v for v in values if np.isfinite(v)]
+    rng = np.random.default_rng(seed)
+    median, (low, high) = metrics.median_with_interval(np.clip(values, -1e300, 1e300), rng=rng)
+    known = [v for v in values if not np.isnan(v)]
+    if not known:
+        assert np.isnan(median)
+    elif len(finite) == len(known):
+        assert min(finite) <= low <= high <= max(finite)
+        assert min(finite) <= median <= max(finite)
+
+
+@CHEAP
+@given(wavelength=st.lists(st.floats(380.0, 780.0), min_size=1, max_size=5))
+@pytest.mark.parametrize(
+    "spectrum",
+    [
+        spectra.hemoglobin_extinction, spectra.eumelanin_absorption,
+        spectra.pheomelanin_absorption, spectra.baseline_absorption, spectra.reduced_scattering,
+        spectra.color_matching_functions,
+    ],
+)  # fmt: skip
+def test_a_spectrum_is_not_negative_and_takes_wavelengths_one_by_one(spectrum, wavelength):
+    found = np.asarray(spectrum(wavelength))
+    assert np.all(np.isfinite(found) & (found >= 0.0))
+    one = np.asarray(spectrum([wavelength[0]]))
+    many = found[..., 0] if spectrum is spectra.hemoglobin_extinction else found[0]
+    np.testing.assert_array_equal(np.squeeze(one), np.squeeze(many))
+
+
+@FEW
+@given(camera=st.sampled_from(spectra.camera_names()),
+       light=st.sampled_from(spectra.illuminant_names()), level=SHARE)  # fmt: skip
+def test_an_even_reflectance_has_no_color_under_any_light(camera, light, level):
+    found = spectra.band_average(np.full(31, level), camera, light)
+    np.testing.assert_allclose(found, level, atol=1e-9)
+    weights = spectra.band_weights(camera, light)
+    np.testing.assert_allclose(weights.sum(axis=0), 1.0, atol=1e-9)
+    assert spectra.camera_white(camera, light).max() == pytest.approx(1.0)
+    assert np.all(spectra.illuminant(light) >= 0.0)
+    assert spectra.camera_sensitivity(camera).shape == (spectra.WAVELENGTH_NM.size, 3)
+
+
+@FEW
+@given(nodes=st.integers(2, 200))
+def test_axes_of_color_tables_rise_from_nothing(nodes):
+    for axis in color_table.spectral_axes(nodes):
+        assert axis[0] == 0.0
+        assert np.all(np.diff(axis) > 0.0)
+
+
+CHROMOPHORES = st.tuples(st.floats(0.005, 0.2), st.floats(0.01, 0.2))
+
+
+@FEW
+@given(truth=CHROMOPHORES)
+def test_chromophores_of_a_clean_color_come_back(table, truth):
+    rgb = table.lookup(*truth).astype(np.float32)[None, None]
+    kept = rgb.copy()
+    found = chromophores.invert(rgb, table, shading="known")
+    np.testing.assert_array_equal(rgb, kept)
+    if found.valid[0, 0]:
+        assert found.melanin[0, 0] == pytest.approx(truth[0], rel=0.05)
+        assert found.hemoglobin[0, 0] == pytest.approx(truth[1], rel=0.25)
+    free = chromophores.invert(0.5 * rgb, table)
+    twice = chromophores.invert(rgb, table)
+    if free.valid[0, 0] and twice.valid[0, 0]:
+        # a shading is no chromophore
+        moved = abs(free.melanin[0, 0] - twice.melanin[0, 0])
+        assert moved <= 0.3 * twice.stderr_melanin[0, 0]
+
+
+COLOR = st.lists(
+    st.one_of(st.floats(width=32, allow_nan=True, allow_infinity=True), SHARE.map(np.float32)),
+    min_size=3, max_size=3,
+)  # fmt: skip
+
+
+@CHEAP
+@given(pixels=st.lists(COLOR, min_size=0, max_size=4), free=st.booleans())
+def test_chromophores_of_any_pixels_are_numbers_or_masked(table, pixels, free):
+    rgb = np.asarray(pixels, np.float32).reshape(1, len(pixels), 3)
+    kept = rgb.copy()
+    found = chromophores.invert(rgb, table, shading=None if free else "known")
+    np.testing.assert_array_equal(rgb, kept)
+    for name in ("melanin", "hemoglobin", "stderr_melanin", "stderr_hemoglobin", "residual"):
+        assert np.isfinite(getattr(found, name)[found.valid]).all(), name
+    assert not found.valid[~np.isfinite(rgb).all(axis=-1)].any()
+    weighed = chromophore_posterior.weigh(rgb, table, prior=shading_prior.of_faces())
+    assert not weighed.valid[~np.isfinite(rgb).all(axis=-1)].any()
+    for name in ("melanin", "hemoglobin", "stderr_melanin", "stderr_hemoglobin"):
+        assert np.isfinite(getattr(weighed, name)[weighed.valid]).all(), name
+
+
+@FEW
+@given(noise=st.floats(1e-4, 0.1))
+def test_more_noise_leaves_chromophores_less_identifiable(table, noise):
+    found = [
+        chromophores.identifiability(table, shading="known", variance=lambda c, n=n: (n * c) ** 2)
+        for n in (noise, 2.0 * noise)
+    ]
+    for name in ("stderr_melanin", "stderr_hemoglobin"):
+        fine, coarse = (np.asarray(getattr(each, name), float) for each in found)
+        both = np.isfinite(fine) & np.isfinite(coarse)
+        assert np.all(coarse[both] >= fine[both] * (1.0 - 1e-6))
+
+
+@CHEAP
+@given(values=st.lists(st.floats(-1.0, 1.0), min_size=9, max_size=9))
+def test_an_error_common_to_the_channels_weighs_no_color(values):
+    root = np.array(values).reshape(3, 3)
+    plane = np.eye(3) - 1.0 / 3.0
+    covariance = plane @ root @ root.T @ plane + 1e-4 * plane
+    found = chromophores.without_brightness(covariance)
+    assert np.linalg.eigvalsh(found).min() > 0.0
+    # colors without brightness are as uncertain as before
+    np.testing.assert_allclose(plane @ found @ plane, covariance, atol=1e-12)
+    again = chromophores.model_covariance(covariance, default_noise=False)
+    assert np.isfinite(again).all()
+
+
+@CHEAP
+@given(center=st.floats(-2.0, 0.5), spread=st.floats(0.05, 1.0))
+def test_a_lognormal_prior_has_its_mean_and_spread(center, spread):
+    prior = shading_prior.lognormal(np.exp(center), spread)
+    assert prior.spread == pytest.approx(spread, rel=0.05)
+    assert prior.broadened(1.5).spread >= prior.spread * (1.0 - 1e-9)
+    assert np.isfinite(prior.mean)
+    assert np.all(np.diff(prior.nodes) > 0.0)
+
+
+@CHEAP
+@given(counts=st.lists(st.integers(0, 1000), min_size=3, max_size=40), low=st.floats(-3.0, 0.0))
+def test_a_prior_of_samples_lies_where_they_do(counts, low):
+    assume(sum(counts) > 0)
+    prior = shading_prior.from_samples(low, 0.05, counts)
+    assert prior.nodes[0] <= prior.mean <= prior.nodes[-1]
+
+
+@CHEAP
+@given(cosine=st.floats(-1.0, 1.0), exitance=st.floats(0.0, 1e100))
+def test_skin_gives_back_no_more_than_left_it(cosine, exitance):
+    share = skin_reflectance.transmitted(cosine)
+    assert 0.0 <= share <= 1.0
+    radiance = skin_reflectance.leaving_radiance(np.full(3, exitance), cosine)
+    assert np.all(radiance >= 0.0)
+    assert np.all(radiance <= exitance / np.pi * (1.0 + 1e-12))
+
+
+KIND = st.sampled_from(["ggx", "beckmann"])
+
+
+@FEW
+@given(roughness=st.floats(0.05, 1.0), kind=KIND)
+def test_facets_cover_the_surface_once(roughness, kind):
+    theta = (np.arange(20_000) + 0.5) / 20_000 * np.pi / 2
+    cosine, sine = np.cos(theta), np.sin(theta)
+    density = microfacet.facet_density(cosine, roughness, kind)
+    assert np.all(np.isfinite(density) & (density >= 0.0))
+    area = 2.0 * np.pi * np.sum(density * cosine * sine) * np.pi / 2 / theta.size
+    assert area == pytest.approx(1.0, rel=1e-3)
+
+
+@CHEAP
+@given(light=SHARE, view=SHARE, half=SHARE, turn=SHARE, roughness=st.floats(1e-3, 1.0),
+       eta=st.floats(1.01, 2.0), kind=KIND)  # fmt: skip
+def test_a_lobe_is_the_same_both_ways_and_never_negative(
+    light, view, half, turn, roughness, eta, kind
+):
+    there, back = (
+        microfacet.brdf(a, b, half, turn, roughness=roughness, eta=eta, kind=kind)
+        for a, b in ((light, view), (view, light))
+    )
+    assert np.isfinite(there)
+    assert there >= 0.0
+    np.testing.assert_allclose(there, back, rtol=1e-9)
+    seen = microfacet.visibility(light, view, roughness, kind)
+    assert np.isfinite(seen)
+    assert seen >= 0.0
+
+
+@CHEAP
+@given(light=VECTOR, view=VECTOR)
+def test_half_and_difference_angles_come_back_as_directions(light, view):
+    light, view = unit(light), unit(view)
+    light[2], view[2] = abs(light[2]), abs(view[2])
+    up = np.array([0.0, 0.0, 1.0])
+    assume(np.linalg.norm(light + view) > 1e-3)
+    angles = merl.to_angles(light, view, up)
+    again = merl.to_angles(*merl.to_directions(*angles), up)
+    np.testing.assert_allclose(again[:2], angles[:2], atol=1e-6)
+    for place, centers in zip(merl.bins(*angles), merl.bin_centers(), strict=True):
+        assert 0 <= place < centers.size
+
+
+@FEW
+@given(seed=st.integers(0, 999), size=st.sampled_from([1, 3, 5, 9]), scale=st.sampled_from([1e-30, 1.0, 1e30]))
+def test_what_is_detectable_knows_no_unit(seed, size, scale):
+    rng = np.random.default_rng(seed)
+    estimate, stderr = rng.standard_normal((12, 10)), rng.uniform(0.1, 3.0, (12, 10))
+    valid = rng.uniform(size=(12, 10)) > 0.2
+    first = detectability.detectable(estimate, stderr, valid, size_px=size)
+    scaled = detectability.detectable(scale * estimate, scale * stderr, valid, size_px=size)
+    np.testing.assert_array_equal(first, scaled)
+    assert first.dtype == bool
+
+
+@CHEAP
+@given(diffuse=st.floats(0.0, 1e6), specular=st.floats(0.0, 1e6))
+def test_polarized_pictures_are_parted_into_what_they_were_made_of(diffuse, specular):
+    parallel = np.full((2, 3, 3), specular + 0.5 * diffuse)
+    crossed = np.full((2, 3, 3), 0.5 * diffuse)
+    found = polarization.separate(parallel, crossed)
+    good = found.valid
+    np.testing.assert_allclose(found.diffuse[good], diffuse, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.specular[good], specular, rtol=1e-6, atol=1e-9 * diffuse)
+
+
+@FEW
+@given(seed=st.integers(0, 99), scale=st.floats(0.1, 10.0))
+def test_independent_components_of_a_picture_know_no_exposure(seed, scale):
+    rng = np.random.default_rng(seed)
+    pigment = rng.uniform(0.1, 1.0, (2, 24, 24))
+    absorb = np.array([[0.2, 0.6, 1.1], [0.1, 0.9, 0.4]])
+    rgb = np.exp(-np.tensordot(pigment, absorb, axes=(0, 0)))
+    valid = np.ones((24, 24), bool)
+    found, other = (tsumura.tsumura_ica(k * rgb, valid) for k in (1.0, scale))
+    for name in type(found).__slots__:
+        value, again = getattr(found, name), getattr(other, name)
+        if isinstance(value, np.ndarray) and value.shape[:2] == (24, 24) and value.dtype != bool:
+            assert np.isfinite(value).all()
+            assert np.isfinite(again).all()
+
+
+@CHEAP
+@given(place=st.tuples(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2)), view=VECTOR)
+def test_places_of_normals_come_back(place, view):
+    at = np.array(place)
+    normal = lobe_response.normal_at(at)
+    assert np.linalg.norm(normal) == pytest.approx(1.0)
+    if normal[2] > 0.05:
+        np.testing.assert_allclose(lobe_response.place_of(normal), at, atol=1e-6)
+    frame = lobe_response.frame_of(unit(view))
+    np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-9)
+
+
+@CHEAP
+@given(seed=st.integers(0, 999), scale=st.sampled_from([1e-30, 1.0, 1e30]))
+def test_model_errors_of_a_relief_only_widen_and_scale_with_it(seed, scale):
+    rng = np.random.default_rng(seed)
+    height = (scale * rng.standard_normal((6, 5))).astype(np.float32)
+    stderr = (scale * rng.uniform(0.01, 1.0, (6, 5))).astype(np.float32)
+    valid = rng.uniform(size=(6, 5)) > 0.3
+    found = relief_errors.of_height(height, stderr, valid)
+    assert np.all(found >= stderr)
+    np.testing.assert_array_equal(found[~valid], stderr[~valid])
+    normals = rng.standard_normal((6, 5, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    angles = rng.uniform(0.01, 1.0, (6, 5)).astype(np.float32)
+    wider = relief_errors.of_normals(normals, angles, valid)
+    assert np.all(wider >= angles)
+    np.testing.assert_array_equal(relief_errors.of_normals(normals, angles, valid & False), angles)
