@@ -76,7 +76,7 @@ def _full() -> Mapping[str, Callable[[Path], Trials]]:
     return {
         "flash": lambda folder: interval_trials.flash(folder, flash, width_px=768),
         "gradient": lambda folder: interval_trials.gradient(folder, sites, width_px=128),
-        "dome": lambda folder: interval_trials.dome(folder, faces, width_px=200),
+        "dome": lambda folder: interval_trials.dome(folder, faces, width_px=320),
         "probe": lambda folder: interval_trials.probe(folder, media),
     }
 

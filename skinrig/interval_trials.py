@@ -32,9 +32,11 @@ RAYLEIGH_68: Final = float(np.sqrt(-2.0 * np.log(1.0 - 0.6827)))
 BLOOD_STATES: Final = ("smile", "anger", "fear", "exercise")
 FACTORS_95: Final[Mapping[str, float]] = {
     "melanin": 2.7, "hemoglobin": 2.7, "height": 2.1, "normals of the gradient sphere": 1.9,
+    "normals of the dome": 1.9, "R_d, red": 2.9, "R_d, green": 2.9, "R_d, blue": 2.9,
 }  # fmt: skip
 """Half width of a 95 % interval over that of the 68 % one where tails are heavier than a
-Gaussian's, to 0.1, set on seeds 0 to 19, which are not judged; others are `GAUSSIAN_95`, of angles
+Gaussian's, to 0.1, set on subjects that are not judged: 14 of the flash rig and 6 patches of seeds
+0 to 13, and the one face of the dome's demonstration. Others are `GAUSSIAN_95`, of angles
 `RAYLEIGH_95`."""
 
 
