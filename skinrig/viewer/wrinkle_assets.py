@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from model.texture_resampling import resampled
 from model.wrinkle_expressions import as_table
 from model.wrinkle_model import FILE, WrinkleModel
-from model.wrinkles import Layer, mask_textures
+from model.wrinkles import Layer, decode, encode, mask_textures
 from skinrig.viewer.facial_color_assets import filled
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
@@ -27,6 +27,8 @@ Float32 = NDArray[np.float32]
 MAP_PX: Final = 512
 """Side of wrinkle maps, at most: half a millimeter of a face; the paper has 256."""
 MASK_PX: Final = 64
+WEIGHTS_PX: Final = 128
+"""Side of the normals that the zones' weights are found on."""
 ZONES: Final = 8
 """Of each wrinkle map, in two RGBA textures."""
 MOST_LAYERS: Final = 4
@@ -81,7 +83,19 @@ def simulated_model(subject: Subject, *, size: int) -> WrinkleModel:
         amplitudes(neutral, posed, size=(few, few)), zones=ZONES,
         rng=np.random.default_rng(subject.seed),
     )  # fmt: skip
-    return fit(neutral, posed, zones.masks, size=(size, size)).model()
+    # weights hardly depend on detail: found on coarse normals, then one map is fitted to them
+    coarse = (min(WEIGHTS_PX, size),) * 2
+    rough = fit(
+        _coarser(neutral, coarse), {name: _coarser(n, coarse) for name, n in posed.items()},
+        zones.masks, size=coarse,
+    )  # fmt: skip
+    table = as_table(rough.model().layers[0].table)
+    return fit(neutral, posed, zones.masks, size=(size, size), table=table).model()
+
+
+def _coarser(normals: Float32, shape: tuple[int, int]) -> Float32:
+    planes = np.moveaxis(encode(normals, limit=None), 2, 0)
+    return np.asarray(decode(np.moveaxis(resampled(planes, shape), 0, 2)), np.float32)
 
 
 def from_model(model: WrinkleModel, source: SceneSource, *, origin: str) -> Assets:
