@@ -12,7 +12,7 @@ from typing import Any
 from capture.session import Session
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from reconstruction import stages
+from reconstruction import stage_record, stages
 from reconstruction.evidence import Evidence, EvidenceError
 from reconstruction.hold_out import HoldOut
 
@@ -203,7 +203,9 @@ def reconstruct(
     ]
     previous = _previous(Path(out))
     outcome = stages.run(graph, list(want), cache=_Kept(graph, previous), progress=progress)
-    outcome = replace(outcome, assumed=tuple(evidence.assumed))
+    earlier = {} if previous is None else _recorded_keys(previous)
+    work = stage_record.record(graph, outcome, _made_keys(graph, previous, earlier))
+    outcome = replace(outcome, assumed=tuple(evidence.assumed), work=work)
     # what the subject agreed to goes wherever the maps go
     consent = [opened.manifest.to_json()["subject"]] if opened.source == "measured" else []
     current = previous is not None and previous.parameters.get("consent", []) == consent
@@ -234,6 +236,7 @@ def reconstruct(
             "state": state,
             "truth": truth,
             "stages": {stage.name: keys[stage.name] for stage in graph},
+            "work": [dict(entry) for entry in work],
             "assumed": evidence.assumed,
             "consent": consent,
             "noted": sorted(noted),
@@ -284,6 +287,17 @@ def _contents(appearance: SkinAppearance) -> dict[str, SkinMap | bytes]:
 def _recorded_keys(appearance: SkinAppearance) -> dict[str, str]:
     recorded = appearance.parameters.get("stages", {})
     return {str(k): str(v) for k, v in recorded.items()} if isinstance(recorded, dict) else {}
+
+
+def _made_keys(
+    graph: Sequence[stages.Stage], previous: SkinAppearance | None, recorded: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the input hashes of the stages that an appearance holds something of."""
+    if previous is None:
+        return {}
+    before = _contents(previous)
+    made = {stage.name for stage in graph if any(name in before for name in stage.makes)}
+    return {name: key for name, key in recorded.items() if name in made}
 
 
 def _all_keys(graph: Sequence[stages.Stage]) -> dict[str, str]:

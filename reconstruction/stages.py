@@ -69,6 +69,8 @@ class Outcome:
     """Input hash of each stage that was needed."""
     assumed: tuple[str, ...] = ()
     """What was taken for granted for want of a calibration."""
+    work: tuple[Mapping[str, str], ...] = ()
+    """What became of each stage and why, see `reconstruction.stage_record.record`."""
 
 
 def order(stages: Sequence[Stage], want: Iterable[str]) -> list[Stage]:

@@ -1,0 +1,117 @@
+"""Which stages ran, were reused or skipped, and that asking again costs nothing."""
+
+import json
+
+import numpy as np
+import pytest
+
+from reconstruction import stage_record, stages
+from reconstruction.stages import Stage
+
+
+class Memory:
+    """A cache that keeps everything."""
+
+    def __init__(self):
+        self.kept = {}
+
+    def load(self, key):
+        return self.kept.get(key)
+
+    def save(self, key, products):
+        self.kept[key] = dict(products)
+
+
+def graph(gain=2.0):
+    return [
+        Stage("frames", (), ("light",), lambda: {"light": np.ones(3)}),
+        Stage(
+            "separate", ("light",), ("diffuse",), lambda light: {"diffuse": gain * light},
+            {"gain": gain},
+        ),
+        Stage("invert", ("diffuse",), ("melanin",), lambda diffuse: {"melanin": diffuse.sum()}),
+        Stage("draw", ("diffuse",), ("picture",), lambda diffuse: {"picture": diffuse}),
+    ]  # fmt: skip
+
+
+def done(entries):
+    return {entry["stage"]: entry["done"] for entry in entries}
+
+
+def why(entries):
+    return {entry["stage"]: entry["why"] for entry in entries}
+
+
+def test_what_nothing_wanted_needs_is_skipped():
+    outcome = stages.run(graph(), ["melanin"])
+    entries = stage_record.record(graph(), outcome, {})
+    assert done(entries) == {
+        "frames": "run", "separate": "run", "invert": "run", "draw": "skipped"
+    }  # fmt: skip
+    assert why(entries)["draw"] == "nothing wanted depends on it"
+    assert why(entries)["invert"] == "it was not made before"
+    assert [len(entry["inputs"]) for entry in entries] == [64, 64, 64, 0]
+
+
+def test_the_same_again_is_reused_and_what_it_needed_is_skipped():
+    cache = Memory()
+    first = stages.run(graph(), ["melanin"], cache=cache)
+    cache.kept = {key: made for key, made in cache.kept.items() if "melanin" in made}
+    again = stages.run(graph(), ["melanin"], cache=cache)
+    entries = stage_record.record(graph(), again, first.keys)
+    assert done(entries) == {
+        "frames": "skipped", "separate": "skipped", "invert": "reused", "draw": "skipped"
+    }  # fmt: skip
+    assert why(entries)["frames"] == "what depends on it was reused"
+    assert why(entries)["invert"] == "its inputs are the same"
+
+
+def test_a_changed_setting_runs_what_depends_on_it_and_says_so():
+    cache = Memory()
+    first = stages.run(graph(), ["melanin"], cache=cache)
+    again = stages.run(graph(gain=3.0), ["melanin"], cache=cache)
+    entries = stage_record.record(graph(gain=3.0), again, first.keys)
+    assert done(entries)["separate"] == done(entries)["invert"] == "run"
+    assert why(entries)["invert"] == "its inputs have changed"
+    assert done(entries)["frames"] == "reused"
+
+
+@pytest.mark.render
+def test_asking_for_nothing_new_reads_no_frame_and_touches_no_file(tmp_path, monkeypatch):
+    from capture.session import Session
+    from model import store
+    from reconstruction import pipeline
+    from skinrig.simulation import simulate_session
+
+    session = simulate_session("flash", tmp_path / "session-flash", width_px=64).session
+    out = tmp_path / "appearance"
+
+    def work_of(outcome):
+        written = store.read(out).parameters["work"]
+        return outcome, {entry["stage"]: entry["done"] for entry in written}
+
+    first, written = work_of(pipeline.reconstruct(session, want=["melanin"], out=out))
+    assert written == done(first.work)
+    assert written["chromophores"] == "run"
+    assert written["tsumura"] == "skipped"
+
+    def standing():
+        return {
+            path.name: (path.stat().st_mtime_ns, path.stat().st_ino, path.read_bytes())
+            for path in [*out.iterdir()]
+        } | {".": out.stat().st_mtime_ns}
+
+    before = standing()
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, "read", lambda *_: pytest.fail("a frame was read"))
+        again = pipeline.reconstruct(session, want=["melanin"], out=out)
+    assert standing() == before
+    assert again.ran == ()
+    assert done(again.work)["chromophores"] == "reused"
+    assert set(done(again.work).values()) == {"reused", "skipped"}
+    assert json.dumps(again.work)
+
+    _, more = work_of(pipeline.reconstruct(session, want=["tsumura_melanin"], out=out))
+    assert more["tsumura"] == "run"
+    assert standing() != before
+    assert "melanin" in store.read(out).maps
