@@ -57,7 +57,7 @@ def benchmarks(a: Run, b: Run) -> str:
     rows, plots = [], ""
     for name, stage in documents[0]["stages"].items():
         other = documents[1]["stages"].get(name)
-        if other is None or stage["size"] != other["size"]:
+        if other is None or stage.get("size") != other.get("size"):
             continue
         rows += _settings_of_stage(name, stage, other)
         if stage["points"] and other["points"]:

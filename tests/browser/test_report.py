@@ -1,0 +1,196 @@
+"""The report in a browser: no request, nothing refused, accessible in both color schemes."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model import store
+from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig import report
+
+WIDTHS = (1250, 400)
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """Return the addresses of a report on one run and of one that compares two."""
+    folder, rng = tmp_path_factory.mktemp("report"), np.random.default_rng(12345)
+    melanin = 0.02 + 0.1 * np.linspace(0.0, 1.0, 120 * 160).reshape(120, 160)
+    for run in ("one", "two"):
+        maps = {
+            name: SkinMap(
+                melanin + rng.normal(0.0, 0.002, melanin.shape), UNITS[name],
+                np.full(melanin.shape, 0.002),
+            )
+            for name in ("melanin", "hemoglobin")
+        }  # fmt: skip
+        maps["residual"] = SkinMap(np.abs(rng.normal(0.0, 1.0, melanin.shape)), "1")
+        store.write(
+            folder / run / "maps",
+            SkinAppearance(
+                maps, "simulated", parameters={"truth": "truth", "assumed": ["flat light"]},
+                inputs={"session": run}, left_out=(("gloss", "no parallel frames"),),
+            ),
+        )  # fmt: skip
+        truth = {
+            f"{name}{suffix}": SkinMap(melanin, UNITS[name] if not suffix else "1")
+            for name in ("melanin", "hemoglobin")
+            for suffix in ("", "_blurred")
+        }
+        store.write(
+            folder / run / "truth",
+            SkinAppearance(truth, "simulated", parameters={"kind": "truth"}),
+        )
+    found = []
+    for name, paths in (("one", [folder / "one"]), ("both", [folder / "one", folder / "two"])):
+        path = folder / f"{name}.html"
+        path.write_text(report.make(paths).html, encoding="utf-8")
+        found.append(path)
+    return found
+
+
+@pytest.fixture(scope="session")
+def axe():
+    """Return the source of axe-core: of AXE_CORE, or of node_modules."""
+    places = [os.environ.get("AXE_CORE", ""), "node_modules/axe-core/axe.min.js"]
+    found = next((Path(place) for place in places if place and Path(place).is_file()), None)
+    if found is None:
+        pytest.skip("axe-core is not installed: npm install axe-core, or name its file by AXE_CORE")
+    return found.read_text(encoding="utf-8")
+
+
+def opened(browser, path, *, scheme="light", width=1250, **options):
+    context = browser.new_context(
+        color_scheme=scheme, viewport={"width": width, "height": 900}, **options
+    )
+    page = context.new_page()
+    problems = []
+    page.on("console", lambda message: problems.append(message.text))
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on(
+        "request",
+        lambda asked: (
+            None
+            if asked.url == path.as_uri() or asked.url.startswith("data:")
+            else problems.append(asked.url)
+        ),
+    )
+    page.goto(path.as_uri())
+    return context, page, problems
+
+
+def serious(page, axe):
+    """Return axe's serious and critical findings, and how many rules passed."""
+    page.evaluate(axe)
+    found = page.evaluate("axe.run(document)")
+    return (
+        [
+            f"{one['id']}: {one['nodes'][0]['html'][:200]}"
+            for one in found["violations"]
+            if one["impact"] in ("serious", "critical")
+        ],
+        len(found["passes"]),
+    )
+
+
+def test_a_report_asks_for_nothing_and_its_policy_refuses_nothing_of_it(browser, pages):
+    for path in pages:
+        context, page, problems = opened(browser, path)
+        assert problems == []
+        # the policy did not refuse the style: the verdict has its bar, plots their size
+        bar = page.evaluate("getComputedStyle(document.querySelector('.verdict')).borderLeftWidth")
+        assert bar == "5px"
+        loaded = page.evaluate("[...document.images].map(i => i.complete && i.naturalWidth > 0)")
+        assert loaded
+        assert all(loaded)
+        context.close()
+
+
+def test_the_policy_refuses_what_is_not_the_page_s_own(browser, pages, tmp_path):
+    path = tmp_path / "changed.html"
+    text = pages[0].read_text(encoding="utf-8")
+    path.write_text(text.replace("<main", "<script>document.title='ran'</script><main", 1))
+    context, page, problems = opened(browser, path)
+    assert page.title() != "ran"
+    assert any("Content Security Policy" in problem for problem in problems)
+    context.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", WIDTHS)
+def test_axe_finds_nothing_serious(browser, pages, axe, scheme, width):
+    for path in pages:
+        context, page, _ = opened(browser, path, scheme=scheme, width=width, bypass_csp=True)
+        findings, passes = serious(page, axe)
+        assert findings == []
+        assert passes > 10
+        context.close()
+
+
+def test_axe_would_find_a_picture_without_a_text_and_pale_words(browser, pages, axe, tmp_path):
+    path = tmp_path / "changed.html"
+    text = pages[0].read_text(encoding="utf-8").replace(' alt="', ' data-alt="', 1)
+    path.write_text(text.replace("--soft-fg:#4a525b", "--soft-fg:#c4c8cc"), encoding="utf-8")
+    context, page, _ = opened(browser, path, bypass_csp=True)
+    # the style no longer fits its digest: set the pale color by hand
+    page.evaluate("document.documentElement.style.setProperty('--soft-fg', '#c4c8cc')")
+    findings, _ = serious(page, axe)
+    assert {one.split(":")[0] for one in findings} >= {"image-alt", "color-contrast"}
+    context.close()
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_only_tables_scroll_sideways_and_a_keyboard_reaches_them(browser, pages, width):
+    context, page, _ = opened(browser, pages[0], width=width)
+    wide = page.evaluate("document.documentElement.scrollWidth")
+    assert wide <= width
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+    focusable = page.evaluate(
+        "[...document.querySelectorAll('.scroll')].map(e => { e.focus(); "
+        "return document.activeElement === e && !!e.getAttribute('aria-label') })"
+    )
+    assert focusable
+    assert all(focusable)
+    context.close()
+
+
+def test_words_of_plots_have_the_color_of_the_page_s_words(browser, pages):
+    for scheme in ("light", "dark"):
+        context, page, _ = opened(browser, pages[0], scheme=scheme)
+        colors = page.evaluate(
+            "[getComputedStyle(document.body).color, "
+            "getComputedStyle(document.querySelector('svg text')).fill]"
+        )
+        assert colors[0] == colors[1]
+        context.close()
+
+
+def test_printed_pages_are_white_and_show_what_is_folded(browser, pages):
+    context, page, _ = opened(browser, pages[0], scheme="dark")
+    dark = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    page.emulate_media(media="print", color_scheme="dark")
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    assert dark != "rgb(255, 255, 255)"
+    hidden = page.evaluate(
+        "[...document.querySelectorAll('details table')].filter(t => !t.checkVisibility("
+        "{contentVisibilityAuto: true}) || t.getBoundingClientRect().height < 10).length"
+    )
+    assert hidden == 0
+    assert page.pdf(format="A4").startswith(b"%PDF")
+    context.close()
+
+
+def test_the_skip_link_and_the_contents_lead_to_their_places(browser, pages):
+    context, page, _ = opened(browser, pages[0])
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.className") == "skip"
+    page.keyboard.press("Enter")
+    assert page.url.endswith("#content")
+    targets = page.evaluate(
+        "[...document.querySelectorAll('nav a')].map(a => !!document.querySelector(a.hash))"
+    )
+    assert len(targets) >= 3
+    assert all(targets)
+    context.close()

@@ -1,0 +1,81 @@
+"""Calibrations in the report: as old as they were at capture, expired ones missed."""
+
+import hashlib
+import json
+from datetime import date
+
+import numpy as np
+import pytest
+
+from capture.calibration import store as calibrations
+from capture.calibration.record import Calibration, Quantity
+from model import store
+from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig import report
+
+
+def write_run(folder, *, captured="2026-03-10", valid_until=date(2026, 6, 1), worst=0.3):
+    """Write a calibration of two cameras, a session of a day, and maps made by both."""
+    calibration = folder / "calibration"
+    values = {
+        serial: {"reprojection_px": Quantity(np.array(px), stderr=np.array(0.02))}
+        for serial, px in (("C1", 0.1), ("C2", worst))
+    }
+    calibrations.save(
+        Calibration(
+            "geometry", "dome", ("C1", "C2"), date(2026, 3, 1), valid_until, "simulated", values
+        ),
+        calibration,
+    )
+    session = folder / "session"
+    (session / "frames").mkdir(parents=True)
+    (session / "session.json").write_text(
+        json.dumps({"plan": {"rig": "dome"}, "created_at": f"{captured}T10:00:00+00:00",
+                    "source": "simulated", "seed": 0})
+    )  # fmt: skip
+    digest = hashlib.sha256((calibration / "geometry.json").read_bytes()).hexdigest()
+    store.write(
+        folder / "maps",
+        SkinAppearance(
+            {"melanin": SkinMap(np.full((4, 4), 0.1), UNITS["melanin"])}, "simulated",
+            parameters={"session": "session"}, inputs={"calibration geometry": digest},
+        ),
+    )  # fmt: skip
+    return folder
+
+
+def test_a_calibration_is_as_old_as_it_was_at_capture(tmp_path):
+    html = report.build([write_run(tmp_path)])
+    assert "All 1 checks kept" in html
+    assert "in force, 83 days left" in html  # 10 March to 1 June
+    assert ">9<" in html  # days from 1 to 10 March
+
+
+@pytest.mark.parametrize("captured", ["2026-06-02", "2026-02-28"])
+def test_a_calibration_that_was_not_in_force_at_capture_is_a_missed_check(tmp_path, captured):
+    html = report.build([write_run(tmp_path, captured=captured)])
+    assert "1 of 1 checks missed" in html
+    assert "not in force at capture" in html
+
+
+def test_the_worst_device_is_named(tmp_path):
+    html = report.build([write_run(tmp_path)])
+    row = html[html.index("reprojection</td>") :]
+    assert row.index("C2") < row.index("</tr>")
+    assert "0.3" in row[: row.index("</tr>")]
+
+
+def test_a_damaged_calibration_is_told_and_missed_and_the_rest_is_shown(tmp_path):
+    path = write_run(tmp_path) / "calibration" / "geometry.json"
+    path.write_text(path.read_text().replace("0.1", "0.2"))
+    html = report.build([tmp_path])
+    assert "1 of 1 checks missed" in html
+    assert "melanin" in html
+
+
+def test_without_a_session_no_age_is_claimed(tmp_path):
+    folder = write_run(tmp_path)
+    (folder / "session" / "session.json").unlink()
+    html = report.build([folder])
+    assert "no session here tells when it was used" in html
+    assert "No limit was checked" in html

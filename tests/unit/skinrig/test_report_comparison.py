@@ -1,0 +1,248 @@
+"""Two runs beside each other: chance is no difference, a difference is found where it is."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from model import store
+from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig import map_comparison, report, run_comparison, truth_errors
+from skinrig.bench_document import to_document
+from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
+from skinrig.map_comparison import BY_CHANCE, compare
+from skinrig.report import ReportError
+
+SIDE = 200
+PIXELS = SIDE * SIDE
+Z = 3.89
+"""Of a two-sided test that fails once in 10,000 seeds."""
+
+
+def share_is(found, expected):
+    return abs(found - expected) <= Z * math.sqrt(expected * (1 - expected) / PIXELS)
+
+
+def two_estimates(rng, *, stated=1.0, spread=(0.3, 0.4)):
+    truth = rng.uniform(1.0, 2.0, (SIDE, SIDE))
+    maps = [
+        SkinMap(truth + rng.normal(0.0, s, truth.shape), "mm", np.full(truth.shape, stated * s))
+        for s in spread
+    ]
+    return maps[0], maps[1]
+
+
+def test_noise_of_the_stated_size_lies_apart_as_chance_has_it(rng):
+    found = compare("thickness", *two_estimates(rng))
+    for share, expected in zip(found.beyond, BY_CHANCE, strict=True):
+        assert share_is(share, expected)
+    assert found.combined == pytest.approx(0.5, rel=1e-5)
+    assert not found.disagree
+
+
+def test_noise_twice_as_large_as_stated_is_called_a_disagreement(rng):
+    found = compare("thickness", *two_estimates(rng, stated=0.5))
+    assert not share_is(found.beyond[0], BY_CHANCE[0])
+    assert found.disagree
+
+
+def test_a_spot_that_moved_by_five_standard_errors_is_found_where_it_is(rng):
+    one, other = two_estimates(rng)
+    values = other.values.copy()
+    values[20:60, 100:140] += 2.5
+    found = compare("thickness", one, SkinMap(values, "mm", other.stderr))
+    assert found.disagree
+    spot = np.zeros((SIDE, SIDE), bool)
+    spot[20:60, 100:140] = True
+    far = np.abs(found.sigmas) > 3.0
+    assert far[spot].mean() > 0.95  # 5 sigma less 1 sigma of noise: 97.7 % lie beyond 3
+    assert far[~spot].mean() < 0.01
+
+
+def turned(normals, angle, direction):
+    """Turn normals near z by small angles in directions across them."""
+    shift = angle[..., None] * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
+    out = np.concatenate([shift, np.ones((*angle.shape, 1))], axis=-1)
+    return out / np.linalg.norm(out, axis=-1, keepdims=True)
+
+
+def noisy_normals(rng, spread, stated):
+    x, y = rng.normal(0.0, spread, (2, SIDE, SIDE))
+    normals = turned(None, np.hypot(x, y), np.arctan2(y, x))
+    return SkinMap(normals, "1", np.full(normals.shape, stated))
+
+
+def test_normals_that_err_as_stated_lie_apart_as_chance_has_it(rng):
+    honest = [noisy_normals(rng, 0.01, 0.01) for _ in range(2)]
+    found = compare("normals", *honest)
+    assert found.unit == "°"
+    for share, expected in zip(found.beyond, BY_CHANCE, strict=True):
+        assert share_is(share, expected)
+    assert not found.disagree
+    assert compare("normals", *(noisy_normals(rng, 0.01, 0.005) for _ in range(2))).disagree
+
+
+def test_equal_maps_are_zero_apart_even_where_they_claim_no_error():
+    one = SkinMap(np.ones((3, 4)), "mm", np.zeros((3, 4)))
+    found = compare("thickness", one, one)
+    assert found.high == 0.0
+    assert found.beyond == (0.0, 0.0, 0.0)
+    assert not found.disagree
+
+
+def test_pixels_that_one_estimate_masks_are_counted_and_not_subtracted():
+    valid = np.array([[True, False, True]])
+    one = SkinMap(np.ones((1, 3)), "mm", np.ones((1, 3)), valid)
+    found = compare("thickness", one, SkinMap(np.full((1, 3), 2.0), "mm", np.ones((1, 3))))
+    assert (found.pixels, found.only_a, found.only_b) == (2, 0, 1)
+    assert np.isnan(found.difference[0, 1])
+
+
+def test_of_colors_the_channel_that_is_farthest_off_is_shown():
+    one = SkinMap(np.zeros((1, 1, 3)), "1", np.ones((1, 1, 3)))
+    other = SkinMap(np.array([[[0.0, -6.0, 3.0]]]), "1", np.ones((1, 1, 3)))
+    found = compare("r_d", one, other)
+    assert found.sigmas[0, 0] == pytest.approx(-6.0 / math.sqrt(2.0))
+    assert found.difference[0, 0] == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize(
+    ("other", "word"),
+    [
+        (SkinMap(np.ones((2, 3)), "mm"), r"shapes \(2, 2\) and \(2, 3\)"),
+        (SkinMap(np.ones((2, 2)), "um"), "units 'mm' and 'um'"),
+    ],
+)
+def test_maps_that_cannot_be_subtracted_are_refused_with_what_differs(other, word):
+    with pytest.raises(ValueError, match=word):
+        compare("thickness", SkinMap(np.ones((2, 2)), "mm"), other)
+
+
+def write_maps(folder, rng, *, shift=0.0, **parameters):
+    melanin = np.full((40, 50), 0.05)
+    noisy = melanin * (1 + shift) + rng.normal(0, 0.001, melanin.shape)
+    store.write(
+        folder,
+        SkinAppearance(
+            {"melanin": SkinMap(noisy, UNITS["melanin"], np.full(melanin.shape, 0.001))},
+            "simulated", parameters={"truth": "truth", **parameters},
+            inputs={"session": f"sha256:{folder.name}"},
+        ),
+    )  # fmt: skip
+    return folder
+
+
+def write_truth(folder):
+    maps = {
+        name: SkinMap(np.full((40, 50), 0.05), UNITS["melanin"] if name == "melanin" else "1")
+        for name in ("melanin", "melanin_blurred")
+    }
+    store.write(folder, SkinAppearance(maps, "simulated", parameters={"kind": "truth"}))
+    return folder
+
+
+def write_bench(path, seconds=1.0):
+    points = tuple(
+        Point({"n": n}, Timing(n * seconds, (n, n), 2 * n, 1.0), 1 / n, (0.9 / n, 1.1 / n))
+        for n in (1, 2, 4)
+    )
+    stage = StageBenchmark("inversion", "error, %", "truth", 0.1, points, (Limit("s", 2, 3, "<="),))
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(to_document([stage])))
+    return path
+
+
+@pytest.fixture
+def folders(tmp_path, rng):
+    return {
+        "a": write_maps(tmp_path / "a", rng, step=1),
+        "b": write_maps(tmp_path / "b", rng, step=2, shift=0.3),
+        "truth": write_truth(tmp_path / "truth"),
+        "bench": write_bench(tmp_path / "bench.json"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("given", "compared"),
+    [
+        (("a", "b"), True),
+        (("a", "b", "truth"), True),
+        (("a", "truth"), False),  # a set of maps and what it is judged by: one collection
+        (("a", "bench"), False),
+        (("a", "b", "bench"), False),
+        (("a",), False),
+    ],
+)
+def test_exactly_two_of_one_kind_are_a_comparison(folders, given, compared):
+    paths = [folders[name] for name in given]
+    assert (run_comparison.sides(paths) is not None) == compared
+    assert run_comparison.sides(paths, insist=False) is None
+
+
+def test_a_comparison_of_what_are_not_two_runs_is_refused_with_what_was_given(folders):
+    with pytest.raises(ReportError, match=r"a \(maps\).*truth \(truth\), expected two of one kind"):
+        report.make([folders["a"], folders["truth"]], compare=True)
+    with pytest.raises(ReportError, match="does not exist"):
+        report.make([folders["a"], folders["a"] / "nothing"])
+
+
+def test_a_check_that_got_worse_is_said_first(folders):
+    done = report.make([folders["a"], folders["b"], folders["truth"]])
+    assert done.compared == ("A: a", "B: b")
+    assert "1 of 1 checks of both changed their verdict, 1 for the worse." in done.html
+    assert "1 of 1 maps differ beyond their combined standard errors." in done.html
+    assert "Errors against the truths" in done.html
+    assert "parameter step" in done.html
+    assert done.html == report.make([folders["a"], folders["b"], folders["truth"]]).html
+
+
+def test_without_truths_it_is_said_that_nobody_knows_which_run_is_right(folders):
+    html = report.make([folders["a"], folders["b"]]).html
+    assert "what differs can be told, what is right cannot" in html
+    assert "Errors against the truths" not in html
+
+
+def test_two_runs_are_paired_by_the_names_of_their_folders(tmp_path, rng):
+    for run in ("one", "two"):
+        (tmp_path / run).mkdir()
+        write_maps(tmp_path / run / "face", rng)
+    write_maps(tmp_path / "two" / "hand", rng)
+    html = report.make([tmp_path / "one", tmp_path / "two"]).html
+    assert "Maps: face" in html
+    assert "Only in one" in html
+    assert "hand" in html
+
+
+def test_two_runs_of_the_same_frames_are_said_to_share_their_noise(tmp_path, rng):
+    for run in ("one", "two"):
+        (tmp_path / run).mkdir()
+        write_maps(tmp_path / run / "face", rng)
+    assert "made of the same frames" in report.make([tmp_path / "one", tmp_path / "two"]).html
+
+
+def test_two_benchmarks_are_compared_setting_by_setting(tmp_path):
+    paths = [write_bench(tmp_path / name / "bench.json", s) for name, s in (("x", 1.0), ("y", 2.0))]
+    html = report.make(paths).html
+    assert "Settings that both measured" in html
+    assert '<td class="n">2</td>' in html  # seconds of B over those of A
+
+
+def test_meshes_of_other_places_are_not_subtracted(tmp_path, rng):
+    for name, at in (("a", 0.0), ("b", 8.0)):
+        place = np.zeros((20, 20, 3))
+        place[..., 0], place[..., 1] = np.meshgrid(np.arange(20.0) + at, np.arange(20.0))
+        maps = {
+            "position": SkinMap(place, "mm"),
+            "r_d": SkinMap(np.full((20, 20, 3), 0.3), "1", np.full((20, 20, 3), 0.01)),
+        }
+        store.write(tmp_path / name, SkinAppearance(maps, "simulated"))
+    html = report.make([tmp_path / "a", tmp_path / "b"]).html
+    assert "texels of the two meshes lie 8.0 mm apart" in html
+
+
+def test_errors_against_the_truth_come_with_their_band(folders):
+    rows = truth_errors.of(store.read(folders["b"]), store.read(folders["truth"]))
+    assert {row.skin for row in rows} == {"all", "C_m 0.05–0.1"}
+    assert all(row.error == pytest.approx(30.0, abs=0.3) for row in rows)
+    assert map_comparison.MOST_BEYOND > BY_CHANCE[-1]

@@ -1,0 +1,207 @@
+"""The page as programs read it: landmarks, headings, captions, alt texts, and a strict policy."""
+
+import base64
+import hashlib
+import io
+import re
+from html.parser import HTMLParser
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from model import store
+from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig import figures, map_pictures, page, png, report, svg, verdict_section
+
+
+class Outline(HTMLParser):
+    """What a screen reader needs of a page, and what is wrong with it."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.headings, self.ids, self.targets, self.faults = [], [], [], []
+        self.landmarks, self.tables, self.captions, self.in_head = set(), 0, 0, False
+        self.feed(html)
+        if self.tables != self.captions:
+            self.faults.append(f"{self.tables} tables, {self.captions} captions")
+        for level, before in zip(self.headings[1:], self.headings, strict=False):
+            if level > before + 1:
+                self.faults.append(f"heading {level} after {before}")
+        if len(set(self.ids)) != len(self.ids):
+            self.faults.append("an id twice")
+        if set(self.targets) - set(self.ids):
+            self.faults.append("a link to nowhere")
+
+    def handle_starttag(self, tag, attrs):
+        has = dict(attrs)
+        if re.fullmatch("h[1-6]", tag):
+            self.headings.append(int(tag[1]))
+        if tag in ("main", "nav", "header", "section"):
+            self.landmarks.add(tag)
+        self.tables += tag == "table"
+        self.captions += tag == "caption"
+        if "id" in has:
+            self.ids.append(has["id"])
+        if tag == "a":
+            self.targets.append(has["href"].removeprefix("#"))
+        if tag == "img" and not has.get("alt"):
+            self.faults.append("an image without a text")
+        if tag == "svg" and not (has.get("role") == "img" and has.get("aria-label")):
+            self.faults.append("a plot without a name")
+        if tag == "th" and "scope" not in has:
+            self.faults.append("a heading cell of nothing")
+        if "style" in has or tag == "script":
+            self.faults.append("what the policy refuses")
+
+
+@pytest.fixture(scope="module")
+def html(tmp_path_factory):
+    tmp_path, rng = tmp_path_factory.mktemp("run"), np.random.default_rng(12345)
+    melanin = 0.03 + 0.05 * rng.random((30, 40))
+    stderr = np.full(melanin.shape, 0.004)
+    truth = {
+        name: SkinMap(melanin, UNITS["melanin"] if name == "melanin" else "1")
+        for name in ("melanin", "melanin_blurred")
+    }
+    found = SkinMap(melanin + rng.normal(0, 0.004, melanin.shape), UNITS["melanin"], stderr)
+    store.write(
+        tmp_path / "maps",
+        SkinAppearance({"melanin": found, "picture": SkinMap(np.ones((30, 40, 3)), "1")},
+                       "simulated", parameters={"truth": "truth"},
+                       left_out=(("gloss", "no parallel frames"),)),
+    )  # fmt: skip
+    store.write(
+        tmp_path / "truth", SkinAppearance(truth, "simulated", parameters={"kind": "truth"})
+    )
+    return report.build([tmp_path])
+
+
+def test_a_page_has_landmarks_headings_in_order_captions_and_texts(html):
+    outline = Outline(html)
+    assert outline.faults == []
+    assert outline.headings[0] == 1
+    assert outline.headings.count(1) == 1
+    assert outline.landmarks == {"main", "nav", "header", "section"}
+    assert outline.tables >= 4
+
+
+@pytest.mark.parametrize(
+    ("what", "into"),
+    [
+        ("<h3>", "<h5>"),
+        (' alt="', ' title="'),
+        ("<caption>", "<p>"),
+        (' scope="col"', ""),
+        ('href="#', 'href="#no-'),
+        ("<figcaption>", '<figcaption style="color:red">'),
+        ('role="img"', ""),
+    ],
+)
+def test_the_outline_finds_what_is_missing(html, what, into):
+    assert what in html
+    assert Outline(html.replace(what, into)).faults
+
+
+def test_the_policy_allows_the_page_s_own_style_and_nothing_else(html):
+    style = re.search(r"<style>(.*?)</style>", html, re.DOTALL)[1]
+    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', html)[1]
+    assert policy == (
+        f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; base-uri 'none'; "
+        "form-action 'none'"
+    )
+    assert html.count("<style") == 1
+
+
+def test_a_picture_tells_in_words_what_it_shows_in_colors():
+    values = np.arange(100.0).reshape(10, 10)
+    valid = np.ones((10, 10), bool)
+    valid[:2] = False
+    shown = map_pictures.scalar_picture(
+        "error", values, low=0.0, high=99.0, valid=valid, unit="um", of="height"
+    )
+    alt = re.search(r'alt="([^"]*)"', shown)[1]
+    assert alt == (
+        "height, error: median 59.5 um, 90 % of pixels within 23.95 to 95.05, 20 % without a "
+        "value; color scale 0 to 99 um"
+    )
+
+
+def test_a_map_s_picture_has_the_scale_s_colors_to_a_128th_and_gray_without_a_value(rng):
+    values = rng.random((40, 50))
+    values[3, 4] = np.nan
+    data = png.encode_scalar(values, 0.0, 1.0, scale="viridis", levels=map_pictures.LEVELS)
+    seen = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
+    assert seen[3, 4].tolist() == [png.GRAY] * 3
+    fine = png.colorize(values, 0.0, 1.0).astype(int)
+    step = np.abs(np.diff(png.palette("viridis", 128).astype(int), axis=0)).max()
+    assert np.abs(seen - fine).max() <= step
+    coarse = png.encode_scalar(values, 0.0, 1.0, levels=8)
+    eighth = np.asarray(Image.open(io.BytesIO(coarse)).convert("RGB")).astype(int)
+    assert np.abs(eighth - fine).max() > step
+
+
+def test_a_picture_of_noise_takes_its_seven_bits_a_pixel_and_one_of_a_slope_far_fewer(rng):
+    bits = 7 * 128 * 128 / 8
+    noise = png.encode_scalar(rng.random((128, 128)), 0.0, 1.0, levels=128)
+    assert bits < len(noise) < 1.1 * bits
+    slope = np.add.outer(np.linspace(0.0, 0.5, 128), np.linspace(0.0, 0.5, 128))
+    assert len(png.encode_scalar(slope, 0.0, 1.0, levels=128)) < 0.2 * bits
+
+
+def test_the_bar_beside_a_picture_runs_through_the_picture_s_colors(html):
+    style = re.search(r"<style>(.*?)</style>", html, re.DOTALL)[1]
+    stops = re.search(r"\.bar\.viridis\{background:linear-gradient\(90deg,([^)]*)\)", style)[1]
+    assert stops.split(",")[0] == "#" + bytes(png.palette("viridis", 2)[0]).hex()
+    assert len(stops.split(",")) == page.BAR_STOPS
+
+
+def test_a_plot_is_well_formed_and_says_its_numbers():
+    series = [figures.Curve("red", [1.0, 2.0, 3.0], [1.0, 0.1, 0.01], [0.1, 0.01, 0.02])]
+    drawn = figures.curves("decay", "mm", "1/mm", series, log_y=True)
+    root = ElementTree.fromstring(drawn)
+    assert root.get("role") == "img"
+    assert root.get("aria-label") == "decay: 1/mm against mm; red 0.01 to 1 over 1 to 3"
+    assert "style=" not in drawn
+    texts = {"".join(node.itertext()) for node in root.iter("{http://www.w3.org/2000/svg}text")}
+    assert {"decay", "mm", "1/mm", "red", "0.01", "0.1"} <= texts
+
+
+def test_plots_of_one_page_do_not_share_names_of_their_parts():
+    plots = [
+        figures.curves(title, "x", "y", [figures.Curve("one", [0.0, 1.0], [0.0, 1.0])])
+        for title in ("first", "second")
+    ]
+    first, second = (set(re.findall(r' id="([^"]*)"', plot)) for plot in plots)
+    assert first
+    assert not first & second
+    for plot, names in zip(plots, (first, second), strict=True):
+        assert {a or b for a, b in re.findall(r'href="#([^"]*)"|url\(#([^)]*)\)', plot)} == names
+
+
+def test_lines_of_a_simplified_plot_stay_where_they_were():
+    path = '<path d="M 10.004 20.006 \nL 30.5 40 \n" style="fill: none; stroke: #123456"/>'
+    other = path.replace("10.004", "11").replace("30.5", "31")
+    drawn = f'<svg width="9pt"><g id="g_1">{path}{other}</g></svg>'
+    found = re.search(r'<path d="([^"]*)" fill="none" stroke="#123456"/>', svg.simplified(
+        drawn, alt="lines"))  # fmt: skip
+    assert found[1] == "M10 20.01L30.5 40M11 20.01L31 40"
+
+
+def test_skin_that_fares_worse_than_the_whole_is_named_though_the_check_is_kept():
+    kept = page.Check("melanin", 5.0, 10.0, "<=", "%", worst="dark: 30 %", worst_got=25.0)
+    assert any(
+        "beyond the limit of the whole" in text for text in verdict_section.weaknesses([kept])
+    )
+    even = page.Check("melanin", 5.0, 10.0, "<=", "%", worst="dark: 9 %", worst_got=8.0)
+    assert not any("beyond the limit" in text for text in verdict_section.weaknesses([even]))
+
+
+def test_a_check_that_is_no_number_is_missed():
+    missed = page.Check("error", float("nan"), 1.0, "<=")
+    assert verdict_section.headline([missed]) == "1 of 1 checks missed their limit."
+    assert "missed: error, – , at most 1" in " ".join(verdict_section.weaknesses([missed])).replace(
+        "–,", "– ,"
+    )
