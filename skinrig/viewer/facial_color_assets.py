@@ -30,6 +30,8 @@ SIMULATED_SIZE: Final = 512
 """Texels a side of the simulated states that the rig is made from: it is kept smaller yet."""
 RADIUS_OF_SIZE: Final = 24.0 / 512.0
 """Radius of the local statistics' disc, as a part of the map's side."""
+FINE: Final = 8
+"""Words of the finest octave's steps, of chromophores of 2048 texels a side and more."""
 ALBEDO: Final = "r_d"
 
 
@@ -67,7 +69,7 @@ def assets(source: SceneSource) -> Assets:
     )
     roots = np.cbrt(np.stack([found.melanin, found.hemoglobin], axis=-1))
     textures = {
-        "chromophores": Texture(roots.astype(np.float32), "u8"),
+        "chromophores": Texture(roots.astype(np.float32), fine=_fine(roots.shape[0])),
         "facial_states": Texture(np.stack(list(found.states.values())).astype(np.float32), "u8"),
     }
     names = list(found.states)
@@ -97,6 +99,11 @@ def assets(source: SceneSource) -> Assets:
         "params": {"weights": dict.fromkeys([*names[1:], *source.mesh.shapes], 0.0)},
         "left_out": tuple(left_out),
     }
+
+
+def _fine(size: int) -> int:
+    """Return how coarsely the finest octave is kept: texels below 0.2 mm hold noise."""
+    return FINE if size >= 2048 else 1
 
 
 def _face(source: SceneSource) -> FaceColor:

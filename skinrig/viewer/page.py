@@ -10,7 +10,7 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from typing import Final
 
-from skinrig.viewer.packing import Packed, pack
+from skinrig.viewer.packing import Packed, as_text, pack
 from skinrig.viewer.scene import ViewerScene
 
 SCRIPTS: Final = (
@@ -60,14 +60,14 @@ def chunks() -> dict[str, str]:
         for name, text in zip(parts[1::2], parts[2::2], strict=True):
             if name in found:
                 raise PageError(f"glsl/{entry.name}: chunk {name!r} is there twice")
-            found[name] = text.strip("\n") + "\n"
+            found[name] = _bare(text.strip("\n") + "\n")
     return found
 
 
 def script() -> str:
     """Return all scripts as one strict function that shares an object ``V``."""
     here = resources.files("skinrig.viewer").joinpath("js")
-    body = "\n".join(here.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
+    body = "\n".join(_bare(here.joinpath(name).read_text(encoding="utf-8")) for name in SCRIPTS)
     glsl = json.dumps(chunks(), sort_keys=True)
     return f'(() => {{\n"use strict";\nconst V = {{glsl: {glsl}}};\n{body}\n}})();\n'
 
@@ -111,13 +111,18 @@ def render(packed: Packed, *, connect: bool = False) -> str:
         "POLICY": policy,
         "STYLE": style,
         "HEADER": packed.header_bytes().decode("utf-8").replace("</", "<\\/"),
-        "PAYLOAD": base64.b64encode(packed.payload).decode("ascii"),
+        "PAYLOAD": as_text(packed.payload),
         "SCRIPT": code,
     }
     for name in parts:
         if page.count("{{" + name + "}}") != 1:
             raise PageError(f"page.html: expected {{{{{name}}}}} once")
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], page)
+
+
+def _bare(text: str) -> str:
+    """Return a script without lines that are comments, and without indentation."""
+    return re.sub(r"^[ \t]+", "", re.sub(r"^[ \t]*//.*\n", "", text, flags=re.M), flags=re.M)
 
 
 def _hash(text: str) -> str:

@@ -1,22 +1,30 @@
-"""How far light spreads in the skin, as a sum of Gaussians for the screen."""
+"""How far light spreads in skin where nothing of it was measured: the page's default profile.
+
+Measured translucency comes with the fitted reflectance (`skinrig.viewer.reflectance_assets`); the
+page switches between the two.
+"""
 
 from __future__ import annotations
 
+from model import skin_reflectance
+from skinrig.viewer import gaussian_profiles
 from skinrig.viewer.scene import Assets, SceneSource
 
-# Placeholder figures until the fit of the scene's own profile is in: d'Eon and Luebke's skin
-# shares the same form (variances in mm^2, weights of red, green and blue).
-_VARIANCES_MM2 = (0.0484, 0.187, 0.567, 1.99)
-_WEIGHTS = ((0.333, 0.791, 0.993), (0.118, 0.198, 0.007), (0.191, 0.007, 0.0), (0.358, 0.004, 0.0))
+R_D = (0.46, 0.31, 0.23)
+"""R_d of facial skin, Weyrich et al. 2006, figure 11, linear sRGB; it shapes the profile's core."""
 
 
 def assets(source: SceneSource) -> Assets:
-    """Return variances and weights of the Gaussians."""
+    """Return variances and weights of the Gaussians of the population's mean dipole."""
+    depth_mm, told = skin_reflectance.population_mean_mm()
+    profile = gaussian_profiles.fit(R_D, 1.0 / depth_mm)
     return {
         "facts": {
             "scattering": {
-                "variances_mm2": list(_VARIANCES_MM2),
-                "weights": [list(row) for row in _WEIGHTS],
+                "variances_mm2": profile.variances_mm2.tolist(),
+                "weights": profile.weights.tolist(),
+                "edge_error": profile.edge_error.tolist(),
+                "told": told,
             }
         }
     }

@@ -47,11 +47,15 @@ class Texture:
         channel; "f16" and "f32" as they are.
     filter
         Between texels.
+    fine
+        Of "u8" alone: the finest octave (what a texel differs by from its neighborhood) is rounded
+        to so many words; 1 keeps all. Noise costs the most bytes and shows the least there.
     """
 
     values: Float32
     storage: Storage = "u8"
     filter: Filter = "linear"
+    fine: int = 1
 
     def __post_init__(self) -> None:
         """Check shape, numbers and names."""
@@ -69,6 +73,13 @@ class Texture:
             raise SceneError(f"texture: got {self.values.dtype} or NaN, expected finite float32")
         if self.storage not in get_args(Storage) or self.filter not in get_args(Filter):
             raise SceneError(f"texture: got {self.storage!r}, {self.filter!r}: unknown")
+        if self.fine != 1 and (
+            self.storage != "u8" or not 1 < self.fine < 128 or any(n % 2 for n in shape[-3:-1])
+        ):
+            raise SceneError(
+                f"texture: got fine = {self.fine} of {self.storage} {shape}, expected 1, or up to "
+                "127 of u8 with an even number of texels a side"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,8 +11,8 @@ from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 MAPS_SIZE: Final = 256
 """Most texels a side of roughness and intensity, which vary by region."""
-BECKMANN_PER_GGX: Final = 1.0
-"""Beckmann's m of the same curvature of the peak as GGX's alpha (both are 1/(pi a^2) high)."""
+FINE: Final = 16
+"""Words of the finest octave's steps, of reliefs of 2048 texels a side and more: 4 um at most."""
 
 
 def assets(source: SceneSource) -> Assets:
@@ -20,9 +20,10 @@ def assets(source: SceneSource) -> Assets:
     subject = source.subject
     if subject is None:
         return {"left_out": (("relief", "nothing of the surface was measured"),)}
-    covered = subject.atlas.covered
+    covered, size = subject.atlas.covered, subject.size
     height = filled(subject.height_um, covered)[..., None]
-    roughness = BECKMANN_PER_GGX * halved(filled(subject.roughness, covered), MAPS_SIZE)
+    # Beckmann's m and GGX's alpha give a peak of the same height, 1 / (pi m^2)
+    roughness = halved(filled(subject.roughness, covered), MAPS_SIZE)
     # hair hides the skin's gloss, as the subject's own renderings have it
     intensity = 1.0 - halved(filled(subject.hair, covered), MAPS_SIZE)
     maps = np.stack([roughness, intensity], axis=-1)
@@ -36,7 +37,9 @@ def assets(source: SceneSource) -> Assets:
         )
     return {
         "textures": {
-            "relief_height": Texture(height.astype(np.float32), "u8", "mipmap"),
+            "relief_height": Texture(
+                height.astype(np.float32), "u8", "mipmap", fine=FINE if size >= 2048 else 1
+            ),
             "surface_maps": Texture(maps.astype(np.float32), "u8"),
         },
         "left_out": left_out,

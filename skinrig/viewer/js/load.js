@@ -2,15 +2,65 @@
 V.TYPES = {u1: Uint8Array, u2: Uint16Array, u4: Uint32Array, i2: Int16Array, i4: Int32Array,
   f4: Float32Array, f2: Uint16Array, f8: Float64Array};
 
-V.inflate = async text => {
-  const raw = atob(text);
-  const bytes = new Uint8Array(raw.length);
-  for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+// Characters of seven bits each; larger ones stand for one that is unsafe in a page and the next.
+V.UNSAFE = [0, 8, 9, 10, 11, 12, 13, 26, 27, 34, 38, 60, 127];
+V.bytesOf = (text, count) => {
+  const out = new Uint8Array(count);
+  let [held, bits, at] = [0, 0, 0];
+  const put = code => {
+    held = ((held << 7) | code) & 0x3fff;
+    bits += 7;
+    if (bits >= 8) {
+      bits -= 8;
+      if (at < count) out[at++] = held >> bits;
+    }
+  };
+  for (let i = 0; i < text.length; i++) {
+    const code = text.charCodeAt(i);
+    if (code >= 128) put(V.UNSAFE[(code >> 7) - 1]);
+    put(code & 127);
+  }
+  return out;
+};
+
+V.inflate = async (text, count) => {
+  const stream = new Blob([V.bytesOf(text, count)]).stream()
+    .pipeThrough(new DecompressionStream("gzip"));
   return new Response(stream).arrayBuffer();
 };
 
+// Words of half as many texels a side, doubled linearly in whole numbers, and the steps of the
+// finest octave; as skinrig.viewer.packing.joined.
+V.joinOctaves = (buffer, entry) => {
+  const coarse = V.unpackArray(buffer, entry.coarse);
+  const steps = new Int8Array(V.unpackArray(buffer, entry.steps).buffer);
+  const [layers, h, w, channels] = entry.coarse.shape;
+  const out = new Uint8Array(4 * coarse.length);
+  for (let l = 0; l < layers; l++) {
+    for (let y = 0; y < 2 * h; y++) {
+      const near = y >> 1;
+      const far = Math.min(Math.max(near + (y & 1 ? 1 : -1), 0), h - 1);
+      for (let x = 0; x < 2 * w; x++) {
+        const mid = x >> 1;
+        const side = Math.min(Math.max(mid + (x & 1 ? 1 : -1), 0), w - 1);
+        const to = ((l * 2 * h + y) * 2 * w + x) * channels;
+        const a = ((l * h + near) * w + mid) * channels;
+        const b = ((l * h + near) * w + side) * channels;
+        const c = ((l * h + far) * w + mid) * channels;
+        const d = ((l * h + far) * w + side) * channels;
+        for (let k = 0; k < channels; k++) {
+          const sum = 9 * coarse[a + k] + 3 * (coarse[b + k] + coarse[c + k]) + coarse[d + k];
+          const word = ((sum + 8) >> 4) + entry.fine * steps[to + k];
+          out[to + k] = word < 0 ? 0 : word > 255 ? 255 : word;
+        }
+      }
+    }
+  }
+  return out;
+};
+
 V.unpackArray = (buffer, entry) => {
+  if (entry.predictor === "octaves") return V.joinOctaves(buffer, entry);
   const Type = V.TYPES[entry.type];
   const count = entry.shape.reduce((a, b) => a * b, 1);
   const size = Type.BYTES_PER_ELEMENT;
@@ -44,7 +94,8 @@ V.unpackArray = (buffer, entry) => {
 
 V.load = async () => {
   const header = JSON.parse(document.getElementById("header").textContent);
-  const buffer = await V.inflate(document.getElementById("payload").textContent);
+  const buffer = await V.inflate(document.getElementById("payload").textContent,
+    header.packed_bytes);
   document.getElementById("payload").textContent = "";
   const array = entry => V.unpackArray(buffer, entry);
   const mesh = header.mesh;
