@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from typing import Final
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numba import njit, prange
@@ -49,6 +50,7 @@ class SkinBounce:
     """
 
     def __init__(self, caster: Caster, *, patches: int = PATCHES) -> None:
+        self.mesh = caster.mesh
         self.atlas = unwrap(caster.mesh, patches)
         covered = self.atlas.covered
         self._covered = covered
@@ -108,6 +110,17 @@ class SkinBounce:
         out = np.zeros((*self._covered.shape, r_d.shape[1]), np.float32)
         out[self._covered] = total
         return out
+
+
+_living: WeakValueDictionary[int, SkinBounce] = WeakValueDictionary()
+
+
+def bounce_on(caster: Caster) -> SkinBounce:
+    """Return the exchange on a mesh, the same as long as anybody holds it."""
+    found = _living.get(id(caster.mesh))  # which is the mesh's own while the exchange holds it
+    if found is None:
+        found = _living[id(caster.mesh)] = SkinBounce(caster)
+    return found
 
 
 def _texel_area(atlas: Atlas) -> Float32Array:

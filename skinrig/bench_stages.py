@@ -21,6 +21,7 @@ STAGES = {
     "render-flash": "bench_flash.render",
     "render-dome": "bench_dome_render.render",
     "render-gradient": "bench_gradient_render.render",
+    "omissions": "bench_omissions.omissions",
     "skin-stretch": "bench_skin_stretch.stretched",
     "layered-reflectance": "bench_tissue.layered_reflectance",
     "color-table": "bench_tissue.table",
@@ -116,7 +117,7 @@ def run_stages(
     BenchError
         For an unknown stage.
     """
-    chosen = list(names) if names else list(STAGES)
+    chosen = list(names) if names else bench_plan.in_order(STAGES)
     for name in chosen:
         if name not in STAGES:
             raise BenchError(f"stage: got {name!r}, expected one of {', '.join(STAGES)}")

@@ -327,9 +327,10 @@ def _scene(rig: Rig, order: Order) -> Any:
     else:
         person = make_subject(order.subject, seed=order.seed, size=TEXELS, mesh=order.mesh)
     motion = head_motion(order.seed) if order.move else None
+    light = _light_of_skin(order)
     return DomeScene(
         rig, person, dome=built, motion=motion, state=order.states[0], movement=order.movement,
-        seed=order.seed, **_light_of_skin(order),
+        seed=order.seed, subsurface=light["subsurface"], interreflections=light["interreflections"],
         conditions=conditions,
     )  # fmt: skip
 

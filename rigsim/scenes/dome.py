@@ -43,7 +43,7 @@ from rigsim.scenes.olat import Hits, Lamp
 from rigsim.scenes.olat_vector import VectorLight
 from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.skin_bleeding import SkinBleeding
-from rigsim.skin_bounce import SkinBounce
+from rigsim.skin_bounce import SkinBounce, bounce_on
 from rigsim.subject import Subject
 from rigsim.surface_brdf import SkinSurface, skin_surface
 from rigsim.targets import Target
@@ -543,7 +543,7 @@ class DomeScene:
         camera = view.spectral_sensitivity
         if camera not in self._bleeding:
             if self.interreflections and self._bounce is None:
-                self._bounce = SkinBounce(self._caster)
+                self._bounce = bounce_on(self._caster)
             self._bleeding[camera] = SkinBleeding(
                 self._face(),
                 self.surface(view),

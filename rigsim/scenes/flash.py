@@ -33,7 +33,7 @@ from rigsim.scenes.flash_needs import BOUNCES, LATERAL, SPECTRAL
 from rigsim.scenes.picture import Look, Picture
 from rigsim.scenes.skin_glow import SkinGlow, SurfaceLight, light_skin, light_surface
 from rigsim.sensor import Sensor, expose, sensor_of
-from rigsim.skin_bounce import SkinBounce
+from rigsim.skin_bounce import SkinBounce, bounce_on
 from rigsim.subject import Subject
 from rigsim.targets import Target
 from rigsim.variant import VariantChoice
@@ -98,7 +98,7 @@ class _Stage:
     def exchange(self) -> SkinBounce:
         """Return how light goes from skin to skin."""
         if not self.bounce:
-            self.bounce["skin"] = SkinBounce(self.caster)
+            self.bounce["skin"] = bounce_on(self.caster)
         return self.bounce["skin"]
 
 
