@@ -65,6 +65,9 @@ def intervals(*, toy: bool) -> StageBenchmark:
             for trial in trials
             if not trial.deviation.size
         ),
+        condition=("quantity", "skin", "nominal %"),
+        interval_of="subjects, by the exact interval of a share",
+        no_bands="bands of skin are points of their own",
     )
 
 

@@ -14,8 +14,9 @@ from skinrig.skin_bands import MELANIN_BANDS
 
 # simulated sessions, surveys and faces: over 5 s of processor time even when small
 HEAVY = {
-    "dome-geometry", "editing", "gradient-normals", "probe-session", "render-gradient",
-    "sphere-lights", "traits",
+    "dome-geometry", "editing", "gradient-normals", "head-motion", "intervals",
+    "normal-integration", "omissions", "probe-session", "render-dome", "render-gradient",
+    "render-model", "sphere-lights", "traits",
 }  # fmt: skip
 LEAST_POINTS = 4
 
