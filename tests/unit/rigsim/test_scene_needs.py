@@ -1,0 +1,179 @@
+"""Which effects scenes build: by what they would change over the noise of that sensor."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from capture.rig import load_rig
+from rigsim import effect_sizes
+from rigsim.furrow_light import hidden_share
+from rigsim.lateral import spread_light
+from rigsim.mesh import build_mesh
+from rigsim.probe_tissue import HomogeneousTissue, parse_subject
+from rigsim.render import Caster
+from rigsim.scene_needs import ENOUGH, Effect, NeedsError, Noise, SceneNeeds, decide
+from rigsim.scenes import flash_needs
+from rigsim.scenes.dome import DomeScene
+from rigsim.scenes.flash import FlashScene
+from rigsim.scenes.probe import ProbeScene
+from rigsim.sensor import expose, sensor_of
+from rigsim.subject import make_subject
+from rigsim.targets import make_target
+
+pytestmark = pytest.mark.render
+
+
+def plate(*corners):
+    faces = np.arange(4 * len(corners)).reshape(-1, 4)
+    uv = [(x + 0.05 + 0.5 * k, y) for k in range(len(corners)) for x, y in
+          ((0, 0), (0.4, 0), (0.4, 0.9), (0, 0.9))]  # fmt: skip
+    triangles = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+    return Caster(build_mesh(np.concatenate(corners).astype(float), triangles, uv))
+
+
+SQUARE = np.array([[0, 0, 0], [40, 0, 0], [40, 40, 0], [0, 40, 0]])
+
+
+def test_the_noise_is_that_of_exposures(rng):
+    """4000 pixels; the sample deviation of n normal numbers scatters by 1 / sqrt(2 n), 1.1 %."""
+    sensor = sensor_of(load_rig("flash").views[0], prnu=0.0, dsnu_e=0.0, vignetting=0.0)
+    noise = Noise.of(sensor)
+    for level in (0.02, 0.5):
+        light = np.full((64, 64, 3), level, np.float32)
+        dn = expose(light, sensor=sensor, rng=rng).astype(float)
+        found = dn.std(ddof=1) / (sensor.white - sensor.black)
+        assert found == pytest.approx(float(noise.sigma(level)), rel=0.045)  # 1e-4 twice
+
+
+def test_a_record_may_not_call_negligible_what_is_not():
+    with pytest.raises(NeedsError, match="build it"):
+        Effect("bounces", "negligible", "flat", ENOUGH)
+    with pytest.raises(NeedsError, match="expected one of built"):
+        Effect("bounces", "maybe", "flat")
+    with pytest.raises(NeedsError, match="bounces twice"):
+        SceneNeeds((Effect("bounces", "built", "a"), Effect("bounces", "absent", "b")))
+    assert decide("b", ENOUGH, None, switch="", because="x").built
+    assert not decide("b", 0.999 * ENOUGH, None, switch="", because="x").built
+
+
+@pytest.mark.parametrize("pixel_mm", [0.5, 3.0])
+def test_light_lost_at_an_edge_is_what_spreading_moves_across_it(pixel_mm):
+    """Expected: the mean over a lit pixel beside a shadow. Tolerance: texels of 0.25 mm, 3 %."""
+    from rigsim.atlas import unwrap
+
+    mesh = plate(SQUARE).mesh
+    atlas = unwrap(mesh, 256)
+    x = atlas.position_mm[..., 0]
+    lit = ((x >= 20.0) & atlas.covered).astype(np.float32)[..., None]
+    spread = spread_light(lit, atlas, [0.8], [[1.0]])[..., 0]
+    inside = atlas.covered & (x >= 20.0) & (x < 20.0 + pixel_mm)
+    inside &= np.abs(atlas.position_mm[..., 1] - 20.0) < 10.0
+    lost = 1.0 - float(spread[inside].mean())
+    told = effect_sizes.edge_loss([0.8], [[1.0]], pixel_mm)
+    assert lost == pytest.approx(told, rel=0.12, abs=0.01)
+
+
+def test_a_plate_gets_no_light_from_itself_and_a_corner_does():
+    flat = plate(SQUARE)
+    assert effect_sizes.is_flat(flat.mesh)
+    assert effect_sizes.exchange_share(flat) == 0.0
+    wall = SQUARE[:, [2, 1, 0]] - [0.01, 0.0, 0.0]
+    corner = plate(SQUARE, wall[::-1])
+    assert not effect_sizes.is_flat(corner.mesh)
+    # beside the edge a patch sees up to half a hemisphere of wall, through two boundaries
+    assert 0.15 < effect_sizes.exchange_share(corner) < 0.5
+
+
+def test_a_groove_hides_its_sky_as_two_walls_do():
+    """In a V of 90 degrees the other wall, of length L, hides (1 - d / sqrt(L^2 + d^2)) / 2 of the
+    sky of a point a distance d from the bottom. Tolerance: sectors, and a groove of finite length.
+    """
+    x = np.abs(np.arange(257) - 128.0)
+    height = np.repeat(x[None, :], 1025, axis=0).astype(np.float32)
+    slope = np.sign(np.arange(257) - 128.0)
+    normals = np.zeros((1025, 257, 3), np.float32)
+    normals[..., 0], normals[..., 2] = -slope / math.sqrt(2.0), 1.0 / math.sqrt(2.0)
+    found = hidden_share(height, normals, margin=0, pixel_um=1.0, sectors=64)
+    d = np.arange(8, 60)
+    told = 0.5 * (1.0 - d / np.hypot(128.0, d))
+    np.testing.assert_allclose(found[512, 128 + d], told, rtol=0.06)
+    assert hidden_share(np.zeros((4, 4), np.float32), np.float32([[[0, 0, 1]]]).repeat(4, 0)
+                        .repeat(4, 1), margin=0, pixel_um=1.0, sectors=8).max() == 0.0  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def faces():
+    return {name: make_subject(name, seed=3, size=96) for name in ("II", "darkest")}
+
+
+@pytest.fixture(scope="module")
+def flash():
+    return load_rig("flash").resized(64)
+
+
+def test_pale_skin_needs_what_the_darkest_does_not(flash, faces):
+    pale, dark = (FlashScene(flash, faces[name]).needs for name in ("II", "darkest"))
+    assert pale.builds(flash_needs.SPECTRAL)
+    assert dark[flash_needs.SPECTRAL].verdict == "negligible"
+    sizes = [needs[flash_needs.BOUNCES].over_noise for needs in (pale, dark)]
+    assert sizes[0] > 20.0 * sizes[1]
+
+
+def test_a_noisier_sensor_needs_less(flash, faces):
+    sensor = sensor_of(flash.views[0])
+    noisy = dataclasses.replace(sensor, read_noise_e=1e4)
+    sharp = FlashScene(flash, faces["darkest"], sensor=sensor).needs
+    coarse = FlashScene(flash, faces["darkest"], sensor=noisy).needs
+    for name in (flash_needs.BOUNCES, flash_needs.LATERAL):
+        assert sharp.builds(name)
+        assert coarse[name].verdict == "negligible"
+    assert coarse[flash_needs.SPECTRAL].reason.startswith("there is no such light")
+
+
+def test_what_is_asked_for_is_done_and_said(flash, faces):
+    asked = FlashScene(flash, faces["II"], lateral=False, interreflections=False)
+    for name in (flash_needs.BOUNCES, flash_needs.LATERAL):
+        effect = asked.needs[name]
+        assert effect.verdict == "asked"
+        assert f"{effect.switch}=False asks for it" in effect.reason
+    assert (asked.lateral, asked.interreflections) == (False, False)
+    forced = FlashScene(flash, faces["darkest"], spectral=True)
+    assert forced.needs[flash_needs.SPECTRAL].verdict == "built"
+    assert "spectral=True asks for it" in forced.needs[flash_needs.SPECTRAL].reason
+
+
+def test_flat_targets_need_neither_shadows_nor_bounces(flash):
+    dome = load_rig("dome").resized(64).subset(views=["C02"])
+    for scene in (FlashScene(flash, make_target("chart")), DomeScene(dome, make_target("white"))):
+        assert scene.needs[flash_needs.BOUNCES].verdict == "negligible"
+        assert scene.needs[flash_needs.LATERAL].verdict == "absent"
+
+
+def test_films_alone_ask_for_polarization(flash, faces):
+    assert FlashScene(flash, faces["II"]).needs.builds(flash_needs.POLARIZATION)
+    dome = load_rig("dome").resized(64).subset(views=["C02"])
+    assert DomeScene(dome, faces["II"]).needs[flash_needs.POLARIZATION].verdict == "absent"
+
+
+def test_gray_tissue_is_traced_once_and_skin_color_by_color():
+    rig = load_rig("probe")
+    gray = ProbeScene(rig, HomogeneousTissue(0.04, 1.5)).needs
+    assert gray["tissue traced color by color"].verdict == "negligible"
+    assert gray["layers of the tissue"].verdict == "absent"
+    skin = ProbeScene(rig, parse_subject("III", seed=0)).needs
+    assert skin.builds("tissue traced color by color")
+    assert skin.builds("layers of the tissue")
+
+
+@pytest.mark.long
+def test_color_of_bounced_light_is_redder_than_band_by_band(flash, faces):
+    """The mean of a square is larger than the square of the mean, in red most."""
+    one = FlashScene(flash, faces["II"]).radiance()
+    plain = FlashScene(flash, faces["II"], spectral=False).radiance()
+    none = FlashScene(flash, faces["II"], interreflections=False).radiance()
+    more, bounced = (one - plain).sum(axis=(0, 1)), (plain - none).sum(axis=(0, 1))
+    assert (bounced > 0.0).all()
+    assert more[0] / bounced[0] > 0.01
+    assert more[0] / bounced[0] > 1.5 * abs(more[1] / bounced[1])

@@ -1,0 +1,47 @@
+"""The report's table of what scenes leave out."""
+
+import json
+
+import pytest
+
+from skinrig import omissions_section
+
+EFFECTS = [
+    {"name": "shadows", "verdict": "built", "reason": "a face", "over_noise": 55.0, "switch": ""},
+    {"name": "bounces", "verdict": "negligible", "reason": "<flat>", "over_noise": 0.0,
+     "switch": "interreflections"},
+    {"name": "lens", "verdict": "unmodeled", "reason": "1 px", "over_noise": None, "switch": ""},
+]  # fmt: skip
+
+
+@pytest.fixture
+def session(tmp_path):
+    def make(name, extra):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "session.json").write_text(json.dumps({"extra": extra}))
+        return folder
+
+    return make
+
+
+def test_what_is_left_out_comes_before_what_is_built(session):
+    html = omissions_section.section([session("session-a", {"effects": EFFECTS})])
+    places = [html.index(word) for word in ("bounces", "lens", "shadows")]
+    assert places == sorted(places)
+    assert "1 effects built, 2 not" in html
+    assert "&lt;flat&gt;" in html
+    assert "<flat>" not in html
+
+
+def test_sessions_of_like_scenes_share_a_table_in_any_order(session):
+    two = [session(name, {"effects": EFFECTS}) for name in ("session-b", "session-a")]
+    other = session("session-c", {"effects": EFFECTS[:1]})
+    html = omissions_section.section([*two, other])
+    assert html.count("<table") == 2
+    assert "session-a, session-b" in html
+    assert html == omissions_section.section([other, *reversed(two)])
+
+
+def test_measured_sessions_and_folders_that_are_none_say_nothing(session, tmp_path):
+    assert omissions_section.section([session("session-real", {}), tmp_path / "nowhere"]) == ""
