@@ -110,7 +110,7 @@ def render(packed: Packed, *, connect: bool = False) -> str:
     parts = {
         "POLICY": policy,
         "STYLE": style,
-        "HEADER": packed.header_bytes().decode("utf-8").replace("</", "<\\/"),
+        "HEADER": packed.header_bytes().decode("utf-8").replace("<", "\\u003c"),
         "PAYLOAD": as_text(packed.payload),
         "SCRIPT": code,
     }

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 PRESET = "III"
 """Skin type of faces of whom nothing else is known."""
 SMALLEST = 64
+POSITION_STEPS = np.float32(1024.0)
+"""Steps of a millimetre that positions are rounded to; strain is of the rounded mesh throughout."""
 
 
 def scene(
@@ -96,7 +98,7 @@ def viewer_mesh(subject: Subject) -> ViewerMesh:
     """Return a person's mesh; its own blend shapes come behind those of the expressions."""
     own = {n: d for n, d in subject.mesh.shapes.items() if np.any(d)}
     return ViewerMesh(
-        positions=subject.mesh.vertices_mm,
+        positions=np.round(subject.mesh.vertices_mm * POSITION_STEPS) / POSITION_STEPS,
         normals=subject.mesh.normals,
         uv=subject.mesh.uv,
         faces=subject.mesh.faces.astype(np.int32),

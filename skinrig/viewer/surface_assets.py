@@ -11,8 +11,8 @@ from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 MAPS_SIZE: Final = 256
 """Most texels a side of roughness and intensity, which vary by region."""
-FINE: Final = 16
-"""Words of the finest octave's steps, of reliefs of 2048 texels a side and more: 4 um at most."""
+FINE: Final = 20
+"""Words of the finest octave's steps, of reliefs of 2048 texels a side and more: 5 um at most."""
 
 
 def assets(source: SceneSource) -> Assets:

@@ -65,9 +65,10 @@ V.unpackArray = (buffer, entry) => {
   const count = entry.shape.reduce((a, b) => a * b, 1);
   const size = Type.BYTES_PER_ELEMENT;
   if (entry.predictor === "raw") return new Type(buffer, entry.offset, count);
+  const Word = {1: Uint8Array, 2: Uint16Array, 4: Uint32Array}[size];
   // low bytes first, then high ones
   const bytes = new Uint8Array(buffer, entry.offset, count * size);
-  const out = new Type(count);
+  const out = new Word(count);
   for (let b = 0; b < size; b++) {
     const shift = 8 * b;
     const from = b * count;
@@ -89,7 +90,7 @@ V.unpackArray = (buffer, entry) => {
       }
     }
   }
-  return out;
+  return new Type(out.buffer);
 };
 
 V.load = async () => {
@@ -108,7 +109,7 @@ V.load = async () => {
     ...header,
     mesh: {
       positions: array(mesh.positions), uv: array(mesh.uv), faces: array(mesh.faces),
-      weld: array(mesh.weld), normals: Float32Array.from(array(mesh.normals), n => n / 32767),
+      weld: array(mesh.weld), normals: Float32Array.from(array(mesh.normals), n => n / 8191),
       shapes,
     },
     textures: Object.fromEntries(Object.entries(header.textures)

@@ -1,0 +1,120 @@
+"""One page, whole and closed: policy, hashes, the same bytes; written whole or not at all."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+
+import numpy as np
+import pytest
+
+from model.skin import SkinAppearance, SkinMap
+from skinrig.viewer import page, writing
+from skinrig.viewer.scene import SceneError, Texture, ViewerMesh, ViewerScene
+
+
+@pytest.fixture
+def scene():
+    mesh = ViewerMesh(
+        positions=np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0]], np.float32),
+        normals=np.tile(np.float32([0, 0, 1]), (3, 1)),
+        uv=np.array([[0, 0], [1, 0], [0, 1]], np.float32),
+        faces=np.array([[0, 1, 2]], np.int32),
+    )
+    return ViewerScene(
+        mesh=mesh,
+        textures={"noise": Texture(np.zeros((4, 4, 1), np.float32))},
+        provenance={"name": "</script><script>alert(1)</script>"},
+        left_out=(("color", "none was measured"),),
+    )
+
+
+def _policy(text):
+    return re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', text)[1]
+
+
+def _inline(text):
+    return re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+
+
+def test_a_page_allows_its_own_script_and_style_and_no_network(scene):
+    text = page.build(scene)
+    policy = _policy(text)
+    assert "default-src 'none'" in policy
+    assert "connect-src 'none'" in policy
+    (code,) = _inline(text)
+    digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+    assert f"'sha256-{digest}'" in policy
+    assert "unsafe" not in policy
+    assert not re.search(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//""", text)
+    assert "connect-src 'self'" in _policy(page.build(scene, connect=True))
+
+
+def test_names_cannot_break_out_of_their_block(scene):
+    text = page.build(scene)
+    assert "<script>alert(1)" not in text
+    assert len(_inline(text)) == 1
+
+
+def test_the_same_scene_gives_the_same_page(scene):
+    assert page.build(scene) == page.build(scene)
+
+
+def test_every_script_is_packed_and_the_starter_comes_last():
+    found = {entry.name for entry in page._files("js", ".js")}
+    assert found == set(page.SCRIPTS)
+    assert page.SCRIPTS[0] == "graph.js"
+    assert page.SCRIPTS[-1] == "main.js"
+
+
+def test_comments_are_left_out_of_the_page_and_code_is_not():
+    assert page._bare("  // why\n  a = 'x // y';\n\tb();\n") == "a = 'x // y';\nb();\n"
+
+
+def test_a_page_replaces_an_older_one_whole(scene, tmp_path):
+    out = tmp_path / "deep" / "face.html"
+    first = writing.write(scene, out)
+    assert out.stat().st_size == first["bytes"]
+    writing.write(scene, out)
+    assert sorted(p.name for p in out.parent.iterdir()) == ["face.html"]
+
+
+def test_a_page_that_cannot_be_packed_leaves_the_older_one(scene, tmp_path, monkeypatch):
+    out = tmp_path / "face.html"
+    out.write_text("older")
+
+    def full(*_):
+        raise OSError(28, "No space left on device", "face.html")
+
+    monkeypatch.setattr(writing.os, "replace", full)
+    with pytest.raises(OSError, match="No space"):
+        writing.write(scene, out)
+    assert [p.name for p in tmp_path.iterdir()] == ["face.html"]
+    assert out.read_text() == "older"
+
+
+@pytest.mark.parametrize("size", [32, 8192])
+def test_a_size_that_no_page_can_hold_is_refused(size):
+    with pytest.raises(SceneError, match="expected 64 to 4096"):
+        writing.compose([], size=size)
+
+
+def test_landmarks_without_a_picture_are_refused(tmp_path):
+    with pytest.raises(SceneError, match="name the folder"):
+        writing.compose([], landmarks=tmp_path / "landmarks.csv")
+
+
+def test_maps_that_no_face_can_wear_are_refused_with_what_makes_them(tmp_path):
+    from model import store
+
+    flat = SkinAppearance(
+        maps={"normals": SkinMap(np.zeros((4, 4, 3), np.float32), "1")},
+        source="measured",
+        parameters={"kind": "appearance"},
+        inputs={},
+        versions={},
+    )
+    store.write(tmp_path / "appearance", flat)
+    with pytest.raises(SceneError, match="skinrig fit facial-color"):
+        writing.compose([tmp_path / "appearance"], size=64)
