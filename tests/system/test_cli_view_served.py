@@ -1,0 +1,67 @@
+"""`skinrig view --port`: served until interrupted; a displacement needs the server."""
+
+from __future__ import annotations
+
+import json
+import urllib.request
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from skinrig.console import Console
+from skinrig.viewer import writing
+from skinrig.viewer.scene import ViewerMesh, ViewerScene
+from skinrig.viewer.tiles import TileError
+
+
+@pytest.fixture
+def plate() -> ViewerScene:
+    uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
+    positions = np.concatenate([40.0 * uv, np.zeros((4, 1))], axis=1).astype(np.float32)
+    normals = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
+    faces = np.array([[0, 1, 3], [0, 3, 2]], np.int32)
+    return ViewerScene(ViewerMesh(positions, normals, uv, faces))
+
+
+def test_a_displacement_without_a_server_is_a_mistake_in_use(tmp_path):
+    from skinrig.cli import app
+
+    found = CliRunner().invoke(app, ["view", "--displacement", str(tmp_path / "d.npy")])
+    assert found.exit_code != 0
+    assert "add --port 0" in (found.output + str(found.exception))
+
+
+def test_a_served_page_is_there_with_its_tiles_until_it_ends(plate, tmp_path, capsys, monkeypatch):
+    from skinrig.viewer import server
+
+    path = tmp_path / "height.npy"
+    heights = np.random.default_rng(0).normal(0.0, 9.0, (1024, 1024)).astype(np.float32)
+    np.save(path, heights)
+    seen = {}
+
+    def wait(self, seconds=None):
+        with urllib.request.urlopen(self.url, timeout=10) as answer:
+            seen["page"] = answer.read().decode("utf-8")
+        with urllib.request.urlopen(f"{self.url}tiles/1/0/0", timeout=10) as answer:
+            seen["tile"] = answer.read()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(server.Served, "wait", wait)
+    writing.serve(plate, 0, [], console=Console(True), displacement=path)
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == "skinrig.view-served/1"
+    assert document["displacement_px"] == 1024
+    assert "connect-src 'self'" in seen["page"]
+    words = np.frombuffer(seen["tile"], "<u2").reshape(256, 256)
+    mean = heights[:512, :512].reshape(256, 2, 256, 2).mean(axis=(1, 3))
+    assert np.corrcoef(words.ravel(), mean.ravel())[0, 1] > 0.999999
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(document["url"], timeout=5)
+
+
+def test_a_file_that_is_no_displacement_is_named(plate, tmp_path):
+    path = tmp_path / "height.npy"
+    np.save(path, np.zeros((300, 300), np.float32))
+    with pytest.raises(TileError, match=r"displacement: got shape \(300, 300\)"):
+        writing.serve(plate, 0, [], console=Console(True), displacement=path)
