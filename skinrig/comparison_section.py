@@ -132,7 +132,7 @@ def _difference_row(one: MapDifference) -> tuple[object, ...]:
 def _pictures(a: Run, b: Run, pair: Pair) -> str:
     """Draw A | B | difference | difference over the combined standard error."""
     told = [one for one in pair.differences if one.sigmas is not None and one.name != "position"]
-    order = sorted(told, key=_farthest_first)
+    order = sorted((one for one in told if one.high > 0.0), key=_farthest_first)
     body = ""
     for one in order[:MOST_SHOWN]:
         body += f"<h3>{page.escape(one.name)}</h3><div class='maps'>"

@@ -156,6 +156,7 @@ def _relief_errors(
         "relief; on skin, steep walls of furrows hide light from themselves, which is not "
         "corrected, and standard errors, which know noise alone, are then too small.</p>"
     )
+    note += page.one_skin(truth.parameters)
     return "<h3>Errors of normals and height</h3>" + note + page.table(
         ("state", "pixels", "masked %", "mean error °", "median °", "68 % interval",
          "unblurred truth °", "median standard error °", "68 % coverage %", "height rms um",

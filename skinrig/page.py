@@ -171,6 +171,21 @@ def note(text: str) -> str:
     return f'<p class="note">{escape(text)}</p>'
 
 
+def one_skin(parameters: Mapping[str, object]) -> str:
+    """Return a remark on whom errors are of, where a session holds one subject and has no bands.
+
+    Examples
+    --------
+    >>> one_skin({"preset": "III"})
+    '<p class="note">Errors are of one subject, III: there are no bands to tell apart.</p>'
+    """
+    for key in ("subject", "preset"):
+        if parameters.get(key):
+            subject = parameters[key]
+            return note(f"Errors are of one subject, {subject}: there are no bands to tell apart.")
+    return note("Errors are of one subject: there are no bands to tell apart.")
+
+
 def document(title: str, lead: str, sections: str) -> str:
     """Return the whole page; it makes no request and runs no script.
 

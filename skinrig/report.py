@@ -104,8 +104,20 @@ def make(
     checks_of_all: list[page.Check] = []
     found = discover(places)
     body = sections(found, checks_of_all)
-    html = page.document(title, verdict_section.section(checks_of_all, found.words()), body)
+    lead = verdict_section.section(checks_of_all, found.words(), _least_known(found))
+    html = page.document(title, lead, body)
     return Report(html, tuple(checks_of_all), None)
+
+
+def _least_known(found: Findings) -> list[str]:
+    """Return what maps without a truth know least of."""
+    told = []
+    for name, folder in found.appearances.items():
+        parameters: Mapping[str, Any] = store.read_document(folder).parameters
+        states = parameters.get("parts", {}).get("facial_color", {}).get("truth", {})
+        if not found.truths.keys() & {parameters.get("truth"), *states.values()}:
+            told += unjudged_section.weaknesses(name, store.read(folder))
+    return told
 
 
 def judge(found: Findings, checks: list[page.Check]) -> None:

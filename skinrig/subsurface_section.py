@@ -156,7 +156,7 @@ def _errors(
     name: str, appearance: SkinAppearance, truth: SkinAppearance, checks: list[page.Check]
 ) -> str:
     rows = evaluation.compare_fits(appearance, truth)
-    body = ""
+    body = page.one_skin(truth.parameters)
     for kind in dict.fromkeys(row.kind for row in rows):
         found = evaluation.by_method([row for row in rows if row.kind == kind])
         body += f"<h3>Error of sigma_tr against the truth, {page.escape(kind)} tissue</h3>"

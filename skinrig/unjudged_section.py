@@ -13,6 +13,45 @@ RESIDUALS = ("residual", "misfit", "gamut_distance")
 BANDED = ("melanin", "hemoglobin")
 
 
+MOST_NAMED = 3
+"""Maps of an appearance that are named first: those that know least."""
+
+
+def weaknesses(name: str, appearance: SkinAppearance) -> list[str]:
+    """Return what an appearance without a truth knows least of, by its own standard errors.
+
+    Parameters
+    ----------
+    name
+        Of the appearance.
+    appearance
+        Its maps; those without standard errors say nothing.
+
+    Examples
+    --------
+    >>> thickness = SkinMap(np.full((2, 2), 2.0), "mm", np.full((2, 2), 0.1))
+    >>> weaknesses("cheek", SkinAppearance({"thickness": thickness}, "measured"))
+    ['cheek: thickness, median standard error 5 % of its value']
+    """
+    told: list[tuple[float, str]] = []
+    angles: list[tuple[float, str]] = []
+    for key, one in sorted(appearance.maps.items()):
+        row = _spread(key, one) if one.stderr is not None else None
+        if row is None:
+            continue
+        share = float(str(row[2]))
+        missing = f", {100 - share:.0f} % of pixels without a value" if share < 99.5 else ""
+        if row[1] == "°":
+            angle = float(str(row[4]))
+            text = f"{name}: {key}, median standard error {page.number(angle)}°"
+            angles.append((angle, text + missing))
+        elif np.isfinite(percent := float(str(row[5]))):
+            text = f"{name}: {key}, median standard error {page.number(percent)} % of its value"
+            told.append((percent, text + missing))
+    first = sorted(told, reverse=True)[:MOST_NAMED] + sorted(angles, reverse=True)[:1]
+    return [text for _, text in first]
+
+
 def section(appearance: SkinAppearance) -> str:
     """Return standard errors and residuals of maps, by melanin band where melanin is among them.
 

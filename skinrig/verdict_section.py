@@ -35,8 +35,18 @@ def headline(checks: Sequence[page.Check]) -> str:
     return f"All {len(checks)} checks kept their limits."
 
 
-def section(checks: Sequence[page.Check], about: str = "") -> str:
-    """Return the verdict, where it is worst, and all checks; ``about`` says of what, as text."""
+def section(checks: Sequence[page.Check], about: str = "", unjudged: Sequence[str] = ()) -> str:
+    """Return the verdict, where it is worst, and all checks.
+
+    Parameters
+    ----------
+    checks
+        All there are.
+    about
+        Of what, as text.
+    unjudged
+        What maps without a truth know least of, in sentences.
+    """
     kind = "bad" if any(not check.passed for check in checks) else "good"
     body = f'<p class="verdict {kind if checks else ""}">{page.escape(headline(checks))}</p>'
     if about:
@@ -45,6 +55,12 @@ def section(checks: Sequence[page.Check], about: str = "") -> str:
     if weak:
         items = "".join(f"<li>{page.escape(text)}</li>" for text in weak)
         body += f'<h2>Where it is worst</h2><ul class="worst">{items}</ul>'
+    if unjudged:
+        items = "".join(f"<li>{page.escape(text)}</li>" for text in unjudged)
+        body += "<h2>Without a truth: least known</h2>" + page.note(
+            "By their own standard errors; how far they are from the truth is not known."
+        )
+        body += f'<ul class="worst">{items}</ul>'
     if checks:
         body += "<h2>Checks</h2>" + page.checks_table(checks)
     return body

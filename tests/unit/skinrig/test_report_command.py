@@ -1,0 +1,90 @@
+"""`skinrig report` as a user runs it: what it prints, what it leaves behind, what it promises."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model import store
+from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig import map_comparison, map_pictures, report_folders, run_comparison, verdict_section
+from skinrig.cli import main
+from skinrig.front_view import WIDTH_PX
+
+PAGE = Path(__file__).parents[3] / "docs" / "report.md"
+
+
+@pytest.fixture
+def maps(tmp_path):
+    for name, level in (("monday", 0.05), ("tuesday", 0.06)):
+        melanin = np.full((20, 30), level)
+        store.write(
+            tmp_path / name,
+            SkinAppearance(
+                {"melanin": SkinMap(melanin, UNITS["melanin"], np.full(melanin.shape, 0.001))},
+                "measured",
+            ),
+        )
+    return tmp_path
+
+
+def test_one_run_is_reported_and_two_are_compared_and_it_is_said_which(maps, capsys):
+    out = maps / "page.html"
+    assert main(["report", str(maps / "monday"), "-o", str(out)]) == 0
+    assert "No limit was checked" in capsys.readouterr().out
+    assert "least known" in out.read_text("utf-8")
+    both = [str(maps / "monday"), str(maps / "tuesday")]
+    assert main(["report", *both, "-o", str(out)]) == 0
+    assert "compared A: monday with B: tuesday; --no-compare" in capsys.readouterr().out
+    assert "in combined standard errors" in out.read_text("utf-8")
+    assert main(["report", *both, "--no-compare", "-o", str(out), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["compared"] is None
+    assert told["bytes"] == out.stat().st_size
+    assert [p.name for p in maps.iterdir() if p.name.startswith(".")] == []
+
+
+def test_what_cannot_be_compared_is_refused_and_nothing_is_written(maps, capsys):
+    out = maps / "page.html"
+    assert main(["report", str(maps / "monday"), "--compare", "-o", str(out)]) == 3
+    assert "expected two of one kind" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_page_that_cannot_be_written_leaves_the_old_one_and_no_part(maps, monkeypatch):
+    out = maps / "page.html"
+    out.write_text("old")
+
+    def full(*_):
+        raise OSError(28, "No space left on device", str(out))
+
+    monkeypatch.setattr(report_folders.os, "replace", full)
+    assert main(["report", str(maps / "monday"), "-o", str(out)]) == 3
+    assert out.read_text() == "old"
+    assert [p.name for p in maps.iterdir() if p.name.startswith(".")] == []
+
+
+def test_a_document_that_is_damaged_is_named(maps, capsys):
+    (maps / "bench.json").write_text('{"schema": "skinrig.bench/2"')
+    assert main(["report", str(maps), "-o", str(maps / "page.html")]) == 3
+    message = capsys.readouterr().err
+    assert "bench.json: cannot be read as JSON" in message
+    assert "Traceback" not in message
+
+
+@pytest.mark.parametrize(
+    ("words", "value"),
+    [
+        (r"fewer than (\d+) %", 100 * verdict_section.OVERCONFIDENT),
+        (r"or more than (\d+) % of truths", 100 * verdict_section.UNDERCONFIDENT),
+        (r"more than (\d+) % are masked", 100 * verdict_section.MUCH_MASKED),
+        (r"more than (\d+) % lie beyond 3", 100 * map_comparison.MOST_BEYOND),
+        (r"within (\d+) mm in the median", run_comparison.SAME_PLACE_MM),
+        (r"has (\d+) colors", map_pictures.LEVELS),
+        (r"faces from the front (\d+)", WIDTH_PX),
+    ],
+)
+def test_the_page_on_reports_tells_the_numbers_of_the_program(words, value):
+    assert float(re.search(words, PAGE.read_text("utf-8"))[1]) == value
