@@ -10,155 +10,55 @@ the stretch of the skin.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.microstructure import (
-    ALPHA_LIMITS,
-    FOREHEAD,
-    KernelTable,
-    gaussian_weights,
-    kernel_parameters,
-)
+from model.microstructure import ALPHA_LIMITS, FOREHEAD, KernelTable, kernel_parameters
 from skinrig.viewer import relief_growth
+from skinrig.viewer.micro_relief import (
+    PATCH_PX,
+    MicroRelief,
+    MicrostructureAssetError,
+    fitted_relief,
+    simulated_relief,
+)
 from skinrig.viewer.relief_growth import GrownRelief
 from skinrig.viewer.scene import Assets, SceneSource, Texture, ViewerMesh, ViewerScene
+from skinrig.viewer.slope_variances import STRETCH_RANGE, slope_rms, strained_variance
 from skinrig.viewer.tiles import TILE_PX, Pyramid
-
-if TYPE_CHECKING:
-    from model.skin import SkinAppearance
 
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 SAMPLE_PX: Final = 512
 """Side of the part of a displacement that its slopes are known from."""
-PATCH_PX: Final = 256
-"""Side of the patch in the page: 3 to 4 mm of skin; some 80 kB."""
 CELL_PX: Final = 56
-STRETCHES: Final = 33
-"""Stretch ratios a side of the table of variances, evenly from 0.5 to 1.5."""
-STRETCH_RANGE: Final = (0.5, 1.5)
-FEWEST_PX: Final = 6
-"""Pixels a side of the coarsest level whose slopes are counted."""
 MOST_BREAKS: Final = 8
 """Lines of alpha that the shader has room for, less one."""
 MOST_REACH_PX: Final = 64
 """Kernels that reach farther than this leave nothing of the window."""
 
 
-class MicrostructureAssetError(ValueError):
-    """Relief that the page cannot show."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MicroRelief:
-    """A measured or simulated neutral relief with the kernels of that skin.
-
-    Attributes
-    ----------
-    height_um : ndarray of float32, shape (h, w)
-        Finite; row 0 is the top.
-    pixel_um : float
-        Length of skin that a pixel has.
-    table : KernelTable
-    source : str
-        "measured" or "simulated", and from where; shown in the page.
-    """
-
-    height_um: Float32
-    pixel_um: float
-    table: KernelTable = FOREHEAD
-    source: str = "simulated"
-
-
 def assets(source: SceneSource) -> Assets:
     """Return the microstructure of a scene, or why there is none.
 
-    Examples
-    --------
-    >>> sorted(assets.__annotations__)
-    ['return', 'source']
+    A fitted relief comes before a simulated one; what is simulated on a captured face is said.
     """
-    relief = relief_of(source)
-    if relief is None:
-        return Assets(
-            left_out=(
-                (
-                    "microstructure",
-                    "no relief of microstructure in the appearance; "
-                    "`skinrig fit microstructure` adds it",
-                ),
-            )
-        )
-    return from_relief(relief, source.mesh, seed=source.seed)
-
-
-def relief_of(source: SceneSource) -> MicroRelief | None:
-    """Return the relief that belongs to a scene: fitted before simulated; None where neither."""
     dynamic = source.appearances.get("dynamic")
-    if dynamic is not None:
-        return fitted_relief(dynamic)
-    if source.kind in ("procedural", "mesh"):
-        return simulated_relief(source.seed)
-    return None
-
-
-def fitted_relief(appearance: SkinAppearance) -> MicroRelief | None:
-    """Return the first site's relief of `skinrig fit microstructure`; None without that part."""
-    from skinrig.dynamic_appearance import MICROSTRUCTURE, parts_of
-
-    part = parts_of(appearance).get(MICROSTRUCTURE)
-    if part is None:
-        return None
-    site, entry = sorted(part["sites"].items())[0]
-    found = appearance.maps[entry["map"]]
-    text = bytes(appearance.files[entry["table"]]).decode("utf-8")
-    valid = np.ones(found.values.shape[:2], bool) if found.valid is None else found.valid
-    return MicroRelief(
-        largest_square(np.squeeze(found.values).astype(np.float32), valid),
-        float(entry["pixel_um"]),
-        KernelTable.from_json(text),
-        f"{part['source']}: {site}",
-    )
-
-
-def simulated_relief(seed: int, *, site: str = "forehead", pixel_um: float = 15.0) -> MicroRelief:
-    """Return relief of the simulated skin of a site, `PATCH_PX` a side."""
-    from rigsim.microrelief import make_micro_skin
-
-    skin = make_micro_skin(site, seed=seed, size_mm=1e-3 * pixel_um * PATCH_PX, texel_um=pixel_um)
-    return MicroRelief(skin.height_um, pixel_um, FOREHEAD, f"simulated: {site}")
-
-
-def largest_square(height: Float32, valid: NDArray[np.bool_]) -> Float32:
-    """Return the largest square without holes; the first one in reading order of several.
-
-    Examples
-    --------
-    >>> holes = np.array([[0, 1, 1], [1, 1, 1]], bool)
-    >>> largest_square(np.arange(6, dtype=np.float32).reshape(2, 3), holes).tolist()
-    [[1.0, 2.0], [4.0, 5.0]]
-    """
-    good = np.asarray(valid, bool) & np.isfinite(height)
-    size = np.zeros(good.shape, np.int64)
-    for y in range(good.shape[0]):
-        row = good[y].astype(np.int64)
-        if y:
-            # side of the largest square that ends at each pixel
-            above = size[y - 1]
-            for x in np.flatnonzero(row):
-                if x:
-                    row[x] = 1 + min(above[x], above[x - 1], row[x - 1])
-        size[y] = row
-    side = int(size.max(initial=0))
-    if side == 0:
-        raise MicrostructureAssetError("relief: got no valid pixel, expected some millimetres")
-    bottom, right = np.argwhere(size == side)[0] + 1
-    return np.ascontiguousarray(height[bottom - side : bottom, right - side : right])
+    relief = None if dynamic is None else fitted_relief(dynamic)
+    if relief is not None:
+        return from_relief(relief, source.mesh, seed=source.seed)
+    add = "`skinrig fit microstructure` adds its own"
+    if source.subject is None:
+        return Assets(left_out=(("microstructure", f"none was measured; {add}"),))
+    made = from_relief(simulated_relief(source.seed), source.mesh, seed=source.seed)
+    if source.kind in ("dynamic", "dome", "model"):
+        told = f"what is drawn of it is simulated, its kernels are the paper's forehead; {add}"
+        made["left_out"] = (("microstructure of this face", told),)
+    return made
 
 
 def grown(relief: MicroRelief, *, seed: int = 0) -> GrownRelief:
@@ -328,59 +228,3 @@ def largest_sigma_um(table: KernelTable) -> float:
     """Return the widest kernel of a table within its range, um."""
     ends = np.array([*table.stretch_range, np.nextafter(1.0, 0.0), 1.0])
     return float(kernel_parameters(ends, table)[1].max())
-
-
-def slope_rms(growth: GrownRelief) -> list[float]:
-    """Return the rms of slopes that pixels of 2^level px still show, by level of a relief.
-
-    A slope is the gradient by central differences over two pixels of the level, as the page's
-    normals are; levels end where less than six pixels a side are left.
-    """
-    found = []
-    height = growth.patch.astype(np.float64)
-    step = growth.pixel_um
-    while height.shape[0] >= FEWEST_PX:
-        dx = (height[1:-1, 2:] - height[1:-1, :-2]) / (2.0 * step)
-        dy = (height[2:, 1:-1] - height[:-2, 1:-1]) / (2.0 * step)
-        found.append(float(np.sqrt(np.mean(dx**2 + dy**2))))
-        side = height.shape[0] // 2
-        height = height[: 2 * side, : 2 * side].reshape(side, 2, side, 2).mean(axis=(1, 3))
-        step *= 2.0
-    return found
-
-
-def strained_variance(growth: GrownRelief, table: KernelTable) -> Floats:
-    """Return how the variance of slopes changes under strain, relative to neutral skin.
-
-    The kernels' transfer functions on the patch's power spectrum, averaged with that of the
-    patch turned by 90 degrees: what direction the relief has of its own is not followed. Slopes
-    are those of the deformed surface: heights over lengths that are stretched too.
-
-    Parameters
-    ----------
-    growth : GrownRelief
-    table : KernelTable
-
-    Returns
-    -------
-    ndarray, shape (STRETCHES, STRETCHES, 2)
-        Variance along s and along t by r_s (rows) and r_t (columns), over `STRETCH_RANGE`.
-    """
-    side = growth.patch.shape[0]
-    window = np.hanning(side + 2)[1:-1]
-    spectrum = np.abs(np.fft.fft2(growth.patch * window[:, None] * window)) ** 2
-    spectrum = 0.5 * (spectrum + spectrum.T)
-    turn = 2.0 * np.pi * np.fft.fftfreq(side)
-    slope = np.sin(turn) ** 2
-    ratios = np.linspace(*STRETCH_RANGE, STRETCHES)
-    alpha, sigma_um = kernel_parameters(ratios, table)
-    transfer = np.empty((STRETCHES, side))
-    for row, (a, s) in enumerate(zip(alpha, sigma_um / growth.pixel_um, strict=True)):
-        weights = gaussian_weights(s)
-        wave = np.cos(turn[:, None] * np.arange(weights.size)) @ (
-            weights * np.where(np.arange(weights.size) > 0, 2.0, 1.0)
-        )
-        transfer[row] = (1.0 - a + a * wave) ** 2
-    neutral = float(slope @ spectrum.sum(axis=1))
-    along = (transfer * slope) @ spectrum @ transfer.T / neutral
-    return np.stack([along / ratios[:, None] ** 2, along.T / ratios[None, :] ** 2], axis=2)

@@ -26,7 +26,7 @@ int moves(ivec2 at) {
 
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);
-  size_px = ivec2(p_microstructure_window_px);
+  size_px = ivec2(p_microstructure_side_px);
   int left = moves(at);
   source = vec4(0.0);
   if (left > PAD) return;
@@ -89,7 +89,7 @@ float placed(ivec2 corner, ivec2 at, int level) {
 
 void main() {
   int level = int(p_microstructure_place.z + 0.5);
-  int n = int(p_microstructure_window_px);
+  int n = int(p_microstructure_side_px);
   ivec2 at = u_origin + ivec2(int(gl_FragCoord.x), n - 1 - int(gl_FragCoord.y));
   vec2 cells = (vec2(at) + 0.5) * exp2(float(level)) / float(u_growth.x);
   float down = cells.y * 1.1547005383792515;
@@ -283,9 +283,9 @@ float microstructureMode() {
 vec4 microstructureAt(vec2 uv, out float shown) {
   float whole = floor(p_microstructure_virtual_px / exp2(p_microstructure_place.z));
   vec2 at = uv * whole - p_microstructure_place.xy;
-  vec2 inside = min(at, p_microstructure_window_px - at) - p_microstructure_margin_px;
+  vec2 inside = min(at, p_microstructure_side_px - at) - p_microstructure_margin_px;
   shown = smoothstep(0.0, 24.0, min(inside.x, inside.y)) * step(0.5, p_microstructure_place.w);
-  return buffer_microstructure(at / p_microstructure_window_px);
+  return buffer_microstructure(at / p_microstructure_side_px);
 }
 
 // Variance of slopes along one axis, relative to neutral skin's.

@@ -7,7 +7,7 @@
 // the camera under this light; the largest one times the slopes' root mean square bounds, to first
 // order, the root mean square error of leaving them out, in radiance where 1 is a white surface.
 // V.detail.state holds it; below the tolerance they are left out.
-Object.assign(V.defaults, {detail: 1, detail_tolerance: 1 / 255});
+Object.assign(V.defaults, {detail: 1, detail_tolerance: 2 / 255});
 V.detail = {ALBEDO: 0.8, NORMALS: 400, state: {}};
 V.statistics.detail = V.detail.state;
 

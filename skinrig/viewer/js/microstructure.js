@@ -15,10 +15,10 @@ V.microstructure = {};
 Object.assign(V.defaults, {
   microstructure: 2,          // 0 none, 1 static, 2 dynamic, 3 all three side by side
   microstructure_sampling: 1, // 0 bilinear, 1 cubic
-  microstructure_window_px: 512,
+  microstructure_window_px: 0,  // side of the window; 0: as the canvas needs it
   microstructure_at: null,    // [u, v, level] holds the window; null: it follows the view
   microstructure_place: [0, 0, 0, 0],  // column, row (from the bottom), level, whether drawn
-  microstructure_virtual_px: 8, microstructure_margin_px: 0, microstructure_variance: [0, 0],
+  microstructure_side_px: 512, microstructure_virtual_px: 8, microstructure_margin_px: 0, microstructure_variance: [0, 0],
   microstructure_split_px: 256, variance_stretch: [0.5, 1.5, 33], strain_px: 512,
 });
 
@@ -62,10 +62,18 @@ V.microstructure.aim = p => {
   return found;
 };
 
+// Side of a window that holds all that the canvas shows, and the margins that fade.
+V.microstructure.side = p => {
+  if (p.microstructure_window_px) return p.microstructure_window_px;
+  const needed = Math.max(...V.screen()) / 0.75 + 2 * (p.microstructure_margin_px + 24);
+  return Math.min(Math.max(128 * Math.ceil(needed / 128), 256), V.microstructure.MOST_PX);
+};
+V.microstructure.MOST_PX = 1024;
+
 // Column and row of the window's lower left pixel, its level, and whether anything is drawn.
 V.microstructure.place = p => {
   const facts = V.microstructure.facts;
-  const n = p.microstructure_window_px;
+  const n = p.microstructure_side_px;
   let aim = null;
   let level = 0;
   if (p.microstructure_at) {
@@ -132,13 +140,13 @@ V.microstructure.table = () => {
 };
 
 V.microstructure.windowKey = p =>
-  [...p.microstructure_place, p.microstructure_window_px].join();
+  [...p.microstructure_place, p.microstructure_side_px].join();
 
 // Lower left corner and sides of the window in texture coordinates.
 V.microstructure.window = p => {
   const [x, y, level] = p.microstructure_place;
   const whole = Math.floor(p.microstructure_virtual_px / 2 ** level);
-  const n = p.microstructure_window_px;
+  const n = p.microstructure_side_px;
   return [x / whole, y / whole, n / whole, n / whole];
 };
 
@@ -173,6 +181,7 @@ V.start.push(() => {
   });
   const drawGraph = V.drawGraph;
   V.drawGraph = (side, p, demand) => {
+    p.microstructure_side_px = V.microstructure.side(p);
     p.microstructure_place = V.microstructure.place(p);
     const [, , level, shown] = p.microstructure_place;
     // what pixels larger than the window's average is not shown either
@@ -184,8 +193,8 @@ V.start.push(() => {
     drawGraph(side, p, demand);
   };
   const {windowKey, drawn, moves} = V.microstructure;
-  const n2 = p => p.microstructure_window_px ** 2;
-  const side = p => p.microstructure_window_px;
+  const n2 = p => p.microstructure_side_px ** 2;
+  const side = p => p.microstructure_side_px;
   const chunks = ["principal", "kernel_lookup"];
   const first = p => `${p.microstructure_sampling}`;
   // taps of a Gaussian along a line at the largest kernel, an upper bound

@@ -245,7 +245,8 @@ V.strain.upload = (side, p) => {
   }
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made.faces);
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, Uint32Array.from(drawn), gl.DYNAMIC_DRAW);
-  side.strain = {...made, key, count: drawn.length, milliseconds, found};
+  V.statistics.strain_ms = milliseconds;
+  side.strain = {...made, key, count: drawn.length};
   return side.strain;
 };
 V.ATTRIBUTES.a_tensor = 6;

@@ -39,7 +39,7 @@ V.tiles.fill = ctx => {
   const {tile_px} = V.microstructure.facts.tiles;
   const {levels, virtual_px} = V.microstructure.facts;
   const [left, bottom, level] = ctx.p.microstructure_place;
-  const n = ctx.p.microstructure_window_px;
+  const n = ctx.p.microstructure_side_px;
   const whole = virtual_px / 2 ** level;
   const top = whole - bottom - n;
   const out = new Float32Array(n * n);

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from model.microstructure import FOREHEAD, KernelTable, convolve, kernel_parameters
+from skinrig.viewer import micro_relief, slope_variances
 from skinrig.viewer import microstructure_assets as assets
-from skinrig.viewer.microstructure_assets import MicroRelief, MicrostructureAssetError
+from skinrig.viewer.micro_relief import MicroRelief, MicrostructureAssetError
 from skinrig.viewer.scene import ViewerMesh
 
 
 @pytest.fixture(scope="module")
 def relief() -> MicroRelief:
-    return assets.simulated_relief(3)
+    return micro_relief.simulated_relief(3)
 
 
 def plate(side_mm: float = 250.0) -> ViewerMesh:
@@ -35,8 +36,8 @@ def slope_variance(height, pixel, stretch=(1.0, 1.0)):
 @pytest.mark.parametrize(("r_s", "r_t"), [(1.25, 0.8125), (1.125, 1.0), (1.0, 0.75)])
 def test_the_variance_of_slopes_under_strain_is_that_of_convolved_relief(relief, r_s, r_t):
     growth = assets.grown(relief)
-    table = assets.strained_variance(growth, relief.table)
-    ratios = np.linspace(*assets.STRETCH_RANGE, assets.STRETCHES)
+    table = slope_variances.strained_variance(growth, relief.table)
+    ratios = np.linspace(*slope_variances.STRETCH_RANGE, slope_variances.STRETCHES)
     found = table[np.searchsorted(ratios, r_s), np.searchsorted(ratios, r_t)]
     alpha, sigma_um = kernel_parameters([r_s, r_t], relief.table)
     sigma = sigma_um / growth.pixel_um
@@ -57,21 +58,21 @@ def test_the_variance_of_slopes_under_strain_is_that_of_convolved_relief(relief,
 
 
 def test_neutral_skin_keeps_its_variance(relief):
-    table = assets.strained_variance(assets.grown(relief), relief.table)
-    middle = assets.STRETCHES // 2
+    table = slope_variances.strained_variance(assets.grown(relief), relief.table)
+    middle = slope_variances.STRETCHES // 2
     np.testing.assert_allclose(table[middle, middle], 1.0, rtol=1e-9)
 
 
 def test_compressed_skin_is_rougher_and_stretched_skin_smoother(relief):
-    table = assets.strained_variance(assets.grown(relief), relief.table)
-    middle = assets.STRETCHES // 2
+    table = slope_variances.strained_variance(assets.grown(relief), relief.table)
+    middle = slope_variances.STRETCHES // 2
     along = table[:, middle, 0]
     assert along[middle - 6] > 1.5
     assert along[middle + 6] < 0.75
 
 
 def test_larger_pixels_show_less_of_the_slopes(relief):
-    rms = assets.slope_rms(assets.grown(relief))
+    rms = slope_variances.slope_rms(assets.grown(relief))
     assert len(rms) >= 5
     assert all(b < a for a, b in pairwise(rms))
     assert rms[5] < 0.1 * rms[0]
@@ -98,7 +99,7 @@ def test_a_relief_of_few_pixels_is_refused():
 
 def test_a_relief_without_a_valid_pixel_is_refused():
     with pytest.raises(MicrostructureAssetError, match="no valid pixel"):
-        assets.largest_square(np.zeros((4, 4), np.float32), np.zeros((4, 4), bool))
+        micro_relief.largest_square(np.zeros((4, 4), np.float32), np.zeros((4, 4), bool))
 
 
 def test_the_patch_has_no_tilt_of_its_own(relief):
@@ -106,3 +107,13 @@ def test_the_patch_has_no_tilt_of_its_own(relief):
     a = assets.grown(MicroRelief(tilted, 15.0))
     b = assets.grown(MicroRelief(relief.height_um, 15.0))
     np.testing.assert_allclose(a.patch, b.patch, atol=1e-3)
+
+
+def test_a_face_of_which_nothing_is_known_says_what_adds_its_microstructure():
+    class Source:
+        appearances: dict[str, object] = {}  # noqa: RUF012
+        subject = None
+
+    made = assets.assets(Source)  # type: ignore[arg-type]
+    assert made["left_out"][0][0] == "microstructure"
+    assert "skinrig fit microstructure" in made["left_out"][0][1]
