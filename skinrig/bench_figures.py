@@ -61,7 +61,9 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
             axes.plot(seconds[bend], error[bend], "o", mfc="none", mec="0.5", ms=11)
         for index in best if named or len(best) > 1 else ():
             effort = {
-                k: v for k, v in points[index]["knobs"].items() if k not in front["condition"]
+                k: v
+                for k, v in points[index]["knobs"].items()
+                if k not in front["condition"] and any(p["knobs"].get(k) != v for p in points)
             }
             label = _words(effort)
             label += "  (knee)" if index == bend else ""

@@ -92,20 +92,20 @@ MEASURED_S: Final[dict[str, float]] = {
     "light-order": 1, "wrinkle-weights": 3, "wrinkle-storage": 3, "anisotropy": 5,
     "translucency": 6, "fibre-readings": 8, "normal-histogram": 9, "subsurface-batch": 10,
     "diffuse-albedo": 12, "efficiency": 12, "microstructure-passes": 13, "hdr": 15, "brdf": 17,
-    "wrinkles": 18, "wrinkle-sum": 19, "dome-lights": 21, "misalignment": 22, "color-table": 26,
-    "shared-melanin": 28, "subsurface-fit": 30, "perfusion-curves": 31, "render-gradient": 34,
-    "head-motion": 34, "texture-fill": 35, "lumitexels": 35, "normals": 37, "facial-color": 38,
-    "chromophores": 39, "layered-reflectance": 39, "expression-alignment": 39, "brdf-space": 40,
-    "render-flash": 44, "reflectance": 46, "gradient-normals": 50, "texture-matching": 53,
-    "probe-session": 41, "editing": 42, "subsurface-gather": 64, "normal-integration": 65,
-    "render-dome": 70,
+    "wrinkles": 18, "wrinkle-sum": 19, "dome-lights": 21, "misalignment": 22, "dome-geometry": 26,
+    "color-table": 26, "shared-melanin": 28, "subsurface-fit": 30, "perfusion-curves": 31,
+    "render-gradient": 34, "head-motion": 34, "texture-fill": 35, "lumitexels": 35,
+    "normals": 37, "facial-color": 38, "chromophores": 39, "layered-reflectance": 39,
+    "expression-alignment": 39, "brdf-space": 40, "render-flash": 44, "reflectance": 46,
+    "gradient-normals": 50, "texture-matching": 53, "probe-session": 41, "editing": 42,
+    "subsurface-gather": 64, "normal-integration": 65, "render-dome": 70,
 }  # fmt: skip
 """About how many seconds each takes at full size on two cores that do nothing else: of a run alone,
 the processor seconds of the main thread and half of those of all others, which share two cores.
 What errors by melanin band add to that is estimated from small sizes."""
 
 GUESSED_S: Final[dict[str, float]] = {
-    "dome-geometry": 90, "traits": 90, "photon-transport": 120, "sphere-lights": 120,
+    "traits": 90, "photon-transport": 120, "sphere-lights": 120,
     "render-model": 130, "skin-stretch": 150, "microstructure": 150,
     "displacement-synthesis": 200, "kernel-fit": 300, "omissions": 300, "intervals": 600,
 }  # fmt: skip
