@@ -10,6 +10,7 @@ import typer
 
 from skinrig.cli_options import Json, Out
 from skinrig.console import Console
+from skinrig.errors import UsageError
 
 NEXT: Final[Mapping[str, str]] = {
     "maps": "read maps.json: units, ranges and frames; maps.mtlx holds the color spaces",
@@ -88,6 +89,9 @@ def export(
     from skinrig.exporting.options import Delivery
 
     console = Console(json)
+    known = (*appearances.FORMATS, *brdfs.SUFFIX, *sessions.FORMATS, light_lists.NAME)
+    if to not in known:
+        raise UsageError(f"--to: got {to!r}, expected one of {', '.join(known)}")
     if to in brdfs.SUFFIX:
         place = brdfs.place_of(at, radius_mm=radius, diffuse=not without_diffuse)
         done = appearances.export_brdfs(source, out, to=to, place=place, use=use)

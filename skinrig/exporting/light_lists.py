@@ -162,9 +162,9 @@ def in_camera_frame(
 
     Examples
     --------
-    >>> ahead = np.array([[0.0, 0.0, 700.0]])
+    >>> ahead = np.array([[0.0, -10.0, 700.0]])
     >>> in_camera_frame(ahead, np.diag([1.0, -1.0, -1.0])).tolist()
-    [[0.0, 0.0, 700.0]]
+    [[0.0, -10.0, 700.0]]
     """
     return np.asarray((position_mm @ np.asarray(rotation).T) * _UP)
 

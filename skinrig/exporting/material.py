@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from model import fresnel, skin_reflectance
+from model import dipole, fresnel, skin_reflectance
 from model.skin import SkinAppearance
 from rigsim.mesh import Mesh
 from skinrig.exporting import subsurface_radius, surface_fit, tangents
@@ -31,8 +31,8 @@ NOTES: Final[dict[str, str]] = {
     "specular_roughness": "square root of GGX's alpha, the lobe nearest to the measured mixture",
     "specular_weight": "factor of the reflection of a smooth dielectric of specular_ior",
     "specular_misfit": "what the single lobe leaves of the measured mixture, relative RMS",
-    "subsurface_radius": "mean free path with the measured sigma_tr under OpenPBR's inversion "
-    "of the color: sqrt(3) s(color) / sigma_tr",
+    "subsurface_radius": "mean free path at which light in the medium that OpenPBR finds for "
+    "the color decays as it does in the measured one, by exact transport",
     "translucency": "1/sigma_tr as measured or assumed",
 }
 
@@ -61,6 +61,8 @@ class Material:
         Roughness, weight, misfit.
     translucency_mm, translucency_stderr_mm
         1/sigma_tr, (H, W, 3), mm.
+    deficit
+        1 - alpha' of the measured medium, (H, W, 3); that of R_d 0.001 to 0.999 beyond.
     eta
         Refractive index.
     assumed
@@ -81,6 +83,7 @@ class Material:
     surface: surface_fit.SurfaceFit
     translucency_mm: Floats
     translucency_stderr_mm: Floats | None
+    deficit: NDArray[np.float64]
     eta: float
     assumed: tuple[str, ...]
     source: str
@@ -129,6 +132,7 @@ class Material:
             surface=surface_fit.fit(model.lobes, np.nan_to_num(model.weights), eta=model.eta),
             translucency_mm=np.where(known, depth, usual).astype(np.float32),
             translucency_stderr_mm=model.translucency_stderr_mm,
+            deficit=deficit_of(r_d, model.eta),
             eta=model.eta,
             assumed=model.assumed,
             source=appearance.source,
@@ -137,7 +141,8 @@ class Material:
     @property
     def radius_mm(self) -> Floats:
         """Mean free path, (H, W, 3), mm; see :mod:`skinrig.exporting.subsurface_radius`."""
-        return subsurface_radius.radius_mm(self.translucency_mm, self.base_color).astype(np.float32)
+        found = subsurface_radius.radius_mm(self.translucency_mm, self.base_color, self.deficit)
+        return found.astype(np.float32)
 
     @property
     def specular_weight(self) -> Floats:
@@ -232,6 +237,26 @@ class Material:
                     )
                 )
         return out
+
+
+def deficit_of(r_d: NDArray[np.floating[Any]], eta: float) -> NDArray[np.float64]:
+    """Return 1 - alpha' of the medium of an albedo, looked up between 1 000 exact values.
+
+    Parameters
+    ----------
+    r_d
+        Any shape; held within 0.001 to 0.999.
+    eta
+        Refractive index over that of air.
+
+    Examples
+    --------
+    >>> deficit_of(np.array([0.436, 7.0]), 1.3).round(3).tolist()
+    [0.041, 0.0]
+    """
+    nodes = np.linspace(0.001, 0.999, 999)
+    root = np.sqrt(dipole.invert_to_deficit(nodes, eta))  # smooth at an albedo of 1, too
+    return np.asarray(np.interp(r_d, nodes, root) ** 2, np.float64)
 
 
 def read_mesh(path: Path) -> Mesh:

@@ -1,23 +1,28 @@
-"""From 1/sigma_tr to the radius that OpenPBR takes, and back.
+"""From R_d and 1/sigma_tr to the radius that OpenPBR takes, and back.
 
-OpenPBR (and what follows it: MaterialX, Arnold, Blender's random walk by a similar rule) takes the
-color that a medium shows and its mean free path, and finds the albedo of single scattering itself.
-With Kulla and Conty's fit, which OpenPBR's specification names, the medium of color A and radius r
-has 1 - alpha = s(A)^2 for isotropic scattering, and so
+OpenPBR, and what follows it, takes the color that a medium shows and its mean free path r, and
+finds the albedo of single scattering itself: by Kulla and Conty's fit, which its specification
+names, 1 - alpha = s(color)^2 for isotropic scattering. Far from where it entered, light in that
+medium decays by k(alpha) / r with the exact k of transport, alpha = k / artanh(k).
 
-    sigma_tr = sqrt(3 (1 - alpha)) / r = sqrt(3) s(A) / r.
+The measured medium of alpha' and sigma_tr = sqrt(3 (1 - alpha')) sigma_t' decays by k(alpha')
+sigma_t'. The radius is the one with the same decay:
 
-The radius below is the one whose sigma_tr is the measured one under that rule. What is left: the
-fit is of an index-matched half space; other renderers invert otherwise; and diffusion's sigma_tr
-lies above the exact decay of light, by 4 % at alpha = 0.9 and 14 % at 0.7.
+    r = k(alpha) / (k(alpha') sigma_t') = k(alpha) sqrt(3 (1 - alpha')) / (k(alpha') sigma_tr).
+
+Both media show the same color. They differ in what is between: the renderer's has no reflection
+from inside at its surface, and so a lower albedo and a longer path for the same color. Renderers
+that invert the color otherwise get another decay.
 
 References
 ----------
 Kulla and Conty 2017, Revisiting Physically Based Shading at Imageworks, SIGGRAPH course;
-Andersson et al. 2024, OpenPBR Surface 1.1, section on subsurface.
+OpenPBR Surface 1.1, section on subsurface; Case and Zweifel 1967, Linear Transport Theory (k).
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,20 +48,70 @@ def deficit_root(color: ArrayLike) -> Floats:
     """
     a = np.clip(np.asarray(color, np.float64), LEAST_COLOR, MOST_COLOR)
     root = 4.09712 + 4.20863 * a - np.sqrt(9.59217 + 41.6808 * a + 17.7126 * a * a)
-    return np.asarray(np.clip(root, 1e-6, 1.0))
+    return np.asarray(np.clip(root, 1e-4, 1.0 - 1e-3))
 
 
-def radius_mm(translucency_mm: ArrayLike, color: ArrayLike) -> Floats:
-    """Return the mean free path for 1/sigma_tr under a color, mm, shape of both."""
-    return np.sqrt(3.0) * deficit_root(color) * np.asarray(translucency_mm, np.float64)
+def decay(deficit: ArrayLike) -> Floats:
+    """Return the exact decay of light over sigma_t, isotropic scattering: alpha = k / artanh k.
 
-
-def translucency_mm(radius: ArrayLike, color: ArrayLike) -> Floats:
-    """Return 1/sigma_tr of a mean free path under a color, mm: the inverse of `radius_mm`.
+    Parameters
+    ----------
+    deficit
+        1 - alpha, 1e-9 to 0.999; beyond it is held there.
 
     Examples
     --------
-    >>> float(translucency_mm(radius_mm(3.5, 0.4), 0.4).round(9))
+    >>> decay([1e-6, 0.1, 0.5]).round(4).tolist()
+    [0.0017, 0.5254, 0.9575]
+    """
+    log_deficit, log_artanh = _decay_table()
+    held = np.log(np.clip(np.asarray(deficit, np.float64), 1e-9, 0.999))
+    return np.asarray(np.tanh(np.exp(np.interp(held, log_deficit, log_artanh))))
+
+
+def radius_mm(translucency_mm: ArrayLike, color: ArrayLike, deficit: ArrayLike) -> Floats:
+    """Return the mean free path for OpenPBR.
+
+    Parameters
+    ----------
+    translucency_mm
+        1/sigma_tr of the measured medium, mm.
+    color
+        What it shows, 0 to 1.
+    deficit
+        1 - alpha' of the measured medium; NaN: not known, sigma_tr is taken for its decay.
+
+    Returns
+    -------
+    ndarray
+        mm, of the shape of all.
+    """
+    return np.asarray(_per_translucency(color, deficit) * np.asarray(translucency_mm, np.float64))
+
+
+def translucency_mm(radius: ArrayLike, color: ArrayLike, deficit: ArrayLike) -> Floats:
+    """Return 1/sigma_tr of a mean free path, mm: the inverse of `radius_mm`.
+
+    Examples
+    --------
+    >>> float(translucency_mm(radius_mm(3.5, 0.4, 0.2), 0.4, 0.2).round(9))
     3.5
     """
-    return np.asarray(radius, np.float64) / (np.sqrt(3.0) * deficit_root(color))
+    return np.asarray(np.asarray(radius, np.float64) / _per_translucency(color, deficit))
+
+
+def _per_translucency(color: ArrayLike, deficit: ArrayLike) -> Floats:
+    own = np.asarray(deficit, np.float64)
+    known = np.isfinite(own) & (own > 0.0)
+    safe = np.where(known, np.clip(own, 1e-9, 0.999), 0.1)
+    diffusion = np.where(known, np.sqrt(3.0 * safe) / decay(safe), 1.0)
+    return np.asarray(decay(deficit_root(color) ** 2) * diffusion)
+
+
+@lru_cache(maxsize=1)
+def _decay_table() -> tuple[Floats, Floats]:
+    """Return log(1 - alpha) and log artanh k, both increasing."""
+    t = np.geomspace(1e-5, 2e3, 8001)
+    series = t**2 / 3.0 - 2.0 * t**4 / 15.0
+    exact = 1.0 - np.tanh(t) / t
+    return np.log(np.where(t < 1e-2, series, exact)), np.log(t)

@@ -2,8 +2,7 @@
 
 Least squares over the directions of the lobes' grid up to 60 degrees of half angle between light
 and view, each counting by its solid angle and both cosines over the mean lobe there: neither the
-peak nor the tail decides alone. All sums are
-those of K lobes: a texel costs K^2 products, whatever its mixture.
+peak nor the tail decides alone. All sums are those of K lobes: a texel costs K (K + 69) products.
 """
 
 from __future__ import annotations
@@ -22,6 +21,8 @@ Floats = NDArray[np.float64]
 
 ROUGHNESS: Final = np.linspace(0.15, 1.0, 69)
 """Of materials: the square root of the slope width alpha."""
+CHUNK: Final = 1 << 15
+"""Texels at a time: 69 sums of each are held."""
 LEAST_COSINE: Final = 0.2
 MOST_THETA_D: Final = np.deg2rad(60.0)
 """Grazing light is left out: there one lobe of a smooth dielectric's index cannot follow a mixture,
@@ -68,10 +69,21 @@ def fit(lobes: BrdfBasis, weights: ArrayLike, *, eta: float) -> SurfaceFit:
     SurfaceFit
         Texels without any surface reflection have weight 0 and roughness 1.
     """
-    share = np.asarray(weights, np.float64)
-    gram, cross, own = _products(lobes, eta)
+    share = np.asarray(weights)
+    products = _products(lobes, eta)
+    flat = share.reshape(-1, share.shape[-1])
+    found = np.empty((3, len(flat)), np.float32)
+    for start in range(0, len(flat), CHUNK):
+        part = slice(start, start + CHUNK)
+        found[:, part] = _fit(flat[part].astype(np.float64), *products)
+    roughness, weight, misfit = found.reshape(3, *share.shape[:-1])
+    return SurfaceFit(roughness, weight, misfit)
+
+
+def _fit(share: Floats, gram: Floats, cross: Floats, own: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return roughness, weight and misfit of N mixtures, by the products of `_products`."""
     energy = np.einsum("...k,kl,...l->...", share, gram, share)
-    along = share @ cross  # (H, W, R)
+    along = share @ cross  # (N, R)
     explained = np.maximum(along, 0.0) ** 2 / own
     best = np.argmax(explained, axis=-1)
     inner = np.clip(best, 1, len(ROUGHNESS) - 2)
@@ -98,10 +110,10 @@ def fit(lobes: BrdfBasis, weights: ArrayLike, *, eta: float) -> SurfaceFit:
     left = np.maximum(energy - np.maximum(here, explained.max(axis=-1)), 0.0)
     dark = energy <= 1e-30
     misfit = np.sqrt(left / np.where(dark, 1.0, energy))
-    return SurfaceFit(
-        np.where(dark, 1.0, roughness).astype(np.float32),
-        np.where(dark, 0.0, scale).astype(np.float32),
-        np.where(dark, 0.0, misfit).astype(np.float32),
+    return (
+        np.where(dark, 1.0, roughness),
+        np.where(dark, 0.0, scale),
+        np.where(dark, 0.0, misfit),
     )
 
 

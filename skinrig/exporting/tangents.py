@@ -23,6 +23,9 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 LEAST = 1e-12
+LEAST_VOLUME = 1e-6
+"""Of a frame: below it the texture is folded, and no normal is told."""
+LEAST_Z = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,15 +141,23 @@ def to_tangent(normals: ArrayLike, axes: Floats, covered: Bools) -> NDArray[np.f
         The third component is above 0 as a map must have it: normals that face away from the
         surface are laid onto its horizon.
     """
-    given = np.asarray(normals, np.float64)
-    good = covered & (np.abs(np.linalg.det(axes)) > 1e-6) & np.isfinite(given).all(axis=-1)
-    whole = np.where(good[..., None, None], axes, np.eye(3))
-    # n is along n' A with the axes as rows of A: the inverse, as renderers interpolate A
-    solved = np.linalg.solve(np.swapaxes(whole, -1, -2), np.nan_to_num(given)[..., None])
-    found = _unit(np.asarray(solved[..., 0], np.float64))
-    found[..., 2] = np.maximum(found[..., 2], 1e-3)
-    found[~good] = (0.0, 0.0, 1.0)
-    return _unit(found).astype(np.float32)
+    given = np.asarray(normals)
+    good = covered & np.isfinite(given).all(axis=-1)
+    out = np.zeros(given.shape, np.float32)
+    out[..., 2] = 1.0
+    world = given[good].astype(np.float64)
+    tangent, bitangent, normal = (axes[..., row, :][good] for row in range(3))
+    # n is along n' A with the axes as rows of A: the adjugate, as renderers interpolate A
+    volume = np.sum(np.cross(tangent, bitangent) * normal, axis=-1)
+    found = np.empty_like(world)
+    found[:, 0] = np.sum(np.cross(bitangent, normal) * world, axis=-1)
+    found[:, 1] = np.sum(np.cross(normal, tangent) * world, axis=-1)
+    found[:, 2] = np.sum(np.cross(tangent, bitangent) * world, axis=-1)
+    found = _unit(found * np.sign(volume)[:, None])
+    found[:, 2] = np.maximum(found[:, 2], LEAST_Z)
+    found[np.abs(volume) < LEAST_VOLUME] = (0.0, 0.0, 1.0)
+    out[good] = _unit(found)
+    return out
 
 
 def from_tangent(tangent_normals: ArrayLike, axes: Floats) -> NDArray[np.float64]:

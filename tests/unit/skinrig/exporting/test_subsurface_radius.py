@@ -5,7 +5,13 @@ import pytest
 from scipy.optimize import brentq
 
 from model.tissue_optics import layer_stack_reflectance
-from skinrig.exporting.subsurface_radius import deficit_root, radius_mm, translucency_mm
+from skinrig.exporting.material import deficit_of
+from skinrig.exporting.subsurface_radius import (
+    decay,
+    deficit_root,
+    radius_mm,
+    translucency_mm,
+)
 
 
 @pytest.mark.parametrize("color", [0.1, 0.3, 0.5, 0.7, 0.9])
@@ -35,21 +41,47 @@ def _even_light(albedo, nodes=400):
     return float(1.0 - 2.0 * root * np.sum(mu * h * w))
 
 
-def test_the_radius_gives_the_measured_decay_back(rng):
-    depth, color = rng.uniform(0.2, 8.0, 50), rng.uniform(0.02, 0.98, 50)
-    np.testing.assert_allclose(translucency_mm(radius_mm(depth, color), color), depth, rtol=1e-12)
-    # sigma_tr = sqrt(3 sigma_a sigma_t') of the medium that the renderer will build
-    total = 1.0 / radius_mm(depth, color)
-    absorbed = total * deficit_root(color) ** 2
-    np.testing.assert_allclose(1.0 / np.sqrt(3.0 * absorbed * total), depth, rtol=1e-12)
+def exact_decay(albedo):
+    """Solve albedo / (2 k) ln((1 + k) / (1 - k)) = 1 for the decay k in units of sigma_t."""
+    return brentq(lambda k: albedo / (2 * k) * np.log((1 + k) / (1 - k)) - 1, 1e-9, 1 - 1e-15)
 
 
-@pytest.mark.parametrize(("albedo", "above"), [(0.9, 0.042), (0.7, 0.145)])
-def test_diffusion_decays_faster_than_light_by_what_the_docs_say(albedo, above):
-    """Exact: albedo / (2 k) ln((1 + k) / (1 - k)) = 1 for the decay k in units of sigma_t."""
-    exact = brentq(lambda k: albedo / (2 * k) * np.log((1 + k) / (1 - k)) - 1, 1e-6, 1 - 1e-9)
-    assert np.sqrt(3.0 * (1.0 - albedo)) / exact - 1.0 == pytest.approx(above, abs=0.002)
+@pytest.mark.parametrize("albedo", [0.2, 0.4, 0.7, 0.9, 0.99, 0.99999])
+def test_light_decays_as_transport_theory_has_it(albedo):
+    assert decay(1.0 - albedo) == pytest.approx(exact_decay(albedo), rel=1e-5)
 
 
-def test_white_and_black_have_finite_radii():
-    assert np.isfinite(radius_mm(1.0, [-0.2, 0.0, 1.0, 1.3])).all()
+def test_diffusion_alone_would_be_off_by_what_the_docs_say():
+    """sqrt(3 (1 - albedo)) over the exact decay: why the exact one is used."""
+    off = [np.sqrt(3.0 * (1.0 - a)) / exact_decay(a) for a in (0.9, 0.7, 0.4)]
+    np.testing.assert_allclose(off, [1.042, 1.145, 1.361], atol=0.002)
+
+
+def test_the_renderers_medium_lets_light_decay_as_the_measured_one(rng):
+    for depth, color, deficit in rng.uniform([0.2, 0.05, 0.02], [8.0, 0.95, 0.6], (20, 3)):
+        radius = float(radius_mm(depth, color, deficit))
+        rendered = exact_decay(1.0 - float(deficit_root(color)) ** 2) / radius
+        total = 1.0 / (depth * np.sqrt(3.0 * deficit))  # sigma_t' of the measured medium
+        assert rendered == pytest.approx(exact_decay(1.0 - deficit) * total, rel=2e-5)
+
+
+def test_the_radius_gives_the_measured_translucency_back(rng):
+    depth, color, deficit = rng.uniform([0.2, 0.0, 0.02], [8.0, 1.0, 0.6], (50, 3)).T
+    radius = radius_mm(depth, color, deficit)
+    np.testing.assert_allclose(translucency_mm(radius, color, deficit), depth, rtol=1e-12)
+
+
+def test_albedos_are_looked_up_as_they_are_inverted(rng):
+    from model import dipole
+
+    r_d = rng.uniform(0.002, 0.998, 200)
+    exact = dipole.invert_to_deficit(r_d, 1.4)
+    np.testing.assert_allclose(deficit_of(r_d, 1.4), exact, rtol=1e-4, atol=1e-7)
+
+
+def test_white_black_and_unknown_media_have_finite_radii():
+    color = [-0.2, 0.0, 1.0, 1.3]
+    for deficit in (0.0, 1e-12, 1.0, np.nan):
+        found = radius_mm(1.0, color, deficit)
+        assert np.isfinite(found).all()
+        assert (found > 0.0).all()

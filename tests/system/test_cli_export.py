@@ -1,0 +1,125 @@
+"""`skinrig export` of maps and materials as a user calls it."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from model import brdf_recipe, brdf_tables, store
+from model.skin import UNITS, SkinAppearance, SkinMap
+from reconstruction.dome_stages import BASIS_FILE, _basis_bytes
+from rigsim.atlas import unwrap
+from rigsim.mesh import build_mesh
+from skinrig.cli import app, main
+from skinrig.exporting import obj
+from skinrig.exporting.tangents import FramedMesh
+
+SIDE = 32
+
+
+@pytest.fixture
+def dome(tmp_path):
+    """A bent square of skin that was measured."""
+    u, v = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5)))
+    points = np.stack([90 * u - 45, 90 * v - 45, 20 * np.sin(np.pi * u)], -1)
+    corner = np.arange(25).reshape(5, 5)
+    a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
+    faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    mesh = build_mesh(points, faces, np.stack([u, v], -1))
+    atlas = unwrap(mesh, SIDE)
+    every = dict(brdf_recipe.materials())
+    lobes = brdf_tables.tabulate({"ggx": every["ggx 0.33 eta 1.4"]})
+    maps = {
+        "position": SkinMap(atlas.position_mm, "mm", valid=atlas.covered),
+        "normals": SkinMap(atlas.normal, "1", valid=atlas.covered),
+        "r_d": SkinMap(np.full((SIDE, SIDE, 3), 0.4), "1"),
+        "basis_weight_0": SkinMap(np.full((SIDE, SIDE), 0.9), "1"),
+    }
+    agreed = {"pseudonym": "P042", "consent_scope": ["research"], "consent_expires": None}
+    return store.write(
+        tmp_path / "dome",
+        SkinAppearance(
+            maps, "measured", {"consent": [agreed]},
+            files={
+                BASIS_FILE: _basis_bytes(lobes, 1, {1: (np.eye(1), 0.0)}),
+                "mesh.obj": obj.text(FramedMesh.of(mesh), 1.0, "mm").encode(),
+            },
+        ),
+    )  # fmt: skip
+
+
+def run(capsys, *argv):
+    code = main([str(one) for one in argv])
+    return code, capsys.readouterr()
+
+
+@pytest.mark.parametrize("to", ["maps", "mtlx", "gltf", "usd"])
+def test_each_format_ends_with_the_next_step_and_a_sealed_folder(dome, tmp_path, capsys, to):
+    if to == "usd":
+        pytest.importorskip("pxr")
+    out = tmp_path / "out"
+    code, said = run(capsys, "export", dome, "--to", to, "--use", "research", "--out", out)
+    assert code == 0, said.err
+    assert "next: " in said.out
+    assert list(out.glob("ascmhl/*.mhl"))
+
+
+def test_one_json_document_says_what_was_written_and_left_out(dome, tmp_path, capsys):
+    out = tmp_path / "out"
+    argv = ["export", dome, "--to", "gltf", "--use", "research", "--out", out, "--json"]
+    code, said = run(capsys, *argv)
+    assert code == 0
+    told = json.loads(said.out)
+    assert (told["schema"], told["to"], told["files"]) == ("skinrig.export/1", "gltf", 2)
+    assert [what for what, _ in told["left_out"]] == ["subsurface light", "morph targets"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["--to", "maps"], 2, "--use: got none"),
+        (["--to", "maps", "--use", "film"], 3, "P042 has not agreed"),
+        (["--to", "fbx", "--use", "research"], 2, "expected one of maps, mtlx"),
+        (["--to", "mtlx", "--use", "research", "--unit", "inch"], 2, "--unit: got 'inch'"),
+        (["--to", "gltf", "--use", "research", "--normal-y", "dx"], 2, "glTF knows gl alone"),
+        (["--to", "maps", "--use", "research", "--only", "melanin"], 3, "got melanin"),
+        (["--to", "spectral", "--use", "research"], 3, "as of the flash rig"),
+        (["--to", "metahuman", "--use", "research"], 3, "skinrig fit wrinkles"),
+        (["--to", "lp", "--use", "research"], 3, "session"),
+    ],
+)
+def test_what_cannot_be_exported_says_why_and_leaves_nothing(
+    dome, tmp_path, capsys, arguments, code, says
+):
+    out = tmp_path / "out"
+    found, said = run(capsys, "export", dome, *arguments, "--out", out)
+    assert found == code
+    assert says in said.err
+    assert "Traceback" not in said.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dome"]
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path, capsys):
+    code, said = run(capsys, "export", tmp_path / "no", "--to", "maps", "--out", tmp_path / "out")
+    assert code == 3
+    assert "is no APPEARANCE/ folder" in said.err
+
+
+def test_simulated_maps_need_no_use(tmp_path, capsys):
+    melanin = SkinMap(np.full((4, 6), 0.05), UNITS["melanin"])
+    blood = SkinMap(np.full((4, 6), 0.03), UNITS["hemoglobin"])
+    folder = store.write(
+        tmp_path / "flash", SkinAppearance({"melanin": melanin, "hemoglobin": blood}, "simulated")
+    )
+    code, said = run(capsys, "export", folder, "--to", "spectral", "--out", tmp_path / "out")
+    assert code == 0, said.err
+    assert "left out: stokes.exr" in said.out
+
+
+def test_the_help_names_every_format():
+    from skinrig.exporting import appearances, brdfs, light_lists, sessions
+
+    text = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).output
+    for name in (*appearances.FORMATS, *brdfs.SUFFIX, *sessions.FORMATS, light_lists.NAME):
+        assert name in text
