@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -40,9 +41,10 @@ def model(*, toy: bool) -> StageBenchmark:
     rays = (1, 2) if toy else (1, 2, 3, 4)
     rig = load_rig("dome").resized(width + width % 2).subset(views=[VIEW])
     face = make_subject("III", seed=5, size=size)
-    direct = {"interreflections": False, "subsurface": False}  # as the model has it
-    scene = DomeScene(rig, face, **direct)
-    true = DomeScene(rig, face, subpixels=fine, **direct).radiance(VIEW, [LIGHT])[0]
+    # as the model has it
+    direct = partial(DomeScene, interreflections=False, subsurface=False)
+    scene = direct(rig, face)
+    true = direct(rig, face, subpixels=fine).radiance(VIEW, [LIGHT])[0]
     camera = CameraPose.nominal(rig.views[0])
     light = true_light(scene, LIGHT, VIEW)
     caster = Caster(face.mesh)
@@ -113,9 +115,10 @@ def model(*, toy: bool) -> StageBenchmark:
 def _on_skin(preset: str, rig: Rig, *, size: int, fine: int) -> BandError:
     """Return the error of a face of a preset's melanin, at 4 rays a pixel."""
     face = make_subject(preset, seed=5, size=size)
-    direct = {"interreflections": False, "subsurface": False}  # as the model has it
-    scene = DomeScene(rig, face, **direct)
-    true = DomeScene(rig, face, subpixels=fine, **direct).radiance(VIEW, [LIGHT])[0]
+    # as the model has it
+    direct = partial(DomeScene, interreflections=False, subsurface=False)
+    scene = direct(rig, face)
+    true = direct(rig, face, subpixels=fine).radiance(VIEW, [LIGHT])[0]
     on = FittedSurface.of(true_model(scene, VIEW), face.mesh)
     camera = CameraPose.nominal(rig.views[0])
     light = true_light(scene, LIGHT, VIEW)
