@@ -178,7 +178,7 @@ def filled(values: NDArray[np.floating], valid: Mask) -> Floats:
     few = (values.shape[0], values.shape[1])
     while missing.any() and valid.any():
         few = (max(1, few[0] // 2), max(1, few[1] // 2))
-        cells = Cells(valid.shape, few)  # type: ignore[arg-type]
+        cells = Cells(valid.shape, few)
         coarse, held = cells.coarsen(out, valid)
         (up,) = cells.refine(coarse, valid=held)
         known = missing & np.isfinite(up)
@@ -205,9 +205,9 @@ def _albedo(source: SceneSource) -> Texture | None:
         if appearance is None or ALBEDO not in appearance.maps:
             continue
         found = appearance.maps[ALBEDO]
-        valid = np.isfinite(found.values).all(axis=-1)
+        valid: Mask = np.asarray(np.isfinite(found.values).all(axis=-1), np.bool_)
         if found.valid is not None:
-            valid &= found.valid
+            valid = valid & found.valid
         values = np.stack([filled(found.values[..., c], valid) for c in range(3)], axis=-1)
         return Texture(np.clip(halved(values, source.size), 0.0, 1.0).astype(np.float32), "u8")
     return None

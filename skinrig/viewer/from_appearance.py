@@ -15,7 +15,7 @@ from model.skin import SkinAppearance
 from skinrig import dynamic_appearance
 from skinrig.viewer import procedural
 from skinrig.viewer.assembling import assemble
-from skinrig.viewer.scene import SceneError, SceneSource, ViewerScene
+from skinrig.viewer.scene import Kind, SceneError, SceneSource, ViewerScene
 
 if TYPE_CHECKING:
     from rigsim.mesh import Mesh
@@ -65,9 +65,10 @@ def scene(
     first = next(iter(appearances.values()))
     seed = first.seed if isinstance(first.seed, int) and first.seed >= 0 else 0
     subject = procedural.simulated(surface, preset=procedural.PRESET, size=size, seed=seed)
-    kind = next(name for name in ("model", "dome", "dynamic") if name in appearances)
+    kinds: tuple[Kind, ...] = ("model", "dome", "dynamic")
+    kind = next(name for name in kinds if name in appearances)
     source = SceneSource(
-        kind,  # type: ignore[arg-type]
+        kind,
         procedural.viewer_mesh(subject),
         size,
         seed=seed,
@@ -152,7 +153,7 @@ def picture_landmarks(source: SceneSource, part: dict[str, Any]) -> dict[str, tu
     if isinstance(name, str):
         folder = source.paths["dynamic"].resolve().parent / Path(name).name
         if (folder / store.DOCUMENT).is_file():
-            points = store.read_document(folder).parameters.get("landmarks_px")
+            points: Any = store.read_document(folder).parameters.get("landmarks_px")
             if isinstance(points, dict):
                 return {key: (float(x), float(y)) for key, (x, y) in points.items()}
     raise SceneError(

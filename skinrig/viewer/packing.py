@@ -18,16 +18,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from skinrig.viewer import octaves
 from skinrig.viewer.scene import Storage, Texture, ViewerMesh, ViewerScene
 
 Float32 = NDArray[np.float32]
-Words = NDArray[np.integer[Any]] | NDArray[np.floating[Any]]
+Words = NDArray[Any]
+"""uint8, uint16, int16, float16 or float32."""
 
 PREDICTORS: Final = ("none", "left", "up", "plane")
 """Which neighbors a word is predicted from; "plane" is left + up - upper left."""
-UNSAFE: Final = (0, 8, 9, 10, 11, 12, 13, 26, 27, 34, 38, 60, 127)
-"""Codes of characters that HTML, editors or transports may change: controls, line ends, and those
-with which markup begins."""
 NORMAL_STEPS: Final = 8191.0
 """Steps of a normal's component from 0 to 1: 0.005 degrees."""
 SHAPE_BITS: Final = 32767
@@ -98,90 +97,13 @@ def dequantize(words: Words, low: Float32, high: Float32) -> Float32:
     return np.asarray(low[..., None, None, :] + span * (words.astype(np.float32) / top), np.float32)
 
 
-def as_text(data: bytes) -> str:
-    """Return bytes as text of which UTF-8 holds seven bits a byte (base64: six).
-
-    A character below 128 is seven bits, the first the highest. Those that a page or an editor may
-    change (`UNSAFE`) become, with the seven bits behind them, one of two bytes:
-    ``(index in UNSAFE + 1) * 128 + next``.
-
-    Parameters
-    ----------
-    data
-        Any bytes.
-
-    Examples
-    --------
-    >>> [ord(one) for one in as_text(bytes([131, 6]))]
-    [65, 65, 64]
-    """
-    bits = np.unpackbits(np.frombuffer(data, np.uint8))
-    groups = np.concatenate([bits, np.zeros(-len(bits) % 7, np.uint8)]).reshape(-1, 7)
-    codes = (groups @ (1 << np.arange(6, -1, -1))).astype(np.uint16)
-    unsafe = np.full(128, -1, np.int64)
-    unsafe[list(UNSAFE)] = np.arange(len(UNSAFE))
-    if len(codes) and unsafe[codes[-1]] >= 0:
-        codes = np.append(codes, np.uint16(32))  # something for the last to be joined with
-    keep = np.ones(len(codes), np.bool_)
-    behind = -1  # the last that was joined to one before it
-    for at in np.flatnonzero(unsafe[codes] >= 0):
-        if at == behind:
-            continue
-        behind = int(at) + 1
-        keep[behind] = False
-        codes[at] = (unsafe[codes[at]] + 1) * 128 + codes[behind]
-    return codes[keep].astype("<u2").tobytes().decode("utf-16-le")
-
-
-def octaves(values: Float32, fine: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return words of half as many texels a side, and the steps that the finest octave adds.
-
-    Parameters
-    ----------
-    values
-        Words before they are rounded, 0 to 255, shape (L, H, W, C), H and W even.
-    fine
-        Words a step.
-
-    Returns
-    -------
-    coarse, steps : ndarray of uint8
-        (L, H/2, W/2, C), and (L, H, W, C) modulo 256; `joined` makes words of them.
-    """
-    L, H, W, C = values.shape
-    means = values.reshape(L, H // 2, 2, W // 2, 2, C).mean(axis=(2, 4))
-    coarse = np.rint(means).astype(np.uint8)
-    steps = np.rint((values - _doubled(coarse)) / fine).astype(np.int64)
-    return coarse, (steps % 256).astype(np.uint8)
-
-
-def joined(coarse: NDArray[np.uint8], steps: NDArray[np.uint8], fine: int) -> NDArray[np.uint8]:
-    """Return the words of `octaves`, (L, H, W, C)."""
-    words = _doubled(coarse) + fine * steps.view(np.int8).astype(np.int64)
-    return np.clip(words, 0, 255).astype(np.uint8)
-
-
-def _doubled(coarse: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Return twice as many texels a side, interpolated linearly and rounded half up, (L, H, W, C).
-
-    Whole numbers throughout, so that the page comes to the same words.
-    """
-    c = coarse.astype(np.int64)
-    for axis in (1, 2):
-        ahead = np.concatenate([c.take([0], axis), c.take(range(c.shape[axis] - 1), axis)], axis)
-        behind = np.concatenate([c.take(range(1, c.shape[axis]), axis), c.take([-1], axis)], axis)
-        pair = np.stack([3 * c + ahead, 3 * c + behind], axis=axis + 1)
-        c = pair.reshape(*(n * (2 if k == axis else 1) for k, n in enumerate(c.shape)))
-    return (c + 8) >> 4
-
-
 def stored(texture: Texture) -> tuple[Words, Float32, Float32]:
     """Return the words that the page holds of a texture, and their range."""
     if texture.fine == 1:
         return quantize(texture.values, texture.storage)
     _, low, high = quantize(texture.values, "u8")
-    coarse, steps = octaves(_unrounded(texture.values, low, high), texture.fine)
-    return joined(coarse, steps, texture.fine).reshape(texture.values.shape), low, high
+    coarse, steps = octaves.split(_unrounded(texture.values, low, high), texture.fine)
+    return octaves.joined(coarse, steps, texture.fine).reshape(texture.values.shape), low, high
 
 
 def _unrounded(values: Float32, low: Float32, high: Float32) -> NDArray[np.float64]:
@@ -258,7 +180,7 @@ def pack(scene: ViewerScene) -> Packed:
         else:
             errors[f"{name} rms"] = float(np.sqrt(np.mean(off.astype(np.float64) ** 2)))
             turned = np.ascontiguousarray(_unrounded(texture.values, low, high)[:, ::-1])
-            coarse, steps = octaves(turned, texture.fine)
+            coarse, steps = octaves.split(turned, texture.fine)
             data = {
                 "predictor": "octaves",
                 "fine": texture.fine,

@@ -96,9 +96,10 @@ def load_mesh(path: Path) -> Mesh:
 
 def viewer_mesh(subject: Subject) -> ViewerMesh:
     """Return a person's mesh; its own blend shapes come behind those of the expressions."""
+    rounded = np.round(subject.mesh.vertices_mm * POSITION_STEPS) / POSITION_STEPS
     own = {n: d for n, d in subject.mesh.shapes.items() if np.any(d)}
     return ViewerMesh(
-        positions=np.round(subject.mesh.vertices_mm * POSITION_STEPS) / POSITION_STEPS,
+        positions=np.asarray(rounded, np.float32),
         normals=subject.mesh.normals,
         uv=subject.mesh.uv,
         faces=subject.mesh.faces.astype(np.int32),

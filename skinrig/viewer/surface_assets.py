@@ -27,7 +27,7 @@ def assets(source: SceneSource) -> Assets:
     # hair hides the skin's gloss, as the subject's own renderings have it
     intensity = 1.0 - halved(filled(subject.hair, covered), MAPS_SIZE)
     maps = np.stack([roughness, intensity], axis=-1)
-    left_out = ()
+    left_out: tuple[tuple[str, str], ...] = ()
     if source.kind in ("dynamic", "dome", "model"):
         left_out = (
             (
