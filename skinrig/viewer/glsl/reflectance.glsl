@@ -86,53 +86,59 @@ float translucencyWidth(vec2 uv) {
 //@chunk lobe_share_pass
 // Shares of the lobes under the surface traits: the nearest of at least 0 to what is asked, by
 // sweeps of coordinate descent on lobes of length 1 (skinrig.viewer.trait_assets.projected).
-uniform float u_gram[SHARE_COUNT * SHARE_COUNT];
-uniform float u_scale[SHARE_COUNT];
-uniform float u_pull[SHARE_COUNT];
+uniform vec4 u_gram[SHARE_COUNT * SHARE_GROUPS];
+uniform vec4 u_scale[SHARE_GROUPS];
+uniform vec4 u_pull[SHARE_GROUPS];
 uniform float u_active;
 in vec2 v_uv;
 layout(location = 0) out vec4 o_0;
-#if SHARE_COUNT > 4
+#if SHARE_GROUPS > 1
 layout(location = 1) out vec4 o_1;
 #endif
-#if SHARE_COUNT > 8
+#if SHARE_GROUPS > 2
 layout(location = 2) out vec4 o_2;
 #endif
-#if SHARE_COUNT > 12
+#if SHARE_GROUPS > 3
 layout(location = 3) out vec4 o_3;
 #endif
+vec4 found[SHARE_GROUPS];
+float product(int k) {
+  float sum = 0.0;
+  for (int g = 0; g < SHARE_GROUPS; g++) sum += dot(u_gram[SHARE_GROUPS * k + g], found[g]);
+  return sum;
+}
 void main() {
-  float found[SHARE_COUNT];
-  float wanted[SHARE_COUNT];
-  for (int g = 0; g < SHARE_COUNT / 4; g++) {
-    vec4 some = sample_lobe_shares(vec3(v_uv, float(g)));
-    for (int c = 0; c < 4; c++) found[4 * g + c] = some[c] * u_scale[4 * g + c];
+  vec4 wanted[SHARE_GROUPS];
+  for (int g = 0; g < SHARE_GROUPS; g++) {
+    found[g] = sample_lobe_shares(vec3(v_uv, float(g))) * u_scale[g];
   }
   if (u_active > 0.5) {
-    for (int k = 0; k < SHARE_COUNT; k++) {
-      wanted[k] = u_pull[k];
-      for (int j = 0; j < SHARE_COUNT; j++) wanted[k] += u_gram[SHARE_COUNT * k + j] * found[j];
+    for (int g = 0; g < SHARE_GROUPS; g++) {
+      int k = 4 * g;
+      wanted[g] = u_pull[g] + vec4(product(k), product(k + 1), product(k + 2), product(k + 3));
     }
     for (int sweep = 0; sweep < SWEEPS; sweep++) {
-      for (int k = 0; k < SHARE_COUNT; k++) {
-        float now = 0.0;
-        for (int j = 0; j < SHARE_COUNT; j++) now += u_gram[SHARE_COUNT * k + j] * found[j];
-        found[k] = max(found[k] + wanted[k] - now, 0.0);
+      for (int g = 0; g < SHARE_GROUPS; g++) {
+        int k = 4 * g;
+        found[g].x = max(found[g].x + wanted[g].x - product(k), 0.0);
+        found[g].y = max(found[g].y + wanted[g].y - product(k + 1), 0.0);
+        found[g].z = max(found[g].z + wanted[g].z - product(k + 2), 0.0);
+        found[g].w = max(found[g].w + wanted[g].w - product(k + 3), 0.0);
       }
     }
   }
-  for (int k = 0; k < SHARE_COUNT; k++) found[k] /= u_scale[k];
-  o_0 = vec4(found[0], found[1], found[2], found[3]);
-#if SHARE_COUNT > 4
-  o_1 = vec4(found[4], found[5], found[6], found[7]);
+  o_0 = found[0] / u_scale[0];
+#if SHARE_GROUPS > 1
+  o_1 = found[1] / u_scale[1];
 #endif
-#if SHARE_COUNT > 8
-  o_2 = vec4(found[8], found[9], found[10], found[11]);
+#if SHARE_GROUPS > 2
+  o_2 = found[2] / u_scale[2];
 #endif
-#if SHARE_COUNT > 12
-  o_3 = vec4(found[12], found[13], found[14], found[15]);
+#if SHARE_GROUPS > 3
+  o_3 = found[3] / u_scale[3];
 #endif
 }
+
 //@chunk albedo_trait_pass
 // Factor by which traits change the albedo: each trait's logarithm at amount 1 or -1, a layer each,
 // times the amount (skinrig.editing_albedo gives the ends).

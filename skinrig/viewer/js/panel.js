@@ -126,7 +126,8 @@ V.registerTraits = () => {
   const albedo = V.scene.facts.albedo_traits?.traits ?? {};
   for (const name of Object.keys(V.scene.params.traits ?? {})) {
     const said = V.only(
-      surface[name] && `surface: within ${V.percent(Math.max(...surface[name].held_error))} of the editor's`,
+      surface[name] && `surface: within ${surface[name].held_error.map(V.percent).join(" (less) and ")} (more) ` +
+        "of the editor's",
       albedo[name] && `albedo: half a trait within ${(100 * albedo[name].between_error).toFixed(1)} % of R_d`,
     );
     V.controls.push({group: "traits", kind: "range", path: ["traits", name], min: -1, max: 1,
@@ -245,10 +246,11 @@ V.describeScene = () => {
     const list = V.element("ul", {className: "facts"});
     const add = (name, text) => list.append(V.element("li", {}, V.element("b", {}, `${name}: `), text));
     for (const [name, value] of Object.entries(provenance)) {
-      add(V.capital(V.words(name)), typeof value === "string" ? value : JSON.stringify(value));
+      add(V.capital(V.words(name)), [].concat(value).map(one =>
+        typeof one === "object" ? JSON.stringify(one) : String(one)).join(", "));
     }
     const vertices = V.scene.mesh.positions.length / 3;
-    add("Mesh", `${vertices} vertices, ${V.scene.mesh.faces.length / 3} triangles, ` +
+    add("Geometry", `${vertices} vertices, ${V.scene.mesh.faces.length / 3} triangles, ` +
       `${Object.keys(V.scene.mesh.shapes).length} blend shapes`);
     const errors = Object.entries(V.scene.quantization_error ?? {}).filter(([name]) => !name.startsWith("shape "));
     if (errors.length) {

@@ -53,7 +53,7 @@ V.start.push(() => {
         `lobe_shares_${i}`, {format: "RGBA16F", size: [width, height], space: "uv"},
       ])),
       draw: ctx => ctx.full(V.program(["full_vertex"], ["lobe_share_pass"],
-        {SHARE_COUNT: 4 * layers, SWEEPS: sweeps}), {
+        {SHARE_COUNT: 4 * layers, SHARE_GROUPS: layers, SWEEPS: sweeps}), {
         u_gram: Array.from(padded.gram), u_scale: Array.from(padded.scale),
         u_pull: Array.from(V.traitPull(ctx.p)),
         u_active: active(ctx.p),
