@@ -9,7 +9,7 @@ V.SCATTER = {taps: 4, reach: 2.5, slantLimit: 4, interpolation: 0.75 ** 4};
 // a function that chooses: V.profileName = p => name.
 V.profiles = {};
 V.profileName = () => "default";
-V.profile_ = p => V.profiles[V.profileName(p)] ?? V.profiles.default;
+V.diffusionProfile = p => V.profiles[V.profileName(p)] ?? V.profiles.default;
 
 // Cut at its reach and summed in steps, a Gaussian is narrower than it was meant: this widens it.
 V.scatterWidening = () => {
@@ -33,7 +33,7 @@ V.buildScattering = () => {
   const screen = {format: "RGBA16F", space: "screen"};
   const most = Math.max(...Object.values(V.profiles).map(one => one.variances_mm2.length));
   const sigma = (p, i) => {
-    const {variances_mm2: variances} = V.profile_(p);
+    const {variances_mm2: variances} = V.diffusionProfile(p);
     return Math.sqrt(variances[i] - (i ? variances[i - 1] : 0));
   };
   V.passes.push({
@@ -54,7 +54,7 @@ V.buildScattering = () => {
       const from = source;
       V.passes.push({
         name, after: [from, "surface"],
-        enabled: p => Boolean(p.scattering) && i < V.profile_(p).variances_mm2.length,
+        enabled: p => Boolean(p.scattering) && i < V.diffusionProfile(p).variances_mm2.length,
         key: p => [p.scattering_scale, sigma(p, i), V.cameraKey(p)].join(),
         targets: () => ({[name]: {...screen, size: V.screen()}}),
         draw: ctx => ctx.full(V.program(["full_vertex"], ["scatter_fragment"], defines), {
@@ -78,16 +78,16 @@ V.buildScattering = () => {
   }
   V.passes.push({
     name: "radiance", after: ["surface", "scatter_source", ...last],
-    key: p => [p.texturing, p.scattering, V.profile_(p).weights].join(),
+    key: p => [p.texturing, p.scattering, V.diffusionProfile(p).weights].join(),
     targets: () => ({radiance: {...screen, size: V.screen()}}),
     draw: ctx => {
-      const {weights} = V.profile_(ctx.p);
+      const {weights} = V.diffusionProfile(ctx.p);
       const plain = !ctx.p.scattering;
       ctx.full(V.program(["full_vertex"], [plain ? "radiance_plain" : `radiance_${weights.length}`],
         {GAUSSIANS: weights.length}),
       {u_post: V.POWERS[ctx.p.texturing][1], u_weights: weights.flat()});
     },
-    cost: p => ({taps: (2 + (p.scattering ? V.profile_(p).weights.length : 1)) * pixels(),
+    cost: p => ({taps: (2 + (p.scattering ? V.diffusionProfile(p).weights.length : 1)) * pixels(),
       bytes: 8 * pixels()}),
   });
 };
