@@ -152,7 +152,8 @@ def exitance(
     source_area_mm2
         Area that each stands for, (S,), mm^2; 0: none, the source is left out.
     entered
-        Irradiance times F_t of its direction, (S, 3), W/mm^2: what passed the surface.
+        Irradiance times F_t of its direction, (S, 3), W/mm^2: what passed the surface. Its largest
+        is 0 or at least 1e-30: the tree holds single precision.
     at_mm
         Exit points, (Q, 3), mm, on the same surface.
     r_d, translucency_mm

@@ -70,6 +70,7 @@ def uneven_edges(quantiles: ArrayLike, unit: float) -> Floats:
     share = 0.5 * (at - low) / (high - low) + 0.5 * occurrence
     widths = np.diff(np.interp(np.linspace(0.0, 1.0, BINS + 1), share, at))
     # a value that occurs very often holds several edges: keep them apart
-    widths = np.maximum(widths, 1e-12 * (high - low))
+    least = max(1e-12 * (high - low), 4.0 * float(np.spacing(max(abs(low), abs(high)))))
+    widths = np.maximum(widths, least)
     widths *= (high - low) / widths.sum()
     return np.asarray(low + np.concatenate([[0.0], np.cumsum(widths)]))

@@ -92,7 +92,7 @@ def invert(
         Distance of each fibre from the source, mm, at least 0.
     reflectance_per_mm2 : array_like, shape (..., F)
         Profiles, 1/mm^2: all exitance R(r), or what a fibre takes (``collection``). Values that
-        are not finite are left out, negative ones are used.
+        are not finite are left out, negative ones are used; sizes up to 1e30.
     eta : float
         Refractive index of the medium over that outside, at least 1.
     variance : array_like, broadcast to the profiles, optional

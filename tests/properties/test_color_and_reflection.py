@@ -279,7 +279,11 @@ def test_half_and_difference_angles_come_back_as_directions(light, view):
 
 
 @FEW
-@given(seed=st.integers(0, 999), size=st.sampled_from([1, 3, 5, 9]), scale=st.sampled_from([1e-30, 1.0, 1e30]))
+@given(
+    seed=st.integers(0, 999),
+    size=st.sampled_from([1, 3, 5, 9]),
+    scale=st.sampled_from([1e-30, 1.0, 1e30]),
+)
 def test_what_is_detectable_knows_no_unit(seed, size, scale):
     rng = np.random.default_rng(seed)
     estimate, stderr = rng.standard_normal((12, 10)), rng.uniform(0.1, 3.0, (12, 10))

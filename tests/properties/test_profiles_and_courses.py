@@ -1,0 +1,232 @@
+"""Radial profiles, directions, and blood in time over their declared domains."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model import dipole, photon_table
+from reconstruction import (
+    anisotropy,
+    brdf_basis,
+    diffuse_albedo,
+    diffusion_ellipse,
+    direction_harmonics,
+    perfusion_curves,
+    perfusion_fit,
+    repeatability,
+    subsurface,
+    tiles,
+    translucency,
+)
+
+CHEAP = settings(derandomize=True, deadline=None, max_examples=25, database=None)
+FEW = settings(CHEAP, max_examples=8)
+
+SEED = st.integers(0, 9999)
+RADIUS = np.linspace(0.5, 9.0, 18)
+ANY = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@FEW
+@given(sigma_a=st.floats(0.01, 0.5), sigma_s=st.floats(0.7, 3.0), gain=st.floats(0.999, 1.001))
+def test_coefficients_of_a_clean_profile_come_back(sigma_a, sigma_s, gain):
+    profile = gain * photon_table.reflectance(RADIUS, sigma_a, sigma_s)
+    kept = profile.copy()
+    fit = subsurface.invert(RADIUS, profile, variance=(0.01 * profile) ** 2, g_error=0.0)
+    np.testing.assert_array_equal(profile, kept)
+    if fit.valid:
+        truth = float(dipole.effective_transport(sigma_a, sigma_s))
+        assert fit.sigma_tr_per_mm == pytest.approx(truth, rel=0.02)
+        low, high = fit.interval_per_mm
+        assert low <= fit.sigma_tr_per_mm <= high
+    baseline = subsurface.fit_dipole(RADIUS, dipole.reflectance(RADIUS, sigma_a, sigma_s, 1.4))
+    if baseline.valid:
+        truth = float(dipole.effective_transport(sigma_a, sigma_s))
+        assert baseline.sigma_tr_per_mm == pytest.approx(truth, rel=1e-3)
+
+
+@FEW
+@given(values=st.lists(ANY, min_size=18, max_size=18),
+       method=st.sampled_from(["photon_table", "diffusion", "dipole"]))  # fmt: skip
+def test_a_fit_of_any_readings_is_a_number_or_not_valid(values, method):
+    readings = np.array(values)
+    # beyond these sizes no unit of length makes a reflectance per area
+    readings[np.abs(readings) > 1e30] = np.inf
+    readings[np.abs(readings) < 1e-30] = 0.0
+    fit = subsurface.invert(RADIUS, readings[None], variance=1e-6, method=method)
+    if fit.valid[0]:
+        assert np.isfinite(fit.sigma_tr_per_mm[0])
+        assert np.isfinite(fit.interval_per_mm[0]).all()
+    else:
+        assert fit.reason(0)
+
+
+ANGLES = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+
+
+@CHEAP
+@given(ratio=st.floats(1.0, 2.0), axis=st.floats(0.0, 3.1), level=st.floats(1e-6, 1e6),
+       turn=st.floats(0.0, 3.0))  # fmt: skip
+def test_anisotropy_knows_no_unit_and_turns_with_the_skin(ratio, axis, level, turn):
+    uv = 0.5 * np.log(ratio) * np.array([[np.cos(2 * axis), np.sin(2 * axis)]])
+    values, slopes = diffusion_ellipse.relative_sigma_tr(ANGLES, uv)
+    assert np.all(values > 0.0)
+    assert np.isfinite(slopes).all()
+    first = anisotropy.estimate(ANGLES, level * values[0])
+    again = anisotropy.estimate(ANGLES + turn, values[0])
+    assert first.ratio >= 1.0
+    assert first.ratio == pytest.approx(float(again.ratio), rel=1e-6)
+    parameters = np.array([[0.0, *uv[0], 0.0, 0.0]])
+    mean, by = diffusion_ellipse.mean_over_directions(parameters)
+    assert values.min() - 1e-9 <= mean[0] <= values.max() + 1e-9
+    assert np.isfinite(by).all()
+    assert diffusion_ellipse.all_directions().ndim == 1
+    bias = anisotropy.one_direction_bias(first, [0.0, 1.0])
+    assert bias is not None
+
+
+@CHEAP
+@given(coefficients=st.lists(st.floats(-1.0, 1.0), min_size=5, max_size=5))
+def test_harmonics_come_back_from_enough_directions(coefficients):
+    columns = direction_harmonics.design(ANGLES)
+    values = (columns @ coefficients)[:, None]
+    weight = np.ones_like(values)
+    count = direction_harmonics.different_directions(ANGLES, weight > 0)
+    assert count.tolist() == [16]
+    kept, outliers = direction_harmonics.without_outliers(ANGLES, values, weight)
+    assert kept.shape == outliers.shape == (16, 1)
+    assert outliers.sum() <= 2
+    found = direction_harmonics.fit(ANGLES, values, weight)
+    assert any(
+        np.allclose(np.ravel(getattr(found, name))[:5], coefficients, atol=1e-6)
+        for name in type(found).__slots__
+        if np.size(getattr(found, name)) >= 5
+    )
+
+
+@CHEAP
+@given(power=st.floats(1e-12, 1e12), residual=st.floats(1e-12, 1e12), dof=st.integers(1, 40))
+def test_a_tail_is_a_probability_that_falls_with_the_power(power, residual, dof):
+    tail = direction_harmonics.log_tail(
+        np.array([power, 2.0 * power]), np.full(2, residual), np.full(2, dof)
+    )
+    assert np.all(tail <= 1e-12)
+    assert tail[1] <= tail[0] + 1e-12
+    assert not np.isnan(tail).any()
+
+
+@FEW
+@given(seed=SEED, constant=st.floats(0.5, 3.0), scale=st.sampled_from([1e-3, 1.0, 1e3]))
+def test_a_course_knows_no_unit(seed, constant, scale):
+    rng = np.random.default_rng(seed)
+    time_s = np.linspace(0.0, 12.0, 40)
+    course = 1.0 + 2.0 * (1.0 - np.exp(-time_s / constant)) + 0.01 * rng.standard_normal(40)
+    first = perfusion_fit.fit_course(time_s, course)
+    other = perfusion_fit.fit_course(time_s, scale * course)
+    assert first.time_constant_s == pytest.approx(constant, rel=0.2)
+    assert other.time_constant_s == pytest.approx(first.time_constant_s, rel=1e-3)
+    phase = np.sort(rng.uniform(0.0, 10.0, 40))
+    level = np.where(
+        phase < 5.0, 1.0 - np.exp(-phase / constant), np.exp(-(phase - 5.0) / constant)
+    )
+    cycle = perfusion_fit.fit_cycle(phase, level, cycle_s=10.0)
+    assert np.isfinite(cycle.time_constant_s)
+    assert cycle.interval_s[0] <= cycle.interval_s[1]
+
+
+@CHEAP
+@given(seed=SEED, scale=st.sampled_from([1e-6, 1.0, 1e6]), radius=st.floats(0.1, 4.0))
+def test_means_over_discs_scale_and_lie_among_the_pixels(seed, scale, radius):
+    rng = np.random.default_rng(seed)
+    maps, places = rng.uniform(1.0, 2.0, (2, 12, 12)), {"cheek": (5.0, 6.0)}
+    found = perfusion_curves.disc_means(scale * maps, places, radius)
+    assert np.all((found.mean >= scale) & (found.mean <= 2.0 * scale))
+    rows, columns = perfusion_curves.disc_pixels((12, 12), "cheek", (5.0, 6.0), radius)
+    assert 1 <= rows.size == columns.size
+
+
+@CHEAP
+@given(seed=SEED, cycle=st.floats(1.0, 100.0))
+def test_levels_that_never_change_have_no_transition_and_repeat(seed, cycle):
+    rng = np.random.default_rng(seed)
+    phase = np.sort(rng.uniform(0.0, cycle, 30))
+    values = np.where(phase < cycle / 2, 1.0, 2.0) + 1e-6 * rng.standard_normal(30)
+    groups = perfusion_curves.same_phase(phase, cycle_s=cycle)
+    assert groups.shape == (30,)
+    late = np.tile((np.arange(8) + 0.5) / 8 * cycle, 2)
+    level = np.where(late < cycle / 2, 1.0, 2.0) + 1e-6 * rng.standard_normal(16)
+    found = perfusion_curves.transition(late, level, cycle_s=cycle, false_alarm=1e-9)
+    assert not found.seen
+    told = perfusion_curves.reproducibility(np.arange(16.0) * cycle, late, level, cycle_s=cycle)
+    assert told is not None
+    assert values.size == 30
+
+
+@FEW
+@given(seed=SEED, scale=st.sampled_from([1e-6, 1.0, 1e6]))
+def test_repeats_are_judged_the_same_in_any_unit(seed, scale):
+    rng = np.random.default_rng(seed)
+    level = np.array([2.0, 3.0, 2.0, 3.0])[:, None, None]
+    maps = level + 0.1 * rng.standard_normal((4, 12, 12))
+    states = ["neutral", "smile"] * 2
+    for judge in (
+        lambda k: repeatability.compare(
+            k * maps, states, stderr=np.full(maps.shape, 0.1 * k)
+        ).region("whole face").correlation,
+        lambda k: repeatability.drift(
+            k * maps, states, [0.0, 10.0, 20.0, 30.0], stderr=np.full(maps.shape, 0.1 * k)
+        )[-1].slope_per_minute / k,
+    ):  # fmt: skip
+        assert judge(scale) == pytest.approx(judge(1.0), rel=1e-6, abs=1e-9)
+
+
+@FEW
+@given(seed=SEED, level=st.floats(0.2, 3.0))
+def test_a_map_between_equal_sites_is_that_value_nearly(seed, level):
+    places = np.random.default_rng(seed).uniform(0.1, 0.9, (6, 2))
+    sigma_tr = np.full((6, 3), level)
+    found = translucency.interpolate(places, sigma_tr, 1e-3 * sigma_tr, (10, 9))
+    assert np.all(np.isfinite(found.values) & (found.values > 0.0))
+    assert np.all(found.stderr > 0.0)
+    prior = translucency.population_prior()
+    assert np.isfinite(prior.log_mean).all()
+    assert translucency.sites_of_labels(["chin", "cheek"]).shape == (2, 2)
+
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@FEW
+@given(albedo=st.floats(0.02, 0.95), seed=SEED, scale=st.sampled_from([1.0, 0.5]))
+def test_the_albedo_of_matte_points_comes_back(albedo, seed, scale):
+    rng = np.random.default_rng(seed)
+    ways = rng.normal(size=(2, 1, 30, 3))
+    ways[..., 2] = np.abs(ways[..., 2]) + 0.5
+    light, view = ways / np.linalg.norm(ways, axis=-1, keepdims=True)
+    from model import skin_reflectance
+
+    through = skin_reflectance.transmitted(light[..., 2]) * skin_reflectance.transmitted(
+        view[..., 2]
+    )
+    samples = np.repeat((scale * albedo * through / np.pi)[..., None], 3, axis=-1)
+    found = diffuse_albedo.estimate(samples, light, view, UP[None], eta=1.4)
+    if found.valid[0]:
+        np.testing.assert_allclose(found.r_d[0], scale * albedo, rtol=0.02)
+        reduced = diffuse_albedo.reduced_albedo(found, eta=1.4)
+        assert reduced is not None
+    rest = brdf_basis.surface_samples(samples, light, view, UP[None], found.r_d, eta=1.4)
+    assert np.isfinite(rest.value[rest.valid]).all()
+
+
+@CHEAP
+@given(errors=st.lists(st.floats(0.0, 1e6), min_size=1, max_size=20), share=st.floats(0.0, 1.0))
+def test_the_plateau_is_one_of_the_ranks(errors, share):
+    rank = brdf_basis.plateau(errors, share=share)
+    assert 1 <= rank <= len(errors)
+
+
+@CHEAP
+@given(values=st.lists(st.integers(), max_size=30), window=st.integers(1, 9))
+def test_tiles_come_back_in_their_order(values, window):
+    assert list(tiles.map_tiles(lambda v: v + 1, values, window=window)) == [v + 1 for v in values]
