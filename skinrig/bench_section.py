@@ -67,7 +67,7 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
     if bands:
         body += page.table(
             bench_table.BAND_COLUMNS, bands,
-            caption="Error of the usual setting by melanin band; of light: over that of the lightest",
+            caption="Error of the usual setting by melanin band; of light: over the lightest one",
         )  # fmt: skip
     return body + _left_out(document)
 
