@@ -145,7 +145,7 @@ V.SHARED = ["camera_yaw_deg", "camera_pitch_deg", "camera_distance_mm", "camera_
   "exposure", "background", "view", "view_low", "view_high", "split", "compare", "heads"];
 
 // Parameters that passes keep for themselves.
-V.transient = name => /^(microstructure_(place|virtual_px|margin_px|variance|split_px)|detail_wrinkles)$/.test(name);
+V.transient = name => /^(microstructure_(place|side_px|virtual_px|margin_px|variance|split_px)|detail_wrinkles)$/.test(name);
 
 V.faceOf = p => JSON.parse(JSON.stringify(Object.fromEntries(
   Object.entries(p).filter(([name]) => !V.SHARED.includes(name) && !V.transient(name)))));

@@ -6,20 +6,19 @@
 // and the symmetric part of the map from skin to texture.
 V.strain = {SLIVER: 1e-6, FINE: 0, DEGENERATE: 1, NO_TEXTURE: 2};
 
-// Vertices at one place before and after the move share a number.
-V.strain.places = (rest, moved) => {
-  const count = rest.length / 3;
-  const place = new Int32Array(count);
-  const known = new Map();
-  const words = new Float64Array(6);
+// Vertices at one place before and after the move share a number; `weld` tells which share one
+// before.
+V.strain.places = (moved, weld) => {
+  const place = new Int32Array(weld.length);
+  const split = new Map();
   let places = 0;
-  for (let v = 0; v < count; v++) {
-    // sums with 0 make -0 and 0 one key
-    for (let c = 0; c < 3; c++) { words[c] = rest[3 * v + c] + 0; words[3 + c] = moved[3 * v + c] + 0; }
-    const key = words.join();
-    let at = known.get(key);
-    if (at === undefined) { at = places++; known.set(key, at); }
-    place[v] = at;
+  for (let v = 0; v < weld.length; v++) {
+    const first = weld[v];
+    const others = first === v ? [] : split.get(first) ?? [first];
+    const same = others.find(o => moved[3 * o] === moved[3 * v]
+      && moved[3 * o + 1] === moved[3 * v + 1] && moved[3 * o + 2] === moved[3 * v + 2]);
+    place[v] = same === undefined ? places++ : place[same];
+    if (same === undefined && first !== v) split.set(first, [...others, v]);
   }
   return {place, places};
 };
@@ -33,16 +32,22 @@ V.strain.triangles = (rest, moved, faces, uv) => {
   };
   const {kind, basis, area, change, toUv} = out;
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-  const edge = (p, i, j) => [p[3 * j] - p[3 * i], p[3 * j + 1] - p[3 * i + 1],
-    p[3 * j + 2] - p[3 * i + 2]];
+  const edge = (into, p, i, j) => {
+    into[0] = p[3 * j] - p[3 * i];
+    into[1] = p[3 * j + 1] - p[3 * i + 1];
+    into[2] = p[3 * j + 2] - p[3 * i + 2];
+  };
+  const [a, b, c, n, A, B, da, db, sa, sb] = Array.from({length: 10}, () => new Float64Array(3));
   for (let f = 0; f < count; f++) {
-    const [i, j, k] = [faces[3 * f], faces[3 * f + 1], faces[3 * f + 2]];
-    const a = edge(rest, i, j);
-    const b = edge(rest, i, k);
-    const c = edge(rest, j, k);
+    const i = faces[3 * f], j = faces[3 * f + 1], k = faces[3 * f + 2];
+    edge(a, rest, i, j);
+    edge(b, rest, i, k);
+    edge(c, rest, j, k);
     const aa = dot(a, a);
     let longest = Math.max(aa, dot(b, b), dot(c, c));
-    const n = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    n[0] = a[1] * b[2] - a[2] * b[1];
+    n[1] = a[2] * b[0] - a[0] * b[2];
+    n[2] = a[0] * b[1] - a[1] * b[0];
     const twice = Math.sqrt(dot(n, n));
     if (!(twice > V.strain.SLIVER * longest)) { kind[f] = V.strain.DEGENERATE; continue; }
     // on axes e1 = a / |a|, e2 = n x e1: a = (x, 0), b = (u, v)
@@ -58,13 +63,17 @@ V.strain.triangles = (rest, moved, faces, uv) => {
     basis[at + 5] = nx * ey - ny * ex;
     area[f] = twice;
     // changes of the edges' inner products, without cancellation
-    const A = edge(moved, i, j);
-    const B = edge(moved, i, k);
-    const da = [A[0] - a[0], A[1] - a[1], A[2] - a[2]];
-    const db = [B[0] - b[0], B[1] - b[1], B[2] - b[2]];
-    const gaa = dot(da, [A[0] + a[0], A[1] + a[1], A[2] + a[2]]);
+    edge(A, moved, i, j);
+    edge(B, moved, i, k);
+    for (let m = 0; m < 3; m++) {
+      da[m] = A[m] - a[m];
+      db[m] = B[m] - b[m];
+      sa[m] = A[m] + a[m];
+      sb[m] = B[m] + b[m];
+    }
+    const gaa = dot(da, sa);
     const gab = dot(da, B) + dot(a, db);
-    const gbb = dot(db, [B[0] + b[0], B[1] + b[1], B[2] + b[2]]);
+    const gbb = dot(db, sb);
     // C - 1 = X^-T [gaa gab; gab gbb] X^-1 with X = [x u; 0 v]
     const p = gaa / (x * x);
     const q = (gab / x - p * u) / v;
@@ -82,8 +91,8 @@ V.strain.triangles = (rest, moved, faces, uv) => {
       change[3 * f] = -1;
       change[3 * f + 2] = -1;
     }
-    const [ua, va] = [uv[2 * j] - uv[2 * i], uv[2 * j + 1] - uv[2 * i + 1]];
-    const [ub, vb] = [uv[2 * k] - uv[2 * i], uv[2 * k + 1] - uv[2 * i + 1]];
+    const ua = uv[2 * j] - uv[2 * i], va = uv[2 * j + 1] - uv[2 * i + 1];
+    const ub = uv[2 * k] - uv[2 * i], vb = uv[2 * k + 1] - uv[2 * i + 1];
     longest = Math.max(ua * ua + va * va, ub * ub + vb * vb, (ub - ua) ** 2 + (vb - va) ** 2);
     if (!(Math.abs(ua * vb - va * ub) > V.strain.SLIVER * longest)) {
       kind[f] = V.strain.NO_TEXTURE;
@@ -98,12 +107,14 @@ V.strain.triangles = (rest, moved, faces, uv) => {
   return out;
 };
 
-// A triangle's axes turned by the shortest way into the plane across `normal`: six numbers.
+// A triangle's axes turned by the shortest way into the plane across `normal`: six numbers, valid
+// until the next call.
+V.strain.turned = new Float64Array(6);
 V.strain.carried = (basis, at, n, m) => {
   const c = basis[at + 6] * n[m] + basis[at + 7] * n[m + 1] + basis[at + 8] * n[m + 2];
   const sign = c >= 0 ? 1 : -1;
   const scale = 1 / (1 + Math.abs(c));
-  const out = new Float64Array(6);
+  const out = V.strain.turned;
   for (let e = 0; e < 2; e++) {
     const b = at + 3 * e;
     const d = (basis[b] * n[m] + basis[b + 1] * n[m + 1] + basis[b + 2] * n[m + 2]) * scale;
@@ -116,7 +127,7 @@ V.strain.carried = (basis, at, n, m) => {
 
 // Tensor T - 1 and texture metric at each vertex, three numbers each (11, 12, 22), and which hold.
 V.strain.vertices = (rest, moved, faces, uv) => {
-  const {place, places} = V.strain.places(rest, moved);
+  const {place, places} = V.strain.places(moved, V.scene.mesh.weld);
   const {kind, basis, area, change, toUv} = V.strain.triangles(rest, moved, faces, uv);
   const triangles = faces.length / 3;
   const normal = new Float64Array(3 * places);
@@ -147,7 +158,7 @@ V.strain.vertices = (rest, moved, faces, uv) => {
   const share = new Float64Array(2 * count);
   for (let f = 0; f < triangles; f++) {
     if (kind[f] === V.strain.DEGENERATE) continue;
-    const [p, q, r] = [change[3 * f], change[3 * f + 1], change[3 * f + 2]];
+    const p = change[3 * f], q = change[3 * f + 1], r = change[3 * f + 2];
     for (let corner = 0; corner < 3; corner++) {
       const vertex = faces[3 * f + corner];
       const w = place[vertex];
@@ -238,15 +249,19 @@ V.strain.upload = (side, p) => {
     gl.vertexAttribPointer(V.ATTRIBUTES[name], width, gl.FLOAT, false, 0, 0);
   });
   // the triangle of the lowest number has a pixel that several hold: it is drawn last
-  const drawn = [];
+  const drawn = new Uint32Array(faces.length);
+  let count = 0;
   for (let f = faces.length - 3; f >= 0; f -= 3) {
-    const [a, b, c] = [faces[f], faces[f + 1], faces[f + 2]];
-    if (found.valid[a] && found.valid[b] && found.valid[c]) drawn.push(a, b, c);
+    const a = faces[f], b = faces[f + 1], c = faces[f + 2];
+    if (!(found.valid[a] && found.valid[b] && found.valid[c])) continue;
+    drawn[count++] = a;
+    drawn[count++] = b;
+    drawn[count++] = c;
   }
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made.faces);
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, Uint32Array.from(drawn), gl.DYNAMIC_DRAW);
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, drawn.subarray(0, count), gl.DYNAMIC_DRAW);
   V.statistics.strain_ms = milliseconds;
-  side.strain = {...made, key, count: drawn.length};
+  side.strain = {...made, key, count};
   return side.strain;
 };
 V.ATTRIBUTES.a_tensor = 6;

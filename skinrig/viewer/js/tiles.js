@@ -15,7 +15,11 @@ V.tiles.of = (level, row, column) => {
   }
   if (!V.tiles.asked.has(name)) {
     V.tiles.asked.add(name);
-    V.tiles.fetch(name).catch(() => { V.tiles.failed += 1; });
+    // what failed is not asked for again: the coarser level stays
+    V.tiles.fetch(name).catch(() => {
+      V.tiles.failed += 1;
+      V.say?.("A part of the displacement could not be fetched: is the server still running?");
+    });
   }
   return null;
 };
