@@ -148,6 +148,8 @@ def kernel_parts(
     It is the part of the bump that a reach of a quarter would have.
     """
     r, a = np.asarray(radius_mm, np.float64), np.asarray(reach_mm, np.float64)
+    # a reach whose square is no number is that of a point
+    a = np.where(a > 1e-150, a, 0.0)
     inside = (r < a) & (a > FINE * media.depth_mm)
     a = np.where(a > 0.0, a, 1.0)
     edge, missing = profile(a, media), _missing(a, media)
