@@ -128,7 +128,7 @@ def test_a_region_is_the_mean_over_its_texels(appearance, tmp_path, lobes, rng):
 
 def test_places_without_reflectance_are_named(appearance, tmp_path):
     with pytest.raises(BrdfExportError, match="row 0, column 4"):
-        write_brdfs(appearance, tmp_path, to="rgl", place=Place(0.5, 1.0))
+        write_brdfs(store.read(appearance), tmp_path, to="rgl", place=Place(0.5, 1.0))
     with pytest.raises(BrdfExportError, match=r"u 1\.5"):
         Place(1.5, 0.0)
     with pytest.raises(ExportError, match="expected one of merl, rgl"):
@@ -137,7 +137,7 @@ def test_places_without_reflectance_are_named(appearance, tmp_path):
     dark = read.maps | {"r_d": SkinMap(np.full((SIDE, SIDE, 3), -0.01), "1")}
     store.write(tmp_path / "dark", SkinAppearance(dark, "simulated", files=read.files))
     with pytest.raises(BrdfExportError, match="r_d is"):
-        write_brdfs(tmp_path / "dark", tmp_path, to="rgl", place=Place(0.5, 0.5))
+        write_brdfs(store.read(tmp_path / "dark"), tmp_path, to="rgl", place=Place(0.5, 0.5))
 
 
 def test_the_command_line_exports_and_says_what_is_wrong(appearance, tmp_path, capsys):
