@@ -175,11 +175,26 @@ def simulate(
         ),
     ] = False,
     subsurface: Annotated[
-        bool, typer.Option("--subsurface", help="Light in the dome spreads sideways in the skin.")
+        bool,
+        typer.Option(
+            "--subsurface",
+            help="Light in the dome spreads sideways in the skin, even where no pixel shows it.",
+        ),
     ] = False,
     interreflections: Annotated[
-        bool, typer.Option("--interreflections", help="Light in the dome goes from skin to skin.")
+        bool,
+        typer.Option(
+            "--interreflections",
+            help="Light in the dome goes from skin to skin, even where no pixel shows it.",
+        ),
     ] = False,
+    leave_out: Annotated[
+        str | None,
+        typer.Option(
+            help="What a dome's scene does not build although it changes pixels: subsurface, "
+            "interreflections, joined by commas."
+        ),
+    ] = None,
     condition: Annotated[
         list[str] | None,
         typer.Option(
@@ -236,7 +251,7 @@ def simulate(
         sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
         relaxation_s=relaxation, subsurface=subsurface, interreflections=interreflections,
         conditions=amounts_of(condition, "--condition"),
-        plan=None if plan is None else read_plan(plan),
+        plan=None if plan is None else read_plan(plan), leave_out=names_of(leave_out) or (),
     )  # fmt: skip
     console.say(
         f"{done.session}: {done.frames} frames" + (f", truth in {done.truth}" if done.truth else "")
@@ -458,7 +473,7 @@ def reconstruct(
     console.document(
         "skinrig.reconstruct/1",
         {"path": out, "ran": done.ran, "reused": done.reused, "left_out": done.left_out,
-         "assumed": done.assumed},
+         "assumed": done.assumed, "work": [dict(w) for w in done.work]},
     )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from skinrig import (
     extremes_section,
     map_pictures,
     microrelief_section,
+    omissions_section,
     page,
     pictures_section,
     population_section,
@@ -154,6 +155,7 @@ def sections(found: Findings, checks: list[page.Check]) -> str:
     body += population_section.section(appearances)
     body += _documents(found, checks)
     body += calibration_section.section(found.calibrations, appearances, sessions, checks)
+    body += omissions_section.section(found.sessions)
     return body + session_section.section(sessions)
 
 
