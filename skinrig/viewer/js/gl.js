@@ -124,13 +124,9 @@ V.declarations = text => {
 V.use = (program, side, p, uniforms = {}) => {
   const gl = V.gl;
   gl.useProgram(program.handle);
-  let unit = 0;
-  const bind = (info, texture, target = gl.TEXTURE_2D) => {
-    gl.activeTexture(gl.TEXTURE0 + unit);
-    gl.bindTexture(target, texture);
-    gl.uniform1i(info.at, unit);
-    unit += 1;
-  };
+  // bound when all are uploaded: an upload takes the first unit
+  const bound = [];
+  const bind = (info, texture, target = gl.TEXTURE_2D) => bound.push([info, texture, target]);
   for (const [name, info] of program.uniforms) {
     const rest = name.slice(2);
     if (name in uniforms) {
@@ -154,12 +150,17 @@ V.use = (program, side, p, uniforms = {}) => {
       throw new Error(`uniform ${name} was not set`);
     }
   }
+  bound.forEach(([info, texture, target], unit) => {
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(target, texture);
+    gl.uniform1i(info.at, unit);
+  });
 };
 
 V.setUniform = (info, value) => {
   const gl = V.gl;
   switch (info.type) {
-    case gl.FLOAT: gl.uniform1fv(info.at, [].concat(value)); break;
+    case gl.FLOAT: gl.uniform1fv(info.at, typeof value === "number" ? [value] : value); break;
     case gl.FLOAT_VEC2: gl.uniform2fv(info.at, value); break;
     case gl.FLOAT_VEC3: gl.uniform3fv(info.at, value); break;
     case gl.FLOAT_VEC4: gl.uniform4fv(info.at, value); break;
