@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from skinrig import resident_memory
+from skinrig.benchmarks import resident_memory
 
 Made = TypeVar("Made")
 

@@ -10,22 +10,22 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig import (
-    cli_analysing,
-    cli_completion,
-    cli_dynamic,
-    cli_editing,
-    cli_export,
-    cli_importing,
-    cli_planning,
-    cli_reflectance,
-    cli_rendering,
-    cli_report,
-    cli_view,
-    errors,
+from skinrig import errors
+from skinrig.commands import (
+    analysing,
+    completion,
+    dynamic,
+    editing,
+    export,
+    importing,
+    planning,
+    reflectance,
+    rendering,
+    report,
+    view,
 )
-from skinrig.cli_help import Commands
-from skinrig.cli_options import (
+from skinrig.commands.help import Commands
+from skinrig.commands.options import (
     AllBrackets,
     Angles,
     Captures,
@@ -94,7 +94,7 @@ def demo(
         str,
         typer.Option(
             help="Rigs, joined by commas: flash, dome, gradient, probe; default all.",
-            autocompletion=cli_completion.several_rigs,
+            autocompletion=completion.several_rigs,
         ),
     ] = "flash,dome,gradient,probe",
     seed: Seed = 0,
@@ -116,7 +116,7 @@ def simulate(
     out: Out,
     size: Annotated[
         str,
-        typer.Option(help="Of the pictures: small or full.", autocompletion=cli_completion.sizes),
+        typer.Option(help="Of the pictures: small or full.", autocompletion=completion.sizes),
     ] = "small",
     width: Annotated[
         int | None, typer.Option(help="Pixels across, instead of the size; even but for gradient.")
@@ -135,7 +135,7 @@ def simulate(
             help="Preset, I to VI, palest or darkest; of the dome also P01 to P87 of the "
             "simulated population; of the probe also homogeneous:SIGMA_A,SIGMA_S_PRIME[,G] or "
             "anisotropic:SIGMA_A,SIGMA_S_PRIME[,STRENGTH[,AXIS]], 1/mm and degrees.",
-            autocompletion=cli_completion.subjects,
+            autocompletion=completion.subjects,
         ),
     ] = "III",
     mesh: Annotated[Path | None, typer.Option(help="Face mesh, .npz or .obj.")] = None,
@@ -144,7 +144,7 @@ def simulate(
         typer.Option(
             help="A target instead of a face: white, dark; of the flash rig chart, flat, malus; "
             "of the dome charuco, mirror; of the gradient rig ball, flat; of the probe phantom.",
-            autocompletion=cli_completion.targets,
+            autocompletion=completion.targets,
         ),
     ] = None,
     site: Site = None,
@@ -157,7 +157,7 @@ def simulate(
         list[str] | None,
         typer.Option(
             help="State of the face, such as smile or exercise; repeatable for the flash rig.",
-            autocompletion=cli_completion.states,
+            autocompletion=completion.states,
         ),
     ] = None,
     movement: Annotated[
@@ -200,7 +200,7 @@ def simulate(
         typer.Option(
             help="Condition of the face in the dome, NAME or NAME=AMOUNT up to 1: cold, hot, "
             "sweat, lotion, makeup, powder; repeatable.",
-            autocompletion=cli_completion.conditions,
+            autocompletion=completion.conditions,
         ),
     ] = None,
     plan: Annotated[
@@ -238,7 +238,7 @@ def simulate(
     )
     from skinrig.consent import subject_of
     from skinrig.next_steps import after_session
-    from skinrig.simulation import USES, pseudonym, simulate_session
+    from skinrig.simulating.simulation import USES, pseudonym, simulate_session
 
     console = Console(json)
     done = simulate_session(
@@ -264,7 +264,7 @@ def simulate(
 def capture(
     rig: Annotated[
         str,
-        typer.Argument(help="Name of a rig, or its TOML file.", autocompletion=cli_completion.rigs),
+        typer.Argument(help="Name of a rig, or its TOML file.", autocompletion=completion.rigs),
     ],
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the session.")] = None,
     port: Annotated[list[str] | None, typer.Option(help="Box: NAME=URL; repeatable.")] = None,
@@ -363,7 +363,7 @@ def calibrate(
         typer.Argument(
             help="Of the flash rig sensor, color, polarization, white; of the dome geometry, "
             "lights; of the gradient sphere sensor, lights, polarization; of the probe fibre.",
-            autocompletion=cli_completion.calibrations,
+            autocompletion=completion.calibrations,
         ),
     ],
     sessions: Annotated[list[Path], typer.Argument(help="Sessions of the target.")],
@@ -383,8 +383,8 @@ def calibrate(
 
     Example: skinrig calibrate sensor session-flat --out calibration
     """
-    from skinrig.calibrating import calibrate as make
-    from skinrig.calibrating_dome import dome_targets
+    from skinrig.calibrating.calibrate import calibrate as make
+    from skinrig.calibrating.dome import dome_targets
 
     console = Console(json)
     done = make(kind, sessions, out, targets=dome_targets(square_mm, sphere_mm), phantom=phantom)
@@ -402,19 +402,19 @@ def calibrate(
     )  # fmt: skip
 
 
-app.command()(cli_planning.plan)
-app.command()(cli_rendering.render)
-app.command()(cli_editing.edit)
-app.command()(cli_report.report)
-app.command()(cli_view.view)
-app.command()(cli_export.export)
-cli_dynamic.fit_app.command("traits")(cli_editing.fit_traits)
-app.add_typer(cli_importing.import_app, name="import")
-cli_dynamic.fit_app.command("reflectance")(cli_reflectance.fit_reflectance)
-app.add_typer(cli_dynamic.fit_app, name="fit")
-app.add_typer(cli_dynamic.apply_app, name="apply")
-cli_analysing.analyse_app.command("albedo")(cli_editing.analyse_albedo)
-app.add_typer(cli_analysing.analyse_app, name="analyse")
+app.command()(planning.plan)
+app.command()(rendering.render)
+app.command()(editing.edit)
+app.command()(report.report)
+app.command()(view.view)
+app.command()(export.export)
+dynamic.fit_app.command("traits")(editing.fit_traits)
+app.add_typer(importing.import_app, name="import")
+dynamic.fit_app.command("reflectance")(reflectance.fit_reflectance)
+app.add_typer(dynamic.fit_app, name="fit")
+app.add_typer(dynamic.apply_app, name="apply")
+analysing.analyse_app.command("albedo")(editing.analyse_albedo)
+app.add_typer(analysing.analyse_app, name="analyse")
 
 
 @app.command()
@@ -424,7 +424,7 @@ def reconstruct(
         str,
         typer.Option(
             help="Maps, separated by commas; a wrong name lists those there are.",
-            autocompletion=cli_completion.wants,
+            autocompletion=completion.wants,
         ),
     ],
     out: Out,
@@ -481,7 +481,7 @@ def reconstruct(
 def bench(
     stage: Annotated[
         list[str] | None,
-        typer.Option(help="Stage; repeatable; default all.", autocompletion=cli_completion.stages),
+        typer.Option(help="Stage; repeatable; default all.", autocompletion=completion.stages),
     ] = None,
     budget: Annotated[float, typer.Option(help="Seconds to spend, about.")] = 600.0,
     toy: Annotated[bool, typer.Option("--toy", help="Smallest sizes, no limits judged.")] = False,
@@ -507,12 +507,12 @@ def bench(
     """
     console = Console(json)
     if extremes:
-        from skinrig.extremes_section import run_extremes
+        from skinrig.reporting.extremes import run_extremes
 
         document = run_extremes(stage or (), out=out, console=console)
     else:
-        from skinrig import bench_table
-        from skinrig.bench_stages import run_stages
+        from skinrig.benchmarks import table as bench_table
+        from skinrig.benchmarks.stages import run_stages
 
         document = run_stages(stage, budget_s=budget, toy=toy, out=out, console=console)
         if out is not None:

@@ -17,7 +17,7 @@ from typing import Any
 from model import store
 from skinrig.console import Console, plain
 from skinrig.demo_rigs import RIGS, Findings
-from skinrig.simulation import truth_folder
+from skinrig.simulating.simulation import truth_folder
 
 MOST_AT_ONCE = 2
 """Rigs that run side by side: much of each is the work of one core, or waits for a compiler."""
@@ -80,7 +80,7 @@ def run_demo(
         found.next = part.next
         shares |= seconds
     with _share("measure error against run time", shares, console):
-        from skinrig.bench_stages import run_stages
+        from skinrig.benchmarks.stages import run_stages
 
         bench = run_stages(None, budget_s=8.0, toy=True, out=out, console=console)
     document: dict[str, Any] = {

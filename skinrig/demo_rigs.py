@@ -16,8 +16,8 @@ import numpy as np
 
 from model import store
 from reconstruction import pipeline
-from skinrig.calibrating import calibrate
-from skinrig.simulation import Simulated, simulate_session
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.simulating.simulation import Simulated, simulate_session
 
 FLASH_SUBJECTS = ("II", "IV")
 """Skin types of the flash rig's faces: one light, one dark, so that errors by melanin show."""
@@ -35,7 +35,7 @@ DOME_WANT = (
 DOME_HELD_OUT = "lights=16,23"
 """Lights, by number, whose photographs no fit sees: renderings are compared with them."""
 DOME_LEFT_OUT = ("subsurface",)
-"""Light that spreads sideways takes half a minute, and blurs less than the demo's pixels of 2 mm."""
+"""Light that spreads sideways takes half a minute, and blurs less than its pixels of 2 mm."""
 DOME_COMPARED = 3
 """How many of their photographs are compared."""
 DOME_WIDTH_PX = 320
@@ -64,7 +64,7 @@ Share = Callable[[str], AbstractContextManager[None]]
 
 def _flash(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
     """Capture targets and two faces with the flash rig, down to melanin, blood and its changes."""
-    from skinrig.fitting_facial_color import fit_facial_color
+    from skinrig.fitting.facial_color import fit_facial_color
 
     calibration = out / "calibration-flash"
     with share("flash: capture the calibration targets"):
@@ -143,7 +143,7 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
         )  # fmt: skip
         found.errors += _surface_rows(appearance, capture.truth)
     with share("dome: render photographs that no fit has seen"):
-        from skinrig.rendering_evaluation import FULL, evaluate_folders
+        from skinrig.rendering.evaluation import FULL, evaluate_folders
 
         compared = evaluate_folders(
             appearance, capture.session, out / f"pictures-dome-{DOME_SUBJECT}",
@@ -175,7 +175,7 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
 
 def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
     """Capture a glass ball and stretched skin in the gradient sphere, down to kernels."""
-    from skinrig.fitting_microstructure import fit_microstructure
+    from skinrig.fitting.microstructure import fit_microstructure
 
     calibration = out / "calibration-gradient"
     ball = out / "session-gradient-ball"
@@ -261,13 +261,11 @@ def _left_out(rig: str, capture: Simulated) -> dict[str, Any]:
 
 
 def _chromophore_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
-    from skinrig import evaluation
+    from skinrig.evaluating import flash
 
     if truth is None:
         return []
-    rows = evaluation.compare(
-        store.read(appearance), store.read(truth), rng=np.random.default_rng(0)
-    )
+    rows = flash.compare(store.read(appearance), store.read(truth), rng=np.random.default_rng(0))
     return [
         [appearance.name.removeprefix("appearance-"), row.name, 100 * row.median_relative, "%",
          100 * row.coverage.share, 100 * row.masked]
@@ -276,26 +274,27 @@ def _chromophore_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
 
 
 def _moving_rows(appearance: Path, out: Path) -> list[list[Any]]:
-    from skinrig import facial_color_evaluation
-    from skinrig.applying import hemoglobin_rig
+    from skinrig.applying.expression import hemoglobin_rig
     from skinrig.dynamic_appearance import FACIAL_COLOR, parts_of
+    from skinrig.evaluating import facial_color
 
     found = store.read(appearance)
     named = parts_of(found)[FACIAL_COLOR]["truth"]
     truths = {state: store.read(out / folder) for state, folder in named.items()}
-    states, _ = facial_color_evaluation.compare(
+    states, _ = facial_color.compare(
         found, hemoglobin_rig(found), truths, rng=np.random.default_rng(0)
     )
     return [
         [appearance.name.removeprefix("appearance-"), f"blood of {row.state}, {row.way}",
          100 * row.median_relative, "%", 100 * row.coverage, 0.0]
-        for row in states if row.way in (facial_color_evaluation.WAYS[1],
-                                         facial_color_evaluation.WAYS[3])
+        for row in states if row.way in (facial_color.WAYS[1],
+                                         facial_color.WAYS[3])
     ]  # fmt: skip
 
 
 def _surface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
-    from skinrig import reflection_evaluation, surface_evaluation
+    from skinrig.evaluating import reflection
+    from skinrig.evaluating import surface as surface_evaluation
 
     if truth is None:
         return []
@@ -305,19 +304,19 @@ def _surface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
         [name, row.name, row.judged[1], row.unit, 100 * row.coverage.share, 100 * row.masked]
         for row in surface_evaluation.compare(found, true, rng=np.random.default_rng(0))
     ]
-    held_out = reflection_evaluation.compare(found, true, rng=np.random.default_rng(0))
+    held_out = reflection.compare(found, true, rng=np.random.default_rng(0))
     if held_out is not None:
         rows.append([name, "reflection, held out", 100 * held_out.median, "%", float("nan"), 0.0])
     return rows
 
 
 def _subsurface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
-    from skinrig import subsurface_evaluation
+    from skinrig.evaluating import subsurface
 
     if truth is None:
         return []
     name = appearance.name.removeprefix("appearance-")
-    fits = subsurface_evaluation.compare_fits(store.read(appearance), store.read(truth))
+    fits = subsurface.compare_fits(store.read(appearance), store.read(truth))
     lost = {
         method: np.mean([not row.valid for row in fits if row.method == method])
         for method in dict.fromkeys(row.method for row in fits)
@@ -325,25 +324,25 @@ def _subsurface_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
     return [
         [name, f"sigma_tr, {row.method}", 100 * row.median, "%", 100 * row.coverage,
          100 * float(lost[row.method])]
-        for row in subsurface_evaluation.by_method(fits)
+        for row in subsurface.by_method(fits)
     ]  # fmt: skip
 
 
 def _microrelief_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
-    from skinrig import microrelief_evaluation
+    from skinrig.evaluating import microrelief
 
     if truth is None:
         return []
     found, true = store.read(appearance), store.read(truth)
     name = appearance.name.removeprefix("appearance-")
     rows: list[list[Any]] = []
-    for row in microrelief_evaluation.compare(found, true, rng=np.random.default_rng(0)):
+    for row in microrelief.compare(found, true, rng=np.random.default_rng(0)):
         if row.state.endswith("_n0"):
             rows.append([name, "normals, neutral", row.mean_deg, "deg", 100 * row.coverage,
                          100 * row.masked])  # fmt: skip
             rows.append([name, "height, neutral", 100 * row.height_relative, "%",
                          100 * row.height_coverage, 100 * row.masked])  # fmt: skip
-    strain = microrelief_evaluation.compare_stretch(found, true)
+    strain = microrelief.compare_stretch(found, true)
     if strain:
         worst = max(strain, key=lambda row: abs(row.error))
         rows.append(

@@ -9,30 +9,30 @@ from typing import Any
 
 from model import store
 from model.skin import SkinAppearance
-from skinrig import (
-    bench_section,
-    calibration_section,
-    chromophore_section,
-    comparison_section,
-    dynamic_section,
-    extremes_section,
-    map_pictures,
-    microrelief_section,
-    omissions_section,
-    page,
-    pictures_section,
-    population_section,
-    provenance_section,
-    run_comparison,
-    sequence_section,
-    session_section,
-    subsurface_section,
-    surface_section,
-    unjudged_section,
-    verdict_section,
-)
 from skinrig.dynamic_appearance import parts_of
-from skinrig.report_folders import Findings, ReportError, discover, read_json
+from skinrig.reporting import (
+    bench,
+    calibration,
+    chromophore,
+    comparison,
+    dynamic,
+    extremes,
+    map_pictures,
+    microrelief,
+    omissions,
+    page,
+    population,
+    provenance,
+    run_comparison,
+    sequence,
+    session,
+    subsurface,
+    unjudged,
+)
+from skinrig.reporting import pictures as pictures_section
+from skinrig.reporting import surface as surface_section
+from skinrig.reporting import verdict as verdict_section
+from skinrig.reporting.folders import Findings, ReportError, discover, read_json
 
 __all__ = ["Report", "ReportError", "build", "make"]
 
@@ -83,7 +83,7 @@ def make(
     title
         Heading of the page.
     compare
-        Whether two runs are compared; None: by the rule of `skinrig.run_comparison.sides`.
+        Whether two runs are compared; None: by the rule of `run_comparison.sides`.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def make(
             judge(run.found, run.checks)
         pairs = run_comparison.compared(*both)
         html = page.document(
-            title, comparison_section.lead(*both, pairs), comparison_section.sections(*both, pairs)
+            title, comparison.lead(*both, pairs), comparison.sections(*both, pairs)
         )
         checks = tuple(both[0].checks + both[1].checks)
         return Report(html, checks, (both[0].label, both[1].label))
@@ -117,7 +117,7 @@ def _least_known(found: Findings) -> list[str]:
         parameters: Mapping[str, Any] = store.read_document(folder).parameters
         states = parameters.get("parts", {}).get("facial_color", {}).get("truth", {})
         if not found.truths.keys() & {parameters.get("truth"), *states.values()}:
-            told += unjudged_section.weaknesses(name, store.read(folder))
+            told += unjudged.weaknesses(name, store.read(folder))
     return told
 
 
@@ -134,8 +134,8 @@ def judge(found: Findings, checks: list[page.Check]) -> None:
     appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
     _maps(found, appearances, checks)
     _documents(found, checks)
-    sessions = session_section.facts_of(found.sessions)
-    calibration_section.section(found.calibrations, appearances, sessions, checks)
+    sessions = session.facts_of(found.sessions)
+    calibration.section(found.calibrations, appearances, sessions, checks)
 
 
 def sections(found: Findings, checks: list[page.Check]) -> str:
@@ -149,14 +149,14 @@ def sections(found: Findings, checks: list[page.Check]) -> str:
         Judgements are added to it.
     """
     appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
-    sessions = session_section.facts_of(found.sessions)
+    sessions = session.facts_of(found.sessions)
     body = _maps(found, appearances, checks)
-    body += chromophore_section.identifiability(appearances.values())
-    body += population_section.section(appearances)
+    body += chromophore.identifiability(appearances.values())
+    body += population.section(appearances)
     body += _documents(found, checks)
-    body += calibration_section.section(found.calibrations, appearances, sessions, checks)
-    body += omissions_section.section(found.sessions)
-    return body + session_section.section(sessions)
+    body += calibration.section(found.calibrations, appearances, sessions, checks)
+    body += omissions.section(found.sessions)
+    return body + session.section(sessions)
 
 
 def _maps(
@@ -164,7 +164,7 @@ def _maps(
 ) -> str:
     body = ""
     for name, appearance in appearances.items():
-        if dynamic_section.is_dynamic(appearance):
+        if dynamic.is_dynamic(appearance):
             body += _dynamic_section(name, appearance, found, checks)
         else:
             body += _appearance_section(name, appearance, found.truth_of(appearance), checks)
@@ -175,10 +175,10 @@ def _documents(found: Findings, checks: list[page.Check]) -> str:
     body = ""
     for path in found.documents:
         document = read_json(path)
-        if bench_section.is_bench(document):
-            body += bench_section.section(document, checks)
-        elif document["schema"] == extremes_section.SCHEMA:
-            body += extremes_section.section(document, checks)
+        if bench.is_bench(document):
+            body += bench.section(document, checks)
+        elif document["schema"] == extremes.SCHEMA:
+            body += extremes.section(document, checks)
         else:
             body += _document_section(document)
     return body
@@ -200,19 +200,19 @@ def _appearance_section(
         body += f'<div class="maps">{"".join(pictures)}</div>'
     if "position" in appearance.maps:
         body += surface_section.section(name, appearance, truth, checks)
-    elif microrelief_section.is_microrelief(appearance):
-        body += microrelief_section.section(name, appearance, truth, checks)
+    elif microrelief.is_microrelief(appearance):
+        body += microrelief.section(name, appearance, truth, checks)
     else:
-        if subsurface_section.is_probe(appearance):
-            body += subsurface_section.section(name, appearance, truth, checks)
-        elif sequence_section.is_sequence(appearance):
-            body += sequence_section.section(appearance)
+        if subsurface.is_probe(appearance):
+            body += subsurface.section(name, appearance, truth, checks)
+        elif sequence.is_sequence(appearance):
+            body += sequence.section(appearance)
         if truth is not None and "melanin" in truth.maps:
-            body += chromophore_section.errors(name, appearance, truth, checks)
-        body += chromophore_section.panels(appearance, truth)
+            body += chromophore.errors(name, appearance, truth, checks)
+        body += chromophore.panels(appearance, truth)
     if truth is None:
-        body += unjudged_section.section(appearance)
-    return body + provenance_section.section(appearance)
+        body += unjudged.section(appearance)
+    return body + provenance.section(appearance)
 
 
 def _dynamic_section(
@@ -225,10 +225,10 @@ def _dynamic_section(
         if folder in found.truths
     }
     body = f"<h2>Moving face: {page.escape(name)}</h2>"
-    body += dynamic_section.section(name, appearance, truths, checks)
+    body += dynamic.section(name, appearance, truths, checks)
     if not truths:
-        body += unjudged_section.section(appearance)
-    return body + provenance_section.section(appearance)
+        body += unjudged.section(appearance)
+    return body + provenance.section(appearance)
 
 
 def _document_section(document: Mapping[str, Any]) -> str:

@@ -6,8 +6,9 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from capture.rig import Probe, Rig, load_rig
-from skinrig import simulating_dome, simulating_flash, simulating_gradient
-from skinrig.simulation import SIZES, SimulationError
+from skinrig.simulating import dome as simulating_dome
+from skinrig.simulating import flash, gradient
+from skinrig.simulating.simulation import SIZES, SimulationError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -71,14 +72,14 @@ def serve_rig(
                 "caliper waits for its host; skinrig simulate gradient makes them"
             )
         rig = rig.cropped(GRADIENT_WIDTH_PX)
-        scene = simulating_gradient.make_scene(rig, site=site, preset=subject, seed=seed)
+        scene = gradient.make_scene(rig, site=site, preset=subject, seed=seed)
         # what all states share is made before anybody asks, so that no client waits for it
         scene.lighting()
     elif rig.probe is not None:
         scene = _probe_scene(rig, rig.probe, subject, seed)
     else:
         dome = "dome" in rig.boxes
-        width = (simulating_dome if dome else simulating_flash).WIDTHS_PX[size]
+        width = (simulating_dome if dome else flash).WIDTHS_PX[size]
         rig = rig.resized(width) if width != rig.views[0].width_px else rig
         scene = _dome_scene(rig, subject, seed) if dome else _flash_scene(rig, subject, seed)
     with serve(rig, pty=pty, tcp=tcp, allow_remote=allow_remote, seed=seed, scene=scene) as served:

@@ -29,7 +29,7 @@ from model.tissue_optics import ANISOTROPY_SKIN
 from rigsim.scenes.flash import FlashScene
 from rigsim.subject import make_subject
 from rigsim.targets import make_target
-from skinrig.simulating_flash import to_superpixels
+from skinrig.simulating.flash import to_superpixels
 
 SEEDS = range(20)
 PRESETS = ("palest", "I", "II", "III", "IV", "V", "VI", "darkest")

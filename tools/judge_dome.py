@@ -17,9 +17,10 @@ import numpy as np
 
 from model import store
 from reconstruction import pipeline
-from skinrig import reflection_evaluation, surface_evaluation
-from skinrig.calibrating import calibrate
-from skinrig.simulation import simulate_session
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating import reflection
+from skinrig.evaluating import surface as surface_evaluation
+from skinrig.simulating.simulation import simulate_session
 
 WANT = ("half_vector_normals", "normals", "normals_refined", "r_d", "lobe_residual", "samples")
 
@@ -60,7 +61,7 @@ def main(arguments: list[str]) -> None:
                 f"bias {row.bias:.2f} covers {100 * row.coverage.share:.0f} % "
                 f"stderr {row.median_stderr:.3f}"
             )
-        print(f"  {reflection_evaluation.compare(found, truth, rng=np.random.default_rng(0))}")
+        print(f"  {reflection.compare(found, truth, rng=np.random.default_rng(0))}")
 
 
 class timed:  # noqa: N801

@@ -22,9 +22,9 @@ from model import store
 from reconstruction import pipeline
 from reconstruction.flash_stages import NOISE_STDERR
 from skinrig.bounds import cramer_rao
-from skinrig.calibrating import calibrate
-from skinrig.evaluation import BANDS, BOUND_FACTOR, BOUND_LIMIT, MEDIAN_LIMIT
-from skinrig.simulation import simulate_session
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating.flash import BANDS, BOUND_FACTOR, BOUND_LIMIT, MEDIAN_LIMIT
+from skinrig.simulating.simulation import simulate_session
 
 PRESETS = ("palest", "I", "II", "III", "IV", "V", "VI", "darkest")
 STATES = ("neutral", "smile", "anger", "fear", "exercise")

@@ -15,10 +15,10 @@ from pathlib import Path
 
 from model import store
 from reconstruction import pipeline
-from skinrig import subsurface_evaluation as evaluation
-from skinrig.bench_probe import medium
-from skinrig.calibrating import calibrate
-from skinrig.simulation import simulate_session, truth_folder
+from skinrig.benchmarks.probe import medium
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating import subsurface as evaluation
+from skinrig.simulating.simulation import simulate_session, truth_folder
 
 
 def main(arguments: list[str]) -> None:

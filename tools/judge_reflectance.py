@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from reconstruction import pipeline
-from skinrig.calibrating import calibrate
-from skinrig.fitting_reflectance import fit_reflectance
-from skinrig.rendering_evaluation import FULL, evaluate_folders
-from skinrig.simulation import simulate_session
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.fitting.reflectance import fit_reflectance
+from skinrig.rendering.evaluation import FULL, evaluate_folders
+from skinrig.simulating.simulation import simulate_session
 
 SUBJECTS = ("palest", "II", "III", "V", "darkest")
 WANT = ("normals", "normals_refined", "r_d", "basis_weight_0")

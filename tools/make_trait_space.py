@@ -37,8 +37,9 @@ from model.traits import TraitSpace, cosine
 from reconstruction import brdf_basis, common_regions
 from rigsim.population import Member, shifted, table_1
 from rigsim.skin_conditions import CONDITIONS
-from skinrig import albedo_vectors, trait_regions, trait_truth
-from skinrig.trait_truth import CommonFaces
+from skinrig.traits import albedo_vectors, regions
+from skinrig.traits import truth as trait_truth
+from skinrig.traits.truth import CommonFaces
 
 TAN = 1.5
 WORN = ("normal", *CONDITIONS)
@@ -270,7 +271,7 @@ def main() -> None:
     spaces = {}
     for region in REGIONS:
         both = [vectors(maps, faces, texture, region) for maps in (once, again)]
-        spaces[trait_regions.space_name(region)] = albedo_space(
+        spaces[regions.space_name(region)] = albedo_space(
             both[0], people, both[1], shows, whose, texture, given.seed
         )
         tell(f"albedo of {region} learned")
@@ -279,13 +280,13 @@ def main() -> None:
     library = TraitLibrary(
         {name: packaged(space) for name, space in {**spaces, "surface": surface}.items()},
         "simulated",
-        trait_regions.library_parameters(
+        regions.library_parameters(
             faces.frame, "quantiles", contrast="regression", seed=given.seed, people=len(people),
             made_by="tools/make_trait_space.py", tan_factor=TAN,
             cosine_to_truth={part: {n: round(c, 4) for n, c in row.items()}
                              for part, row in truth.items()},
         ),
-        {trait_regions.TEXTURE_SPACE: trait_regions.texture_bytes(texture)},
+        {regions.TEXTURE_SPACE: regions.texture_bytes(texture)},
     )  # fmt: skip
     content = library.to_bytes(precision="int8")
     back = from_bytes(content)

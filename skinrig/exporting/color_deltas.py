@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from model import fresnel, store
 from model.skin import SkinAppearance
 from model.texture_resampling import resampled
-from skinrig import applying
+from skinrig.applying import expression
 from skinrig.exporting.images import CAMERA, SRGB, Image, ImageFolder
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.sealing import ExportError
@@ -76,7 +76,7 @@ def write(
     states : list of str
         All that the rig has.
     """
-    rig = applying.hemoglobin_rig(appearance)
+    rig = expression.hemoglobin_rig(appearance)
     have = sorted(rig.states)
     states = chosen(have, delivery, "color", left_out)
     colors = _colors(appearance, rig, states, delivery, left_out)
@@ -125,7 +125,7 @@ def _colors(
         blends[state] = rig.evaluate({state: 1.0})
         seen &= blends[state].valid
     shown = {
-        state: applying.colors(melanin.values, blend.hemoglobin, seen).astype(np.float64)
+        state: expression.colors(melanin.values, blend.hemoglobin, seen).astype(np.float64)
         for state, blend in blends.items()
     }
     neutral = shown[NEUTRAL]

@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
-from skinrig import png
 from skinrig.errors import UsageError
 from skinrig.exporting.images import Image, ImageFolder, coded
 from skinrig.exporting.material import COLOR_NOTE, NOTES, Material
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.provenance import provenance
 from skinrig.exporting.sealing import write_json
+from skinrig.reporting import png
 
 FILE, DOCUMENT = "skin.glb", "glb.json"
 SCHEMA: Final = "skinrig.export.glb/1"

@@ -14,7 +14,7 @@ from skinrig.exporting.images import CAMERA, DATA, SRGB, Image, ImageFolder, png
 from skinrig.exporting.options import NORMAL_Y, Delivery
 from skinrig.exporting.provenance import ORIENTATION, provenance
 from skinrig.exporting.sealing import ExportError, write_json
-from skinrig.rendering_geometry import MESH_FILES
+from skinrig.rendering.geometry import MESH_FILES
 
 DOCUMENT: Final = "maps.json"
 SCHEMA: Final = "skinrig.export.maps/1"
@@ -172,7 +172,7 @@ def _tangent_normals(
     """Write normals in the mesh's frames; return the PNG's name, and why there is none."""
     from skinrig.exporting import tangents
     from skinrig.exporting.tangents import FramedMesh
-    from skinrig.rendering_geometry import GeometryError, own_mesh
+    from skinrig.rendering.geometry import GeometryError, own_mesh
 
     found = next((n for n in ("normals_refined", "normals") if n in names), None)
     if found is None:

@@ -101,11 +101,11 @@ class Material:
 
         Raises
         ------
-        model.skin_reflectance.SkinReflectanceError, skinrig.rendering_geometry.GeometryError,
+        model.skin_reflectance.SkinReflectanceError, skinrig.rendering.geometry.GeometryError,
         rigsim.mesh.MeshError, ExportError
             Naming the map or file that is missing or does not fit.
         """
-        from skinrig.rendering_geometry import FittedSurface, own_mesh
+        from skinrig.rendering.geometry import FittedSurface, own_mesh
 
         model = skin_reflectance.assemble(appearance)
         own = own_mesh(appearance)
@@ -269,7 +269,7 @@ def read_mesh(path: Path) -> Mesh:
     """
     from rigsim.mesh import build_mesh
     from skinrig import blend_shapes
-    from skinrig.rendering_geometry import read_mesh as without_shapes
+    from skinrig.rendering.geometry import read_mesh as without_shapes
 
     if path.is_dir() or path.suffix.lower() in (".gltf", ".glb"):
         read = blend_shapes.load(path)

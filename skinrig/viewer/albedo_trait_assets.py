@@ -18,7 +18,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinrig import edit_masks, editing_albedo, face_textures, trait_regions
+from skinrig import face_textures
+from skinrig.editing import albedo as editing_albedo
+from skinrig.editing import masks
+from skinrig.traits import regions
 from skinrig.viewer.reflectance_assets import filled
 from skinrig.viewer.scene import SceneSource, Texture
 from skinrig.viewer.trait_assets import told_from_chance
@@ -94,14 +97,14 @@ def albedo_traits(source: SceneSource) -> AlbedoTraits | str:
     face = face_textures.read(path)
     if not {"position", "r_d"} <= set(face.appearance.maps):
         return f"{path.name} has no maps position and r_d"
-    library, _ = trait_regions.load(None)
-    parts = trait_regions.parts_of(library)
+    library, _ = regions.load(None)
+    parts = regions.parts_of(library)
     space = parts.albedo["face"]
     names = told_from_chance(space.traits.traits)
     r_d = face.r_d.values
     valid = face_textures.valid_of(face.r_d)
     chart = face.chart(parts.frame)
-    region = edit_masks.feathered("face", parts.frame)
+    region = masks.feathered("face", parts.frame)
 
     def log_factor(name: str, amount: float) -> Float32:
         found = editing_albedo.edit_albedo(

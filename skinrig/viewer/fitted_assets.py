@@ -19,7 +19,7 @@ def assets(source: SceneSource) -> Assets:
 
     Raises
     ------
-    model.skin_reflectance.SkinReflectanceError, skinrig.surface_mixtures.SurfaceMixtureError
+    SkinReflectanceError, SurfaceMixtureError
         For a fitted folder that is damaged.
     """
     found = reflectance_assets.lobes_of(source)

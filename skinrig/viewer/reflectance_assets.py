@@ -90,7 +90,7 @@ def assemble(source: SceneSource, found: PageLobes) -> Assets:
 
 def lobes_of(source: SceneSource) -> PageLobes:
     """Return the lobes of a face, or of the mean of a population."""
-    from skinrig import surface_mixtures
+    from skinrig.editing import surface_mixtures
 
     for kind in FITTED:
         appearance = source.appearances.get(kind)

@@ -101,7 +101,7 @@ def test_a_default_of_none_shows_in_the_annotation():
 
 def test_a_hidden_none_would_be_found():
     assert none_defaults_without_none("def f(a: int = None, b: int | None = None): ...") == ["f.a"]
-    imports = "from skinrig.cli_options import Json, Site\n"
+    imports = "from skinrig.commands.options import Json, Site\n"
     assert none_defaults_without_none(imports + "def f(a: Json = None, b: Site = None): ...") == [
         "f.a"
     ]

@@ -7,8 +7,8 @@ import math
 
 import pytest
 
-from skinrig.bench_document import SCHEMA
-from skinrig.bench_stages import STAGES, BenchError, run_stages
+from skinrig.benchmarks.document import SCHEMA
+from skinrig.benchmarks.stages import STAGES, BenchError, run_stages
 from skinrig.console import Console, plain
 from skinrig.skin_bands import MELANIN_BANDS
 

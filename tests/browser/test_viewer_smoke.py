@@ -15,7 +15,7 @@ def test_a_page_draws_a_face_without_errors_or_requests(viewer):
 
 
 def test_the_first_picture_is_the_one_that_is_drawn_again(viewer):
-    """Textures reach the device while the first frame is drawn, and must not take each other's place."""
+    """Textures reach the device while the first frame is drawn, and keep their own places."""
     first = viewer.read("albedo")
     assert first[first[..., 3] > 0, 0].std() > 0.005
     viewer.bench(1)

@@ -392,8 +392,8 @@ def test_ignoring_exit_polarization_fails_the_bound_that_the_correction_meets():
 def test_targets_captured_by_the_whole_rig_calibrate_to_the_truth(kind, tmp_path):
     """Through boxes, camera, session and disk at 384 pixels: the truth within 5 stated errors."""
     from rigsim.films import films_of
-    from skinrig.calibrating import calibrate
-    from skinrig.simulation import simulate_session
+    from skinrig.calibrating.calibrate import calibrate
+    from skinrig.simulating.simulation import simulate_session
 
     target = {"sensor": "flat", "polarization": "malus", "color": "chart"}[kind]
     simulate_session("flash", tmp_path / "s", target=target, width_px=384)

@@ -17,9 +17,10 @@ from model.skin import SkinAppearance
 from reconstruction import pipeline, scan_mesh
 from reconstruction.surface_estimates import PointValues
 from reconstruction.surface_texture import SurfaceTexture
-from skinrig import reflection_evaluation, surface_evaluation
-from skinrig.calibrating import calibrate
-from skinrig.simulation import simulate_session
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating import reflection
+from skinrig.evaluating import surface as surface_evaluation
+from skinrig.simulating.simulation import simulate_session
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 
@@ -134,7 +135,7 @@ def test_albedo_is_right_but_for_what_pixels_of_this_size_average(judged):
 
 
 def test_reflection_in_directions_of_no_light_is_predicted(judged):
-    found = reflection_evaluation.compare(judged.maps, judged.truth, rng=np.random.default_rng(0))
+    found = reflection.compare(judged.maps, judged.truth, rng=np.random.default_rng(0))
     assert found.points > 200
     assert found.median < 0.06
     # it can fail: with the albedo of a tenth more, it does
@@ -143,7 +144,7 @@ def test_reflection_in_directions_of_no_light_is_predicted(judged):
         judged.maps,
         maps={**judged.maps.maps, "r_d": dataclasses.replace(r_d, values=1.1 * r_d.values)},
     )
-    wrong = reflection_evaluation.compare(brighter, judged.truth, rng=np.random.default_rng(0))
+    wrong = reflection.compare(brighter, judged.truth, rng=np.random.default_rng(0))
     assert wrong.median > 0.06
 
 

@@ -25,7 +25,7 @@ from reconstruction import pipeline
 from reconstruction.evidence import EvidenceError
 from reconstruction.hold_out import HoldOutError
 from reconstruction.stages import StageError
-from skinrig.simulating_dome import small_dome
+from skinrig.simulating.dome import small_dome
 
 AXES_MM = np.array([58.0, 85.0, 66.0])
 CENTER_MM = np.array([0.0, 5.0, -16.0])

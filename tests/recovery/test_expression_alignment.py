@@ -14,7 +14,7 @@ from reconstruction import (
     shading_prior,
     shared_melanin,
 )
-from skinrig.bench_alignment import (
+from skinrig.benchmarks.alignment import (
     displaced,
     face_of,
     moved_face,

@@ -7,11 +7,11 @@ import pytest
 
 from model import store
 from reconstruction import pipeline
-from skinrig.applying import hemoglobin_rig
-from skinrig.calibrating import calibrate
-from skinrig.facial_color_evaluation import WAYS, compare, true_blood
-from skinrig.fitting_facial_color import fit_facial_color
-from skinrig.simulation import simulate_session
+from skinrig.applying.expression import hemoglobin_rig
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating.facial_color import WAYS, compare, true_blood
+from skinrig.fitting.facial_color import fit_facial_color
+from skinrig.simulating.simulation import simulate_session
 
 pytestmark = [pytest.mark.long, pytest.mark.render]
 

@@ -14,9 +14,9 @@ from capture.calibration import store as calibration_store
 from capture.session import Session
 from model import store
 from reconstruction import pipeline
-from skinrig.calibrating import calibrate
-from skinrig.evaluation import compare, limit
-from skinrig.simulation import simulate_session
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating.flash import compare, limit
+from skinrig.simulating.simulation import simulate_session
 
 pytestmark = pytest.mark.render
 

@@ -8,8 +8,8 @@ import pytest
 from capture.plan.gradient import state_of, states
 from capture.session import Session, verify
 from model import store
-from skinrig.simulating_gradient import GripLog
-from skinrig.simulation import SimulationError, simulate_session
+from skinrig.simulating.gradient import GripLog
+from skinrig.simulating.simulation import SimulationError, simulate_session
 
 SMALL = {"width_px": 48, "angles": (0.0,), "steps": (-1, 1), "seed": 4}
 

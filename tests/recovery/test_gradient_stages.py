@@ -13,9 +13,9 @@ from reconstruction.evidence import EvidenceError
 from reconstruction.gradient_images import GradientImages
 from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, fit_kernel
 from reconstruction.normal_histogram import measure
-from skinrig import microrelief_evaluation as evaluation
+from skinrig.evaluating import microrelief as evaluation
 from skinrig.report import build
-from skinrig.simulation import simulate_session
+from skinrig.simulating.simulation import simulate_session
 
 pytestmark = [pytest.mark.long, pytest.mark.render]
 

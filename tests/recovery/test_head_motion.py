@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reconstruction import head_motion
-from skinrig.bench_motion import simulate
+from skinrig.benchmarks.motion import simulate
 
 
 @pytest.mark.long

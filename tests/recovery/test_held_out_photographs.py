@@ -20,11 +20,11 @@ from reconstruction import pipeline
 from rigsim import dome_build
 from rigsim.led_light import lobe_exponent, white_intensity
 from rigsim.sensor import sensor_of, vignetting_map
-from skinrig import rendering_evaluation
-from skinrig.photograph_errors import LIMIT
-from skinrig.photographs import Photographs, PhotographsError
-from skinrig.simulating_dome import small_dome
-from skinrig.simulation import simulate_session
+from skinrig.rendering import evaluation
+from skinrig.rendering.photograph_errors import LIMIT
+from skinrig.rendering.photographs import Photographs, PhotographsError
+from skinrig.simulating.dome import small_dome
+from skinrig.simulating.simulation import simulate_session
 
 DOME = {"lights": 32, "views": 4}
 WIDTH_PX = 200
@@ -91,7 +91,7 @@ def test_photographs_that_no_fit_has_seen_are_predicted(fitted):
     assert len(photographs.shots) == DOME["lights"] + (DOME["views"] - 1) * len(lights)
 
     def judge(model, *, ablation=False):
-        return rendering_evaluation.evaluate(
+        return evaluation.evaluate(
             appearance, photographs, model=model, subsurface="local", count=6,
             ablation=ablation, rng=np.random.default_rng(0),
         )  # fmt: skip
@@ -134,7 +134,7 @@ def test_a_head_that_sits_elsewhere_in_another_session_is_found(fitted):
     photographs = Photographs.of(out / "session-face", elsewhere, calibration=out / "calibration")
     assert len(photographs.shots) == DOME["lights"] * DOME["views"]
     assert "the head sits" in photographs.assumed[0]
-    found, _ = rendering_evaluation.evaluate(
+    found, _ = evaluation.evaluate(
         elsewhere, photographs, subsurface="local", count=4, ablation=False,
         rng=np.random.default_rng(0),
     )  # fmt: skip

@@ -12,7 +12,7 @@ import pytest
 from reconstruction import normal_histogram
 from rigsim.microrelief import make_micro_skin
 from rigsim.skin_stretch import deform
-from skinrig.bench_microstructure import (
+from skinrig.benchmarks.microstructure import (
     TEXEL_UM,
     fitted_table,
     slopes_under,

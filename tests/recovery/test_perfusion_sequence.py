@@ -9,9 +9,9 @@ import pytest
 
 from reconstruction import pipeline
 from reconstruction.evidence import EvidenceError
-from skinrig.calibrating import calibrate
+from skinrig.calibrating.calibrate import calibrate
 from skinrig.sequences import SequenceOrder
-from skinrig.simulation import SimulationError, simulate_session
+from skinrig.simulating.simulation import SimulationError, simulate_session
 
 WIDTH_PX = 192
 

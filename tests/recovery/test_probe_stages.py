@@ -8,11 +8,11 @@ from model import store
 from reconstruction import pipeline
 from reconstruction.evidence import EvidenceError
 from reconstruction.stages import StageError
-from skinrig import subsurface_evaluation as evaluation
-from skinrig.calibrating import calibrate
+from skinrig.calibrating.calibrate import calibrate
 from skinrig.cli import main
+from skinrig.evaluating import subsurface as evaluation
 from skinrig.report import build
-from skinrig.simulation import simulate_session, truth_folder
+from skinrig.simulating.simulation import simulate_session, truth_folder
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
 

@@ -9,9 +9,9 @@ from capture.calibration.geometry import CameraPose
 from capture.rig import load_rig
 from rigsim.scenes.dome import DomeScene
 from rigsim.subject import make_subject
-from skinrig.rendering import render
-from skinrig.rendering_geometry import FittedSurface
-from skinrig.rendering_truth import true_light, true_model
+from skinrig.rendering.geometry import FittedSurface
+from skinrig.rendering.render import render
+from skinrig.rendering.truth import true_light, true_model
 
 LIGHTS = (20, 62)
 

@@ -9,7 +9,7 @@ from model import brdf_tables
 from model.traits import TraitSpace
 from reconstruction import brdf_basis
 from rigsim.population import shifted, table_1
-from skinrig import trait_truth
+from skinrig.traits import truth as trait_truth
 
 PEOPLE = [person for person in table_1() if not person.applied]
 

@@ -12,7 +12,7 @@ from model import metrics, wrinkles
 from model.wrinkles import JIMENEZ2011
 from reconstruction import wrinkle_fit, wrinkle_texels, wrinkle_zones
 from rigsim.subject import make_subject
-from skinrig import bench_wrinkles
+from skinrig.benchmarks import wrinkles as bench_wrinkles
 
 EXPRESSIONS = ("anger", "disgust", "fear", "happiness", "sadness", "surprise")
 

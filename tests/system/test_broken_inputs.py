@@ -8,7 +8,7 @@ import pytest
 
 from capture import raw
 from skinrig.cli import main
-from skinrig.simulation import simulate_session
+from skinrig.simulating.simulation import simulate_session
 
 pytestmark = pytest.mark.render
 

@@ -8,13 +8,13 @@ import pytest
 from skinrig.cli import main
 from skinrig.console import Console
 from skinrig.demo import RIGS, DemoError, run_demo
-from skinrig.simulation import SimulationError
+from skinrig.simulating.simulation import SimulationError
 
 
 @pytest.fixture
 def without_benchmarks(monkeypatch):
     """Benchmarks have tests of their own, and take as long as they are allowed to."""
-    monkeypatch.setattr("skinrig.bench_stages.run_stages", lambda *_, **__: {"passed": True})
+    monkeypatch.setattr("skinrig.benchmarks.stages.run_stages", lambda *_, **__: {"passed": True})
 
 
 @pytest.mark.parametrize("rigs", ["submarine", "dome,submarine", "", "flash,"])

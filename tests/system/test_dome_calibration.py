@@ -11,7 +11,7 @@ from capture.session import Session
 from rigsim.dome_build import build, image_of
 from rigsim.led_light import lobe_exponent, white_intensity
 from skinrig.cli import main
-from skinrig.simulation import simulate_session
+from skinrig.simulating.simulation import simulate_session
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(400)]
 

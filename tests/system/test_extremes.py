@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from skinrig import extremes
 from skinrig.cli import main
+from skinrig.extremes import cases as extremes
 from skinrig.report import build
 
 CASES = extremes.all_cases()

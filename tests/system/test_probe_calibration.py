@@ -9,7 +9,7 @@ from capture.calibration.fibre import FibreCalibration
 from capture.session import Session
 from rigsim.probe_build import build_probe
 from skinrig.cli import main
-from skinrig.simulation import simulate_session
+from skinrig.simulating.simulation import simulate_session
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
 

@@ -12,8 +12,9 @@ import pytest
 
 from capture.session import Session, verify
 from model import store
-from skinrig import errors, simulating_probe
+from skinrig import errors
 from skinrig.cli import main
+from skinrig.simulating import probe
 
 SUBJECT = "homogeneous:0.05,1.4"
 FEW_PHOTONS = {"small": 2000, "full": 2000}
@@ -23,10 +24,10 @@ FEW_PHOTONS = {"small": 2000, "full": 2000}
 def small(monkeypatch):
     """Few photons, and series of 8 exposures that end at half a second."""
     short = {"brackets": 8, "longest_s": 0.5, "darks": 1}
-    monkeypatch.setattr(simulating_probe, "PHOTONS", FEW_PHOTONS)
+    monkeypatch.setattr(probe, "PHOTONS", FEW_PHOTONS)
     for name in ("probe_plan", "probe_calibration_plan"):
-        honest = getattr(simulating_probe, name)
-        monkeypatch.setattr(simulating_probe, name, functools.partial(honest, **short))
+        honest = getattr(probe, name)
+        monkeypatch.setattr(probe, name, functools.partial(honest, **short))
 
 
 def simulate(out, *more):
@@ -151,7 +152,7 @@ def test_a_simulation_is_resumed_in_the_middle_of_a_series_with_the_truth_of_all
 ):
     out = tmp_path / "session-probe"
     words = simulate(out, "--sites", "forehead,cheek", "--seed", "2")
-    honest = simulating_probe.HeadLog.exposure
+    honest = probe.HeadLog.exposure
     seen = []
 
     def exposure(self, *args, **more):
@@ -160,10 +161,10 @@ def test_a_simulation_is_resumed_in_the_middle_of_a_series_with_the_truth_of_all
             raise Killed
         return honest(self, *args, **more)
 
-    monkeypatch.setattr(simulating_probe.HeadLog, "exposure", exposure)
+    monkeypatch.setattr(probe.HeadLog, "exposure", exposure)
     with pytest.raises(Killed):
         main(words)
-    monkeypatch.setattr(simulating_probe.HeadLog, "exposure", honest)
+    monkeypatch.setattr(probe.HeadLog, "exposure", honest)
     assert {r.index["site"] for r in Session.open(out).frames("fibres")} == {"forehead"}
     assert main([*words, "--resume"]) == errors.DONE
     session = Session.open(out)

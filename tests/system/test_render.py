@@ -8,11 +8,12 @@ import pytest
 
 from model import brdf_tables, store
 from model.skin import UNITS, SkinAppearance, SkinMap
-from skinrig import photographs, rendering_camera
 from skinrig.cli import main
-from skinrig.photograph_errors import Photograph
-from skinrig.photographs import Shot
-from skinrig.rendering_lights import Light
+from skinrig.rendering import camera as rendering_camera
+from skinrig.rendering import photographs
+from skinrig.rendering.lights import Light
+from skinrig.rendering.photograph_errors import Photograph
+from skinrig.rendering.photographs import Shot
 
 SIZE = 32
 STEPS = 24
@@ -134,8 +135,8 @@ def test_fewer_lobes_and_a_shadow_boundary_are_drawn(folder, monkeypatch, capsys
     assert [row["lobes"] for row in rows] == [1, 2]
     assert [row["refitted"] for row in rows] == [False, True]
     assert rows[0]["surface_difference_from_2"] > rows[1]["surface_difference_from_2"] == 0.0
-    monkeypatch.setattr("skinrig.rendering_shadow.FACE_TEXELS", 128)
-    monkeypatch.setattr("skinrig.rendering_shadow.PATCH_TEXELS", 64)
+    monkeypatch.setattr("skinrig.rendering.shadow.FACE_TEXELS", 128)
+    monkeypatch.setattr("skinrig.rendering.shadow.PATCH_TEXELS", 64)
     words = ("face", "--shadow-boundary", "--samples", "1", "--out", "shadow", "--json")
     assert run(folder, monkeypatch, *words) == 0
     document = json.loads(capsys.readouterr().out)

@@ -81,7 +81,7 @@ def test_asking_for_nothing_new_reads_no_frame_and_touches_no_file(tmp_path, mon
     from capture.session import Session
     from model import store
     from reconstruction import pipeline
-    from skinrig.simulation import simulate_session
+    from skinrig.simulating.simulation import simulate_session
 
     session = simulate_session("flash", tmp_path / "session-flash", width_px=64).session
     out = tmp_path / "appearance"

@@ -10,8 +10,8 @@ from rigsim.scenes.dome import DomeScene
 from rigsim.scenes.flash import FlashScene
 from rigsim.subject import Subject, make_subject
 from rigsim.variant import VariantChoice
-from skinrig.simulating_dome import small_dome
-from skinrig.simulating_flash import truth_of
+from skinrig.simulating.dome import small_dome
+from skinrig.simulating.flash import truth_of
 
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
 WIDTH = 192

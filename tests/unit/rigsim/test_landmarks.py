@@ -11,7 +11,7 @@ from rigsim.render import Caster
 from rigsim.scenes.flash import FlashScene
 from rigsim.subject import Subject, make_subject
 from rigsim.variant import VariantChoice
-from skinrig.simulating_flash import landmarks_at_superpixels, to_superpixels
+from skinrig.simulating.flash import landmarks_at_superpixels, to_superpixels
 
 # Embree traces the rays, so these tests need no Mitsuba.
 EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")

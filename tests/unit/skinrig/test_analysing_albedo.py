@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from skinrig import analysing_albedo
+from skinrig.analysing import albedo as analysing_albedo
 from skinrig.cli import main
 
 

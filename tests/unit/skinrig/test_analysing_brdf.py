@@ -11,9 +11,10 @@ from model import brdf_tables, store
 from model.skin import SkinAppearance, SkinMap
 from reconstruction import brdf_basis, diffuse_albedo
 from rigsim import population
-from skinrig import analysing_brdf, brdf_space_datasets, brdf_space_figures
-from skinrig.analysing_brdf import AnalysisError
-from skinrig.brdf_space_datasets import Captured, DatasetError
+from skinrig.analysing import brdf as analysing_brdf
+from skinrig.analysing import brdf_space_datasets, brdf_space_figures
+from skinrig.analysing.brdf import AnalysisError
+from skinrig.analysing.brdf_space_datasets import Captured, DatasetError
 from skinrig.cli import main
 
 PERSON = population.table_1()[4]

@@ -9,9 +9,9 @@ from model.skin import UNITS, SkinAppearance, SkinMap
 from model.wrinkle_model import FILE as WRINKLE_FILE
 from model.wrinkle_model import WrinkleModel
 from model.wrinkles import Layer
-from skinrig import applying
 from skinrig import dynamic_appearance as dynamic
-from skinrig.applying import (
+from skinrig.applying import expression
+from skinrig.applying.expression import (
     ApplyError,
     Expression,
     OtherFace,
@@ -190,4 +190,4 @@ def test_the_same_evaluation_gives_the_same_bytes(face, tmp_path):
         for name in ("one", "two")
     )
     assert first == second
-    assert applying.OBSERVER == "linear sRGB"
+    assert expression.OBSERVER == "linear sRGB"

@@ -7,7 +7,7 @@ from model.displacement_convolution import convolve
 from model.mesh_strain import StrainError
 from model.microstructure import FOREHEAD, KernelTable, kernel_parameters
 from model.strain_fields import KernelRegions
-from skinrig.applying_microstructure import ApplyMicrostructureError, apply_microstructure
+from skinrig.applying.microstructure import ApplyMicrostructureError, apply_microstructure
 from skinrig.blend_shapes import BlendShapeMesh
 
 

@@ -7,8 +7,8 @@ from model import store
 from model.microstructure import FOREHEAD
 from model.skin import SkinMap
 from skinrig import dynamic_appearance as dynamic
-from skinrig.applying import ApplyError, Expression, apply_expression
-from skinrig.applying_relief import Relief
+from skinrig.applying.expression import ApplyError, Expression, apply_expression
+from skinrig.applying.relief import Relief
 
 MICRO = (dynamic.MICROSTRUCTURE,)
 
@@ -109,7 +109,7 @@ def test_names_that_nothing_answers_to_are_refused_and_nothing_is_written(folder
 
 
 def test_large_maps_go_beside_the_folder(folder, sheet, tmp_path, monkeypatch):
-    monkeypatch.setattr("skinrig.applying_relief.ASIDE_FROM_PX", 256)
+    monkeypatch.setattr("skinrig.applying.relief.ASIDE_FROM_PX", 256)
     out = tmp_path / "out"
     applied(folder, sheet, out, {"drawn": 1.0})
     large = np.load(tmp_path / "out-large" / "displacement.npy", mmap_mode="r")

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from skinrig import bench_reflectance
+from skinrig.benchmarks import reflectance
 
 
 def test_points_of_the_benchmark_lie_above_their_horizon_and_keep_lights_apart(rng):
-    p = bench_reflectance.face_points("III", points=6, samples=40, rng=rng)
+    p = reflectance.face_points("III", points=6, samples=40, rng=rng)
     assert p.seen.mean() > 0.9
     assert 0.02 < p.left_out.mean() < 0.6
     np.testing.assert_allclose(np.linalg.norm(p.light, axis=-1), 1.0, atol=1e-6)
@@ -20,7 +20,7 @@ def test_points_of_the_benchmark_lie_above_their_horizon_and_keep_lights_apart(r
 
 @pytest.mark.long
 def test_more_lobes_predict_lights_that_were_left_out_better():
-    stage = bench_reflectance.model(toy=True)
+    stage = reflectance.model(toy=True)
     by_rank = {p.knobs["rank"]: p.error for p in stage.points if p.knobs["part"] == "lobes"}
     assert by_rank[1] > 1.5 * by_rank[4]
     assert stage.limits[0].passed

@@ -5,8 +5,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from skinrig import bench_plan, bench_stages, bench_table
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks import plan as bench_plan
+from skinrig.benchmarks import stages as bench_stages
+from skinrig.benchmarks import table as bench_table
 from skinrig.console import Console
 from skinrig.errors import MissingExtra
 

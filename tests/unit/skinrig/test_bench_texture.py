@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from model.steerable_pyramid import analyze
-from skinrig import bench_texture
+from skinrig.benchmarks import texture
 
 
 def test_a_missing_peer_is_said_and_no_limit_is_claimed(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrtools", None)
     monkeypatch.setitem(sys.modules, "pyrtools.pyramids", None)
-    limits, left_out = bench_texture.against_peer()
+    limits, left_out = texture.against_peer()
     assert limits == ()
     assert "10 x pyrtools" in left_out[0][0]
     assert "skinrig[peers]" in left_out[0][1]
@@ -20,21 +20,21 @@ def test_our_responses_are_those_of_the_peer(rng):
     """Tolerance: the peer interpolates its filters in a table."""
     pytest.importorskip("pyrtools")
     image = rng.standard_normal((512, 512))
-    for ours, theirs in zip(analyze(image), bench_texture.peer_responses(image), strict=True):
+    for ours, theirs in zip(analyze(image), texture.peer_responses(image), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=2e-5)
 
 
 @pytest.mark.long
 def test_our_matching_ends_as_near_as_the_peers():
     pytest.importorskip("pyrtools")
-    limits, left_out = bench_texture.against_peer(512)
+    limits, left_out = texture.against_peer(512)
     assert left_out == ()
     assert [limit.passed for limit in limits[2:]] == [True, True]
 
 
 def test_a_made_texture_is_periodic_and_has_spots_of_their_own_color(rng):
-    plain = bench_texture.skin_texture(128, spots=0.0, rng=np.random.default_rng(1))
-    spotted = bench_texture.skin_texture(128, spots=10.0, rng=np.random.default_rng(1))
+    plain = texture.skin_texture(128, spots=0.0, rng=np.random.default_rng(1))
+    spotted = texture.skin_texture(128, spots=10.0, rng=np.random.default_rng(1))
     assert np.abs(plain[0] - plain[-1]).max() < 2.0 * np.abs(np.diff(plain, axis=0)).max()
     darker = np.log(plain / spotted)
     assert darker.min() > -1e-6

@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skinrig import bench_table, resident_memory
-from skinrig.bench_document import knee, pareto_front, to_document
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, Timing, measure
+from skinrig.benchmarks import resident_memory
+from skinrig.benchmarks import table as bench_table
+from skinrig.benchmarks.document import knee, pareto_front, to_document
 
 
 def point(seconds, error):

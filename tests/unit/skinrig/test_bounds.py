@@ -72,7 +72,7 @@ def test_the_bound_of_maps_is_that_at_the_truth(table, rng):
 
 
 def test_an_inflated_standard_error_does_not_widen_its_own_limit(table, rng):
-    from skinrig.evaluation import compare, limit
+    from skinrig.evaluating.flash import compare, limit
 
     honest, inflated = (
         next(

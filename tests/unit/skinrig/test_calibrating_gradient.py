@@ -11,7 +11,7 @@ from capture.calibration import store
 from capture.calibration.sensor import SensorCalibration
 from capture.raw import RawFrame
 from capture.rig import load_rig
-from skinrig.calibrating_gradient import (
+from skinrig.calibrating.gradient import (
     GradientCalibratingError,
     calibrate_gradient,
     of_a_gradient_sphere,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from skinrig import cli_completion
+from skinrig.commands import completion
 
 
 def offered(words):
@@ -39,12 +39,12 @@ def test_tab_completes_names(words, expected):
 @pytest.mark.parametrize(
     ("complete", "typed", "one"),
     [
-        (cli_completion.targets, "ch", "charuco"),
-        (cli_completion.subjects, "dark", "darkest"),
-        (cli_completion.states, "sm", "smile"),
-        (cli_completion.conditions, "lo", "lotion"),
-        (cli_completion.stages, "chrom", "chromophores"),
-        (cli_completion.sizes, "f", "full"),
+        (completion.targets, "ch", "charuco"),
+        (completion.subjects, "dark", "darkest"),
+        (completion.states, "sm", "smile"),
+        (completion.conditions, "lo", "lotion"),
+        (completion.stages, "chrom", "chromophores"),
+        (completion.sizes, "f", "full"),
     ],
 )
 def test_what_is_offered_begins_with_what_is_typed(complete, typed, one):
@@ -55,4 +55,4 @@ def test_what_is_offered_begins_with_what_is_typed(complete, typed, one):
 
 
 def test_a_name_is_not_offered_twice_in_a_list():
-    assert "flash,flash" not in cli_completion.several_rigs("flash,")
+    assert "flash,flash" not in completion.several_rigs("flash,")

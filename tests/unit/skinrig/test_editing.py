@@ -10,10 +10,12 @@ from model import store
 from model.skin import SkinMap
 from model.skin_reflectance import lobes_of
 from model.trait_storage import load
-from skinrig import editing, face_textures, png
+from skinrig import face_textures
 from skinrig.cli import main
-from skinrig.editing import EditError, Order
-from skinrig.editing_spots import SpotOrder
+from skinrig.editing import edit as editing
+from skinrig.editing.edit import EditError, Order
+from skinrig.editing.spots import SpotOrder
+from skinrig.reporting import png
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from model.skin import UNITS, SkinAppearance, SkinMap
-from skinrig.evaluation import compare
+from skinrig.evaluating.flash import compare
 
 
 def appearance(melanin, stderr=None, valid=None):

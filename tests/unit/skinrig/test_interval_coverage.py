@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from skinrig.interval_coverage import GAUSSIAN_95, LEVELS, RAYLEIGH_95, Trial, by_band, pooled
+from skinrig.benchmarks.interval_coverage import (
+    GAUSSIAN_95,
+    LEVELS,
+    RAYLEIGH_95,
+    Trial,
+    by_band,
+    pooled,
+)
 
 
 def trials_of(rng, *, shared, scale=1.0, subjects=12, band="any"):

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from skinrig import omissions_section
+from skinrig.reporting import omissions
 
 EFFECTS = [
     {"name": "shadows", "verdict": "built", "reason": "a face", "over_noise": 55.0, "switch": ""},
@@ -26,7 +26,7 @@ def session(tmp_path):
 
 
 def test_what_is_left_out_comes_before_what_is_built(session):
-    html = omissions_section.section([session("session-a", {"effects": EFFECTS})])
+    html = omissions.section([session("session-a", {"effects": EFFECTS})])
     places = [html.index(word) for word in ("bounces", "lens", "shadows")]
     assert places == sorted(places)
     assert "1 effects built, 2 not" in html
@@ -37,11 +37,11 @@ def test_what_is_left_out_comes_before_what_is_built(session):
 def test_sessions_of_like_scenes_share_a_table_in_any_order(session):
     two = [session(name, {"effects": EFFECTS}) for name in ("session-b", "session-a")]
     other = session("session-c", {"effects": EFFECTS[:1]})
-    html = omissions_section.section([*two, other])
+    html = omissions.section([*two, other])
     assert html.count("<table") == 2
     assert "session-a, session-b" in html
-    assert html == omissions_section.section([other, *reversed(two)])
+    assert html == omissions.section([other, *reversed(two)])
 
 
 def test_measured_sessions_and_folders_that_are_none_say_nothing(session, tmp_path):
-    assert omissions_section.section([session("session-real", {}), tmp_path / "nowhere"]) == ""
+    assert omissions.section([session("session-real", {}), tmp_path / "nowhere"]) == ""

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from skinrig import photograph_errors as errors
-from skinrig.photograph_errors import Photograph, PhotographError
+from skinrig.rendering import photograph_errors as errors
+from skinrig.rendering.photograph_errors import Photograph, PhotographError
 
 SIDE = 24
 

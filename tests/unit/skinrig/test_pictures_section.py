@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from skinrig import page, pictures_section, png
 from skinrig.report import ReportError, build
+from skinrig.reporting import page, pictures, png
 
 
 def a_row(median):
@@ -29,7 +29,7 @@ def test_a_comparison_adds_its_limit_and_names_what_was_left_out(tmp_path):
            "by_band": {"light": {"pixels": 10, "median": 0.06}}},
     )  # fmt: skip
     checks: list[page.Check] = []
-    body = pictures_section.section(folder, checks)
+    body = pictures.section(folder, checks)
     assert [check.passed for check in checks] == [False]
     assert "no surface" in body
     assert "light held out" in body
@@ -45,9 +45,9 @@ def test_a_report_finds_pictures_below_its_folder(tmp_path):
 
 
 def test_large_pictures_stay_in_their_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(pictures_section, "LARGEST_BYTES", 10)
+    monkeypatch.setattr(pictures, "LARGEST_BYTES", 10)
     folder = a_folder(tmp_path / "pictures", view={"name": "C03"}, lights={})
-    body = pictures_section.section(folder, [])
+    body = pictures.section(folder, [])
     assert "Too large for here: radiance.png" in body
     assert "data:image" not in body
 
@@ -56,7 +56,7 @@ def test_other_documents_are_no_pictures(tmp_path):
     folder = tmp_path / "pictures"
     folder.mkdir()
     (folder / "analysis.json").write_text(json.dumps({"schema": "somebody.else/1"}))
-    assert pictures_section.section(folder, []) == ""
+    assert pictures.section(folder, []) == ""
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(ReportError, match="holds no"):

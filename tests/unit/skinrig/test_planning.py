@@ -7,8 +7,8 @@ import pytest
 
 from capture.plan import Plan
 from capture.rig import load_rig
-from skinrig import dome_sight, planning
 from skinrig.cli import main
+from skinrig.planning import dome_sight, plans
 
 
 @pytest.mark.parametrize(
@@ -23,8 +23,8 @@ from skinrig.cli import main
     ],
 )
 def test_what_cannot_be_wanted_is_told(text, word):
-    with pytest.raises(planning.PlanningError, match=word):
-        planning.read_wants(text, "dome")
+    with pytest.raises(plans.PlanningError, match=word):
+        plans.read_wants(text, "dome")
 
 
 def test_a_rig_that_has_no_plans_of_its_own_is_told(capsys):
@@ -65,7 +65,7 @@ def test_a_plan_keeps_what_it_promises_and_says_what_it_leaves_out(tmp_path, cap
                  "--json"])  # fmt: skip
     document = json.loads(capsys.readouterr().out)
     assert code == 0
-    assert document["schema"] == planning.SCHEMA
+    assert document["schema"] == plans.SCHEMA
     assert document["reached"]
     plan = Plan.from_json(file.read_text())
     lit = {step.index["light"] for step in plan.steps if step.kind == "olat"}

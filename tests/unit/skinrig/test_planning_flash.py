@@ -8,8 +8,8 @@ import pytest
 
 from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
-from skinrig import planning, planning_flash
 from skinrig.cli import main
+from skinrig.planning import flash, plans
 
 
 @pytest.fixture(scope="module")
@@ -20,25 +20,25 @@ def rig():
 @pytest.fixture(scope="module")
 def look(rig):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(planning_flash, "TEXTURE_PX", 128)
-        return planning_flash.sight(rig, "III", width_px=96)
+        patch.setattr(flash, "TEXTURE_PX", 128)
+        return flash.sight(rig, "III", width_px=96)
 
 
 @pytest.fixture
 def small(monkeypatch, look):
-    monkeypatch.setattr(planning_flash, "sight", lambda *args, **kwargs: look)
+    monkeypatch.setattr(flash, "sight", lambda *args, **kwargs: look)
 
 
 def test_more_light_frames_and_darks_leave_less_error_down_to_that_of_the_model(look):
     def median(**settings):
-        return planning_flash.predict(look, **settings).median("melanin")
+        return flash.predict(look, **settings).median("melanin")
 
     dim = median(repeats=1, power=0.0625, darks=1)
     assert median(repeats=1, power=0.0625, darks=4) < dim
     assert median(repeats=4, power=0.0625, darks=1) < dim
     assert median(repeats=1, power=1.0, darks=1) < dim
     still = replace(look, gain=0.0, floor=0.0)
-    floor = planning_flash.predict(still, repeats=1, power=1.0, darks=0).median("melanin")
+    floor = flash.predict(still, repeats=1, power=1.0, darks=0).median("melanin")
     assert floor < median(repeats=16, power=1.0, darks=4) < 1.2 * floor
 
 
@@ -47,8 +47,8 @@ def test_four_frames_halve_what_noise_alone_leaves(look):
 
     def noise(repeats):
         every = {"power": 1.0, "darks": 0, "repeats": repeats}
-        whole = planning_flash.predict(look, **every)
-        rest = planning_flash.predict(still, **every)
+        whole = flash.predict(look, **every)
+        rest = flash.predict(still, **every)
         both = whole.valid["melanin"] & rest.valid["melanin"]
         return np.sqrt(whole.sigma["melanin"][both] ** 2 - rest.sigma["melanin"][both] ** 2)
 
@@ -67,9 +67,9 @@ def test_the_plan_leaves_out_what_the_errors_wanted_do_not_need(small, tmp_path,
     assert document["saved_seconds"] > 20.0
     assert all(one["median"] <= one["wanted"] for one in document["forecasts"])
     # half the light would not have been enough
-    look = planning_flash.sight(None, "III")
+    look = flash.sight(None, "III")
     power = document["knobs"]["power"] / 2
-    dimmer = planning_flash.predict(look, repeats=1, power=power, darks=0)
+    dimmer = flash.predict(look, repeats=1, power=power, darks=0)
     assert dimmer.median("melanin") > 0.08 or dimmer.median("hemoglobin") > 0.2
     assert main(["plan", "flash", "--forecast", str(file), "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
@@ -89,8 +89,8 @@ def test_a_plan_without_crossed_frames_or_of_another_rig_is_refused(rig, small, 
     bare = replace(
         whole, steps=tuple(s for s in whole.steps if s.index.get("polarizer") != "crossed")
     )
-    with pytest.raises(planning.PlanningError, match="no crossed frame"):
-        planning_flash.foresee(rig, bare, {})
+    with pytest.raises(plans.PlanningError, match="no crossed frame"):
+        flash.foresee(rig, bare, {})
     file = tmp_path / "plan.json"
     file.write_text(json.dumps(whole.to_json()))
     assert main(["plan", "gradient", "--forecast", str(file)]) == 3
@@ -102,10 +102,10 @@ def test_a_plan_without_crossed_frames_or_of_another_rig_is_refused(rig, small, 
 def test_chromophores_are_reconstructed_from_crossed_frames_alone(rig, tmp_path):
     from model import store
     from reconstruction import pipeline
-    from skinrig.calibrating import calibrate
-    from skinrig.simulation import simulate_session
+    from skinrig.calibrating.calibrate import calibrate
+    from skinrig.simulating.simulation import simulate_session
 
-    plan = planning_flash.crossed_plan(rig, repeats=1, power=1.0, darks=0)
+    plan = flash.crossed_plan(rig, repeats=1, power=1.0, darks=0)
     simulate_session("flash", tmp_path / "session-white", target="white", width_px=128)
     calibrate("white", [tmp_path / "session-white"], tmp_path / "calibration")
     simulate_session("flash", tmp_path / "session-face", subject="II", width_px=128, plan=plan)

@@ -11,9 +11,9 @@ from capture.plan import Plan
 from capture.plan.gradient import gradient_plan
 from capture.plan.steps import PATTERNS
 from capture.rig import load_rig
-from skinrig import planning, planning_gradient
 from skinrig.cli import main
-from skinrig.planning_gradient import SETS, Setting
+from skinrig.planning import gradient, plans
+from skinrig.planning.gradient import SETS, Setting
 
 
 @pytest.fixture(scope="module")
@@ -23,19 +23,19 @@ def rig():
 
 @pytest.fixture(scope="module")
 def look(rig):
-    return planning_gradient.sight(rig, "III", side_px=40)
+    return gradient.sight(rig, "III", side_px=40)
 
 
 @pytest.fixture
 def small(monkeypatch, look):
-    monkeypatch.setattr(planning_gradient, "sight", lambda *args, **kwargs: look)
-    monkeypatch.setattr(planning_gradient, "EXPOSURES", (0.25, 1.0))
+    monkeypatch.setattr(gradient, "sight", lambda *args, **kwargs: look)
+    monkeypatch.setattr(gradient, "EXPOSURES", (0.25, 1.0))
 
 
 @pytest.mark.long
 def test_complements_and_longer_exposures_lower_the_error(look):
     def median(patterns, exposure_s):
-        return planning_gradient.predict(look, Setting(patterns, exposure_s, 2)).median_rad
+        return gradient.predict(look, Setting(patterns, exposure_s, 2)).median_rad
 
     least = median(SETS[0], 0.009)
     assert median(SETS[0], 0.018) < least
@@ -61,8 +61,8 @@ def test_the_quickest_scan_that_reaches_the_error_is_taken(small, tmp_path, caps
 
 
 def test_what_no_scan_reaches_says_why(small, capsys, monkeypatch):
-    monkeypatch.setattr(planning_gradient, "SETS", SETS[:1])
-    monkeypatch.setattr(planning_gradient, "EXPOSURES", (1.0,))
+    monkeypatch.setattr(gradient, "SETS", SETS[:1])
+    monkeypatch.setattr(gradient, "EXPOSURES", (1.0,))
     assert main(["plan", "gradient", "--want", "normals<=0.1deg"]) == 1
     said = capsys.readouterr().out
     assert "the best scan leaves" in said
@@ -71,25 +71,25 @@ def test_what_no_scan_reaches_says_why(small, capsys, monkeypatch):
 
 def test_exposures_that_saturate_or_ask_too_much_of_an_led_are_no_candidates(rig, look):
     bright = replace(look, rates={key: 1000.0 * rate for key, rate in look.rates.items()})
-    assert not list(planning_gradient.candidates(rig, bright))
-    seconds = [plan.estimated_s(rig) for _, plan in planning_gradient.candidates(rig, look)]
+    assert not list(gradient.candidates(rig, bright))
+    seconds = [plan.estimated_s(rig) for _, plan in gradient.candidates(rig, look)]
     assert seconds == sorted(seconds)
     assert len(seconds) > 10
 
 
 def test_patterns_that_do_not_tell_a_gradient_are_refused(rig):
     plan = gradient_plan(rig, angles=[0], steps=(0, 0), patterns=("full", "x", "y"))
-    with pytest.raises(planning.PlanningError, match="z or -z"):
-        planning_gradient.setting_of(plan)
+    with pytest.raises(plans.PlanningError, match="z or -z"):
+        gradient.setting_of(plan)
 
 
 @pytest.mark.long
 def test_normals_are_reconstructed_from_four_patterns_as_well_as_is_forecast(rig, tmp_path):
     from reconstruction.gradient_normals import estimate_roughness, from_patterns
 
-    look = planning_gradient.sight(rig, "III", seed=3, side_px=96)
+    look = gradient.sight(rig, "III", seed=3, side_px=96)
     setting = Setting(SETS[0], 0.018, 0)
-    found = planning_gradient.predict(look, setting)
+    found = gradient.predict(look, setting)
     rng = np.random.default_rng(1)
     gain, floor = look.chip.noise_profile(setting.exposure_s)
     values, variance = {}, {}
@@ -107,5 +107,5 @@ def test_normals_are_reconstructed_from_four_patterns_as_well_as_is_forecast(rig
     error = np.arccos(np.clip(cosine, -1.0, 1.0))[made.valid[inner]]
     # the stated spread of forecasts
     ratio = float(np.median(error)) / found.median_rad
-    spread = planning_gradient.FORECAST_SPREAD
+    spread = gradient.FORECAST_SPREAD
     assert 1.0 / (1.0 + spread) < ratio < 1.0 + spread, math.degrees(found.median_rad)

@@ -9,9 +9,9 @@ import pytest
 from capture.plan import Plan
 from capture.plan.probe import exposure_series_s, probe_plan
 from capture.rig import load_rig
-from skinrig import planning, planning_probe
 from skinrig.cli import main
-from skinrig.planning_probe import Setting
+from skinrig.planning import plans, probe
+from skinrig.planning.probe import Setting
 
 SITES = ("forehead", "cheek")
 
@@ -23,19 +23,19 @@ def rig():
 
 @pytest.fixture(scope="module")
 def look(rig):
-    return planning_probe.sight(rig, "homogeneous:0.05,1.2", sites=SITES)
+    return probe.sight(rig, "homogeneous:0.05,1.2", sites=SITES)
 
 
 @pytest.fixture
 def small(monkeypatch, look):
-    monkeypatch.setattr(planning_probe, "sight", lambda *args, **kwargs: look)
-    monkeypatch.setattr(planning_probe, "SERIES", (3, 6))
-    monkeypatch.setattr(planning_probe, "LONGEST", (0.5, 4.0))
+    monkeypatch.setattr(probe, "sight", lambda *args, **kwargs: look)
+    monkeypatch.setattr(probe, "SERIES", (3, 6))
+    monkeypatch.setattr(probe, "LONGEST", (0.5, 4.0))
 
 
 def test_longer_exposures_and_placements_lower_the_error_down_to_the_common_one(look):
     def sigma(*exposures_s, repeats=1, darks=2):
-        found = planning_probe.predict(look, Setting(SITES, exposures_s, repeats, darks))
+        found = probe.predict(look, Setting(SITES, exposures_s, repeats, darks))
         assert (found.sigma >= found.common).all()
         return np.median(found.sigma)
 
@@ -48,11 +48,11 @@ def test_longer_exposures_and_placements_lower_the_error_down_to_the_common_one(
 def test_variance_of_a_reading_follows_its_photons_and_saturation(look):
     series = exposure_series_s()
     skin = look.reflectance[0]
-    assert np.isfinite(planning_probe._variance(look, skin, series, 2, 1.0)).all()
+    assert np.isfinite(probe._variance(look, skin, series, 2, 1.0)).all()
     # shorter than the shortest exposure would be needed for so much light
-    assert np.isinf(planning_probe._variance(look, 1e3 * skin, series, 2, 1.0)).any()
+    assert np.isinf(probe._variance(look, 1e3 * skin, series, 2, 1.0)).any()
     dim, four = (
-        np.sqrt(planning_probe._variance(look, share * skin, series[:6], 2, 1.0)) / share
+        np.sqrt(probe._variance(look, share * skin, series[:6], 2, 1.0)) / share
         for share in (0.01, 0.04)
     )
     # four times the light: twice as precise by photons, four times by read noise
@@ -90,19 +90,19 @@ def test_a_site_is_left_out_only_where_the_others_tell_it_well_enough(look):
             left = found.sigma[~found.measured]
             return not left.size or float(np.median(left)) <= limit
 
-        return planning_probe.without_sites(look, setting, plan, good)
+        return probe.without_sites(look, setting, plan, good)
 
     kept, whole = least(1e-3)
     assert kept.sites == SITES
     assert len(whole.steps) == len(plan.steps)
     kept, fewer = least(10.0)
     assert len(kept.sites) == 1
-    assert planning_probe.setting_of(fewer).sites == kept.sites
+    assert probe.setting_of(fewer).sites == kept.sites
 
 
 def test_plans_without_skin_or_darks_are_refused(rig):
     plan = probe_plan(rig, sites=SITES)
     for kind, word in (("fibres", "no series on skin"), ("dark", "without light")):
         some = replace(plan, steps=tuple(s for s in plan.steps if s.kind != kind))
-        with pytest.raises(planning.PlanningError, match=word):
-            planning_probe.setting_of(some)
+        with pytest.raises(plans.PlanningError, match=word):
+            probe.setting_of(some)

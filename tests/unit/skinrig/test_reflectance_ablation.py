@@ -7,8 +7,8 @@ from model import brdf_tables
 from model.skin_reflectance import SkinReflectance, lobe_brdf
 from rigsim.mesh import build_mesh
 from skinrig import skin_bands
-from skinrig.photographs import PhotographsError, Shot, _evenly
-from skinrig.reflectance_ablation import one_lobe, without_parts
+from skinrig.rendering.ablation import one_lobe, without_parts
+from skinrig.rendering.photographs import PhotographsError, Shot, _evenly
 
 SIDE = 8
 

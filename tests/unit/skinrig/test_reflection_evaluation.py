@@ -6,7 +6,7 @@ import pytest
 from model import brdf_tables, fresnel
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.dome_stages import BASIS_FILE, RANK, WEIGHTS, _basis_bytes
-from skinrig import reflection_evaluation as evaluation
+from skinrig.evaluating import reflection as evaluation
 
 SIDE = 40
 R_D = np.array([0.5, 0.35, 0.25])

@@ -9,9 +9,9 @@ from model import brdf_tables, microfacet
 from model.skin_reflectance import SkinReflectance, transmitted
 from rigsim.atlas import spread, unwrap
 from rigsim.mesh import build_mesh
-from skinrig import rendering_camera
-from skinrig.rendering import Light, RenderingError, render
-from skinrig.rendering_geometry import GeometryError, own_mesh, parse_mesh, read_mesh
+from skinrig.rendering import camera as rendering_camera
+from skinrig.rendering.geometry import GeometryError, own_mesh, parse_mesh, read_mesh
+from skinrig.rendering.render import Light, RenderingError, render
 
 FRONT = (0.0, 0.0, 700.0)
 
@@ -255,7 +255,7 @@ def test_stretched_skin_has_flatter_relief(matt):
     model = model_on(mesh, matt)
     tilted = np.broadcast_to(np.float32([0.6, 0.0, 0.8]), model.normals.shape)
     model = dataclasses.replace(model, normals=tilted.copy())
-    from skinrig.rendering_geometry import FittedSurface
+    from skinrig.rendering.geometry import FittedSurface
 
     laid = FittedSurface.of(model, wide, rest=mesh)
     normal = laid.normals[16, 16]

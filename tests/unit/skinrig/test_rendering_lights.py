@@ -7,9 +7,9 @@ from capture.calibration.lights import LightTable
 from capture.rig import load_rig
 from model import store
 from skinrig.errors import UsageError
-from skinrig.rendering_environment import directions, environment_lights, read_environment
-from skinrig.rendering_lights import Light, LightError
-from skinrig.rendering_request import Stage, lights_of, subpixels_of
+from skinrig.rendering.environment import directions, environment_lights, read_environment
+from skinrig.rendering.lights import Light, LightError
+from skinrig.rendering.request import Stage, lights_of, subpixels_of
 
 
 @pytest.fixture

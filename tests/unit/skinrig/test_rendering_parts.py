@@ -6,12 +6,12 @@ import pytest
 from model import brdf_tables, microfacet
 from model.skin_reflectance import SkinReflectance
 from rigsim.mesh import build_mesh
-from skinrig import rendering_folder, rendering_shadow
-from skinrig.rendering_bases import RankError, nearest_shares, reduced
-from skinrig.rendering_geometry import FittedSurface
-from skinrig.rendering_lookup_kernels import NEAR_TEXELS, look_up
-from skinrig.rendering_pictures import KNEE, Panel, sheet, tone
-from skinrig.rendering_shadow import LEAST_TRANSLUCENT, MOST_TRANSLUCENT, Boundary
+from skinrig.rendering import folder, shadow
+from skinrig.rendering.bases import RankError, nearest_shares, reduced
+from skinrig.rendering.geometry import FittedSurface
+from skinrig.rendering.lookup_kernels import NEAR_TEXELS, look_up
+from skinrig.rendering.pictures import KNEE, Panel, sheet, tone
+from skinrig.rendering.shadow import LEAST_TRANSLUCENT, MOST_TRANSLUCENT, Boundary
 
 SIZE = 48
 
@@ -122,13 +122,11 @@ def test_a_shadow_is_the_wider_the_smaller_sigma_tr(model, monkeypatch):
     fraction of the fall that the finite picture cuts off. Without spreading the half shadow of the
     light is left, 0.1 mm and a pixel.
     """
-    monkeypatch.setattr(rendering_shadow, "PATCH_TEXELS", 128)
+    monkeypatch.setattr(shadow, "PATCH_TEXELS", 128)
     boundary = Boundary.on_plane(model, size_px=160)
     rise = {}
     for sigma in (MOST_TRANSLUCENT, LEAST_TRANSLUCENT, None):
-        rise[sigma] = rendering_shadow.rise_mm(
-            *rendering_shadow.profile(boundary.shown(sigma, subpixels=1))
-        )
+        rise[sigma] = shadow.rise_mm(*shadow.profile(boundary.shown(sigma, subpixels=1)))
     assert np.all(rise[None] < 0.35)
     assert np.all(rise[MOST_TRANSLUCENT] > rise[LEAST_TRANSLUCENT])
     ratio = rise[MOST_TRANSLUCENT][:2] / rise[LEAST_TRANSLUCENT][:2]
@@ -137,9 +135,9 @@ def test_a_shadow_is_the_wider_the_smaller_sigma_tr(model, monkeypatch):
 
 
 def test_a_shadow_lies_right_of_the_middle(model, monkeypatch):
-    monkeypatch.setattr(rendering_shadow, "PATCH_TEXELS", 32)
+    monkeypatch.setattr(shadow, "PATCH_TEXELS", 32)
     seen = Boundary.on_plane(model, size_px=48).shown(None, subpixels=1)
-    place, level = rendering_shadow.profile(seen)
+    place, level = shadow.profile(seen)
     assert np.all(level[place < -0.6, 1] > 0.2)
     assert np.all(level[place > 0.6] == 0.0)
 
@@ -170,22 +168,20 @@ def test_a_rendering_replaces_an_older_one_and_nothing_else(tmp_path):
     image = np.zeros((2, 3, 3), np.float32)
     out = tmp_path / "picture"
     for word in ("first", "second"):
-        done = rendering_folder.write(
-            out, images={"a": image}, pictures={}, document={"said": word}
-        )
+        done = folder.write(out, images={"a": image}, pictures={}, document={"said": word})
     assert done["said"] == "second"
     assert done["files"] == ["a.exr"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["picture"]
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").write_text("dear")
-    with pytest.raises(rendering_folder.RenderingFolderError, match="no rendering"):
-        rendering_folder.write(tmp_path / "other", images={}, pictures={}, document={})
+    with pytest.raises(folder.RenderingFolderError, match="no rendering"):
+        folder.write(tmp_path / "other", images={}, pictures={}, document={})
     assert (tmp_path / "other" / "letter.txt").read_text() == "dear"
 
 
 def test_a_rendering_that_fails_to_be_written_leaves_nothing(tmp_path):
     with pytest.raises(TypeError):
-        rendering_folder.write(
+        folder.write(
             tmp_path / "x", images={"a": np.zeros((2, 2, 3), np.float32)},
             pictures={"b": None}, document={},
         )  # fmt: skip

@@ -6,8 +6,8 @@ import pytest
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig import report
-from skinrig.bench_document import to_document
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
+from skinrig.benchmarks.document import to_document
 
 
 @pytest.fixture

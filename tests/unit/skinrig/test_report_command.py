@@ -9,9 +9,9 @@ import pytest
 
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
-from skinrig import map_comparison, map_pictures, report_folders, run_comparison, verdict_section
 from skinrig.cli import main
 from skinrig.front_view import WIDTH_PX
+from skinrig.reporting import folders, map_comparison, map_pictures, run_comparison, verdict
 
 PAGE = Path(__file__).parents[3] / "docs" / "report.md"
 
@@ -60,7 +60,7 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one_and_no_part(maps, monk
     def full(*_):
         raise OSError(28, "No space left on device", str(out))
 
-    monkeypatch.setattr(report_folders.os, "replace", full)
+    monkeypatch.setattr(folders.os, "replace", full)
     assert main(["report", str(maps / "monday"), "-o", str(out)]) == 3
     assert out.read_text() == "old"
     assert [p.name for p in maps.iterdir() if p.name.startswith(".")] == []
@@ -77,9 +77,9 @@ def test_a_document_that_is_damaged_is_named(maps, capsys):
 @pytest.mark.parametrize(
     ("words", "value"),
     [
-        (r"fewer than (\d+) %", 100 * verdict_section.OVERCONFIDENT),
-        (r"or more than (\d+) % of truths", 100 * verdict_section.UNDERCONFIDENT),
-        (r"more than (\d+) % are masked", 100 * verdict_section.MUCH_MASKED),
+        (r"fewer than (\d+) %", 100 * verdict.OVERCONFIDENT),
+        (r"or more than (\d+) % of truths", 100 * verdict.UNDERCONFIDENT),
+        (r"more than (\d+) % are masked", 100 * verdict.MUCH_MASKED),
         (r"more than (\d+) % lie beyond 3", 100 * map_comparison.MOST_BEYOND),
         (r"within (\d+) mm in the median", run_comparison.SAME_PLACE_MM),
         (r"has (\d+) colors", map_pictures.LEVELS),

@@ -8,11 +8,12 @@ import pytest
 
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
-from skinrig import map_comparison, report, run_comparison, truth_errors
-from skinrig.bench_document import to_document
+from skinrig import report
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
-from skinrig.map_comparison import BY_CHANCE, compare
+from skinrig.benchmarks.document import to_document
 from skinrig.report import ReportError
+from skinrig.reporting import map_comparison, run_comparison, truth_errors
+from skinrig.reporting.map_comparison import BY_CHANCE, compare
 
 SIDE = 200
 PIXELS = SIDE * SIDE

@@ -13,7 +13,8 @@ from PIL import Image
 
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
-from skinrig import figures, map_pictures, page, png, report, svg, verdict_section
+from skinrig import report
+from skinrig.reporting import figures, map_pictures, page, png, svg, verdict
 
 
 class Outline(HTMLParser):
@@ -192,16 +193,14 @@ def test_lines_of_a_simplified_plot_stay_where_they_were():
 
 def test_skin_that_fares_worse_than_the_whole_is_named_though_the_check_is_kept():
     kept = page.Check("melanin", 5.0, 10.0, "<=", "%", worst="dark: 30 %", worst_got=25.0)
-    assert any(
-        "beyond the limit of the whole" in text for text in verdict_section.weaknesses([kept])
-    )
+    assert any("beyond the limit of the whole" in text for text in verdict.weaknesses([kept]))
     even = page.Check("melanin", 5.0, 10.0, "<=", "%", worst="dark: 9 %", worst_got=8.0)
-    assert not any("beyond the limit" in text for text in verdict_section.weaknesses([even]))
+    assert not any("beyond the limit" in text for text in verdict.weaknesses([even]))
 
 
 def test_a_check_that_is_no_number_is_missed():
     missed = page.Check("error", float("nan"), 1.0, "<=")
-    assert verdict_section.headline([missed]) == "1 of 1 checks missed their limit."
-    assert "missed: error, – , at most 1" in " ".join(verdict_section.weaknesses([missed])).replace(
+    assert verdict.headline([missed]) == "1 of 1 checks missed their limit."
+    assert "missed: error, – , at most 1" in " ".join(verdict.weaknesses([missed])).replace(
         "–,", "– ,"
     )

@@ -9,8 +9,8 @@ from capture.rig import load_rig
 from capture.session import Session, verify
 from skinrig.cli import main
 from skinrig.light_safety import light_figures, light_lines
-from skinrig.simulating_dome import small_dome, spread
-from skinrig.simulation import SimulationError, simulate_session
+from skinrig.simulating.dome import small_dome, spread
+from skinrig.simulating.simulation import SimulationError, simulate_session
 
 DOME = load_rig("dome")
 SMALL_POSES = 10

@@ -8,8 +8,8 @@ from capture.session import verify
 from skinrig.acquisition import choose_plan, needed_boxes, numbers_of, range_of
 from skinrig.errors import UsageError
 from skinrig.light_safety import light_figures, light_lines
-from skinrig.simulating_gradient import make_scene
-from skinrig.simulation import SimulationError, simulate_session
+from skinrig.simulating.gradient import make_scene
+from skinrig.simulating.simulation import SimulationError, simulate_session
 
 RIG = load_rig("gradient")
 

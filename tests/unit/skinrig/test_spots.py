@@ -7,8 +7,8 @@ from model.color_table import build
 from model.tissue_optics import ANISOTROPY_SKIN
 from reconstruction import common_parameterization, common_regions
 from reconstruction.common_parameterization import Correspondence, find_cylinder
-from skinrig import pigment_spots, spot_removal
-from skinrig.pigment_spots import KINDS, SpotError
+from skinrig.editing import pigment_spots, spot_removal
+from skinrig.editing.pigment_spots import KINDS, SpotError
 
 SIDE = 120
 RIM = 8

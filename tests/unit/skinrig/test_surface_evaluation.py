@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.skin import SkinAppearance, SkinMap
-from skinrig import surface_evaluation as evaluation
+from skinrig.evaluating import surface as evaluation
 
 
 def plane(side, rng, *, shift_mm=0.0):

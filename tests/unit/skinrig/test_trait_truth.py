@@ -5,8 +5,8 @@ import pytest
 
 from model import brdf_tables
 from rigsim.population import table_1
-from skinrig import trait_truth
-from skinrig.trait_truth import CommonFaces
+from skinrig.traits import truth as trait_truth
+from skinrig.traits.truth import CommonFaces
 
 PEOPLE = table_1()
 

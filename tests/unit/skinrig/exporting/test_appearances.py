@@ -176,7 +176,7 @@ def test_maps_of_a_captured_session_bear_its_consent_and_older_ones_are_brought_
 
 
 def test_a_fitted_model_bears_the_consent_of_what_it_is_made_of(measured, tmp_path):
-    from skinrig.fitting_reflectance import fit_reflectance
+    from skinrig.fitting.reflectance import fit_reflectance
 
     fit_reflectance(measured, out=tmp_path / "model")
     read = store.read(tmp_path / "model")
@@ -185,7 +185,7 @@ def test_a_fitted_model_bears_the_consent_of_what_it_is_made_of(measured, tmp_pa
 
 def test_an_expression_bears_the_consent_of_both_faces(tmp_path, rng):
     from model.facial_color import HemoglobinRig
-    from skinrig import applying
+    from skinrig.applying import expression as applying
 
     neutral = 0.05 + 0.01 * rng.random((16, 16))
     rig = HemoglobinRig.from_maps(neutral, {"smile": 1.2 * neutral}, radius_px=4.0)

@@ -13,7 +13,7 @@ from model.skin import UNITS, SkinAppearance, SkinMap
 from model.texture_resampling import resampled
 from model.wrinkle_expressions import ExpressionTable
 from model.wrinkle_model import FILE, WrinkleModel
-from skinrig import applying
+from skinrig.applying import expression
 from skinrig.exporting import color_deltas, delta_maps
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.sealing import ExportError
@@ -78,11 +78,11 @@ def test_base_color_plus_its_delta_is_the_color_of_the_expression(moving, tmp_pa
     left_out = dict(delta_maps.write(moving, tmp_path, Delivery(only=("fear", "smile"))))
     told = json.loads((tmp_path / "delta_maps.json").read_text())["color"]
     assert told["maps"] == {"cm1": "fear", "cm2": "smile"}
-    rig = applying.hemoglobin_rig(moving)
+    rig = expression.hemoglobin_rig(moving)
     melanin = moving.maps["melanin"].values
     for name, state in told["maps"].items():
         blend = rig.evaluate({state: 1.0})
-        shown = applying.colors(melanin, blend.hemoglobin, blend.valid)
+        shown = expression.colors(melanin, blend.hemoglobin, blend.valid)
         expected = np.moveaxis(resampled(np.moveaxis(shown, -1, 0).astype(float), (128, 128)), 0, 2)
         found = read(tmp_path / "exr/base_color.exr") + read(tmp_path / f"exr/{name}_delta.exr")
         assert found.shape == (128, 128, 3)
@@ -163,11 +163,11 @@ def test_colors_are_carried_onto_a_texture_by_landmarks(moving, tmp_path, rng):
     )
     delta_maps.write(moving, out, order)
     base, delta = read(out / "exr/base_color.exr"), read(out / "exr/cm1_delta.exr")
-    rig, melanin = applying.hemoglobin_rig(moving), moving.maps["melanin"].values
+    rig, melanin = expression.hemoglobin_rig(moving), moving.maps["melanin"].values
     shown = {}
     for state in ("neutral", "fear"):
         blend = rig.evaluate({state: 1.0})
-        shown[state] = applying.colors(melanin, blend.hemoglobin, blend.valid)
+        shown[state] = expression.colors(melanin, blend.hemoglobin, blend.valid)
     ratio = shown["fear"] / shown["neutral"]
     for u, v in ((0.4, 0.5), (0.5, 0.6), (0.6, 0.4)):
         row, column = int(v * 128), int(u * 128)

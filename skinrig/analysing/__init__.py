@@ -1,0 +1,1 @@
+"""Faces analysed together: spaces of reflectance and of albedo."""

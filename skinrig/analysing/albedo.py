@@ -1,0 +1,307 @@
+"""What the albedo of faces has in common: color histograms of groups (fig. 16), and components."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import texture_histograms
+from model.texture_histograms import GroupHistograms
+from model.texture_space import TextureSpace
+from reconstruction import common_regions
+from skinrig import face_textures
+from skinrig.fitting import traits
+from skinrig.fitting.traits import AlbedoSample, TraitFitError
+from skinrig.traits import albedo_vectors
+from skinrig.traits import labels as trait_labels
+from skinrig.traits.albedo_vectors import VectorKind
+
+Floats = NDArray[np.float64]
+
+BINS: Final = 128
+EVERYBODY: Final = "all"
+SHOWN: Final = ("red", "green", "blue")
+FILES: Final = ("figure-16.png", "histograms.csv", "components.csv", "analysis.json")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlbedoAnalysis:
+    """Histograms by group and region, and how many components the vectors need.
+
+    Attributes
+    ----------
+    histograms
+        Region to histograms of R_d.
+    explained
+        Region to the share of the vectors' variance in each component, falling.
+    scores
+        Region to the faces' places along the first components, (n, k), in standard deviations.
+    names
+        Of the faces.
+    left_out
+        What was not done, and why.
+    """
+
+    histograms: Mapping[str, GroupHistograms]
+    explained: Mapping[str, Floats]
+    scores: Mapping[str, Floats]
+    names: tuple[str, ...]
+    left_out: tuple[tuple[str, str], ...]
+
+    def document(self) -> dict[str, Any]:
+        """Return all of it but the histograms as JSON values."""
+        return {
+            "faces": list(self.names),
+            "groups": {
+                name: int(n)
+                for one in list(self.histograms.values())[:1]
+                for name, n in zip(one.names, one.members, strict=True)
+            },
+            "mean_r_d": {
+                region: {
+                    group: (one.mean[k] @ (0.5 * (one.edges[1:] + one.edges[:-1]))).tolist()
+                    for k, group in enumerate(one.names)
+                }
+                for region, one in self.histograms.items()
+            },
+            "explained": {region: share.tolist() for region, share in self.explained.items()},
+            "components_for_90_percent": {
+                region: int(np.searchsorted(np.cumsum(share), 0.9) + 1)
+                for region, share in self.explained.items()
+            },
+            "left_out": [list(row) for row in self.left_out],
+        }
+
+
+def analyse_measured(
+    out: Path,
+    appearances: Sequence[Path],
+    *,
+    labels: Path | None = None,
+    landmarks: Path | None = None,
+    vectors: VectorKind = "quantiles",
+    size: int | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> AlbedoAnalysis:
+    """Analyse the albedo maps of fitted faces, in a common map by their landmarks.
+
+    Parameters
+    ----------
+    out
+        Folder to write `FILES` into.
+    appearances
+        APPEARANCE/ folders of dome sessions.
+    labels
+        Table, see `trait_labels.read`; groups are its columns of 0 and 1, with and without.
+    landmarks, size
+        See `fitting_traits.fit_traits`.
+    vectors
+        What the components are of, see `albedo_vectors`.
+    progress
+        Called with a line a step.
+
+    Raises
+    ------
+    TraitFitError, FaceError, LabelError, ParameterizationError
+        Naming what is missing or does not fit.
+    """
+    tell = progress or (lambda text: None)
+    faces = traits.read_faces(appearances, landmarks)
+    frame = face_textures.common_frame(faces, size)
+    names = tuple(face.name for face in faces)
+    groups = {EVERYBODY: np.ones(len(names), np.bool_)}
+    if labels is not None:
+        table = trait_labels.read(labels, names)
+        groups |= complements(table.binary)
+    samples = []
+    for face in faces:
+        tell(face.name)
+        samples.append(traits.albedo_sample(face, frame))
+    regions = {name: common_regions.region(name, frame) for name in ("face", "beard", "no-beard")}
+    return _write(out, analyse(samples, names, groups, regions, vectors))
+
+
+def analyse_simulated(
+    out: Path,
+    *,
+    people: int = 87,
+    size: int = 192,
+    vectors: VectorKind = "quantiles",
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> AlbedoAnalysis:
+    """Analyse the simulated population of table 1; parameters as of `analyse_measured`.
+
+    Parameters
+    ----------
+    people
+        How many of the 87, drawn at random, at least 2.
+    size
+        Texels a side of a face.
+    seed
+        Of the population.
+    """
+    from rigsim.population import table_1
+    from skinrig.traits.truth import ALBEDO_NOISE, CommonFaces, labels_of
+
+    tell = progress or (lambda text: None)
+    everybody = table_1(seed=seed)
+    chosen = np.random.default_rng([seed, 1]).permutation(len(everybody))[:people]
+    some = [everybody[k] for k in sorted(chosen)]
+    if len(some) < 2:
+        raise TraitFitError(f"people: got {people}, expected 2 or more")
+    faces = CommonFaces.of(some, size=size, common=128)
+    samples = []
+    for k, person in enumerate(some):
+        if k % 10 == 0:
+            tell(f"face {k} of {len(some)}")
+        rng = np.random.default_rng([seed, 2, k])
+        samples.append(faces.albedo(person, noise=ALBEDO_NOISE, rng=rng))
+    known = sorted({label for person in some for label in person.labels})
+    binary = {
+        name: flags for name, flags in labels_of(some, known).items() if 0 < flags.sum() < len(some)
+    }
+    groups = {EVERYBODY: np.ones(len(some), np.bool_)} | binary
+    regions = {
+        name: common_regions.region(name, faces.frame) for name in ("face", "beard", "no-beard")
+    }
+    names = tuple(person.name for person in some)
+    return _write(out, analyse(samples, names, groups, regions, vectors))
+
+
+def complements(binary: Mapping[str, NDArray[np.bool_]]) -> dict[str, NDArray[np.bool_]]:
+    """Return each group that has members, and of those with a trait also those without."""
+    out = {}
+    for name, flags in binary.items():
+        for group, members in ((name, flags), (f"no {name}", ~flags)):
+            if members.any():
+                out[group] = members
+    return out
+
+
+def analyse(
+    samples: Sequence[AlbedoSample],
+    names: tuple[str, ...],
+    groups: Mapping[str, NDArray[np.bool_]],
+    regions: Mapping[str, NDArray[np.bool_]],
+    vectors: VectorKind,
+) -> AlbedoAnalysis:
+    """Analyse albedo maps that lie in one common map."""
+    images = [one.r_d for one in samples]
+    texture = TextureSpace.fit(
+        [albedo_vectors.encoded(image, vectors) for image in images],
+        valid=[one.valid for one in samples],
+    )
+    histograms, explained, scores = {}, {}, {}
+    left_out: list[tuple[str, str]] = []
+    for region, inside in regions.items():
+        masks = [inside & one.valid for one in samples]
+        fewest = min(int(mask.sum()) for mask in masks)
+        if fewest < traits.LEAST_PIXELS:
+            left_out.append((region, f"a face shows {fewest} pixels of it"))
+            continue
+        reach = (0.0, float(np.ceil(10 * max(np.quantile(i[m], 0.999) for i, m in
+                                             zip(images, masks, strict=True))) / 10))  # fmt: skip
+        histograms[region] = texture_histograms.rgb_histograms(
+            images, groups, valid=masks, reach=reach, bins=BINS
+        )
+        rows = np.array(
+            [
+                albedo_vectors.vector(one.r_d, texture, vectors, valid=one.valid, region=mask)
+                for one, mask in zip(samples, masks, strict=True)
+            ]
+        )
+        left, size, _ = np.linalg.svd(rows - rows.mean(axis=0), full_matrices=False)
+        total = float((size**2).sum())
+        if total == 0.0:
+            left_out.append((f"components of {region}", "all faces are the same"))
+            continue
+        explained[region] = (size**2 / total)[: len(rows) - 1]
+        scores[region] = (left * np.sqrt(len(rows) - 1))[:, : min(5, len(rows) - 1)]
+    return AlbedoAnalysis(histograms, explained, scores, names, tuple(left_out))
+
+
+def _write(out: Path, found: AlbedoAnalysis) -> AlbedoAnalysis:
+    """Write the files into a folder, all or none; other files in it stay."""
+    part = out.with_name(f".{out.name}.{uuid.uuid4().hex}.part")
+    part.mkdir(parents=True)
+    try:
+        (part / FILES[0]).write_bytes(_figure(found))
+        (part / FILES[1]).write_text(_histogram_rows(found), encoding="utf-8")
+        (part / FILES[2]).write_text(_component_rows(found), encoding="utf-8")
+        text = json.dumps({"schema": "skinrig.analyse-albedo/1", **found.document()}, indent=1)
+        (part / FILES[3]).write_text(text + "\n", encoding="utf-8")
+        out.mkdir(parents=True, exist_ok=True)
+        for name in FILES:
+            os.replace(part / name, out / name)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return found
+
+
+def _histogram_rows(found: AlbedoAnalysis) -> str:
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["region", "group", "members", "channel", "r_d_low", "r_d_high", "share",
+                   "stderr"])  # fmt: skip
+    for region, one in found.histograms.items():
+        for g, group in enumerate(one.names):
+            for c, channel in enumerate(SHOWN):
+                for b, share in enumerate(one.mean[g, c]):
+                    error = one.stderr[g, c, b]
+                    rows.writerow(
+                        [region, group, int(one.members[g]), channel, f"{one.edges[b]:.6g}",
+                         f"{one.edges[b + 1]:.6g}", f"{share:.6g}",
+                         f"{error:.3g}" if np.isfinite(error) else ""]
+                    )  # fmt: skip
+    return text.getvalue()
+
+
+def _component_rows(found: AlbedoAnalysis) -> str:
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["region", "face", *(f"component_{k}" for k in range(5))])
+    for region, places in found.scores.items():
+        for name, place in zip(found.names, places, strict=True):
+            rows.writerow([region, name, *(f"{x:.5g}" for x in place)])
+    return text.getvalue()
+
+
+def _figure(found: AlbedoAnalysis) -> bytes:
+    """Draw the histograms of the whole face by group, one panel a group."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    region, one = next(iter(found.histograms.items()))
+    columns = min(4, len(one.names))
+    lines = -(-len(one.names) // columns)
+    figure = Figure(figsize=(2.9 * columns, 2.1 * lines + 0.3), layout="constrained")
+    FigureCanvasAgg(figure)
+    middle = 0.5 * (one.edges[1:] + one.edges[:-1])
+    top = float(one.mean.max()) * 1.05
+    for g, name in enumerate(one.names):
+        axes = figure.add_subplot(lines, columns, g + 1)
+        for c, color in enumerate(("tab:red", "tab:green", "tab:blue")):
+            axes.plot(middle, one.mean[g, c], color=color, lw=1.0)
+            error = np.nan_to_num(one.stderr[g, c])
+            axes.fill_between(middle, one.mean[g, c] - error, one.mean[g, c] + error,
+                              color=color, alpha=0.25, lw=0)  # fmt: skip
+        axes.set_ylim(0, top)
+        axes.set_xlim(one.edges[0], one.edges[-1])
+        axes.set_title(f"{name} ({one.members[g]})", fontsize=9)
+        axes.tick_params(labelsize=7)
+    figure.suptitle(f"R_d, camera RGB, {region}: mean histograms with standard errors", fontsize=9)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=110)
+    return stream.getvalue()

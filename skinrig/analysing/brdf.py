@@ -1,0 +1,337 @@
+"""How many lobes the surfaces of faces need, simulated or measured ones; figures 14 and 15."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import brdf_tables, store
+from model.brdf_tables import BrdfBasis
+from model.skin import SkinMap
+from reconstruction import brdf_space
+from reconstruction.brdf_space import SpaceCurve
+from skinrig.analysing import brdf_space_datasets, brdf_space_figures
+from skinrig.analysing.brdf_space_datasets import Dataset
+from skinrig.errors import UsageError
+from skinrig.traits import labels as trait_labels
+
+FloatArray = NDArray[np.float64]
+
+SCHEMA: Final = "skinrig.analyse-brdf/1"
+BASIS_FILE: Final = "brdf_basis.npz"
+POINTS_A: Final = 5_000
+POINTS_B: Final = 2_000
+TRAINED: Final = 5_000
+"""Points, at most, that common mixtures are made of."""
+HELD_OUT: Final = 5_000
+"""Points, at most, that they are tried on."""
+HELD_OUT_SHARE: Final = 0.3
+"""Part of the points, or of the people, that are kept for that."""
+
+
+class AnalysisError(ValueError):
+    """Appearances whose surface cannot be analysed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Analysis:
+    """One curve of fig. 15, and the mean BRDFs of fig. 14."""
+
+    data: Dataset
+    curve: SpaceCurve
+    held_out: str
+    """What the mixtures were not made of: "points" or "people"."""
+    means: Mapping[str, FloatArray]
+    """Mean shares of the materials by label, (K,) each."""
+
+    @property
+    def above_noise(self) -> int | None:
+        """The first rank whose error is below what noise alone leaves; None: none, or unknown."""
+        below = np.flatnonzero(self.curve.error <= self.data.noise)
+        return self.curve.ranks[int(below[0])] if len(below) else None
+
+    def document(self) -> dict[str, Any]:
+        """Return this as JSON values."""
+        found = self.curve
+        tops = [rank for rank in (8, 12, 16) if rank in found.ranks]
+        return {
+            "name": self.data.name,
+            "points": found.points,
+            "held_out_points": found.held_out_points,
+            "held_out": self.held_out,
+            "ranks": list(found.ranks),
+            "error": found.error.tolist(),
+            "normalized": found.normalized().tolist(),
+            "held_out_error": _numbers(found.held_out),
+            "held_out_stderr": _numbers(found.held_out_stderr),
+            "noise": _numbers([self.data.noise])[0],
+            "plateau": found.plateau(),
+            "plateau_by_share": {
+                f"{share:g}": found.plateau(share=share) for share in brdf_space.SHARES
+            },
+            "plateau_by_largest_rank": {str(most): found.plateau(most=most) for most in tops},
+            "rank_at_noise": self.above_noise,
+            "points_lost": self.data.lost,
+            "left_out": [list(row) for row in found.left_out],
+        }
+
+
+def analyse(
+    data: Dataset,
+    basis: BrdfBasis,
+    *,
+    by_label: bool,
+    groups: Mapping[str, NDArray[np.bool_]] | None = None,
+    ranks: Sequence[int] = brdf_space.RANKS,
+    method: brdf_space.Method = "shares",
+    rng: np.random.Generator,
+) -> Analysis:
+    """Make the curve and the means of one dataset.
+
+    Parameters
+    ----------
+    data
+        The points.
+    basis
+        Their materials.
+    by_label
+        True keeps all points of some labels (people) out of the mixtures, False some of all points.
+    groups
+        Which labels are averaged together, by name, (labels,) bool each; None: each for itself.
+    ranks, method
+        See `reconstruction.brdf_space.curve`.
+    rng
+        Chooses the points.
+
+    Raises
+    ------
+    AnalysisError
+        No point shows how it reflects.
+    """
+    count = len(data.weights)
+    if count < 2:
+        raise AnalysisError(
+            f"{data.name}: {count} points show how the surface reflects, expected 2 or more"
+        )
+    present = np.unique(data.label)
+    if by_label and len(present) > 2:
+        kept = rng.permutation(present)[: max(1, round(HELD_OUT_SHARE * len(present)))]
+        out = np.isin(data.label, kept)
+    else:
+        by_label = False
+        out = np.zeros(count, np.bool_)
+        out[rng.permutation(count)[: round(HELD_OUT_SHARE * count)]] = True
+    trained = rng.permutation(np.flatnonzero(~out))[:TRAINED]
+    tried = rng.permutation(np.flatnonzero(out))[:HELD_OUT]
+    curve = brdf_space.curve(
+        data.weights[trained],
+        basis,
+        ranks=ranks,
+        held_out=data.weights[tried],
+        groups=data.label[tried] if by_label else None,
+        method=method,
+        seed=int(rng.integers(2**31)),
+    )
+    chosen = groups or {
+        name: np.arange(len(data.labels)) == k for k, name in enumerate(data.labels)
+    }
+    means = {}
+    for name, members in chosen.items():
+        among = members[data.label]
+        if among.any():
+            means[name] = data.weights[among].mean(axis=0)
+    return Analysis(data, curve, "people" if by_label else "points", means)
+
+
+def analyse_simulated(
+    out: Path,
+    *,
+    points: int = POINTS_A,
+    points_each: int = POINTS_B,
+    method: brdf_space.Method = "shares",
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[Analysis, ...]:
+    """Analyse one simulated person, dataset A and dataset B, and write the figures.
+
+    Parameters
+    ----------
+    out
+        Folder to write: ``figure-14.png``, ``figure-15.png``, ``curves.csv``, ``analysis.json``.
+    points
+        Points of the one person, and of all conditions of dataset A together.
+    points_each
+        Points of each of the 87 people of dataset B.
+    method
+        See `reconstruction.brdf_space.curve`.
+    seed
+        Of points, noise and factorizations.
+    progress
+        Called with a line for each face.
+    """
+    basis = brdf_tables.default()
+    rng = np.random.default_rng([seed, 70])
+    sets = (
+        brdf_space_datasets.one_person(points, rng=rng),
+        brdf_space_datasets.dataset_a(points, progress=progress, rng=rng),
+        brdf_space_datasets.dataset_b(points_each, progress=progress, rng=rng),
+    )
+    found = tuple(
+        analyse(data, basis, by_label=data.name == "dataset B", method=method, rng=rng)
+        for data in sets
+    )
+    _write(out, found, basis, spheres=found[1], method=method)
+    return found
+
+
+def analyse_measured(
+    out: Path,
+    folders: Sequence[Path],
+    *,
+    labels: Path | None = None,
+    basis: Path | None = None,
+    points_each: int = POINTS_B,
+    method: brdf_space.Method = "shares",
+    seed: int = 0,
+) -> tuple[Analysis, ...]:
+    """Analyse the lobes of measured faces, and write the figures.
+
+    Parameters
+    ----------
+    out
+        Folder to write, see `analyse_simulated`.
+    folders
+        APPEARANCE/ folders of dome sessions with lobes.
+    labels
+        Table ``name,TRAIT,...``, see `skinrig.traits.labels.read`: fig. 14 then shows the mean of
+        each trait's faces; None: of each folder.
+    basis
+        Folder of the MERL files that the lobes were fitted with; None: the built-in materials.
+    points_each
+        Texels of each face.
+    method, seed
+        See `analyse_simulated`.
+
+    Raises
+    ------
+    AnalysisError
+        A folder has no lobes, or of other materials.
+    skinrig.traits.labels.LabelError
+        The table does not fit.
+
+    Notes
+    -----
+    A face's texels hold no more kinds of lobes than it was reconstructed with: its own curve ends
+    there. `skinrig reconstruct --rank 24` keeps more.
+    """
+    names = [folder.name.removeprefix("appearance-") for folder in folders]
+    if len(set(names)) < len(names):
+        raise UsageError(f"appearances: got {', '.join(names)}, one of them twice")
+    table = None if labels is None else trait_labels.read(labels, names)
+    materials = brdf_tables.default() if basis is None else brdf_tables.load(basis)
+    rng = np.random.default_rng([seed, 71])
+    found = [_measured(folder, materials, points_each, rng) for folder in folders]
+    sets = [
+        Dataset(name, shares, np.zeros(len(shares), np.int64), (name,), np.nan, lost)
+        for name, (shares, lost, _) in zip(names, found, strict=True)
+    ]
+    lobes = [kept for _, _, kept in found]
+    if len(sets) > 1:
+        label = np.concatenate([np.full(len(s.weights), k) for k, s in enumerate(sets)])
+        every = np.concatenate([s.weights for s in sets])
+        lost = sum(s.lost for s in sets)
+        sets.append(Dataset("all", every, label, tuple(names), np.nan, lost))
+    groups = None if table is None else dict(table.binary)
+    done = tuple(
+        _up_to(analyse(data, materials, by_label=False, method=method, rng=rng,
+                       ranks=[rank for rank in brdf_space.RANKS if rank <= kept]), kept)
+        for data, kept in zip(sets, lobes, strict=False)
+    )  # fmt: skip
+    for data in sets[len(lobes) :]:
+        done += (analyse(data, materials, by_label=True, groups=groups, method=method, rng=rng),)
+    _write(out, done, materials, spheres=done[-1], method=method)
+    return done
+
+
+def _up_to(one: Analysis, lobes: int) -> Analysis:
+    """Say of a face's own curve why it ends where the lobes that it was reconstructed with do."""
+    why = f"the face has {lobes} lobes; `skinrig reconstruct --rank 24` keeps more"
+    beyond = tuple((rank, why) for rank in brdf_space.RANKS if rank > lobes)
+    curve = dataclasses.replace(one.curve, left_out=(*one.curve.left_out, *beyond[:1]))
+    return dataclasses.replace(one, curve=curve)
+
+
+def _measured(
+    folder: Path, materials: BrdfBasis, count: int, rng: np.random.Generator
+) -> tuple[FloatArray, int, int]:
+    """Return shares of the materials at random texels, how many are no use, and its lobes."""
+    appearance = store.read(folder)
+    weights: list[SkinMap] = []
+    while (name := f"basis_weight_{len(weights)}") in appearance.maps:
+        weights.append(appearance.maps[name])
+    how = f"skinrig reconstruct SESSION --want r_d,basis_weight_0 --rank 24 --out {folder}"
+    if not weights or BASIS_FILE not in appearance.files:
+        raise AnalysisError(f"{folder}: holds no lobes; make them by `{how}`")
+    try:
+        with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as kept:
+            mix = np.asarray(kept["mix"], np.float64)
+            names = tuple(str(name) for name in kept["materials"])
+    except (KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise AnalysisError(
+            f"{folder}: {BASIS_FILE} does not say of which materials the lobes are; `{how}`"
+        ) from error
+    if names != materials.names or mix.shape != (len(weights), materials.size):
+        raise AnalysisError(
+            f"{folder}: its {len(weights)} lobes are of {len(names)} materials ({names[0]}, ...), "
+            f"expected {materials.size} ({materials.names[0]}, ...); say --basis DIR where they "
+            "were fitted with other files than the built-in ones"
+        )
+    known = np.ones(weights[0].values.shape, np.bool_)
+    for one in weights:
+        known &= np.isfinite(one.values) & (True if one.valid is None else one.valid)
+    at = rng.permutation(np.flatnonzero(known))[:count]
+    if not len(at):
+        raise AnalysisError(f"{folder}: none of its texels has valid lobes")
+    shares = np.stack([one.values.reshape(-1)[at] for one in weights], axis=-1).astype(np.float64)
+    mixed = np.maximum(shares, 0.0) @ mix
+    kept_rows = brdf_space.usable(mixed, materials)
+    return mixed[kept_rows], int(np.count_nonzero(~kept_rows)), len(weights)
+
+
+def _write(
+    out: Path, found: Sequence[Analysis], basis: BrdfBasis, *, spheres: Analysis, method: str
+) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    document = {
+        "schema": SCHEMA,
+        "method": method,
+        "rule": "plateau: the first rank whose error exceeds the least one by no more than 5 % of "
+        "the fall from the first rank to the least; normalized: errors over that of the first rank",
+        "datasets": [one.document() for one in found],
+    }
+    (out / "analysis.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    with (out / "curves.csv").open("w", newline="", encoding="utf-8") as stream:
+        table = csv.writer(stream, lineterminator="\n")
+        table.writerow(("dataset", "rank", "error", "normalized", "held_out", "held_out_stderr"))
+        for one in found:
+            curve = one.curve
+            for k, rank in enumerate(curve.ranks):
+                values = (curve.error, curve.normalized(), curve.held_out, curve.held_out_stderr)
+                table.writerow((one.data.name, rank, *(f"{v[k]:.6g}" for v in values)))
+    curves = {one.data.name: one.curve for one in found}
+    (out / "figure-15.png").write_bytes(brdf_space_figures.curves(curves))
+    (out / "figure-14.png").write_bytes(brdf_space_figures.spheres(spheres.means, basis))
+
+
+def _numbers(values: Sequence[float] | FloatArray) -> list[float | None]:
+    return [float(v) if np.isfinite(v) else None for v in values]

@@ -1,0 +1,172 @@
+"""Plots of benchmarks: error against seconds, of one and of two."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from skinrig.reporting import figures
+
+
+def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
+    """Draw one stage of a benchmark document: error against seconds, log-log.
+
+    Parameters
+    ----------
+    stage
+        Name, for the title.
+    document
+        The stage's entry in a ``skinrig.bench/2`` document.
+
+    Returns
+    -------
+    str
+        An image with a name, as SVG. The Pareto front of each condition is joined, in a color of
+        its own, and its points are labelled with their effort; others are hollow. Knees have a
+        ring, and the Cramer-Rao bound a dash where it is known.
+    """
+    figure, axes = figures.canvas(5.2, 3.4)
+    points, fronts = document["points"], document["fronts"]
+    # a log axis has no place for what is quicker than the clock tells
+    seconds = np.maximum(np.array([p["seconds"] for p in points], float), 1e-7)
+    error = np.array([p["error"] for p in points], float)
+    low = np.array([p["error_interval"][0] for p in points], float)
+    high = np.array([p["error_interval"][1] for p in points], float)
+    exact = ~(error > 0.0)
+    if exact.any() and not exact.all():  # a log axis has no place for 0: below the others
+        error = np.where(exact, error[~exact].min() / 10.0, error)
+        low, high = np.where(exact, error, low), np.where(exact, error, high)
+    bars = np.maximum(np.stack([error - low, high - error]), 0.0)
+    bars[0] = np.minimum(bars[0], 0.999 * error)  # a log axis has no room for zero
+    middle = np.log([seconds.min(), seconds.max()]).mean()
+    named = len(fronts) <= MOST_NAMED
+    for number, front in enumerate(fronts):
+        color = figures.COLORS[number % len(figures.COLORS)]
+        own = np.array([_shares(p, front["condition"]) for p in points])
+        best = np.array(front["points"], int)
+        beaten = np.setdiff1d(np.flatnonzero(own), best)
+        axes.errorbar(
+            seconds[own], error[own], yerr=bars[:, own], fmt="none", ecolor=color, elinewidth=1
+        )
+        axes.plot(seconds[beaten], error[beaten], "o", mfc="none", mec=color, ms=4)
+        what = _words(front["condition"]) or "front"
+        axes.plot(
+            seconds[best], error[best], "o-", color=color, ms=4, label=what if named else None
+        )
+        bend = front["knee"]
+        if bend is not None:
+            axes.plot(seconds[bend], error[bend], "o", mfc="none", mec="0.5", ms=11)
+        for index in best if named or len(best) > 1 else ():
+            effort = {
+                k: v
+                for k, v in points[index]["knobs"].items()
+                if k not in front["condition"] and any(p["knobs"].get(k) != v for p in points)
+            }
+            label = _words(effort)
+            label += "  (knee)" if index == bend else ""
+            label += "  (error 0)" if exact[index] else ""
+            # names of points on the right run to the left, into the plot
+            right = np.log(seconds[index]) > middle
+            words = axes.annotate(
+                label, (seconds[index], error[index]), xytext=(-5 if right else 5, 5),
+                textcoords="offset points", ha="right" if right else "left", fontsize=6,
+            )  # fmt: skip
+            words.set_in_layout(False)  # a long label must not squeeze the axes away
+    bounds = np.array([p.get("cramer_rao_bound") or np.nan for p in points], float)
+    if np.isfinite(bounds).any():
+        known = np.isfinite(bounds)
+        axes.plot(seconds[known], bounds[known], "_", color="0.5", ms=14, label="Cramér-Rao")
+    if document.get("reference_error", 0) > 0:
+        axes.axhline(
+            document["reference_error"], color="0.5", lw=0.8, ls=":", label="reference's own"
+        )
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.margins(x=0.25, y=0.2)
+    figures.plain_numbers(axes.xaxis, axes.yaxis)
+    axes.set_xlabel("seconds, warm, median")
+    axes.set_ylabel("\n".join(textwrap.wrap(document["error_name"], 36)))
+    small = document.get("size") == "small"
+    axes.set_title(f"{stage}, small size" if small else stage, fontsize=10)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=6, frameon=False)
+    told = "; ".join(
+        f"{_words(front['condition']) or 'front'}: {len(front['points'])} settings"
+        + (
+            ""
+            if front["knee"] is None
+            else f", knee at {seconds[front['knee']]:.3g} s, error {error[front['knee']]:.3g}"
+        )
+        for front in fronts[:MOST_NAMED]
+    )
+    alt = (
+        f"{stage}: {document['error_name']}, {figures.span_of(error)}, against "
+        f"{figures.span_of(seconds)} seconds for {len(points)} settings; fronts: {told}"
+    )
+    return figures.finished(figure, alt)
+
+
+MOST_NAMED = 6
+"""Fronts that a plot has room to name; of more, only those of several points are labelled."""
+
+
+def _shares(point: Mapping[str, Any], condition: Mapping[str, Any]) -> bool:
+    return all(point["knobs"].get(name) == value for name, value in condition.items())
+
+
+def _words(knobs: Mapping[str, Any]) -> str:
+    return ", ".join(f"{k} {v}" for k, v in knobs.items() if v is not None)
+
+
+def compared_fronts(
+    stage: str, a: tuple[str, Mapping[str, Any]], b: tuple[str, Mapping[str, Any]]
+) -> str:
+    """Draw one stage of two benchmarks: error against seconds of all settings, log-log.
+
+    Parameters
+    ----------
+    stage
+        Name, for the title.
+    a, b
+        Label and stage's entry of a ``skinrig.bench/2`` document.
+
+    Returns
+    -------
+    str
+        An image with a name, as SVG. Settings that both measured are joined by thin lines.
+    """
+    figure, axes = figures.canvas(5.2, 3.4)
+    places: list[dict[str, tuple[float, float]]] = []
+    told = []
+    for number, (label, document) in enumerate((a, b)):
+        points = [p for p in document["points"] if p["error"] > 0.0]
+        seconds = np.array([p["seconds"] for p in points], float)
+        error = np.array([p["error"] for p in points], float)
+        axes.plot(
+            seconds, error, "os"[number], mfc="none" if number else None, ms=5,
+            color=figures.COLORS[number], label=label,
+        )  # fmt: skip
+        places.append(
+            {
+                str(p["knobs"]): (s, e)
+                for p, s, e in zip(points, seconds.tolist(), error.tolist(), strict=True)
+            }
+        )
+        told.append(
+            f"{label}: errors {figures.span_of(error)} in {figures.span_of(seconds)} seconds"
+        )
+    for knobs in sorted(places[0].keys() & places[1].keys()):
+        (s0, e0), (s1, e1) = places[0][knobs], places[1][knobs]
+        axes.plot([s0, s1], [e0, e1], "-", color="0.5", lw=0.6, zorder=0)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.margins(x=0.15, y=0.2)
+    figures.plain_numbers(axes.xaxis, axes.yaxis)
+    axes.set_xlabel("seconds, warm, median")
+    axes.set_ylabel("\n".join(textwrap.wrap(a[1]["error_name"], 36)))
+    axes.set_title(stage, fontsize=10)
+    axes.legend(fontsize=7, frameon=False)
+    return figures.finished(figure, f"{stage}: {'; '.join(told)}")

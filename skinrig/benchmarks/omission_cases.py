@@ -1,0 +1,278 @@
+"""Small scenes of each rig, rendered with and without what their needs speak of."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32Array = NDArray[np.float32]
+
+ROUNDING: Final = 4.0 * float(np.finfo(np.float32).eps)
+"""Relative error of a picture in single precision, after a few sums."""
+
+FACE_TEXELS: Final = 256
+
+REPEATS: Final = 3
+"""Pictures of which the quickest is timed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Omission:
+    """One effect of one scene, compared with and without."""
+
+    rig: str
+    subject: str
+    effect: str
+    verdict: str
+    """As the scene's rule has it, see `rigsim.scene_needs.Verdict`."""
+    told: float | None
+    """Largest change over noise as the rule told it."""
+    found: float
+    """Largest change of any pixel over its noise, as rendered."""
+    uncertain: float
+    """Standard error of ``found`` by photons, and its rounding, in the same unit."""
+    with_s: float
+    """Processor seconds with the effect."""
+    without_s: float
+    """Processor seconds without."""
+
+    @property
+    def at_most(self) -> float:
+        """Largest change over noise with three standard errors on top."""
+        return self.found + 3.0 * self.uncertain
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """What a camera gets, in full scales."""
+
+    light: Float32Array
+    stderr: Float32Array | None = None
+    """Of the Monte Carlo where there is one."""
+
+
+Render = Callable[..., Pictures]
+
+
+def compare(
+    rig: str,
+    subject: str,
+    scene: Any,
+    noise: Any,
+    render: Render,
+    switched: Mapping[str, tuple[Any, Any]],
+) -> Iterator[Omission]:
+    """Render a scene with and without each effect that has a switch.
+
+    Parameters
+    ----------
+    rig, subject
+        Names.
+    scene
+        As its needs decide.
+    noise
+        Of the sensor, see `rigsim.scene_needs.Noise`.
+    render
+        Called with settings of the scene; returns pictures.
+    switched
+        For each switch its settings with and without the effect.
+    """
+    for effect in scene.needs:
+        if effect.switch not in switched:
+            continue
+        on, off = switched[effect.switch]
+        # only of what is left out the seconds are a claim
+        times = REPEATS if effect.verdict == "negligible" else 1
+        have, with_s = _timed(render, {effect.switch: on}, times)
+        lack, without_s = _timed(render, {effect.switch: off}, times)
+        sigma = noise.sigma(have.light)
+        change = np.abs(have.light.astype(np.float64) - lack.light) / sigma
+        place = np.unravel_index(int(np.argmax(change)), change.shape)
+        rounded = ROUNDING * float(np.max(have.light / sigma))
+        error = rounded
+        if have.stderr is not None and lack.stderr is not None:
+            both = np.hypot(have.stderr, lack.stderr) / sigma
+            error = math.hypot(rounded, float(both[place]))
+        yield Omission(
+            rig, subject, effect.name, effect.verdict, effect.over_noise,
+            float(change[place]), error, with_s, without_s,
+        )  # fmt: skip
+
+
+def _timed(render: Render, settings: Mapping[str, Any], times: int) -> tuple[Pictures, float]:
+    least = math.inf
+    for _ in range(times):
+        begin = time.process_time()
+        made = render(**settings)
+        least = min(least, time.process_time() - begin)
+    return made, least
+
+
+def flash_face(preset: str, *, width_px: int, texels: int = FACE_TEXELS) -> Iterator[Omission]:
+    """Compare pictures of a face before the flash rig, parallel and crossed, at full power."""
+    from capture.rig import load_rig
+    from rigsim.scene_needs import Noise
+    from rigsim.scenes.flash import FlashScene
+    from rigsim.subject import make_subject
+
+    rig = load_rig("flash").resized(width_px)
+    face = make_subject(preset, seed=0, size=texels)
+    scene = FlashScene(rig, face)
+
+    def render(**settings: Any) -> Pictures:
+        made = FlashScene(rig, face, **settings)
+        return Pictures(np.stack([made.radiance(name) for name in ("parallel", "crossed")]))
+
+    scene.radiance()  # compiles, and traces what all scenes of this face share
+    yield from compare(
+        "flash", preset, scene, Noise.of(scene.sensor()), render,
+        {
+            "lateral": (True, False), "interreflections": (True, False),
+            "spectral": (True, False), "last_bounce": (1e-7, None),
+        },
+    )  # fmt: skip
+
+
+def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
+    """Compare pictures of a face in the dome under some lights, each exposed to full scale."""
+    from capture.rig import load_rig
+    from rigsim.scene_needs import Noise
+    from rigsim.scenes.dome import DomeScene
+    from rigsim.subject import make_subject
+    from skinrig.simulating.dome import small_dome
+
+    rig = small_dome(load_rig("dome"), lights=lights, views=1, width_px=width_px)
+    face = make_subject(preset, seed=0, size=FACE_TEXELS)
+    scene = DomeScene(rig, face)
+    view = rig.views[0].name
+    brightest = scene.radiance(view).max(axis=(1, 2, 3), keepdims=True)
+
+    def render(**settings: Any) -> Pictures:
+        # what light goes from skin to skin is traced once for all scenes of the face
+        return Pictures(DomeScene(rig, face, **settings).radiance(view) / brightest)
+
+    yield from compare(
+        "dome", preset, scene, Noise.of(scene.sensor()), render,
+        {
+            "subsurface": (True, False), "interreflections": (True, False),
+            "spectral": (True, False), "last_bounce": (1e-7, None),
+        },
+    )  # fmt: skip
+
+
+def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
+    """Compare pictures of a relaxed patch under all LEDs, parallel and crossed, at full scale."""
+    from capture.rig import load_rig
+    from rigsim.scene_needs import Noise
+    from rigsim.scenes.gradient import GradientScene
+    from rigsim.scenes.gradient_reference import NEUTRAL
+    from skinrig.simulating.gradient import make_scene
+
+    rig = load_rig("gradient").cropped(width_px)
+    base = make_scene(rig, site=site)
+    brightest = max(float(part[0].max()) for part in base.moments(NEUTRAL).values())
+
+    def render(**settings: Any) -> Pictures:
+        made = GradientScene(rig, base.subject, sphere=base.sphere, **settings)
+        found = made.moments(NEUTRAL)
+        light = np.stack([part[0] for part in found.values()]) / np.float32(brightest)
+        return Pictures(np.asarray(light, np.float32))
+
+    names = ("shadows", "lateral", "interreflections", "optics")
+    yield from compare(
+        "gradient", site, base, Noise.of(base.sensor()), render,
+        dict.fromkeys(names, (True, False)),
+    )  # fmt: skip
+
+
+def flat_targets() -> Iterator[Omission]:
+    """Show that targets neither shade nor light themselves: rays between their own points."""
+    from capture.rig import load_rig
+    from rigsim.effect_sizes import is_flat
+    from rigsim.render import Caster, visibility
+    from rigsim.scene_needs import Noise
+    from rigsim.scenes.dome import DomeScene
+    from rigsim.scenes.flash import FlashScene
+    from rigsim.skin_bounce import SkinBounce
+    from rigsim.targets import make_target
+    from skinrig.simulating.dome import small_dome
+
+    flash = load_rig("flash").resized(64)
+    dome = small_dome(load_rig("dome"), lights=4, views=1, width_px=64)
+    scenes: list[tuple[str, str, Any]] = [
+        ("flash", name, FlashScene(flash, make_target(name))) for name in ("white", "chart")
+    ]
+    scenes.append(("dome", "white", DomeScene(dome, make_target("white"))))
+    for rig, name, scene in scenes:
+        noise = Noise.of(scene.sensor())
+        caster = Caster(scene.subject.mesh)
+        begin = time.process_time()
+        flat = is_flat(caster.mesh)  # all that leaving it out costs
+        told_s = max(time.process_time() - begin, 1e-6)
+        begin = time.process_time()
+        bounce = SkinBounce(caster, patches=24)
+        got = float(np.asarray(bounce.exchange.sum(axis=1)).max(initial=0.0))
+        seconds = time.process_time() - begin
+        points, normals = (part[0] for part in bounce.surface())
+        begin = time.process_time()
+        seen = min(
+            float(visibility(caster, points, normals, light.position_mm,
+                             radius_mm=light.radius_mm, samples=4).min())
+            for light in scene.rig.lights if light.position_mm[2] > light.radius_mm
+        )  # fmt: skip
+        shading_s = time.process_time() - begin
+        for effect in scene.needs:
+            if effect.verdict != "negligible" or not flat:
+                continue
+            lost, spent = (got, seconds) if effect.switch else (1.0 - seen, shading_s)
+            yield Omission(
+                rig, name, effect.name, effect.verdict, effect.over_noise,
+                noise.share(lost), noise.share(ROUNDING), spent, told_s,
+            )  # fmt: skip
+
+
+def gray_tissue() -> Iterator[Omission]:
+    """Take a gray medium as one color, and as 31 of which bands are made, of the same photons."""
+    from capture.rig import load_rig
+    from rigsim.probe_tissue import HomogeneousTissue
+    from rigsim.scene_needs import Noise
+    from rigsim.scenes.probe import ProbeScene
+    from rigsim.scenes.probe_needs import COLOR
+    from rigsim.suction import HeadState
+
+    rig = load_rig("probe")
+    gray = HomogeneousTissue(0.05, 1.5)
+    bands = tuple(float(nm) for nm in range(400, 701, 10))
+    colored = dataclasses.replace(
+        gray, sigma_a_per_mm=(0.05,) * len(bands), wavelength_nm=bands
+    )  # fmt: skip
+    head = HeadState("forehead", 0.0, True, 0.0, 5.0)
+    pictures, seconds = [], []
+    scene = ProbeScene(rig, gray)
+    for tissue in (colored, gray):
+        begin = time.process_time()
+        made = ProbeScene(rig, tissue)
+        profile = made.profile(head)
+        seconds.append(time.process_time() - begin)
+        if profile is None:
+            raise ValueError("gray tissue: the head touches nothing")
+        light = made.image(made.through_fibres(profile.reflectance_per_mm2))
+        pictures.append(Pictures(light))  # of stored photons: the same for both
+    brightest = np.float32(pictures[0].light.max())
+    noise = Noise.of(scene.sensor())
+    have, lack = (part.light / brightest for part in pictures)
+    sigma = noise.sigma(have)
+    change = np.abs(have - lack) / sigma
+    place = np.unravel_index(int(np.argmax(change)), change.shape)
+    effect = scene.needs[COLOR]
+    yield Omission(
+        "probe", "gray medium", effect.name, effect.verdict, effect.over_noise,
+        float(change[place]), float(ROUNDING * have[place] / sigma[place]), *seconds,
+    )  # fmt: skip

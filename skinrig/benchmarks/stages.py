@@ -1,0 +1,204 @@
+"""Which stages can be measured, and running them."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+from skinrig.benchmark import StageBenchmark
+from skinrig.benchmarks import plan as bench_plan
+from skinrig.benchmarks import table as bench_table
+from skinrig.benchmarks.document import to_document
+from skinrig.console import Console, plain
+from skinrig.errors import EXTRA_MISSING, exit_code, sentence
+
+STAGES = {
+    "chromophores": "chromophores.inversion",
+    "render-flash": "flash.render",
+    "render-dome": "dome_render.render",
+    "render-gradient": "gradient_render.render",
+    "omissions": "omissions.omissions",
+    "skin-stretch": "skin_stretch.stretched",
+    "layered-reflectance": "tissue.layered_reflectance",
+    "color-table": "tissue.table",
+    "expression-alignment": "alignment.aligned",
+    "efficiency": "efficiency.efficiency",
+    "intervals": "intervals.intervals",
+    "misalignment": "alignment.misaligned",
+    "shared-melanin": "shared_melanin.inversion",
+    "facial-color": "facial_color.rig",
+    "diffuse-albedo": "brdf.albedo",
+    "brdf": "brdf.surface",
+    "brdf-space": "brdf_space.space",
+    "reflectance": "reflectance.model",
+    "render-model": "rendering.model",
+    "normals": "photometric.normals",
+    "gradient-normals": "gradient_normals.normals",
+    "hdr": "hdr.merging",
+    "lumitexels": "surface.lumitexels",
+    "texture-fill": "surface.filling",
+    "head-motion": "motion.motion",
+    "dome-geometry": "dome_calibration.geometry",
+    "dome-lights": "dome_calibration.lights",
+    "light-order": "light_order.light_order",
+    "sphere-lights": "gradient_calibration.sphere_lights",
+    "fibre-readings": "fibre_readings.fibre_readings",
+    "normal-integration": "integration.integration",
+    "normal-histogram": "kernels.histograms",
+    "kernel-fit": "kernels.search",
+    "displacement-synthesis": "synthesis.growth",
+    "texture-matching": "texture.matching",
+    "editing": "editing.editing",
+    "traits": "traits.traits",
+    "microstructure": "microstructure.truth",
+    "microstructure-passes": "microstructure.passes",
+    "perfusion-curves": "perfusion.curves",
+    "probe-session": "probe.session",
+    "subsurface-fit": "subsurface.tiers",
+    "subsurface-batch": "subsurface.batches",
+    "subsurface-gather": "subsurface_gather.gathering",
+    "anisotropy": "translucency.directions",
+    "translucency": "translucency.sites",
+    "photon-transport": "transport.photon_transport",
+    "wrinkles": "wrinkles.fitting",
+    "wrinkle-sum": "wrinkles.summing",
+    "wrinkle-storage": "wrinkles.storing",
+    "wrinkle-weights": "wrinkles.weighing",
+}
+"""Module and function of each; a module is imported, and its kernels compiled, when it is run."""
+
+
+class BenchError(ValueError):
+    """A stage that cannot be measured."""
+
+
+def _function(name: str) -> Callable[..., StageBenchmark]:
+    module, function = STAGES[name].split(".")
+    found: Callable[..., StageBenchmark] = getattr(
+        import_module(f"skinrig.benchmarks.{module}"), function
+    )
+    return found
+
+
+def run_stages(
+    names: Sequence[str] | None,
+    *,
+    budget_s: float,
+    toy: bool,
+    out: Path | None,
+    console: Console,
+) -> dict[str, Any]:
+    """Measure stages and return the document of the run.
+
+    Parameters
+    ----------
+    names
+        Out of :data:`STAGES`, each at full size. None: all of them at their small size, and then
+        at full size those that fit into the budget, the quickest first.
+    budget_s
+        Seconds to spend. A stage that would begin after them is left out, and named.
+    toy
+        Small sizes only: for checking that the benchmark runs.
+    out
+        Folder for ``bench.json``; None writes nothing.
+    console
+        Where results and progress go.
+
+    Returns
+    -------
+    dict
+        ``skinrig.bench/2``. Each stage says its ``size``; limits are judged at full size alone, and
+        ``not_judged`` names the stages whose limits were not.
+
+    Raises
+    ------
+    BenchError
+        For an unknown stage.
+    """
+    chosen = list(names) if names else bench_plan.in_order(STAGES)
+    for name in chosen:
+        if name not in STAGES:
+            raise BenchError(f"stage: got {name!r}, expected one of {', '.join(STAGES)}")
+    run = _Run(console, time.perf_counter() + budget_s, asked=bool(names))
+    small = toy or not names
+    for name in chosen:
+        run.measure(name, "small" if small else "full")
+    if small and not toy:
+        run.enlarge()
+    document = run.document()
+    document["toy"] = toy
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(plain(document), indent=1, sort_keys=True)
+        bench_table.write_whole(out / "bench.json", text + "\n")
+    bench_table.show(document, console)
+    return document
+
+
+Size = Literal["small", "full"]
+
+
+@dataclass(slots=True)
+class _Run:
+    """What was measured so far."""
+
+    console: Console
+    until_s: float
+    """When the budget ends, by `time.perf_counter`."""
+    asked: bool
+    """Whether stages were asked for by name: then what they need must be there."""
+    done: dict[str, StageBenchmark] = field(default_factory=dict)
+    size: dict[str, Size] = field(default_factory=dict)
+    compile_s: dict[str, float] = field(default_factory=dict)
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+
+    def measure(self, name: str, size: Size) -> float:
+        """Measure a stage, if there is time, and return the seconds that it took."""
+        began = time.perf_counter()
+        if began > self.until_s:
+            self.left_out.append((name, "the budget was used up"))
+            return 0.0
+        self.console.progress(f"bench {name}, {size} size")
+        try:
+            made = _function(name)(toy=size == "small")
+        except ImportError as error:
+            if self.asked or exit_code(error) != EXTRA_MISSING:
+                raise
+            self.left_out.append((name, sentence(error)))
+            return 0.0
+        # the first time that its kernels are called; later ones find them compiled
+        self.compile_s.setdefault(
+            name, sum(max(p.timing.cold_s - p.timing.seconds, 0.0) for p in made.points)
+        )
+        self.done[name], self.size[name] = made, size
+        return time.perf_counter() - began
+
+    def enlarge(self) -> None:
+        """Measure again at full size what fits into the rest of the budget."""
+        pace = bench_plan.Pace()
+        for name, told_s in bench_plan.quickest_first(self.done, bench_plan.FULL_S):
+            left_s = self.until_s - bench_plan.RESERVE_S - time.perf_counter()
+            if not pace.fits(told_s, left_s):
+                break
+            pace.add(told_s, self.measure(name, "full"))
+
+    def document(self) -> dict[str, Any]:
+        """Return the document of the run."""
+        document = to_document(list(self.done.values()))
+        document["left_out"] = [list(item) for item in self.left_out]
+        document["not_judged"] = [name for name, size in self.size.items() if size == "small"]
+        for name, made in self.done.items():
+            stage = document["stages"][made.name]
+            stage["size"] = self.size[name]
+            stage["compile_seconds"] = self.compile_s[name]
+            if self.size[name] == "small":
+                stage["limits"] = []
+        document["passed"] = all(
+            limit["passed"] for stage in document["stages"].values() for limit in stage["limits"]
+        )
+        return document

@@ -1,0 +1,169 @@
+"""What a benchmark prints and writes beside its JSON: tables, verdicts, one plot a stage."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from skinrig.console import Console
+
+_COLUMNS = (
+    "seconds", "cold_seconds", "peak_memory_mb", "error", "cramer_rao_bound", "efficiency",
+)  # fmt: skip
+
+BAND_COLUMNS = ("stage", "skin", "error", "low", "high", "Cramér-Rao", "of light", "which is")
+"""Of the table of errors by band: the last but one is the error over that of the lightest band."""
+
+
+def show(document: Mapping[str, Any], console: Console) -> None:
+    """Print each stage's points and limits, then one line a stage and what was not judged.
+
+    Parameters
+    ----------
+    document
+        ``skinrig.bench/2``, as `skinrig.benchmarks.stages.run_stages` makes it.
+    console
+        Where it is printed.
+    """
+    for name, stage in document["stages"].items():
+        console.rows(
+            (f"{name} ({stage['size']} size)", "seconds", "cold s", "peak MB",
+             stage["error_name"], "Cramér-Rao", "efficiency", ""),
+            [
+                (knobs(point), *(_cell(point[key]) for key in _COLUMNS), _place(point))
+                for point in stage["points"]
+            ],
+        )  # fmt: skip
+        for limit in stage["limits"]:
+            word = "kept" if limit["passed"] else "MISSED"
+            console.say(
+                f"{word}: {limit['name']}: {limit['got']:.4g} {limit['unit']} "
+                f"({limit['sense']} {limit['bound']:g})"
+            )
+        for what, why in stage["left_out"]:
+            console.say(f"left out: {what}: {why}")
+        console.say()
+    console.rows(
+        (
+            "stage",
+            "size",
+            "points",
+            "fronts",
+            "least error",
+            "knee",
+            "knee s",
+            "best efficiency",
+            "limits",
+        ),
+        [_line(name, stage) for name, stage in document["stages"].items()],
+    )
+    if found := bands(document):
+        console.say()
+        console.rows(BAND_COLUMNS, found)
+    for name, why in document["left_out"]:
+        console.say(f"left out: {name}: {why}")
+    if document["not_judged"]:
+        console.say(
+            "limits not judged, since measured at small size: "
+            f"{', '.join(document['not_judged'])}; `skinrig bench --stage NAME` judges them"
+        )
+
+
+def bands(document: Mapping[str, Any]) -> list[tuple[object, ...]]:
+    """Return the rows of :data:`BAND_COLUMNS`: errors of each stage from light skin to dark."""
+    rows: list[tuple[object, ...]] = []
+    for name, stage in document["stages"].items():
+        first = stage["by_band"][0]["error"] if stage["by_band"] else None
+        for one in stage["by_band"]:
+            low, high = one["error_interval"] or (None, None)
+            of_light = one["error"] / first if first else None
+            rows.append(
+                (name, one["band"], one["error"], _cell(low), _cell(high),
+                 _cell(one["cramer_rao_bound"]), _cell(of_light), stage["error_name"])
+            )  # fmt: skip
+    return rows
+
+
+def write(document: Mapping[str, Any], out: Path) -> None:
+    """Write one table of all points, ``bench.csv``, one by band, and a plot a stage.
+
+    Parameters
+    ----------
+    document
+        ``skinrig.bench/2``.
+    out
+        Folder; made if it is missing. It gets ``bench.csv``, ``bench-bands.csv``, ``NAME.svg``.
+    """
+    from skinrig.benchmarks import figures as bench_figures
+
+    out.mkdir(parents=True, exist_ok=True)
+    rows = [
+        (name, stage["size"], knobs(point), stage["error_name"],
+         *(point[key] for key in _COLUMNS), *point["error_interval"],
+         point["on_front"], point["knee"])
+        for name, stage in document["stages"].items()
+        for point in stage["points"]
+    ]  # fmt: skip
+    head = ("stage", "size", "setting", "error is", *_COLUMNS, "low", "high", "front", "knee")
+    write_whole(out / "bench.csv", _csv(head, rows))
+    write_whole(out / "bench-bands.csv", _csv(BAND_COLUMNS, bands(document)))
+    for name, stage in document["stages"].items():
+        if stage["points"]:
+            plot = bench_figures.error_against_seconds(name, stage)
+            write_whole(out / f"{name}.svg", plot + "\n")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file that is there whole or not at all."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8", newline="")
+    os.replace(part, path)
+
+
+def _csv(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(head)
+    table.writerows(rows)
+    return text.getvalue()
+
+
+def knobs(point: Mapping[str, Any]) -> str:
+    """Return what a point's knobs were set to, on one line.
+
+    Examples
+    --------
+    >>> knobs({"knobs": {"lights": 12, "fit": "robust"}})
+    'lights=12 fit=robust'
+    """
+    return " ".join(f"{name}={value}" for name, value in point["knobs"].items())
+
+
+def _cell(value: float | None) -> float | str:
+    return "" if value is None else float(value)
+
+
+def _place(point: Mapping[str, Any]) -> str:
+    if point["knee"]:
+        return "front, knee"
+    return "front" if point["on_front"] else ""
+
+
+def _line(name: str, stage: Mapping[str, Any]) -> tuple[object, ...]:
+    points = stage["points"]
+    knees = [point for point in points if point["knee"]]
+    bend = knees[0] if len(knees) == 1 else None
+    known = [point["efficiency"] for point in points if point["efficiency"] is not None]
+    missed = sum(not limit["passed"] for limit in stage["limits"])
+    verdict = f"{missed} MISSED" if missed else f"{len(stage['limits'])} kept"
+    many = f"{len(knees)}, one a condition" if len(knees) > 1 else ""
+    return (
+        name, stage["size"], len(points), len(stage["fronts"]),
+        min((float(point["error"]) for point in points), default=""),
+        knobs(bend) if bend else many, bend["seconds"] if bend else "",
+        min(known) if known else "", verdict if stage["size"] == "full" else "not judged",
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Calibrations of each rig from sessions of targets."""

@@ -1,0 +1,270 @@
+"""From sessions of targets to CALIBRATION/: hands the frames of a session to the estimators."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture import raw
+from capture.calibration import chart, color, colorimetry, polarization, sensor, store, white
+from capture.calibration.phantom import read_certificate
+from capture.calibration.photon_transfer import FlatPair
+from capture.session import FrameRecord, Session
+from skinrig.calibrating import dome, gradient, probe
+
+KINDS = (
+    "sensor", "color", "polarization", "white", *dome.KINDS, probe.KIND
+)  # fmt: skip
+
+
+class CalibratingError(ValueError):
+    """Sessions that do not hold the frames a calibration needs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A calibration that was made, and how it differs from the one before it."""
+
+    calibration: store.Calibration
+    path: Path
+    drift: tuple[store.Drift, ...]
+    summary: tuple[tuple[str, str], ...]
+    """What to tell the user: quantity and value with standard error."""
+    findings: tuple[str, ...] = ()
+    """What is wrong with the rig."""
+
+
+def calibrate(
+    kind: str,
+    sessions: Sequence[str | Path],
+    out: str | Path,
+    *,
+    created: date | None = None,
+    targets: dome.DomeTargets | None = None,
+    phantom: str | Path | None = None,
+) -> Outcome:
+    """Make one kind of calibration from target sessions and save it.
+
+    Parameters
+    ----------
+    kind
+        One of :data:`KINDS`.
+    sessions
+        Folders; frames of all of them are pooled. They must come from one camera, those of a
+        dome's "geometry" and "lights" from one rig.
+    out
+        The CALIBRATION/ folder; an older calibration of the kind is compared, then replaced.
+    created
+        Date of the calibration; None: that of the latest session.
+    targets
+        What stood in the dome.
+    phantom
+        Certificate of the block that a probe's "fibre" was measured on; None: of a simulated
+        session the simulated block's.
+
+    Raises
+    ------
+    CalibratingError
+        When a needed kind of frame is missing, or the sessions come from several cameras.
+    """
+    if kind not in KINDS:
+        raise CalibratingError(f"kind: got {kind!r}, expected one of {', '.join(KINDS)}")
+    opened = [Session.open(path) for path in sessions]
+    if not opened:
+        raise CalibratingError("sessions: got none, expected at least one folder")
+    made_on = created or max(s.manifest.created_at.date() for s in opened)
+    findings: tuple[str, ...] = ()
+    if kind == probe.KIND:
+        paper = None if phantom is None else read_certificate(phantom)
+        done = probe.calibrate_probe(opened, out, made_on, certificate=paper)
+        calibration, summary, findings = done.calibration, done.summary, done.findings
+    elif gradient.of_a_gradient_sphere(opened):
+        found = gradient.calibrate_gradient(kind, opened, out, made_on)
+        calibration, summary, findings = found.calibration, found.summary, found.findings
+    elif kind in dome.KINDS:
+        made = dome.calibrate_dome(kind, opened, out, made_on, targets=targets)
+        calibration, summary, findings = made.calibration, made.summary, made.findings
+    else:
+        calibration = _MAKERS[kind](_Frames(opened), made_on)
+        summary = tuple(_summary(calibration))
+    drift: tuple[store.Drift, ...] = ()
+    try:
+        drift = store.drift(store.load(out, kind), calibration)
+    except store.CalibrationMissing:
+        pass
+    Path(out).mkdir(parents=True, exist_ok=True)
+    path = store.save(calibration, out)
+    return Outcome(calibration, path, drift, summary, findings)
+
+
+class _Frames:
+    """The frames of one camera in several sessions."""
+
+    def __init__(self, sessions: Sequence[Session]) -> None:
+        self.sessions = sessions
+        self.rig = sessions[0].rig
+        serials = {view.serial for session in sessions for view in session.rig.views}
+        if len(serials) != 1:
+            raise CalibratingError(
+                f"cameras: got {', '.join(sorted(serials))}, expected one; calibrate each alone"
+            )
+        self.serial = serials.pop()
+        self.source = sessions[0].source
+        self.inputs = {session.id: session.content_hash for session in sessions}
+
+    def of(self, kind: str, **index: str | int | float) -> list[tuple[FrameRecord, raw.RawFrame]]:
+        """Return records with their frames; an empty list when there are none."""
+        return [
+            (record, session.read(record))
+            for session in self.sessions
+            for record in session.frames(kind, **index)
+        ]
+
+    def need(self, kind: str, **index: str | int | float) -> list[tuple[FrameRecord, raw.RawFrame]]:
+        found = self.of(kind, **index)
+        if not found:
+            wanted = " ".join([kind, *(f"{k}={v}" for k, v in index.items())])
+            raise CalibratingError(
+                f"sessions: hold no frames of kind {wanted!r}; capture that target first "
+                "(`skinrig simulate flash --target ...` or `skinrig capture flash`)"
+            )
+        return found
+
+    def dark_level(self) -> NDArray[np.float32] | float:
+        """Return what a frame without light shows above its black level, (h, w, 3)."""
+        darks = [raw.linear_rgb(frame, demosaic="centered").rgb for _, frame in self.of("dark")]
+        return np.mean(darks, axis=0, dtype=np.float32) if darks else 0.0
+
+
+def _sensor(frames: _Frames, created: date) -> store.Calibration:
+    by_power = defaultdict(list)
+    first = frames.need("flat")[0][1]
+    for record, frame in frames.of("flat"):
+        by_power[float(record.settings["power"])].append(frame.cfa)
+    pairs = [
+        FlatPair(cfas[k], cfas[k + 1], light)
+        for light, cfas in sorted(by_power.items())
+        for k in range(0, len(cfas) - 1, 2)
+    ]
+    darks = frames.need("dark")
+    result = sensor.photon_transfer(
+        pairs,
+        [frame.cfa for _, frame in darks],
+        white_dn=first.white,
+        pattern=first.pattern,
+        dark_exposures_s=[float(record.settings["exposure_s"]) for record, _ in darks],
+        block=max(4, min(16, min(first.cfa.shape) // 32)),
+    )
+    return result.to_calibration(
+        serial=frames.serial,
+        rig=frames.rig.name,
+        source=frames.source,
+        created=created,
+        inputs=frames.inputs,
+    )
+
+
+def _white(frames: _Frames, created: date) -> store.Calibration:
+    dark = frames.dark_level()
+    shots = frames.need("subject", polarizer="crossed")
+    linear = [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
+    # the tile depolarizes: crossed filters pass half of its light, the diffuse total is twice that
+    reference = white.white_reference(
+        [2.0 * (image.rgb - dark) for image in linear],
+        variances=[4.0 * image.variance for image in linear],
+        valid=[image.valid for image in linear],
+        lights=[float(record.settings["power"]) for record, _ in shots],
+        reflectance=WHITE_TILE_REFLECTANCE,
+        # every pixel by itself: what the pixels' own gains differ by must cancel in the ratio
+        degree=None,
+    )
+    return reference.to_calibration(
+        serial=frames.serial,
+        rig=frames.rig.name,
+        source=frames.source,
+        created=created,
+        inputs=frames.inputs,
+    )
+
+
+WHITE_TILE_REFLECTANCE = 0.99
+"""Of the white tile, pressed PTFE or the like, between 400 and 700 nm."""
+
+
+def _color(frames: _Frames, created: date) -> store.Calibration:
+    dark = frames.dark_level()
+    shots = frames.need("chart", polarizer="crossed")
+    linear = [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
+    image = np.mean([picture.rgb - dark for picture in linear], axis=0)
+    valid = np.logical_and.reduce([picture.valid for picture in linear])
+    centers = chart.find_chart(image)
+    patches = chart.measure_patches(image, centers, valid=valid)
+    neutral = color.neutral_white(patches.rgb, valid=patches.valid)
+    illuminant = frames.rig.lights[0].illuminant
+    fit = color.fit_matrix(
+        patches.rgb,
+        colorimetry.chart_reference(illuminant),
+        illuminant=illuminant,
+        white=neutral.value,
+        valid=patches.valid,
+    )
+    return color.to_calibration(
+        fit,
+        neutral,
+        serial=frames.serial,
+        rig=frames.rig.name,
+        source=frames.source,
+        created=created,
+        inputs=frames.inputs,
+    )
+
+
+def _polarization(frames: _Frames, created: date) -> store.Calibration:
+    dark = frames.dark_level()
+    shots = frames.need("malus")
+    angles = np.deg2rad([float(record.settings["analyser_deg"]) for record, _ in shots])
+    linear = [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
+    images = [picture.rgb - dark for picture in linear]
+    valid = np.logical_and.reduce([picture.valid for picture in linear])
+    chosen = polarization.modulated_pixels(angles, images, valid=valid)
+    count = int(np.count_nonzero(chosen))
+    if not count:
+        raise CalibratingError("malus frames: no pixel follows the analyser; check the target")
+    mean = np.array([image[chosen].mean(axis=0) for image in images])
+    variance = np.array([p.variance[chosen].sum(axis=0) for p in linear]) / count**2
+    fit = polarization.fit_malus(angles, mean, variance=variance)
+    result = polarization.PolarizationCalibration.from_fit(fit, ("R", "G", "B"))
+    return result.to_calibration(
+        serial=frames.serial,
+        rig=frames.rig.name,
+        source=frames.source,
+        created=created,
+        inputs=frames.inputs,
+    )
+
+
+_MAKERS: dict[str, Callable[[_Frames, date], store.Calibration]] = {
+    "sensor": _sensor,
+    "color": _color,
+    "polarization": _polarization,
+    "white": _white,
+}
+
+
+def _summary(calibration: store.Calibration) -> list[tuple[str, str]]:
+    rows = []
+    for serial, quantities in calibration.values.items():
+        for name, quantity in quantities.items():
+            if quantity.value.size > 9:
+                continue
+            value = ", ".join(f"{v:.5g}" for v in quantity.value.ravel())
+            if quantity.stderr is not None:
+                value += "  ± " + ", ".join(f"{v:.2g}" for v in quantity.stderr.ravel())
+            rows.append((f"{serial} {name}", value))
+    return rows

@@ -1,0 +1,107 @@
+"""`skinrig analyse`: what fitted faces have in common."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, cast
+
+import typer
+
+from skinrig.commands.help import Subcommands
+from skinrig.commands.options import Json, Out
+from skinrig.console import Console
+from skinrig.errors import UsageError
+
+Labels = Annotated[
+    Path | None, typer.Option(help="Table name,TRAIT,... of 0 and 1, a line for each face.")
+]
+
+analyse_app = typer.Typer(cls=Subcommands, help="Analyse faces together.", no_args_is_help=True)
+
+
+@analyse_app.callback()
+def analyse() -> None:
+    """Analyse faces together."""
+
+
+@analyse_app.command("brdf")
+def analyse_brdf(
+    out: Out,
+    appearances: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Maps of dome sessions, with lobes; none: simulated faces."),
+    ] = None,
+    labels: Labels = None,
+    basis: Annotated[
+        Path | None, typer.Option(help="Folder of the MERL files the lobes were fitted with.")
+    ] = None,
+    points: Annotated[
+        int | None,
+        typer.Option(
+            help="Texels of each face, default 2000; simulated: points of the one person and of "
+            "the seven conditions, default 5000, each of the 87 people having two fifths of it."
+        ),
+    ] = None,
+    method: Annotated[
+        str, typer.Option(help="How lobes are joined: as shares of materials, or as brdf.")
+    ] = "shares",
+    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
+    json: Json = False,
+) -> None:
+    """Tell how many lobes the surfaces of faces need, and draw their mean reflection.
+
+    Needed is the first number whose error exceeds the least one by no more than 5 % of the fall
+    from one lobe to the least; the next columns say it by 2 and 10 %, and where the error falls
+    below what noise alone leaves.
+
+    Example: skinrig analyse brdf appearance-a appearance-b --labels labels.csv --out analysis
+    """
+    from skinrig.analysing import brdf as analysing_brdf
+
+    if method not in ("shares", "brdf"):
+        raise UsageError(f"--method: got {method!r}, expected shares or brdf")
+    if points is not None and points < 20:
+        raise UsageError(f"--points: got {points}, expected 20 or more")
+    how = cast(Literal["shares", "brdf"], method)
+    console = Console(json)
+    if appearances:
+        found = analysing_brdf.analyse_measured(
+            out, appearances, labels=labels, basis=basis,
+            points_each=points or analysing_brdf.POINTS_B, method=how, seed=seed,
+        )  # fmt: skip
+    elif labels is not None or basis is not None:
+        raise UsageError("--labels, --basis: are of measured faces; name their folders")
+    else:
+        some = points or analysing_brdf.POINTS_A
+        found = analysing_brdf.analyse_simulated(
+            out, points=some, points_each=max(1, round(0.4 * some)), method=how, seed=seed,
+            progress=console.progress,
+        )  # fmt: skip
+    documents = [one.document() for one in found]
+    console.rows(
+        ("points of", "needs", "by 2 %", "by 10 %", "to noise", "error", "others", "noise"),
+        [
+            (d["name"], str(d["plateau"]), str(d["plateau_by_share"]["0.02"]),
+             str(d["plateau_by_share"]["0.1"]), str(d["rank_at_noise"] or "-"), *_at_plateau(d))
+            for d in documents
+        ],
+    )  # fmt: skip
+    for document in documents:
+        for rank, why in document["left_out"]:
+            console.say(f"left out: {document['name']}, {rank} lobes and more: {why}")
+        if document["points_lost"]:
+            console.say(f"{document['name']}: {document['points_lost']} points show no lobe")
+    console.say(f"{out}: figure-14.png, figure-15.png, curves.csv, analysis.json")
+    console.document("skinrig.analyse-brdf/1", {"out": out, "datasets": documents})
+
+
+def _at_plateau(document: dict[str, object]) -> tuple[str, str, str]:
+    """Return the errors at the plateau, in and out of sample, and what noise leaves."""
+    ranks = cast(list[int], document["ranks"])
+    at = ranks.index(cast(int, document["plateau"]))
+    inside = cast(list[float], document["error"])[at]
+    outside = cast(list[float | None], document["held_out_error"])[at]
+    noise = cast(float | None, document["noise"])
+    return tuple(  # type: ignore[return-value]
+        "-" if value is None else f"{100.0 * value:.1f} %" for value in (inside, outside, noise)
+    )

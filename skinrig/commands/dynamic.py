@@ -1,0 +1,279 @@
+"""`skinrig fit` and `skinrig apply`: models of a moving face, fitted and evaluated."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from skinrig.commands.help import Subcommands
+from skinrig.commands.options import Json, Out
+from skinrig.console import Console
+
+Weights = Annotated[
+    str, typer.Option(help="States and their weights: smile=0.7,anger=0.3; they sum to one.")
+]
+Mesh = Annotated[
+    Path | None,
+    typer.Option(help="Mesh with blend shapes: .npz, OBJ or glTF; strain comes from it."),
+]
+Size = Annotated[int, typer.Option(help="Pixels a side of the displacement map.")]
+At = Annotated[str | None, typer.Option("--site", help="Whose microrelief; default: the first.")]
+Synthesize = Annotated[
+    str,
+    typer.Option(help="Neutral relief: patches (measured ones, grown) or noise (in space)."),
+]
+Extrapolate = Annotated[
+    str, typer.Option(help="Beyond the table's stretch range: hold its ends, or formula.")
+]
+
+fit_app = typer.Typer(cls=Subcommands, help="Fit models to captured data.", no_args_is_help=True)
+apply_app = typer.Typer(
+    cls=Subcommands, help="Evaluate fitted models of a moving face.", no_args_is_help=True
+)
+
+
+@fit_app.command("facial-color")
+def fit_facial_color(
+    sessions: Annotated[list[Path], typer.Argument(help="Flash sessions of one subject.")],
+    out: Out,
+    calibration: Annotated[Path | None, typer.Option(help="CALIBRATION/ folder.")] = None,
+    landmarks: Annotated[
+        Path | None, typer.Option(help="Folder with STATE.csv (name,x,y) for each state.")
+    ] = None,
+    radius: Annotated[
+        float | None, typer.Option(help="Radius of the local statistics, px; default: side / 32.")
+    ] = None,
+    stored_size: Annotated[int, typer.Option(help="Cells a side of scale and bias maps.")] = 256,
+    json: Json = False,
+) -> None:
+    """Fit the hemoglobin rig: blood of each state as scale and bias of the neutral.
+
+    Example: skinrig fit facial-color session-flash --calibration calibration --out moving
+    """
+    from skinrig.fitting.facial_color import fit_facial_color as fit
+    from skinrig.fitting.facial_color import summary
+
+    console = Console(json)
+    found = fit(
+        sessions, out=out, calibration=calibration, landmarks=landmarks, radius_px=radius,
+        stored_size=stored_size, progress=console.progress,
+    )  # fmt: skip
+    rows = summary(found)
+    console.rows(
+        ("state", "change of blood, points", "change, %", "median scale", "place error, px"), rows
+    )
+    for what, why in found.left_out:
+        console.say(f"left out: {what}: {why}")
+    states = ",".join(found.hemoglobin)
+    console.say(f"{out}: hemoglobin rig of {states}")
+    last = list(found.changes)[-1]
+    console.say(f"next: skinrig apply expression {out} --weights {last}=1 --out {last}")
+    console.document(
+        "skinrig.fit/1",
+        {"model": "facial_color", "out": out, "states": list(found.hemoglobin),
+         "radius_px": found.rig.radius_px, "left_out": [list(row) for row in found.left_out],
+         "rows": [list(row) for row in rows]},
+    )  # fmt: skip
+
+
+@fit_app.command("wrinkles")
+def fit_wrinkles(
+    appearances: Annotated[
+        list[Path], typer.Argument(help="Maps of dome sessions: neutral and expressions.")
+    ],
+    out: Out,
+    mask: Annotated[
+        list[Path] | None, typer.Option(help="RGBA picture of four zones; twice for eight.")
+    ] = None,
+    size: Annotated[int, typer.Option(help="Texels a side of the wrinkle map.")] = 256,
+    mask_size: Annotated[int, typer.Option(help="Texels a side of masks that are found.")] = 64,
+    seed: Annotated[int, typer.Option(help="Seed of the search for zones.")] = 0,
+    json: Json = False,
+) -> None:
+    """Fit a wrinkle map, its zones and their weights to normals of expressions.
+
+    Example: skinrig fit wrinkles appearance-neutral surprise=appearance-surprise --out moving
+    """
+    from skinrig.fitting.wrinkles import fit_wrinkles as fit
+    from skinrig.fitting.wrinkles import summary, zone_names
+
+    console = Console(json)
+    found = fit(appearances, out=out, masks=mask, size=size, mask_size=mask_size, seed=seed)
+    console.rows(("expression", *zone_names(found).values()), summary(found))
+    console.say(f"{out}: wrinkles explain {100 * found.fit.explained:.0f} % of the differences")
+    console.document(
+        "skinrig.fit/1",
+        {"model": "wrinkles", "out": out, "explained": found.fit.explained,
+         "rows": [list(row) for row in summary(found)]},
+    )  # fmt: skip
+
+
+@fit_app.command("microstructure")
+def fit_microstructure(
+    appearances: Annotated[
+        list[Path], typer.Argument(help="Maps of caliper sessions with heights and kernels.")
+    ],
+    out: Out,
+    paper_table: Annotated[
+        bool, typer.Option("--paper-table", help="The paper's forehead where kernels are too few.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Fit neutral microrelief and its table of kernels, site by site.
+
+    Example: skinrig fit microstructure forehead=appearance-gradient --out moving
+    """
+    from skinrig.fitting.microstructure import fit_microstructure as fit
+
+    console = Console(json)
+    found = fit(appearances, out=out, paper_table=paper_table, on_message=console.say)
+    console.say(f"next: skinrig apply microstructure {out} --mesh MESH --weights SHAPE=1 --out DIR")
+    console.document(
+        "skinrig.fit/1",
+        {"model": "microstructure", "out": out,
+         "sites": {site: one.document() for site, one in found.items()}},
+    )  # fmt: skip
+
+
+@apply_app.command("expression")
+def apply_expression(
+    appearance: Annotated[Path, typer.Argument(help="Folder that `skinrig fit` made.")],
+    weights: Weights,
+    out: Out,
+    mesh: Mesh = None,
+    parts: Annotated[
+        str | None, typer.Option(help="Of facial_color,wrinkles,microstructure; default: all.")
+    ] = None,
+    normalize: Annotated[
+        bool, typer.Option("--normalize", help="Divide the weights by their sum.")
+    ] = False,
+    clamp: Annotated[
+        str, typer.Option(help="Range of a wrinkle zone's sum: unit is 0...1, signed -1...1.")
+    ] = "unit",
+    emotional: Annotated[
+        bool, typer.Option("--emotional", help="Anger reddens, fear pales the whole face.")
+    ] = False,
+    gain: Annotated[float, typer.Option(help="One more factor of all blood.")] = 1.0,
+    onto: Annotated[
+        Path | None,
+        typer.Option(help="Maps of another face (hemoglobin, melanin) that the rig is applied to."),
+    ] = None,
+    landmarks: Annotated[
+        list[Path] | None,
+        typer.Option(help="Table name,x,y of the rig's face; a second one of the other face."),
+    ] = None,
+    size: Size = 4096,
+    site: At = None,
+    synthesize: Synthesize = "patches",
+    extrapolate: Extrapolate = "hold",
+    seed: Annotated[int, typer.Option(help="Seed of the grown relief.")] = 0,
+    json: Json = False,
+) -> None:
+    """Evaluate blood, color, normals and displacement of an expression.
+
+    Example: skinrig apply expression moving --weights smile=0.7,anger=0.3 --out expression
+    """
+    from skinrig.applying import expression as applying
+    from skinrig.applying.relief import EXTRAPOLATIONS, SOURCES, Relief, one_of
+    from skinrig.dynamic_appearance import PARTS
+
+    console = Console(json)
+    given = applying.parse_weights(weights)
+    wanted = PARTS if parts is None else tuple(p.strip() for p in parts.split(","))
+    expression = applying.Expression(
+        given, normalize=normalize, clamp=one_of("--clamp", clamp, ("unit", "signed")),
+        emotional=emotional, gain=gain, onto=_other_face(onto, landmarks or []),
+    )  # fmt: skip
+    relief = None
+    one_of("--synthesize", synthesize, SOURCES)
+    one_of("--extrapolate", extrapolate, EXTRAPOLATIONS)
+    if mesh is not None:
+        relief = Relief.of(
+            mesh, applying.normalized(expression).weights, size_px=size, site=site,
+            source=synthesize, extrapolate=extrapolate, seed=seed, out=out,
+            progress=console.progress,
+        )  # fmt: skip
+    done = applying.apply_expression(
+        appearance, expression, out=out, parts=wanted, relief=relief, progress=console.progress
+    )
+    _tell(console, out, done)
+
+
+@apply_app.command("microstructure")
+def apply_microstructure(
+    appearance: Annotated[Path, typer.Argument(help="Folder that `skinrig fit` made.")],
+    mesh: Annotated[Path, typer.Option(help="Mesh with blend shapes: .npz, OBJ or glTF.")],
+    weights: Annotated[str, typer.Option(help="Blend shapes or states: jawOpen=0.5,smile=1.")],
+    out: Out,
+    size: Size = 4096,
+    site: At = None,
+    synthesize: Synthesize = "patches",
+    extrapolate: Extrapolate = "hold",
+    seed: Annotated[int, typer.Option(help="Seed of the grown relief.")] = 0,
+    json: Json = False,
+) -> None:
+    """Grow the measured relief over a mesh and let it follow the mesh's strain.
+
+    Example: skinrig apply microstructure moving --mesh head.npz --weights smile=1 --out relief
+    """
+    from skinrig.applying import expression as applying
+    from skinrig.applying.relief import Relief
+    from skinrig.dynamic_appearance import MICROSTRUCTURE
+
+    console = Console(json)
+    given = applying.parse_weights(weights)
+    relief = Relief.of(
+        mesh, given, size_px=size, site=site, source=synthesize, extrapolate=extrapolate,
+        seed=seed, out=out, progress=console.progress,
+    )  # fmt: skip
+    done = applying.apply_expression(
+        appearance, applying.Expression(given), out=out, parts=(MICROSTRUCTURE,), relief=relief,
+        progress=console.progress,
+    )  # fmt: skip
+    _tell(console, out, done)
+
+
+def _other_face(onto: Path | None, landmarks: list[Path]) -> Any:
+    """Return the face that a rig is applied to, with its landmarks."""
+    from model import store
+    from reconstruction import landmark_table
+    from skinrig.applying.expression import OtherFace
+    from skinrig.errors import UsageError
+
+    if onto is None:
+        if landmarks:
+            raise UsageError("--landmarks: is for --onto, another face, which is not given")
+        return None
+    if len(landmarks) not in (0, 2):
+        raise UsageError(
+            f"--landmarks: got {len(landmarks)} tables, expected two, of the rig's face and of the "
+            "other, or none"
+        )
+    tables = [landmark_table.read(path) for path in landmarks]
+    own, other = tables if tables else (None, None)
+    read = {"onto": onto / store.DOCUMENT}
+    read |= dict(zip(("landmarks of the rig", "landmarks of the other"), landmarks, strict=False))
+    found = store.read(onto)
+    hashes = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in read.items()}
+    return OtherFace(found, landmarks=other, landmarks_rig=own, hashes=hashes)
+
+
+def _tell(console: Console, out: Path, done: Any) -> None:
+    rows = [
+        (part, key, value)
+        for part, figures in done.figures.items()
+        for key, value in figures.items()
+        if isinstance(value, int | float | str)
+    ]
+    console.rows(("part", "figure", "value"), rows)
+    for what, why in done.left_out:
+        console.say(f"left out: {what}: {why}")
+    console.say(f"{out}: {', '.join(done.maps)}")
+    console.document(
+        "skinrig.apply/1",
+        {"out": out, "maps": list(done.maps), "figures": done.figures,
+         "left_out": [list(row) for row in done.left_out]},
+    )  # fmt: skip

@@ -1,0 +1,137 @@
+"""The commands below `skinrig import`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from skinrig.commands.help import Subcommands
+from skinrig.commands.options import Consent, ConsentExpires, Json, Out
+from skinrig.console import Console
+
+import_app = typer.Typer(
+    cls=Subcommands, help="Bring in what other devices made.", no_args_is_help=True
+)
+
+
+@import_app.command("photos")
+def import_photos(
+    directory: Annotated[Path, typer.Argument(help="Folder of photographs, or one file.")],
+    out: Out,
+    rig: Annotated[
+        str | None, typer.Option(help="Rig whose camera took them, so that its calibrations hold.")
+    ] = None,
+    subject: Annotated[str, typer.Option(help="Pseudonym of the subject.")] = "unnamed",
+    consent: Consent = None,
+    consent_expires: ConsentExpires = None,
+    json: Json = False,
+) -> None:
+    """Turn RAW, TIFF, EXR, PNG or JPEG photographs into a session.
+
+    Example: skinrig import photos portraits --out session-portraits
+    """
+    from capture.importers import import_photos as bring_in
+    from capture.rig import load_rig
+    from skinrig.consent import subject_of
+
+    console = Console(json)
+    person = subject_of(subject, consent, consent_expires)
+    done = bring_in(directory, out=out, rig=None if rig is None else load_rig(rig), subject=person)
+    for text in done.assumed:
+        console.say(f"assumed: {text}")
+    for name in done.ignored:
+        console.say(f"ignored: {name}")
+    console.say(f"{done.path}: {done.frames} photographs, states {', '.join(done.states)}")
+    state = "" if "neutral" in done.states else f" --state {done.states[0]}"
+    console.say(
+        f"next: skinrig reconstruct {out} --want melanin,hemoglobin --out appearance{state}"
+    )
+    console.document(
+        "skinrig.import/1",
+        {
+            "path": done.path,
+            "frames": done.frames,
+            "assumed": done.assumed,
+            "states": done.states,
+            "ignored": done.ignored,
+        },
+    )
+
+
+@import_app.command("mesh")
+def import_mesh(
+    file: Annotated[Path, typer.Argument(help="Scanned mesh: .obj or .ply.")],
+    session: Annotated[Path, typer.Option(help="Session that gets the mesh.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="New folder for a copy, where it is closed.")
+    ] = None,
+    unit: Annotated[str, typer.Option(help="Unit of the file: mm, cm, m or inch.")] = "mm",
+    json: Json = False,
+) -> None:
+    """Attach a scanned mesh to a session.
+
+    Example: skinrig import mesh scan.obj --unit m --session session
+    """
+    from capture.importers.meshes import import_mesh as bring_in
+
+    console = Console(json)
+    done = bring_in(file, session=session, out=out, unit=unit)
+    size = " x ".join(f"{side:.0f}" for side in done.extent_mm)
+    console.say(
+        f"{done.path}: {done.vertices} vertices, {done.faces} triangles, {size} mm, "
+        f"{'with' if done.has_uv else 'without'} texture coordinates"
+    )
+    after = f"reconstruct {done.path} --want normals --out appearance"
+    console.say(f"next: skinrig {after if done.reopened else f'verify {done.path}'}")
+    console.document(
+        "skinrig.import/1",
+        {"path": done.path, "vertices": done.vertices, "faces": done.faces,
+         "has_uv": done.has_uv, "extent_mm": done.extent_mm, "reopened": done.reopened},
+    )  # fmt: skip
+
+
+@import_app.command("lp")
+def import_lp(
+    directory: Annotated[Path, typer.Argument(help="Folder of pictures, one a light.")],
+    out: Out,
+    lights: Annotated[
+        Path | None, typer.Option(help=".lp, list of directions, or folder of a chrome ball.")
+    ] = None,
+    mask: Annotated[Path | None, typer.Option(help="Picture that is bright at the object.")] = None,
+    encoding: Annotated[
+        str, typer.Option(help="How 8-bit and PNG values code light: auto, sRGB or linear.")
+    ] = "auto",
+    mm_per_px: Annotated[
+        float | None,
+        typer.Option(help="Size of a pixel; then the list's rows are positions in mm."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Turn pictures of one object under many lights, with their light list, into a session.
+
+    Example: skinrig import lp rti-folder --out session-rti
+    """
+    from capture.importers import import_light_list
+
+    console = Console(json)
+    done = import_light_list(
+        directory, out=out, lights=lights, mask=mask,
+        encoding=encoding, mm_per_px=mm_per_px,  # type: ignore[arg-type]
+    )  # fmt: skip
+    for text in done.assumed:
+        console.say(f"assumed: {text}")
+    console.say(f"{done.path}: {done.frames} pictures, lights of {done.lights}")
+    console.say(f"next: skinrig reconstruct {out} --want normals,albedo --out appearance")
+    console.document(
+        "skinrig.import/1",
+        {
+            "path": done.path,
+            "frames": done.frames,
+            "lights": done.lights,
+            "encoding": done.encoding,
+            "mask": done.mask,
+            "assumed": done.assumed,
+        },
+    )

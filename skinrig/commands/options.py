@@ -1,0 +1,73 @@
+"""Options that several commands take."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from skinrig.commands import completion
+
+Rig = Annotated[
+    str,
+    typer.Argument(
+        help="Name of a rig: flash, dome, gradient or probe.", autocompletion=completion.rigs
+    ),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
+Seed = Annotated[int, typer.Option(help="Seed of everything that is drawn.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder to write.")]
+Site = Annotated[
+    str | None,
+    typer.Option(help="Where the gradient rig's skin is from: forehead (default), cheek or chin."),
+]
+Sites = Annotated[
+    str | None,
+    typer.Option(help="Where the probe is placed, joined by commas: forehead,cheek,chin."),
+]
+Repeats = Annotated[
+    int, typer.Option(help="Placements of the probe a site and angle; pairs a state of the flash.")
+]
+AllBrackets = Annotated[
+    bool, typer.Option("--all-brackets", help="The probe's exposures that can show no more, too.")
+]
+Angles = Annotated[
+    str | None,
+    typer.Option(
+        help="Angles of the caliper, degrees, joined by commas: 0,90; of the probe how many "
+        "directions of its head: 16."
+    ),
+]
+Sequence = Annotated[
+    str | None,
+    typer.Option(
+        help="Of the flash rig, a sequence in time: an expression made and dropped by a sound, "
+        "such as smile, or exercise or alcohol, followed after the event."
+    ),
+]
+PromptPeriod = Annotated[
+    str | None, typer.Option(help="Of a sequence: seconds from sound to sound; default 5.")
+]
+ShotPeriod = Annotated[
+    str | None,
+    typer.Option(help="Of a sequence: seconds from shot to shot; default 5.5, of alcohol 300."),
+]
+Captures = Annotated[
+    int | None,
+    typer.Option(help="Shots of a sequence by sounds; default: each phase, a tenth twice."),
+]
+Duration = Annotated[
+    str | None,
+    typer.Option(help="Seconds an event is followed; default 60 for exercise, 3600 for alcohol."),
+]
+Steps = Annotated[str | None, typer.Option(help="First and last position of the caliper: -2..3.")]
+Consent = Annotated[
+    list[str] | None,
+    typer.Option("--consent", help="Use that the subject agreed to; repeatable, or by commas."),
+]
+ConsentExpires = Annotated[
+    datetime | None,
+    typer.Option("--consent-expires", formats=["%Y-%m-%d"], help="Last day of the consent."),
+]

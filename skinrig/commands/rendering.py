@@ -1,0 +1,212 @@
+"""`skinrig render`: pictures of a fitted skin model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import typer
+
+from skinrig import errors
+from skinrig.commands.options import Json
+from skinrig.console import Console
+
+Views = Annotated[
+    str, typer.Option(help="View of the rig, such as C03, or the camera's place in mm: 0,0,700.")
+]
+Lights = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Light of the rig (L017), direction towards it (1,1,2) or place in mm "
+        "(at:300,200,600), with *FACTOR or *R,G,B for its intensity; repeatable."
+    ),
+]
+
+
+def render(
+    appearance: Annotated[
+        list[Path],
+        typer.Argument(help="Fitted maps of the dome, with lobes; several for --bases."),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Folder to write.")],
+    view: Views = "0,0,700",
+    light: Lights = None,
+    environment: Annotated[
+        Path | None, typer.Option(help="Light from everywhere: latitude-longitude OpenEXR map.")
+    ] = None,
+    environment_lights: Annotated[
+        int, typer.Option(help="Lights that are drawn from the environment.")
+    ] = 64,
+    mesh: Annotated[
+        Path | None,
+        typer.Option(help="Another mesh with the maps' texture coordinates: OBJ, PLY or .npz."),
+    ] = None,
+    rig: Annotated[str, typer.Option(help="Rig whose views and lights are named.")] = "dome",
+    calibration: Annotated[
+        Path | None, typer.Option(help="CALIBRATION/ folder; default: the rig as drawn.")
+    ] = None,
+    size: Annotated[int, typer.Option(help="Columns of the picture.")] = 512,
+    fov: Annotated[
+        float, typer.Option(help="Of a camera given by its place: degrees across.")
+    ] = 25.0,
+    target: Annotated[str, typer.Option(help="What that camera looks at, mm.")] = "0,0,0",
+    samples: Annotated[int, typer.Option(help="Rays a pixel: 1, 4, 9, 16 ...")] = 4,
+    shadow_samples: Annotated[
+        int, typer.Option(help="Points of each light's disc that a ray looks for.")
+    ] = 4,
+    light_radius: Annotated[
+        float | None,
+        typer.Option(help="Of lights' discs, mm (far ones at 700 mm); default: the rig's, 10."),
+    ] = None,
+    subsurface: Annotated[
+        str,
+        typer.Option(
+            help="dipole: light spreads in skin; local: it leaves where it entered; none: the "
+            "surface alone."
+        ),
+    ] = "dipole",
+    translucency: Annotated[
+        str | None,
+        typer.Option(help="sigma_tr of red, green, blue everywhere, 1/mm: 0.3558,0.7932,1.5173."),
+    ] = None,
+    components: Annotated[
+        bool, typer.Option("--components", help="Light from inside and surface apart, too.")
+    ] = False,
+    bases: Annotated[
+        str | None,
+        typer.Option(help="Compare numbers of lobes: 1,2,4; more than were fitted cannot be had."),
+    ] = None,
+    shadow_boundary: Annotated[
+        bool,
+        typer.Option(
+            "--shadow-boundary",
+            help="A card's shadow on the forehead and on a flat patch, by least and greatest "
+            "sigma_tr; brings its own view and light.",
+        ),
+    ] = False,
+    exposure: Annotated[
+        float | None, typer.Option(help="Factor of the PNGs; default: skin is shown well.")
+    ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            help="Session whose photographs the model was not fitted to (reconstruct --hold-out): "
+            "render what they show, and compare; with --components take the photograph of --view "
+            "and --light apart."
+        ),
+    ] = None,
+    photographs: Annotated[
+        int, typer.Option(help="With --against: most photographs, even over those held out.")
+    ] = 24,
+    ablation: Annotated[
+        bool,
+        typer.Option(
+            "--ablation/--no-ablation",
+            help="With --against: also compare without each part of the model.",
+        ),
+    ] = True,
+    seed: Annotated[int, typer.Option(help="Of the environment's lights, and of --bases.")] = 0,
+    json: Json = False,
+) -> None:
+    """Render a fitted skin model: radiance as OpenEXR, and a picture of it.
+
+    Example: skinrig render appearance --view C03 --light L017 --calibration calibration --out
+    picture --components
+    """
+    from skinrig.errors import UsageError
+    from skinrig.rendering import figures
+    from skinrig.rendering.render import Subsurface
+    from skinrig.rendering.request import Stage, lights_of, subpixels_of
+
+    console = Console(json)
+    if subsurface not in get_args(Subsurface):
+        raise UsageError(
+            f"--subsurface: got {subsurface!r}, expected {', '.join(get_args(Subsurface))}"
+        )
+    if exposure is not None and not exposure > 0.0:
+        raise UsageError(f"--exposure: got {exposure}, expected a factor above 0")
+    if len(appearance) > 1 and bases is None:
+        raise UsageError("appearance: got several, expected one; several are for --bases")
+    effort = figures.Effort(
+        subsurface=subsurface,  # type: ignore[arg-type]
+        subpixels=subpixels_of(samples),
+        shadow_samples=shadow_samples,
+        exposure=exposure,
+        seed=seed,
+        progress=console.progress,
+    )
+    console.progress(f"read {', '.join(str(path) for path in appearance)}")
+    if against is not None and not components:
+        from skinrig.rendering import evaluation
+
+        found = evaluation.evaluate_folders(
+            appearance[0], against, out, calibration=calibration, translucency=translucency,
+            subsurface=subsurface,  # type: ignore[arg-type]
+            count=photographs, ablation=ablation, seed=seed, progress=console.progress,
+        )  # fmt: skip
+        evaluation.tell(console, found)
+        if not found["passed"]:
+            raise typer.Exit(errors.LIMIT_MISSED)
+        return
+    if shadow_boundary:
+        subject = figures.Subject.of(appearance[0], mesh=mesh)
+        done = figures.draw_shadow_boundary(subject, out, effort, size_px=size)
+        _tell(console, done)
+        return
+    stage = Stage.of(rig, calibration)
+    camera = stage.camera(view, size_px=size, target_mm=target, fov_deg=fov)
+    lights = lights_of(
+        stage, light or (), radius_mm=light_radius, environment=environment,
+        environment_count=environment_lights, seed=seed,
+    )  # fmt: skip
+    subjects = [
+        figures.Subject.of(path, mesh=mesh, translucency=translucency) for path in appearance
+    ]
+    if against is not None:
+        done = figures.draw_photograph(
+            subjects[0], against, view, lights[0].name, out, effort, calibration=calibration
+        )
+    elif bases is None:
+        done = figures.draw(
+            subjects[0], camera, lights, out, effort, components=components, assumed=stage.assumed
+        )
+    else:
+        done = figures.draw_bases(
+            subjects, _ranks(bases), camera, lights, out, effort, assumed=stage.assumed
+        )
+    _tell(console, done)
+
+
+def _ranks(text: str) -> list[int]:
+    from skinrig.errors import UsageError
+
+    try:
+        found = [int(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if not found or min(found) < 1 or len(set(found)) < len(found):
+        raise UsageError(f"--bases: got {text!r}, expected numbers of lobes that differ, as 1,2,4")
+    return found
+
+
+def _tell(console: Console, done: dict[str, Any]) -> None:
+    for assumption in done["assumed"]:
+        console.say(f"assumed: {assumption}")
+    if "bases" in done:
+        for row in done["bases"]:
+            gap = next(v for k, v in row.items() if k.startswith("surface_difference"))
+            words = "nothing is lit" if gap is None else f"{100 * gap:.1f} %"
+            how = "fitted" if row["refitted"] else "reduced"
+            console.say(f"{row['lobes']} lobes, {how}: surface reflection differs by {words}")
+    if "boundaries" in done:
+        console.rows(
+            ("skin", "sigma_tr, 1/mm", "90 to 10 % red, mm", "green", "blue"),
+            [
+                (row["skin"], row["name"].replace("_", " ") if row["sigma_tr_per_mm"] is None
+                 else ", ".join(f"{value:.4g}" for value in row["sigma_tr_per_mm"]),
+                 *row["rise_mm"])
+                for row in done["boundaries"]
+            ],
+        )  # fmt: skip
+    console.say(f"{done['out']}: {', '.join(done['files'])}, {done['seconds']:.1f} s")
+    console.document(done["schema"], {k: v for k, v in done.items() if k != "schema"})

@@ -1,0 +1,93 @@
+"""`skinrig view`: a face in the browser, drawn live."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from skinrig.commands.options import Json
+from skinrig.console import Console
+from skinrig.errors import UsageError
+
+
+def view(
+    appearance: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Folders of one face: what `skinrig fit` wrote, or a dome's maps; none: a "
+            "simulated head."
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="The page.")] = Path("page.html"),
+    mesh: Annotated[
+        Path | None,
+        typer.Option(
+            help="The face's geometry: .npz, .obj (or a folder of them), .gltf or .glb, with "
+            "blend shapes or without."
+        ),
+    ] = None,
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(
+            help="Table name,x,y of the flash rig's neutral picture, to lay its maps on the mesh; "
+            "a simulation has its own."
+        ),
+    ] = None,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            help="Serve the page and its large displacement on this port of this machine alone, 0: "
+            "any free one, in place of writing it."
+        ),
+    ] = None,
+    displacement: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --port: heights of microstructure, um, in the mesh's texture: a .npy file, "
+            "4096 or 16384 px a side, as `skinrig apply microstructure` writes."
+        ),
+    ] = None,
+    preset: Annotated[
+        str, typer.Option(help="Skin type of a simulated head: I to VI, palest or darkest.")
+    ] = "III",
+    seed: Annotated[int, typer.Option(help="Seed of a simulated head.")] = 0,
+    size: Annotated[int, typer.Option(help="Texels a side of the textures, 64 to 4096.")] = 2048,
+    json: Json = False,
+) -> None:
+    """Write one self-contained page that draws a face live: expressions, blood, light, traits.
+
+    Example: skinrig view -o page.html
+
+    Example: skinrig view demo/appearance-flash-moving-II -o face.html
+
+    Example: skinrig view demo/appearance-dome-III --size 1024 --port 0
+    """
+    from skinrig.viewer.writing import compose, serve, write
+
+    console = Console(json)
+    if displacement is not None and port is None:
+        raise UsageError("displacement: a page in a file cannot fetch it; add --port 0")
+    scene = compose(
+        appearance or [],
+        mesh=mesh,
+        landmarks=landmarks,
+        preset=preset,
+        seed=seed,
+        size=size,
+        progress=console.progress,
+    )
+    document: dict[str, Any]
+    if port is None:
+        document = write(scene, out)
+        console.say(
+            f"{out}: {document['bytes'] / 1e6:.2f} MB, {document['textures']} textures, "
+            f"{document['blend_shapes']} blend shapes; open it in a browser"
+        )
+    for what, why in scene.left_out:
+        console.say(f"left out: {what}: {why}")
+    if port is None:
+        console.document("skinrig.view/1", document)
+    else:
+        serve(scene, port, appearance or [], console=console, displacement=displacement)

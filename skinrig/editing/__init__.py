@@ -1,0 +1,1 @@
+"""Traits and spots given to a face or taken from it."""

@@ -1,0 +1,443 @@
+"""An appearance with other traits and other spots, in the same layout: `skinrig edit`."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import store
+from model.skin import SkinAppearance, SkinMap
+from model.trait_storage import TraitLibrary
+from model.trait_vectors import DOUBTFUL_P, TraitVector
+from reconstruction import common_regions
+from skinrig import face_textures
+from skinrig.editing import albedo as editing_albedo
+from skinrig.editing import masks, pigment_spots, surface_mixtures
+from skinrig.editing import spots as editing_spots
+from skinrig.editing import surface as editing_surface
+from skinrig.editing.albedo import AlbedoEdit
+from skinrig.editing.spots import SpotOrder
+from skinrig.editing.surface_mixtures import SurfaceMixtures
+from skinrig.face_textures import Face
+from skinrig.traits import regions
+from skinrig.traits.regions import LibraryParts
+
+Image = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+PARTS: Final = ("albedo", "surface")
+STALE: Final = {"lobe_residual": "is of the lobes before the edit"}
+"""Maps that an edit of the lobes leaves without meaning."""
+
+
+class EditError(ValueError):
+    """An edit that cannot be made as asked."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """What to do to an appearance.
+
+    Attributes
+    ----------
+    traits
+        Name to amount.
+    region
+        One of `common_regions.REGIONS` that the library has: "face", "beard" or "no-beard".
+    parts
+        Of `PARTS`; None: where the library tells a trait from chance.
+    mask
+        Picture of the texture, see `edit_masks.read`.
+    spots
+        Added and removed after the traits.
+    landmarks
+        Table, see `face_textures.read`.
+    basis
+        Folder of MERL files that the lobes were fitted with.
+    iterations
+        Of matching the albedo.
+    seed
+        Of noise and spots.
+    """
+
+    traits: Mapping[str, float]
+    region: str = "face"
+    parts: tuple[str, ...] | None = None
+    mask: Path | None = None
+    spots: tuple[SpotOrder, ...] = ()
+    landmarks: Path | None = None
+    basis: Path | None = None
+    iterations: int = 5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse an empty order and values out of range."""
+        if not self.traits and not self.spots:
+            raise EditError("edit: got neither traits nor spots, expected some")
+        for name, amount in self.traits.items():
+            if not np.isfinite(amount):
+                raise EditError(f"trait {name}: got {amount}, expected a finite amount")
+        for part in self.parts or ():
+            if part not in PARTS:
+                raise EditError(f"parts: got {part!r}, expected of {', '.join(PARTS)}")
+        if self.iterations < 0 or self.seed < 0:
+            raise EditError(
+                f"iterations, seed: got {self.iterations}, {self.seed}, expected at least 0"
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edited:
+    """What an edit made.
+
+    Attributes
+    ----------
+    appearance
+        All maps, edited and not.
+    changed
+        Names of maps and files that differ from the source's.
+    record
+        What was done, as JSON values; in the appearance's parameters as "edit".
+    warnings
+        A sentence each.
+    """
+
+    appearance: SkinAppearance
+    changed: tuple[str, ...]
+    record: Mapping[str, Any]
+    warnings: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class _Work:
+    """State of an edit under way."""
+
+    face: Face
+    maps: dict[str, SkinMap]  # as edited so far
+    files: dict[str, bytes]  # as edited so far
+    record: dict[str, Any]
+    warnings: list[str]
+    left_out: list[tuple[str, str]]
+
+
+def edit(
+    path: Path,
+    order: Order,
+    *,
+    out: Path,
+    library: TraitLibrary | None = None,
+    library_hash: str = "",
+    progress: Callable[[str], None] | None = None,
+) -> Edited:
+    """Write an edited appearance.
+
+    Parameters
+    ----------
+    path
+        APPEARANCE/ folder.
+    order
+        What to do.
+    out
+        APPEARANCE/ folder to write; not the source.
+    library
+        Traits; needed where the order has any.
+    library_hash
+        Of its file, for the record.
+    progress
+        Called with a line a step.
+
+    Raises
+    ------
+    EditError, FaceError, MaskError, SpotError, StoreError, TraitLibraryError
+        Naming what is missing or does not fit; nothing is written.
+    """
+    if out.resolve() == path.resolve():
+        raise EditError(f"out: {out} is the source; name another folder")
+    face = face_textures.read(path, order.landmarks)
+    inputs = {
+        **{f"source {name}": value for name, value in face.appearance.inputs.items()},
+        "appearance": face_textures.digest(path / store.DOCUMENT),
+    }
+    for name, file in (("mask", order.mask), ("landmarks", order.landmarks)):
+        if file is not None:
+            inputs[name] = face_textures.digest(file)
+    if library is not None and library_hash:
+        inputs["traits"] = library_hash
+    done = edited(face, order, library, progress=progress)
+    store.write(out, dataclasses.replace(done.appearance, inputs=inputs))
+    return done
+
+
+def edited(
+    face: Face,
+    order: Order,
+    library: TraitLibrary | None = None,
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> Edited:
+    """Edit an appearance in memory; see `edit`."""
+    tell = progress or (lambda text: None)
+    source = face.appearance
+    work = _Work(face, dict(source.maps), dict(source.files), {}, [], list(source.left_out))
+    parts = _opened(order, library)
+    shape = _texture_shape(source, face)
+    mask = None if order.mask is None else masks.read(order.mask, shape)
+    asked = {name: amount for name, amount in order.traits.items() if amount}
+    if asked and parts is not None:
+        chosen = _chosen(asked, parts, order, work)
+        if chosen["albedo"]:
+            tell(f"albedo: {', '.join(chosen['albedo'])}")
+            _edit_albedo(work, parts, chosen["albedo"], order, mask)
+        if chosen["surface"]:
+            tell(f"lobes: {', '.join(chosen['surface'])}")
+            _edit_surface(work, parts, chosen["surface"], order, mask)
+    spots = [spot for spot in order.spots if spot.amount]
+    if spots:
+        _edit_spots(work, spots, order, mask, tell)
+    changed = tuple(
+        sorted(
+            {n for n, m in work.maps.items() if source.maps.get(n) is not m}
+            | {n for n in source.maps if n not in work.maps}
+            | {n for n, c in work.files.items() if source.files.get(n) != c}
+        )
+    )
+    record = {
+        "of": face.path.resolve().name,
+        "traits": dict(order.traits),
+        "region": order.region,
+        "mask": None if order.mask is None else order.mask.name,
+        "spots": [dataclasses.asdict(spot) for spot in order.spots],
+        "seed": order.seed,
+        "iterations": order.iterations,
+        "landmarks": face.marked_by,
+        "changed": list(changed),
+        "warnings": list(work.warnings),
+        **work.record,
+    }
+    before = source.parameters.get("edit")
+    if before is not None:
+        record["before"] = before
+    appearance = dataclasses.replace(
+        source, maps=work.maps, files=work.files, left_out=tuple(work.left_out),
+        parameters={**source.parameters, "edit": record},
+    )  # fmt: skip
+    return Edited(appearance, changed, record, tuple(work.warnings))
+
+
+def _opened(order: Order, library: TraitLibrary | None) -> LibraryParts | None:
+    """Return the library's parts, after a check that it has what is asked for."""
+    if not order.traits:
+        return None
+    if library is None:
+        raise EditError("traits: got no library to take them from, expected --space FILE")
+    parts = regions.parts_of(library)
+    for name in order.traits:
+        if name not in parts.traits:
+            near = difflib.get_close_matches(name, parts.traits, n=1, cutoff=0.5)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise EditError(
+                f"trait {name!r}: is not one of {', '.join(parts.traits)}{hint} "
+                "`skinrig fit traits` learns others"
+            )
+    if order.region != "face" and order.region not in parts.albedo:
+        have = [r for r in parts.albedo if r != "face"]
+        raise EditError(
+            f"region: got {order.region!r}, expected face"
+            + (f" or {' or '.join(have)}" if have else "; these traits have no other region")
+        )
+    return parts
+
+
+def _texture_shape(source: SkinAppearance, face: Face) -> tuple[int, int]:
+    for name in ("r_d", "basis_weight_0"):
+        if name in source.maps:
+            height, width = source.maps[name].values.shape[:2]
+            return int(height), int(width)
+    raise EditError(
+        f"{face.path}: has neither r_d nor basis_weight_0, there is nothing to edit; it has "
+        f"{', '.join(sorted(source.maps)) or 'no map'}"
+    )
+
+
+def _chosen(
+    asked: Mapping[str, float], parts: LibraryParts, order: Order, work: _Work
+) -> dict[str, dict[str, float]]:
+    """Return which traits to use in which part."""
+    have: dict[str, Mapping[str, TraitVector]] = {
+        "albedo": parts.albedo[order.region].traits.traits if order.region in parts.albedo else {},
+        "surface": {} if parts.surface is None else parts.surface.traits,
+    }
+    missing = {"albedo": "r_d", "surface": "basis_weight_0"}
+    out: dict[str, dict[str, float]] = {part: {} for part in PARTS}
+    for name, amount in asked.items():
+        possible = [p for p in PARTS if name in have[p] and missing[p] in work.maps]
+        if order.parts is not None:
+            use = [p for p in possible if p in order.parts]
+        else:
+            use = [p for p in possible if have[p][name].confidence.p_value <= DOUBTFUL_P]
+            for p in possible if use else []:
+                if p not in use:
+                    chance = have[p][name].confidence.p_value
+                    why = f"the trait is not told from chance there (p = {chance:.2g})"
+                    work.left_out.append((f"{name} in {p}", f"{why}; --parts {p} edits it"))
+            use = use or possible
+        if not use:
+            raise EditError(
+                f"trait {name!r}: none of the parts asked for can be edited by it; the traits have "
+                f"it in {', '.join(p for p in PARTS if name in have[p]) or 'no part'}, the "
+                f"appearance has {', '.join(p for p in PARTS if missing[p] in work.maps)}"
+            )
+        for p in use:
+            out[p][name] = amount
+            work.warnings += [f"{p}: {text}" for text in have[p][name].warnings]
+    return out
+
+
+def _edit_albedo(
+    work: _Work,
+    parts: LibraryParts,
+    amounts: Mapping[str, float],
+    order: Order,
+    mask: Image | None,
+) -> None:
+    space = parts.albedo[order.region]
+    chart = work.face.chart(parts.frame)
+    source = work.maps["r_d"]
+    _say_unmarked(work, order)
+
+    def one(values: Image, given: Mapping[str, float], stream: int) -> AlbedoEdit:
+        return editing_albedo.edit_albedo(
+            values, face_textures.valid_of(source), chart, space, given,
+            region=common_regions.region(order.region, parts.frame),
+            share=masks.feathered(order.region, parts.frame),
+            iterations=order.iterations, rng=np.random.default_rng([order.seed, stream]),
+        )  # fmt: skip
+
+    found = one(source.values, amounts, 0)
+    values, held = found.apply(source.values, mask)
+    back = one(values, {name: -amount for name, amount in amounts.items()}, 1)
+    again, _ = back.apply(values, mask)
+    work.maps["r_d"] = editing_spots.with_values(source, values)
+    good = face_textures.valid_of(source) & (values != source.values).any(axis=-1)
+    work.record["albedo"] = {
+        "traits": dict(amounts),
+        "vectors": space.kind,
+        "clipped_share": found.clipped,
+        "distance_before": found.before,
+        "distance_after": found.after,
+        "held_at_white": int(held.sum()),
+        "change_rms": _relative(values, source.values, good),
+        "return_error_rms": _relative(again, source.values, good),
+        "stderr": "carried: multiplied by the factor of the edit, which has no error of its own",
+    }
+
+
+def _edit_surface(
+    work: _Work,
+    parts: LibraryParts,
+    amounts: Mapping[str, float],
+    order: Order,
+    mask: Image | None,
+) -> None:
+    if parts.surface is None:
+        return
+    share = mask
+    if order.region != "face":
+        _say_unmarked(work, order)
+        over = masks.on_texture(order.region, parts.frame, work.face.chart(parts.frame))
+        share = over if mask is None else mask * over
+    current = dataclasses.replace(work.face.appearance, maps=work.maps, files=work.files)
+    source = surface_mixtures.read(current)
+    found = editing_surface.edit_surface(source, parts.surface, amounts, share=share)
+    tables = surface_mixtures.materials_of(source.materials, source.light_radius_rad, order.basis)
+    back = editing_surface.edit_surface(
+        found.mixtures, parts.surface, {n: -a for n, a in amounts.items()}, share=share
+    )
+    strength = tables.strength()
+    replaced = surface_mixtures.replaced(
+        current, found.mixtures, surface_mixtures.written(found.mixtures, tables)
+    )
+    work.maps = {n: m for n, m in replaced.maps.items() if n not in STALE}
+    work.files = dict(replaced.files)
+    work.left_out += [(n, f"{STALE[n]}") for n in STALE if n in replaced.maps]
+    work.record["surface"] = {
+        "traits": dict(amounts),
+        "clipped_share": found.clipped,
+        "misfit": dict(found.misfit),
+        "lobes": len(found.mixtures.mix),
+        "change_rms": _strengths_apart(found.mixtures, source, strength),
+        "return_error_rms": _strengths_apart(back.mixtures, source, strength),
+        "stderr": "carried; of a lobe that a trait brought the relative error of its vector",
+    }
+
+
+def _edit_spots(
+    work: _Work,
+    spots: Sequence[SpotOrder],
+    order: Order,
+    mask: Image | None,
+    tell: Callable[[str], None],
+) -> None:
+    face = work.face
+    if "r_d" not in work.maps:
+        raise EditError(f"{face.path}: has no map r_d, which spots are drawn into")
+    frame = editing_spots.spot_frame(face)
+    chart = face.chart(frame)
+    skin = masks.on_texture("skin" if order.region == "face" else order.region, frame, chart)
+    # a picture says itself where spots may be; without one they keep off eyes, brows and lips
+    share = skin if mask is None else (mask if order.region == "face" else mask * skin)
+    told = []
+    for number, spot in enumerate(spots):
+        tell(f"{spot.kind}: {spot.amount:+g}")
+        source = work.maps["r_d"]
+        rng = np.random.default_rng([order.seed, 2, number])
+        if spot.amount > 0:
+            values, one = editing_spots.added(face, source, spot, share, rng)
+            work.maps["r_d"] = editing_spots.with_values(source, values)
+        else:
+            values, one = editing_spots.removed(source, spot, share, chart, frame)
+            good = face_textures.valid_of(source) if source.valid is not None else None
+            moved = editing_spots.with_values(source, values)
+            if moved.stderr is not None:  # what is filled in is known no better than it changed
+                off = np.abs(values - source.values)
+                moved = dataclasses.replace(moved, stderr=np.hypot(moved.stderr, off))
+            work.maps["r_d"] = dataclasses.replace(moved, valid=good)
+        told.append({**dataclasses.asdict(spot), **one})
+        least = pigment_spots.KINDS[spot.kind].diameter_mm
+        if face.texel_mm() > least:
+            work.warnings.append(
+                f"{spot.kind}: are smaller ({least} mm) than a texel ({face.texel_mm():.2f} mm) "
+                "and only darken it by their share"
+            )
+    _say_unmarked(work, order)
+    work.record["spots_done"] = told
+
+
+def _say_unmarked(work: _Work, order: Order) -> None:
+    text = "the face has no landmarks: it was unrolled from its foremost point, regions are typical"
+    if not work.face.landmarks and (order.region != "face" or order.spots):
+        if text not in work.warnings:
+            work.warnings.append(text)
+
+
+def _relative(a: Image, b: Image, good: Bools) -> float:
+    if not good.any():
+        return 0.0
+    x, y = a[good].astype(np.float64), b[good].astype(np.float64)
+    return float(np.sqrt(np.mean((x - y) ** 2)) / max(float(np.sqrt(np.mean(y**2))), 1e-12))
+
+
+def _strengths_apart(a: SurfaceMixtures, b: SurfaceMixtures, strength: NDArray[Any]) -> float:
+    """Return how far two faces' mixtures differ over the texels, RMS, relative to the second's."""
+    good = b.valid
+    x = a.weights()[good] @ (a.mix * strength)
+    y = b.weights()[good] @ (b.mix * strength)
+    size = float(np.sqrt(np.mean(y**2)))
+    return float(np.sqrt(np.mean((x - y) ** 2))) / size if size > 0 else 0.0

@@ -1,0 +1,118 @@
+"""Spots added to an appearance's R_d, and those that are there taken away."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from model.skin import SkinMap
+from reconstruction import common_parameterization, texture_fill
+from reconstruction.common_parameterization import Chart, CommonFrame
+from skinrig import face_textures
+from skinrig.editing import pigment_spots, spot_removal
+from skinrig.face_textures import Face
+from skinrig.traits import albedo_vectors
+
+Image = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+
+class SpotOrderError(ValueError):
+    """Spots that nobody can add or remove."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpotOrder:
+    """Spots to add or to remove.
+
+    Attributes
+    ----------
+    kind
+        One of `pigment_spots.KINDS`.
+    amount
+        Above 0 adds spots with so much pigment, below 0 removes that share of those there are.
+    density_per_cm2
+        Of added ones; None: as usual.
+    """
+
+    kind: str
+    amount: float
+    density_per_cm2: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse another kind, and more than all spots removed."""
+        if self.kind not in pigment_spots.KINDS:
+            raise SpotOrderError(
+                f"spots: got {self.kind!r}, expected one of {', '.join(pigment_spots.KINDS)}"
+            )
+        if not np.isfinite(self.amount) or self.amount < -1.0:
+            raise SpotOrderError(f"spots: got {self.kind}={self.amount}, expected at least -1")
+
+
+def spot_frame(face: Face) -> CommonFrame:
+    """Return a map of the whole face without seams, about as fine as its texture."""
+    if face.landmarks:
+        return face_textures.common_frame([face])
+    cylinder = common_parameterization.find_cylinder(face.position, face.surface)
+    places = cylinder.unroll(face.position[face.surface])
+    around = common_parameterization.frame_around((), np.empty((0, 2)), [places], size=64)
+    size = face_textures.size_for(around.side_mm, face.texel_mm())
+    return dataclasses.replace(around, size=size)
+
+
+def added(
+    face: Face, source: SkinMap, spot: SpotOrder, share: Image, rng: np.random.Generator
+) -> tuple[Image, dict[str, Any]]:
+    """Return R_d with spots drawn in, and what was done, as JSON values."""
+    drawn = pigment_spots.draw(
+        spot.kind, source.values, face.position, face.surface, share, amount=spot.amount,
+        density_per_cm2=spot.density_per_cm2, rng=rng,
+    )  # fmt: skip
+    gain = _bled(drawn.gain, face.surface, share)
+    values = np.where(gain == 1.0, source.values, source.values * gain)
+    return values, {
+        "drawn": len(drawn.center_mm),
+        "transmitted": drawn.transmitted.tolist(),
+        "camera": pigment_spots.CAMERA,
+        "illuminant": pigment_spots.ILLUMINANT,
+    }
+
+
+def removed(
+    source: SkinMap, spot: SpotOrder, share: Image, chart: Chart, frame: CommonFrame
+) -> tuple[Image, dict[str, Any]]:
+    """Return R_d with spots filled from around, and what was done, as JSON values."""
+    found = spot_removal.find(
+        source.values, face_textures.valid_of(source), chart, pixel_mm=frame.pixel_mm,
+        range_mm=pigment_spots.KINDS[spot.kind].range_mm,
+    )  # fmt: skip
+    part = (np.float32(-spot.amount) * share * found.share)[..., None]
+    wanted = source.values * (1 - part) + found.fill * part
+    ratio = np.where(part == 0.0, 1.0, wanted / np.maximum(source.values, albedo_vectors.LEAST))
+    gain = _bled(ratio.astype(np.float32), chart.on_surface, share)
+    values = np.where(part == 0.0, source.values * gain, wanted)
+    values = np.where(gain == 1.0, source.values, values)
+    return values.astype(np.float32), {"found": found.spots}
+
+
+def _bled(gain: Image, surface: Bools, share: Image) -> Image:
+    """Carry factors two texels beyond the rims of a texture's islands, where lookups reach."""
+    rim = ndimage.binary_dilation(surface, iterations=2) & ~surface & (share > 0)
+    if not rim.any():
+        return gain
+    filled = texture_fill.push_pull(np.log(gain), surface.astype(np.float32), mask=surface | rim)
+    return np.where(rim[..., None], np.exp(filled.values), gain).astype(np.float32)
+
+
+def with_values(source: SkinMap, values: Image) -> SkinMap:
+    """Return a map with other values, its standard error scaled as they are."""
+    error = source.stderr
+    if error is not None:
+        ratio = np.abs(values) / np.maximum(np.abs(source.values), np.float32(1e-12))
+        error = np.where(values == source.values, error, error * ratio)
+    return dataclasses.replace(source, values=values, stderr=error)

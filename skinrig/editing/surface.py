@@ -1,0 +1,97 @@
+"""Lobes with more or less of some traits: `model.lobe_edits` on an appearance's maps."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import lobe_edits
+from model.skin import SkinMap
+from model.traits import TraitSpace
+from skinrig.editing.surface_mixtures import SurfaceMixtures
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceEdit:
+    """Edited lobes, and what of the edit was possible.
+
+    Attributes
+    ----------
+    mixtures
+        Shares and lobes: the source's first, then those that traits brought.
+    clipped
+        Share of the change that could not be taken off, RMS over the texels.
+    misfit
+        Of each trait: share of its vector that the lobes cannot show.
+    """
+
+    mixtures: SurfaceMixtures
+    clipped: float
+    misfit: Mapping[str, float]
+
+
+def edit_surface(
+    source: SurfaceMixtures,
+    space: TraitSpace,
+    amounts: Mapping[str, float],
+    *,
+    share: NDArray[np.floating] | None = None,
+) -> SurfaceEdit:
+    """Change the lobes of a face.
+
+    Parameters
+    ----------
+    source
+        Its lobes.
+    space
+        Traits of mean mixtures of the same materials.
+    amounts
+        Trait to amount.
+    share
+        (H, W), 0 to 1: how much of the amounts each texel gets; every bit stays where it is 0.
+
+    Raises
+    ------
+    model.trait_vectors.TraitError
+        For other materials, and more than 15 lobes.
+    """
+    weights = source.weights()
+    shape = weights.shape[:2]
+    part = np.ones(shape) if share is None else np.asarray(share, np.float64)
+    asked = {name: amount * part.reshape(-1) for name, amount in amounts.items()}
+    rows = weights.reshape(-1, weights.shape[2])
+    found = lobe_edits.edit_weights(rows, source.mix, space, asked, materials=source.materials)
+    if not any(amounts.values()):
+        return SurfaceEdit(source, 0.0, {})
+    new = np.asarray(found.weights).reshape(*shape, -1).astype(np.float32)
+    noise = _noise(space, amounts)
+    maps = []
+    for k in range(new.shape[2]):
+        if k < len(source.maps):
+            old = source.maps[k]
+            values = np.where(part > 0, new[..., k], old.values)
+            maps.append(dataclasses.replace(old, values=values))
+        else:
+            valid = source.valid if source.maps[0].valid is not None else None
+            error = (noise * new[..., k]).astype(np.float32)
+            maps.append(SkinMap(new[..., k], "1", error, valid, "share of a lobe of a trait"))
+    edited = dataclasses.replace(source, maps=tuple(maps), mix=found.mix)
+    counted = source.valid.reshape(-1) & (part.reshape(-1) > 0)
+    moved, clipped = found.moved[counted], found.clipped[counted]
+    size = float(np.sqrt(np.mean(moved**2))) if len(moved) else 0.0
+    lost = float(np.sqrt(np.mean(clipped**2))) / size if size > 0 else 0.0
+    return SurfaceEdit(edited, lost, dict(found.misfit))
+
+
+def _noise(space: TraitSpace, amounts: Mapping[str, float]) -> float:
+    """Return the relative error of a trait's vector, 1 where it is not known."""
+    worst = max(
+        (space.trait(n).confidence.relative_noise for n, a in amounts.items() if a), default=0.0
+    )
+    return float(worst) if np.isfinite(worst) else 1.0

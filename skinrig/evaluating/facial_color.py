@@ -1,0 +1,180 @@
+"""A fitted hemoglobin rig against the true blood of each state, and against simpler ways."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import metrics
+from model.facial_color import NEUTRAL, HemoglobinRig
+from model.skin import SkinAppearance, SkinMap
+
+Map = NDArray[np.floating[Any]]
+Mask = NDArray[np.bool_]
+
+WAYS: Final = ("measured map", "rig, eq. (6)", "one gain", "neutral map")
+"""How a state's blood can be had: as measured, by the rig, by one factor of the neutral map, or
+by not changing it at all."""
+LEVEL_LIMIT: Final = 0.15
+"""Largest median relative error of a state's blood that counts as kept, as of other maps."""
+
+
+@dataclass(frozen=True, slots=True)
+class StateError:
+    """How well one way gives one state's blood.
+
+    Attributes
+    ----------
+    state, way
+        Name of the state; one of `WAYS`.
+    median_relative, interval
+        Median of |found - true| / true and its 68 % bootstrap interval.
+    rms
+        Of found less true, volume fraction.
+    bias
+        Median of (found - true) / true.
+    coverage
+        Share of true values within the 68 % interval; NaN where the way states no error.
+    pixels
+        How many were compared: where all ways and the truth are valid.
+    """
+
+    state: str
+    way: str
+    median_relative: float
+    interval: tuple[float, float]
+    rms: float
+    bias: float
+    coverage: float
+    pixels: int
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeError:
+    """How well the change of one state's mean blood over the face was found.
+
+    Attributes
+    ----------
+    state
+        Its name.
+    true, found
+        Mean change over the compared pixels, volume fraction.
+    rms
+        Of the change's map less the true one, volume fraction.
+    coverage
+        Share of true changes within the 68 % interval.
+    """
+
+    state: str
+    true: float
+    found: float
+    rms: float
+    coverage: float
+
+
+def true_blood(truth: SkinAppearance) -> SkinMap | None:
+    """Return a state's true blood on the face at rest, after light has spread where that is told.
+
+    Pictures show blood through skin: what can be measured is the blurred map.
+    """
+    names = ("hemoglobin_blurred_at_rest", "hemoglobin_at_rest")
+    if truth.parameters.get("state") == NEUTRAL:
+        names = ("hemoglobin_blurred", "hemoglobin")
+    return next((truth.maps[name] for name in names if name in truth.maps), None)
+
+
+def compare(
+    appearance: SkinAppearance,
+    rig: HemoglobinRig,
+    truths: Mapping[str, SkinAppearance],
+    *,
+    rng: np.random.Generator,
+) -> tuple[list[StateError], list[ChangeError]]:
+    """Compare each state's blood with its truth.
+
+    Parameters
+    ----------
+    appearance
+        With the maps of `skinrig.fitting.facial_color`.
+    rig
+        Its hemoglobin rig.
+    truths
+        Truth of each state, neutral among them.
+    rng
+        For the bootstrap intervals.
+
+    Returns
+    -------
+    states
+        A row for each state and way.
+    changes
+        A row for each state.
+    """
+    states: list[StateError] = []
+    changes: list[ChangeError] = []
+    rest = true_blood(truths[NEUTRAL]) if NEUTRAL in truths else None
+    for state in rig.states:
+        true = true_blood(truths[state]) if state in truths else None
+        measured = appearance.maps.get(f"hemoglobin_{state}")
+        if true is None or measured is None or true.values.shape != measured.values.shape:
+            continue
+        blend = rig.evaluate({state: 1.0})
+        seen = _valid(true) & _valid(measured) & blend.valid & (true.values > 0)
+        if not seen.any():
+            continue
+        neutral = rig.neutral.astype(np.float64)
+        level = float(np.mean(measured.values[seen]) / np.mean(neutral[seen]))
+        found: Mapping[str, tuple[Map, Map | None]] = {
+            WAYS[0]: (measured.values, measured.stderr),
+            WAYS[1]: (blend.hemoglobin, blend.stderr),
+            WAYS[2]: (level * neutral, None),
+            WAYS[3]: (neutral, None),
+        }
+        states += [
+            _row(state, way, values, stderr, true.values, seen, rng)
+            for way, (values, stderr) in found.items()
+        ]
+        change = appearance.maps.get(f"change_{state}")
+        if change is None or rest is None or change.stderr is None:
+            continue
+        both = seen & _valid(change) & _valid(rest)
+        moved = true.values.astype(np.float64) - rest.values
+        got = change.values.astype(np.float64)
+        changes.append(
+            ChangeError(
+                state, float(moved[both].mean()), float(got[both].mean()),
+                float(np.sqrt(np.mean((got - moved)[both] ** 2))),
+                metrics.coverage(got[both], change.stderr[both], moved[both]).share,
+            )
+        )  # fmt: skip
+    return states, changes
+
+
+def _row(
+    state: str,
+    way: str,
+    values: Map,
+    stderr: Map | None,
+    true: Map,
+    seen: Mask,
+    rng: np.random.Generator,
+) -> StateError:
+    found, real = values[seen].astype(np.float64), true[seen].astype(np.float64)
+    relative = (found - real) / real
+    median, interval = metrics.median_with_interval(np.abs(relative), rng=rng)
+    held = float("nan")
+    if stderr is not None:
+        held = metrics.coverage(found, stderr[seen].astype(np.float64), real).share
+    return StateError(
+        state, way, median, interval, float(np.sqrt(np.mean((found - real) ** 2))),
+        float(np.median(relative)), held, int(seen.sum()),
+    )  # fmt: skip
+
+
+def _valid(skin_map: SkinMap) -> Mask:
+    shape = skin_map.values.shape[:2]
+    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

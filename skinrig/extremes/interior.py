@@ -1,0 +1,137 @@
+"""Extremes of light inside the skin: coefficients of the model, and the gathered dipole."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from skinrig.extremes.cases import (
+    Case,
+    Real,
+    Unexpected,
+    as_real,
+    masked,
+    near,
+    refused,
+    rising,
+    within,
+)
+
+STAGE = "light inside skin"
+
+
+def _patch(real: Real, *, step_mm: float = 0.5, count: int = 20):  # type: ignore[no-untyped-def]
+    """Return places and areas of a curved patch."""
+    at = (np.arange(count) - 0.5 * (count - 1)) * step_mm
+    x, y = np.meshgrid(at, at)
+    place = np.stack([x, y, 0.05 * x * y], axis=-1).reshape(-1, 3)
+    return as_real(place, real), as_real(np.full(count**2, step_mm**2), real)
+
+
+def _even(real: Real) -> str:
+    from model.dipole_gather import exitance
+
+    place, area = _patch(real)
+    light = as_real(np.full((len(area), 3), 3.0), real)
+    told = []
+    ends = itertools.product((0.0, 1e-6, 0.5, 1.0 - 1e-9, 1.0), (0.01, 1.0, 100.0))
+    for r_d, length in ends:
+        got = exitance(place, area, light, place[::9], r_d, length)
+        near(got, np.full(got.shape, 3.0 * r_d), relative=1e-5)
+        told.append(r_d)
+    return f"R_d times what entered, for {len(told)} pairs"
+
+
+def _coarse(real: Real) -> str:
+    from model.dipole_gather import exitance
+
+    place, area = _patch(real, step_mm=5.0)
+    light = as_real(1.0 + np.sin(place.astype(np.float64)), real)
+    got = exitance(place, area, light, place, 0.5, 0.01, entered_at=light)
+    return near(got.sum() / (0.5 * light.astype(np.float64).sum()), 1.0, relative=0.01)
+
+
+def _above_one(real: Real) -> str:
+    from model.dipole_gather import exitance
+    from model.dipole_maps import DipoleMaps
+
+    found = DipoleMaps.of(as_real([[[1.2, 1.0, 0.5]]], real), as_real(2.0, real), eta=1.4)
+    if found.outlier.tolist() != [[[True, False, False]]]:
+        raise Unexpected(f"outlier: got {found.outlier.tolist()}, expected the first alone")
+    place, area = _patch(real)
+    light = as_real(np.ones((len(area), 3)), real)
+    near(exitance(place, area, light, place[:5], 1.2, 1.0), np.full((5, 3), 1.2), relative=1e-5)
+    return masked(found.valid, share=(0.3, 0.4)) + ", a named outlier; 1.2 times what entered"
+
+
+def _inverse(real: Real) -> str:
+    from model.dipole_maps import DipoleMaps
+
+    lost = np.geomspace(1e-9 if real is np.float64 else 1e-6, 0.999999, 60)
+    found = DipoleMaps.of((1.0 - as_real(lost, real))[:, None], [1.0], eta=1.4)
+    masked(found.valid, share=(1.0, 1.0))
+    return rising(found.deficit[:, 0], what="1 - alpha'")
+
+
+def _single(real: Real) -> str:
+    from model.dipole_gather import exitance
+
+    one = as_real([[1.0, 2.0, 3.0]], real)
+    return near(exitance(one, as_real([0.1], real), one, one, 0.5, 1.0), [[0.5, 1.0, 1.5]],
+                relative=1e-6)  # fmt: skip
+
+
+def _empty(real: Real) -> str:
+    from model.dipole_gather import exitance
+    from model.dipole_maps import DipoleMaps
+
+    shape = (2, 2, 3)
+    found = DipoleMaps.of(
+        as_real(np.full(shape, 0.5), real), as_real(np.ones(shape), real), eta=1.4,
+        valid=np.zeros((2, 2), bool),
+    )  # fmt: skip
+    none = as_real(np.zeros((0, 3)), real)
+    near(exitance(none, none[:, 0], none, as_real(np.zeros((2, 3)), real), 0.5, 1.0), 0.0)
+    return masked(found.valid) + ", nothing leaves"
+
+
+def _folded(real: Real) -> str:
+    from model.dipole_gather import exitance
+
+    place, area = _patch(real)
+    both = np.concatenate([place, place + as_real([0.0, 0.0, 1e-3], real)])
+    light = np.zeros((len(both), 3), real)
+    light[: len(place)] = 1.0
+    got = exitance(both, np.tile(area, 2), light, both, 1.0, (0.05, 1.0, 50.0))
+    return within(got, -1e-3, 1.0 + 1e-3, what="exitance over the brightest")
+
+
+def _opaque(real: Real) -> str:
+    from model.dipole_gather import GatherError, exitance
+
+    place, area = _patch(real)
+    light = as_real(np.ones((len(area), 3)), real)
+    return refused(lambda: exitance(place, area, light, place, 0.5, 0.0), GatherError,
+                   "translucency_mm")  # fmt: skip
+
+
+CASES = (
+    Case("even light on any medium", STAGE, "R_d 0 to 1, 1/sigma_tr 0.01 to 100 mm",
+         "peaks finer than texels, tails beyond the face", "R_d times what entered", _even),
+    Case("texels far wider than light spreads", STAGE, "5 mm apart, 1/sigma_tr 0.01 mm",
+         "a dipole between its samples: all light lost", "the local term, all light kept",
+         _coarse),
+    Case("albedo above one", STAGE, "R_d 1.2", "no reduced albedo", "a named outlier, masked",
+         _above_one),
+    Case("albedo near one and near none", STAGE, "R_d 1e-6 to 1 - 1e-9",
+         "an infinite slope at alpha' = 1", "1 - alpha' falls as R_d rises", _inverse),
+    Case("a single texel", STAGE, "one source, one exit point at the same place",
+         "a singular distance", "R_d times what entered", _single),
+    Case("nothing valid", STAGE, "an empty mask, no source", "empty sums",
+         "nothing valid, nothing leaves", _empty),
+    Case("skin on skin", STAGE, "a fold 1 um wide, one side dark", "light counted twice",
+         "between none and the brightest", _folded),
+    Case("translucency of zero", STAGE, "1/sigma_tr = 0", "division by it",
+         "GatherError naming translucency_mm", _opaque),
+)  # fmt: skip

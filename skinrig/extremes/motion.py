@@ -1,0 +1,201 @@
+"""Extremes of a moving face: local statistics, blends, wrinkles, strain, kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from skinrig.extremes.cases import (
+    Case,
+    Real,
+    as_real,
+    clean,
+    masked,
+    near,
+    refused,
+    within,
+)
+
+
+def _near_constant(real: Real) -> str:
+    from model import facial_color
+
+    rng = np.random.default_rng(0)
+    h = as_real(1.0 + 1e-6 * rng.standard_normal((64, 64)), real)
+    mean, deviation = facial_color.local_statistics(h, 40.0)
+    exact = float(np.std(np.asarray(h, np.float64)))
+    near(np.mean(mean), 1.0, relative=1e-6)
+    return "deviation over the map's: " + within(
+        np.asarray(deviation)[20:44, 20:44] / exact, 0.8, 1.2
+    )
+
+
+def _constant(real: Real) -> str:
+    from model import facial_color
+
+    _, deviation = facial_color.local_statistics(as_real(np.full((16, 16), 0.1), real), 5.0)
+    return within(deviation, 0.0, 1e-7, what="deviation")
+
+
+def _flat_neutral(real: Real) -> str:
+    from model.facial_color import HemoglobinRig
+
+    neutral = as_real(np.full((64, 64), 0.05), real)
+    smile = as_real(0.05 + 0.01 * np.random.default_rng(1).random((64, 64)), real)
+    rig = HemoglobinRig.from_maps(neutral, {"smile": smile}, radius_px=8.0)
+    found = rig.evaluate({"neutral": 0.0, "smile": 1.0})
+    clean(found.hemoglobin, found.valid, what="hemoglobin")
+    return within(found.hemoglobin, 0.0, 0.32, what="hemoglobin")
+
+
+def _weights_do_not_sum(real: Real) -> str:
+    from model.facial_color import FacialColorError, HemoglobinRig
+
+    h = as_real(0.05 + 0.01 * np.random.default_rng(1).random((32, 32)), real)
+    rig = HemoglobinRig.from_maps(h, {"smile": 1.2 * h}, radius_px=4.0)
+    return refused(lambda: rig.blend({"neutral": 0.5, "smile": 0.9}), FacialColorError, "neutral")
+
+
+def _disc_beyond_map(real: Real) -> str:
+    from model import facial_color
+
+    h = as_real(np.random.default_rng(2).random((8, 8)), real)
+    mean, deviation = facial_color.local_statistics(h, 1000.0)
+    near(mean, np.full((8, 8), np.mean(h, dtype=np.float64)), relative=1e-5)
+    return near(deviation, np.full((8, 8), np.std(h, dtype=np.float64)), relative=1e-4)
+
+
+def _horizon_normals(real: Real) -> str:
+    from model import wrinkles
+
+    normals = as_real([[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]], real)
+    try:
+        found = wrinkles.encode(normals)
+    except ValueError as error:
+        return f"refused: {error}"
+    derivatives = np.asarray(found)
+    return within(derivatives, -1.0, 1.0, what="derivatives")
+
+
+def _wrinkle_sum(real: Real) -> str:
+    from model import wrinkles
+
+    outward = np.array([0.0, 0.0, 1.0])
+    base = wrinkles.encode(as_real(np.zeros((4, 4, 3)) + outward, real))
+    tilted = np.array([0.6, 0.0, 0.8])
+    wrinkle = wrinkles.encode(as_real(np.zeros((4, 4, 3)) + tilted, real))
+    masks = as_real(np.ones((8, 4, 4)), real)
+    weights = as_real(np.full(8, 1e6), real)
+    unit = wrinkles.combine(base, wrinkle, masks, weights)
+    near(np.linalg.norm(unit, axis=-1), np.ones((4, 4)), absolute=1e-5)
+    anger = wrinkles.combine(base, wrinkle, masks, -weights, clamp="unit")
+    near(anger, np.zeros((4, 4, 3)) + outward, absolute=1e-6)
+    return within(unit[..., 2], 0.0, 1.0, what="n_z")
+
+
+def _strain_of(deform, real: Real):  # type: ignore[no-untyped-def]
+    from model import microstructure
+
+    u, v = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9))
+    flat = np.stack([40 * u.ravel(), 40 * v.ravel(), 0 * u.ravel()], -1)
+    cell = np.arange(81).reshape(9, 9)
+    a, b, c, d = (
+        cell[:-1, :-1].ravel(), cell[:-1, 1:].ravel(), cell[1:, 1:].ravel(), cell[1:, :-1].ravel()
+    )  # fmt: skip
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+    uv = np.stack([u.ravel(), v.ravel()], -1)
+    moved = deform(flat)
+    return microstructure.strain(
+        as_real(flat, real), as_real(moved, real), faces, as_real(uv, real)
+    )
+
+
+def _stretch_ends(real: Real) -> str:
+    twice = _strain_of(lambda p: p * [2.0, 1.0, 1.0], real)
+    half = _strain_of(lambda p: p * [0.5, 1.0, 1.0], real)
+    near(twice.r_s, np.full(81, 2.0), relative=1e-5)
+    near(half.r_t, np.full(81, 0.5), relative=1e-5)
+    return f"r_s {twice.r_s.mean():.5f}, r_t {half.r_t.mean():.5f}"
+
+
+def _collapsed(real: Real) -> str:
+    found = _strain_of(lambda p: p * [0.0, 1.0, 1.0], real)
+    clean(found.r_t, found.valid, what="r_t")
+    return within(found.r_t, 0.0, 1.0, what="r_t")
+
+
+def _turned_over(real: Real) -> str:
+    found = _strain_of(lambda p: p * [-1.0, 1.0, 1.0], real)
+    return near(found.r_s, np.ones(81), relative=1e-5)
+
+
+def _no_area(real: Real) -> str:
+    from model import microstructure
+
+    points = as_real([[0, 0, 0], [1, 0, 0], [2, 0, 0]], real)
+    uv = as_real([[0, 0], [1, 0], [0, 1]], real)
+    found = microstructure.strain(points, points, np.array([[0, 1, 2]]), uv)
+    clean(found.r_s, np.ones(3, bool), what="r_s")
+    return masked(found.valid)
+
+
+def _sharpened_again(real: Real) -> str:
+    from model import microstructure
+
+    height = as_real(np.random.default_rng(4).standard_normal((48, 48)), real)
+    axes = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    start = float(np.max(np.abs(height)))
+    for _ in range(4):
+        height = microstructure.convolve(height, *axes, -2.0, 2.0, -2.0, 2.0)
+    # a pass amplifies no frequency by more than 1 + 2 in each direction
+    return "peak over the first: " + within(np.max(np.abs(height)) / start, 0.5, 81.0**2)
+
+
+def _vanishing_kernel(real: Real) -> str:
+    from model import microstructure
+
+    height = as_real(np.random.default_rng(4).standard_normal((32, 32)), real)
+    axes = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    same = microstructure.convolve(height, *axes, 1.0, 0.0, -2.0, 1e-9)
+    return near(same, np.asarray(height), absolute=1e-5)
+
+
+def _table_ends(real: Real) -> str:
+    from model import microstructure
+
+    alpha, sigma = microstructure.kernel_parameters(as_real([0.01, 0.5, 1.0, 2.0, 50.0], real))
+    within(alpha, -2.0, 1.0, what="alpha")
+    refused(lambda: microstructure.kernel_parameters(real(0.0)), ValueError, "stretch")
+    return "0 refused; " + within(sigma, 1.0, 60.0, what="sigma")
+
+
+CASES = (
+    Case("nearly constant skin", "local statistics", "deviation 1e-6 of the mean",
+         "E[h^2] - mean^2 loses all digits in float32", "deviation within sampling",
+         _near_constant),
+    Case("constant skin", "local statistics", "deviation 0", "root of a negative rounding",
+         "0 to rounding", _constant),
+    Case("disc larger than the map", "local statistics", "radius 1000 on 8 x 8",
+         "windows beyond the border", "mean and deviation of the whole map", _disc_beyond_map),
+    Case("neutral face without pattern", "facial color", "sigma_n = 0",
+         "division by the neutral deviation", "finite, within 0 to 0.32", _flat_neutral),
+    Case("weights that do not sum to 1", "facial color", "0.5 + 0.9", "blood from nothing",
+         "FacialColorError with the neutral weight that would do", _weights_do_not_sum),
+    Case("normals on and below the horizon", "wrinkles", "n_z = 0 and -1", "n_x / n_z",
+         "refused, or derivatives within the limit", _horizon_normals),
+    Case("weights of a million", "wrinkles", "sums far beyond the clamp", "lost signs",
+         "unit normals; anger alone vanishes under `unit`", _wrinkle_sum),
+    Case("stretch 2 and 0.5", "strain", "far outside the measured range", "order of the axes",
+         "exact ratios", _stretch_ends),
+    Case("collapsed mesh", "strain", "stretch 0", "inverse of a singular matrix",
+         "r_t 0, finite", _collapsed),
+    Case("mesh turned over", "strain", "a mirror image", "negative stretch", "ratios of 1",
+         _turned_over),
+    Case("triangle without area", "strain", "three points in a line", "division by its area",
+         "not valid, finite", _no_area),
+    Case("sharpened again and again", "convolution", "alpha = -2, four times",
+         "noise grows without bound", "within the gain of the kernel", _sharpened_again),
+    Case("kernel without width", "convolution", "sigma 0 and 1e-9", "0/0 of the weights",
+         "the same relief", _vanishing_kernel),
+    Case("stretch outside the measured", "kernel table", "ratios 0.01 to 50, and 0",
+         "sigma of eq. (9) turns negative", "held within; 0 refused", _table_ends),
+)  # fmt: skip

@@ -1,0 +1,197 @@
+"""Extremes of pictures: exposures, polarizers, chromophores, light stages."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinrig.extremes.cases import (
+    Case,
+    Real,
+    Unexpected,
+    as_real,
+    clean,
+    masked,
+    near,
+    refused,
+    within,
+)
+
+if TYPE_CHECKING:
+    from model.color_table import ColorTable
+
+_BRACKETS = {"gain": 0.5, "read_noise": 3.0, "black": 512.0, "white": 16383.0}
+EXPOSURES_S = (1.0, 0.25, 0.0625)
+
+
+def _merged(dn: NDArray[np.integer]) -> tuple[NDArray[Any], ...]:
+    from capture import hdr
+
+    radiance, variance, valid = hdr.merge(dn, EXPOSURES_S, **_BRACKETS)
+    clean(radiance, valid, what="radiance")
+    clean(variance, valid, what="variance")
+    return radiance, variance, valid
+
+
+def _all_saturated(_: Real) -> str:
+    return masked(_merged(np.full((3, 4, 4), 16383, np.uint16))[2])
+
+
+def _all_black(_: Real) -> str:
+    radiance, _variance, valid = _merged(np.full((3, 4, 4), 512, np.uint16))
+    masked(valid, share=(1.0, 1.0))
+    return within(radiance, -1e-9, 1e-9, what="radiance")
+
+
+def _below_black(_: Real) -> str:
+    # darks subtracted from noise: half of it is negative, and stays so, or the mean is biased
+    rng = np.random.default_rng(3)
+    dn = np.clip(np.round(512 + rng.normal(0, 6, (3, 128, 128))), 0, None).astype(np.uint16)
+    radiance, variance, _valid = _merged(dn)
+    z = float(radiance.mean() / np.sqrt(variance.mean() / radiance.size))
+    if not np.any(radiance < 0):
+        raise Unexpected("no radiance is negative: it was clamped")
+    return f"mean {z:.2g} standard errors from 0: " + within(z, -4.0, 4.0, what="z")
+
+
+def _full_scale(_: Real) -> str:
+    from capture import hdr
+
+    dn = np.full((1, 2, 2), 65534, np.uint16)
+    radiance, _variance, valid = hdr.merge(
+        dn, [2.0], gain=0.5, read_noise=3.0, black=0.0, white=65535.0
+    )
+    masked(valid, share=(1.0, 1.0))
+    return near(radiance, np.full((2, 2), 0.5 * 65534.0), relative=1e-6)
+
+
+def _one_by_one(_: Real) -> str:
+    radiance, _variance, valid = _merged(np.array([[[9000]], [[2634]], [[1042]]], np.uint16))
+    masked(valid, share=(1.0, 1.0))
+    return within(radiance, 8000.0, 9000.0, what="radiance")
+
+
+def _one_electron(_: Real) -> str:
+    rng = np.random.default_rng(5)
+    frames = [
+        np.round(512 + (rng.poisson(1.0 * t, (256, 256)) + rng.normal(0, 3, (256, 256))) / 0.5)
+        for t in EXPOSURES_S
+    ]
+    radiance, variance, valid = _merged(np.clip(np.array(frames), 0, None).astype(np.uint16))
+    masked(valid, share=(1.0, 1.0))
+    # an electron a second is two numbers a second
+    z = float((radiance.mean() - 2.0) / np.sqrt(variance.mean() / radiance.size))
+    return f"mean {z:.2g} standard errors from one electron: " + within(z, -4.0, 4.0, what="z")
+
+
+def _not_polarized(real: Real) -> str:
+    from reconstruction import polarization
+
+    same = as_real(np.full((2, 2, 3), 0.3), real)
+    found = polarization.separate(same, same)
+    return near(found.specular, np.zeros((2, 2, 3)), absolute=1e-6)
+
+
+def _useless_polarizer(real: Real) -> str:
+    from reconstruction import polarization
+
+    same = as_real(np.full((2, 2, 3), 0.3), real)
+    return refused(lambda: polarization.separate(same, same, extinction=1.0), ValueError, "1")
+
+
+def _not_a_number(real: Real) -> str:
+    from reconstruction import polarization
+
+    one, other = (as_real(np.full((2, 2, 3), v), real) for v in (0.5, 0.2))
+    one[0, 0] = np.nan
+    other[1, 1] = np.inf
+    found = polarization.separate(one, other)
+    clean(found.diffuse, found.valid, what="diffuse")
+    return masked(found.valid, share=(0.5, 0.5))
+
+
+def _table() -> ColorTable:
+    from model import color_table
+
+    return color_table.build("Nikon 5100 (NPL)", "D55", size=32)
+
+
+def _black_pixels(real: Real) -> str:
+    from reconstruction import chromophores
+
+    found = chromophores.invert(as_real(np.zeros((4, 3)), real), _table())
+    clean(found.melanin, found.valid, what="melanin")
+    return masked(found.valid)
+
+
+def _odd_colors(real: Real) -> str:
+    from reconstruction import chromophores
+
+    no_skin = [[0, 0, 1], [0, 1, 0], [-0.2, 0.1, 0.1], [np.nan, 0.3, 0.2], [np.inf, 1, 1]]
+    rgb = as_real(np.array(no_skin), real)
+    variance = as_real(np.full((5, 3), 1e-6), real)
+    found = chromophores.invert(rgb, _table(), shading="known", variance=variance)
+    clean(found.melanin, found.valid, what="melanin")
+    clean(found.hemoglobin, found.valid, what="hemoglobin")
+    return masked(found.valid)
+
+
+def _pigment_corners(real: Real) -> str:
+    from reconstruction import chromophores
+
+    table = _table()
+    c_m, c_hd = np.array([0.0, 0.0, 0.5, 0.5]), np.array([0.0, 0.32, 0.0, 0.32])
+    found = chromophores.invert(as_real(table.lookup(c_m, c_hd), real), table, shading="known")
+    near(found.melanin, c_m, absolute=2e-3)
+    return near(found.hemoglobin[:2], c_hd[:2], absolute=2e-3)
+
+
+def _tiny_light(real: Real) -> str:
+    from reconstruction import chromophores
+
+    table = _table()
+    rgb = table.lookup(np.array([0.03]), np.array([0.05]))
+    found = chromophores.invert(as_real(1e-5 * rgb, real), table)
+    plain = chromophores.invert(as_real(rgb, real), table)
+    return near(found.melanin, plain.melanin, relative=0.02)
+
+
+def _no_pixel(real: Real) -> str:
+    from reconstruction import chromophores
+
+    found = chromophores.invert(as_real(np.zeros((0, 3)), real), _table())
+    if found.melanin.shape != (0,):
+        raise Unexpected(f"got shape {found.melanin.shape}, expected (0,)")
+    return "an empty map"
+
+
+CASES = (
+    Case("brackets that all saturate", "hdr", "every frame at white", "0/0 of weights",
+         "not valid", _all_saturated),
+    Case("black frames", "hdr", "every frame at black", "weights without light", "radiance 0",
+         _all_black),
+    Case("negative after the darks", "hdr", "noise around black", "clamping biases the mean",
+         "negative values kept, mean 0 (z, 6e-5 false alarms)", _below_black),
+    Case("16-bit full scale", "hdr", "65,534 of 65,535", "overflow of integers", "valid, exact",
+         _full_scale),
+    Case("one pixel", "hdr", "1 x 1 frames", "loops over rows", "a value", _one_by_one),
+    Case("one electron a second", "hdr", "light far below the read noise",
+         "weights that follow the noise", "mean unbiased (z, 6e-5 false alarms)", _one_electron),
+    Case("skin without gloss", "polarization", "parallel equals crossed", "difference of equals",
+         "no specular light", _not_polarized),
+    Case("polarizer without effect", "polarization", "extinction 1 : 1", "division by zero",
+         "ValueError", _useless_polarizer),
+    Case("no numbers in pictures", "polarization", "NaN and infinity in two pixels",
+         "NaN spreads", "those two masked", _not_a_number),
+    Case("black pixels", "chromophores", "color 0", "logarithm of 0", "not valid", _black_pixels),
+    Case("colors of no skin", "chromophores", "blue, green, negative, NaN, infinity",
+         "Newton leaves the table", "not valid", _odd_colors),
+    Case("corners of the color table", "chromophores", "C_m 0 and 0.5, C_hd 0 and 0.32",
+         "cube-root axes have infinite slope", "truth within 0.002", _pigment_corners),
+    Case("very little light", "chromophores", "shading of 1e-5", "float32 squares underflow",
+         "the same melanin", _tiny_light),
+    Case("no pixel at all", "chromophores", "shape (0, 3)", "reductions over nothing",
+         "an empty map", _no_pixel),
+)  # fmt: skip

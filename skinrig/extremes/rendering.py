@@ -1,0 +1,214 @@
+"""Extremes of the simulation: what a renderer or a sensor gets wrong without a word."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import load_rig
+from skinrig.extremes.cases import Case, Real, Unexpected, as_real, near, refused, within
+
+if TYPE_CHECKING:
+    from rigsim.sensor import Sensor
+
+
+def _sheet(height_mm, offset_mm=(0.0, 0.0, 0.0), side: int = 33, pitch_mm: float = 1.0):  # type: ignore[no-untyped-def]
+    """Return a square sheet facing +z as a mesh of the rig frame."""
+    from rigsim.mesh import build_mesh
+
+    across = (np.arange(side) - (side - 1) / 2) * pitch_mm
+    x, y = np.meshgrid(across, across)
+    points = np.stack([x, y, height_mm(x, y)], -1).reshape(-1, 3) + np.asarray(offset_mm)
+    cell = np.arange(side * side).reshape(side, side)
+    a, b, c, d = (
+        cell[:-1, :-1].ravel(), cell[:-1, 1:].ravel(), cell[1:, 1:].ravel(), cell[1:, :-1].ravel()
+    )  # fmt: skip
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+    uv = np.stack([(x / across[-1] + 1) / 2, (y / across[-1] + 1) / 2], -1).reshape(-1, 2)
+    return build_mesh(points, faces, uv)
+
+
+def _seen(mesh, light_mm) -> NDArray[np.floating]:  # type: ignore[no-untyped-def]
+    from rigsim.render import Caster, visibility
+
+    return visibility(
+        Caster(mesh), mesh.vertices_mm, mesh.normals, np.asarray(light_mm, np.float64)
+    )
+
+
+def _shadow_off_origin(_: Real) -> str:
+    # a wall 4 mm high throws the same shadow wherever the face is
+    def wall(x, y):  # type: ignore[no-untyped-def]
+        return 4.0 * (np.abs(x) < 0.5)
+
+    away = np.array([60.0, -40.0, 300.0])
+    light = np.array([300.0, 0.0, 100.0])
+    here = _seen(_sheet(wall), light)
+    there = _seen(_sheet(wall, away), light + away)
+    share = float(np.mean(here != there))
+    if float(np.mean(here == 0)) < 0.05:
+        raise Unexpected("no shadow at all")
+    return "places that differ: " + within(share, 0.0, 0.01, what="share")
+
+
+def _no_self_shadow(_: Real) -> str:
+    lit = _seen(_sheet(lambda x, y: 0.0 * x), (5700.0, 0.0, 10.0))  # 0.1 degrees over the sheet
+    return "lit " + within(lit, 1.0, 1.0, what="share")
+
+
+def _light_on_skin(_: Real) -> str:
+    lit = _seen(_sheet(lambda x, y: 0.0 * x), (0.3, 0.3, 1.0))
+    return within(lit, 1.0, 1.0, what="share lit by a light at 1 mm")
+
+
+def _light_behind(_: Real) -> str:
+    return within(_seen(_sheet(lambda x, y: 0.0 * x), (0.0, 0.0, -300.0)), 0.0, 0.0, what="share")
+
+
+def _zero_triangles(_: Real) -> str:
+    from rigsim.mesh import build_mesh, vertex_normals
+
+    points = np.array([[0, 0, 0], [40, 0, 0], [0, 40, 0], [80, 0, 0], [40, 40, 9]], np.float64)
+    faces = np.array([[0, 1, 2], [0, 1, 3], [1, 4, 2]])  # the second has no area
+    normals = vertex_normals(points, faces)
+    near(np.linalg.norm(normals, axis=-1)[[0, 1, 2]], np.ones(3), absolute=1e-5)
+    lit = _seen(build_mesh(points, faces, points[:, :2] / 80.0), (0, 0, 300))
+    return within(lit, 0.0, 1.0, what="lit")
+
+
+def _wrong_unit(_: Real) -> str:
+    from rigsim.mesh import MeshError, build_mesh
+
+    points = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+    return refused(
+        lambda: build_mesh(points, np.array([[0, 1, 2]]), np.zeros((3, 2))),
+        MeshError, "millimetres",
+    )  # fmt: skip
+
+
+def _surface(direction: NDArray[np.float64], roughness: float, real: Real) -> tuple[float, float]:
+    from rigsim import surface_brdf
+
+    packed = as_real([0.5, 0.4, 0.3, roughness, 0.5, 0.0015, 1.0], real)
+    up = np.array([0.0, 0.0, 1.0])
+    total, specular = surface_brdf.evaluate(packed, up, direction, direction * [-1, -1, 1])
+    return float(total[0].max()), float(specular[0])
+
+
+def _tilted(degrees: float) -> NDArray[np.float64]:
+    angle = math.radians(degrees)
+    return np.array([math.sin(angle), 0.0, math.cos(angle)])
+
+
+def _grazing(real: Real) -> str:
+    values = [_surface(_tilted(d), 0.3, real)[0] for d in (0.0, 60.0, 89.0, 89.9)]
+    cosine = math.cos(math.radians(89.9))
+    within(values[-1] * cosine, 0.0, 1e3, what="radiance")
+    return within(values, 0.0, 1e6, what="f_r")
+
+
+def _roughness_ends(real: Real) -> str:
+    from model import microfacet
+
+    sharp = microfacet.brdf(
+        real(1.0), real(1.0), real(1.0), real(1.0), roughness=0.01, eta=1.4, kind="ggx"
+    )
+    # at the peak D = 1 / (pi a^2), G = 1: F0 / (4 pi a^2)
+    near(sharp, (0.4 / 2.4) ** 2 / (4 * math.pi * 0.01**2), relative=1e-3)
+    flat = microfacet.brdf(
+        real(1.0), real(1.0), real(1.0), real(1.0), roughness=1.0, eta=1.4, kind="ggx"
+    )
+    return f"peak {float(sharp):.4g}; " + within(flat, 1e-3, 1e-2, what="at 1")
+
+
+def _furnace(real: Real) -> str:
+    from rigsim import surface_brdf
+
+    rng = np.random.default_rng(7)
+    count = 200_000
+    u, v = rng.random(count), rng.random(count)
+    light = np.stack([np.sqrt(u) * np.cos(2 * np.pi * v), np.sqrt(u) * np.sin(2 * np.pi * v),
+                      np.sqrt(1 - u)], -1)  # fmt: skip
+    packed = as_real([1.0, 1.0, 1.0, 0.35, 0.6, 0.0015, 1.0], real)
+    back = []
+    for degrees in (0.0, 45.0, 80.0):
+        total, _ = surface_brdf.evaluate(packed, [0.0, 0.0, 1.0], light, _tilted(degrees))
+        back.append(float(np.pi * np.mean(np.asarray(total, np.float64)[:, 0])))
+    return within(back, 0.0, 1.01, what="share reflected")
+
+
+def _chip() -> Sensor:
+    from rigsim.sensor import sensor_of
+
+    return sensor_of(load_rig("flash").views[0])
+
+
+def _bad_light(real: Real) -> str:
+    from rigsim import sensor
+
+    def exposed(value: float) -> object:
+        light = as_real(np.full((2, 2, 3), value), real)
+        return sensor.expose(light, sensor=_chip(), rng=np.random.default_rng(0))
+
+    for value in (np.nan, np.inf):
+        refused(partial(exposed, value), sensor.SensorError)
+    return refused(partial(exposed, -1.0), sensor.SensorError)
+
+
+def _very_bright(real: Real) -> str:
+    from rigsim import sensor
+
+    chip = _chip()
+    dn = sensor.expose(
+        as_real(np.full((4, 4, 3), 1e9), real), sensor=chip, rng=np.random.default_rng(0)
+    )
+    return near(dn, np.full((4, 4), chip.white), absolute=0.0)
+
+
+def _negative_environment(_: Real) -> str:
+    from rigsim import render
+
+    scene = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+        "light": {"type": "constant", "radiance": {"type": "rgb", "value": [-1.0, -1.0, -1.0]}},
+        "integrator": {"type": "path"},
+    }  # fmt: skip
+    return refused(
+        lambda: render.radiance(scene, kind="rgb", samples=1), render.RenderError, "light.radiance"
+    )
+
+
+CASES = (
+    Case("shadow far from the origin", "ray casting", "300 mm off",
+         "offsets of rays grow with the distance from the origin", "the same shadow",
+         _shadow_off_origin),
+    Case("light along a plane", "ray casting", "0.1 degrees above it",
+         "a flat sheet shadows itself", "all lit", _no_self_shadow),
+    Case("light on the skin", "ray casting", "1 mm away", "rays shorter than their offset",
+         "all lit", _light_on_skin),
+    Case("light behind the skin", "ray casting", "a closed horizon", "light leaks through",
+         "nothing lit", _light_behind),
+    Case("triangles without area", "mesh", "three points in a line", "normal 0/0",
+         "unit normals, and rays that hit the others", _zero_triangles),
+    Case("mesh in metres", "mesh", "an extent of 0.1", "offsets larger than the face",
+         "MeshError saying millimetres", _wrong_unit),
+    Case("light and view at 89.9 degrees", "surface reflection", "cosines of 0.0017",
+         "1/(4 cos cos)", "finite", _grazing),
+    Case("roughness 0.01 and 1", "microfacets", "a mirror and chalk", "overflow of 1/alpha^4",
+         "closed forms", _roughness_ends),
+    Case("white furnace", "surface reflection", "R_d 1 under films of oil",
+         "lobes that add up to more than all light", "at most 1 (1 % for the random directions)",
+         _furnace),
+    Case("light that is none", "sensor", "negative, NaN, infinite", "noise of a negative mean",
+         "SensorError", _bad_light),
+    Case("a billion times full scale", "sensor", "light 1e9", "Poisson numbers overflow",
+         "white", _very_bright),
+    Case("negative environment", "renderer", "radiance -1",
+         "the renderer makes a negative picture without a word", "RenderError",
+         _negative_environment),
+)  # fmt: skip

@@ -1,0 +1,315 @@
+"""Extremes of the surface: normals from light, heights, histograms, albedo, filled textures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skinrig.extremes.cases import (
+    Case,
+    Real,
+    Unexpected,
+    as_real,
+    clean,
+    masked,
+    near,
+    refused,
+    within,
+)
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def _ring(count: int, tilt_rad: float) -> NDArray[np.float64]:
+    turn = np.arange(count) * (2.0 * np.pi / count)
+    side = np.sin(tilt_rad)
+    return np.stack(
+        [side * np.cos(turn), side * np.sin(turn), np.full(count, np.cos(tilt_rad))], -1
+    )
+
+
+def _degrees_off(normals: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
+    from model.metrics import angular_error_rad
+
+    return float(np.degrees(np.max(angular_error_rad(normals, truth))))
+
+
+def _lit(lights: NDArray[np.float64], normal: NDArray[np.float64], real: Real) -> NDArray[Any]:
+    return as_real(np.clip(lights @ normal, 0.0, None)[:, None, None], real)
+
+
+def _coplanar(real: Real) -> str:
+    from reconstruction import photometric_stereo as stereo
+
+    lights = np.array([[np.sin(t), 0.0, np.cos(t)] for t in np.linspace(-0.6, 0.6, 9)])
+    return refused(
+        lambda: stereo.estimate_normals(_lit(lights, UP, real), lights),
+        stereo.PhotometricStereoError, "plane",
+    )  # fmt: skip
+
+
+def _collinear(real: Real) -> str:
+    from reconstruction import photometric_stereo as stereo
+
+    lights = np.repeat(UP[None], 5, axis=0)
+    return refused(
+        lambda: stereo.estimate_normals(_lit(lights, UP, real), lights),
+        stereo.PhotometricStereoError,
+    )  # fmt: skip
+
+
+def _all_shadowed(real: Real) -> str:
+    from reconstruction import photometric_stereo as stereo
+
+    lights = _ring(8, 0.6)
+    found = stereo.estimate_normals(as_real(np.zeros((8, 3, 3)), real), lights)
+    clean(found.normals, found.valid, what="normals")
+    return masked(found.valid)
+
+
+def _two_lights_left(real: Real) -> str:
+    from reconstruction import photometric_stereo as stereo
+
+    lights = _ring(8, 0.6)
+    seen = np.zeros((8, 1, 1), bool)
+    seen[:2] = True
+    found = stereo.estimate_normals(_lit(lights, UP, real), lights, valid=seen)
+    return masked(found.valid)
+
+
+def _nearly_coplanar(real: Real) -> str:
+    from reconstruction import photometric_stereo as stereo
+
+    lights = np.array([[np.sin(t), 1e-3 * (-1.0) ** k, np.cos(t)]
+                       for k, t in enumerate(np.linspace(-0.6, 0.6, 9))])  # fmt: skip
+    lights /= np.linalg.norm(lights, axis=-1, keepdims=True)
+    rng = np.random.default_rng(2)
+    noisy = _lit(lights, UP, real) + as_real(rng.normal(0, 1e-3, (9, 1, 1)), real)
+    try:
+        found = stereo.estimate_normals(
+            noisy, lights, variance=as_real(np.full((9, 1, 1), 1e-6), real)
+        )
+    except stereo.PhotometricStereoError as error:
+        return f"refused: {error}"
+    clean(found.normals, found.valid, what="normals")
+    if np.any(found.valid):
+        off = _degrees_off(found.normals[found.valid], np.broadcast_to(UP, (1, 3)))
+        said = float(np.degrees(found.stderr_rad[found.valid].max()))
+        if off > 4 * said:
+            raise Unexpected(f"{off:.2g} degrees off, but says {said:.2g}")
+        return f"{off:.2g} degrees off, says {said:.2g}"
+    return masked(found.valid)
+
+
+def _grazing(real: Real) -> str:
+    from reconstruction import photometric_stereo as stereo
+
+    lights = _ring(12, np.radians(89.9))
+    found = stereo.estimate_normals(_lit(np.vstack([lights, UP]), UP, real),
+                                    np.vstack([lights, UP]))  # fmt: skip
+    clean(found.normals, found.valid, what="normals")
+    if not np.all(found.valid):
+        return masked(found.valid)
+    off = _degrees_off(found.normals[0], np.broadcast_to(UP, (1, 3)))
+    return within(off, 0.0, 0.1, what="degrees")
+
+
+def _near_light(real: Real) -> str:
+    from reconstruction import photometric_stereo as stereo
+
+    places = 1.0 * _ring(8, 0.6)  # a millimetre from the skin
+    away = np.linalg.norm(places, axis=-1)
+    lit = np.clip(places @ UP / away, 0, None) / away**2
+    found = stereo.estimate_normals(
+        as_real(lit[:, None, None], real), places / away[:, None],
+        light_positions_mm=places, points_mm=np.zeros((1, 1, 3)),
+    )  # fmt: skip
+    masked(found.valid, share=(1.0, 1.0))
+    return within(_degrees_off(found.normals[0], UP[None]), 0.0, 0.05, what="degrees")
+
+
+def _far_light(real: Real) -> str:
+    from reconstruction import photometric_stereo as stereo
+
+    places = 1e7 * _ring(8, 0.6)
+    lit = np.clip(_ring(8, 0.6) @ UP, 0, None) / 1e14
+    found = stereo.estimate_normals(
+        as_real(1e14 * lit[:, None, None], real), _ring(8, 0.6),
+        light_positions_mm=places, points_mm=np.zeros((1, 1, 3)),
+        light_intensity=np.full(8, 1e14),
+    )  # fmt: skip
+    masked(found.valid, share=(1.0, 1.0))
+    return within(_degrees_off(found.normals[0], UP[None]), 0.0, 0.05, what="degrees")
+
+
+def _scales(real: Real) -> str:
+    from reconstruction import photometric_stereo as stereo
+
+    lights = _ring(8, 0.6)
+    tilted = np.array([0.3, -0.2, np.sqrt(1 - 0.13)])
+    off = []
+    for scale in (1e-12, 1e12):
+        found = stereo.estimate_normals(as_real(scale, real) * _lit(lights, tilted, real), lights)
+        masked(found.valid, share=(1.0, 1.0))
+        off.append(_degrees_off(found.normals[0], tilted[None]))
+    return within(off, 0.0, 0.05, what="degrees")
+
+
+def _cliff(real: Real) -> str:
+    from reconstruction import normal_integration
+
+    slope = np.zeros((24, 24))
+    slope[:, 12] = 20.0  # a wall of 87 degrees
+    normals = np.stack([-slope, np.zeros_like(slope), np.ones_like(slope)], -1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    height = normal_integration.integrate(as_real(normals, real))
+    step = float(height[:, 14:].mean() - height[:, :11].mean())
+    within(height, -40.0, 40.0, what="height")
+    return "step of " + within(abs(step), 10.0, 21.0, what="pixels")
+
+
+def _horizontal_normals(real: Real) -> str:
+    from reconstruction import normal_integration
+
+    normals = np.zeros((8, 8, 3))
+    normals[..., 2] = 1.0
+    normals[4, 4] = (1.0, 0.0, 0.0)
+    try:
+        height = normal_integration.integrate(as_real(normals, real))
+    except normal_integration.IntegrationError as error:
+        return f"refused: {error}"
+    return within(height[np.isfinite(height)], -1e4, 1e4, what="height")
+
+
+def _islands(real: Real) -> str:
+    from reconstruction import normal_integration
+
+    normals = np.zeros((16, 16, 3))
+    normals[..., 2] = 1.0
+    valid = np.zeros((16, 16), bool)
+    valid[2:5, 2:5] = valid[10:14, 9:15] = valid[0, 15] = True
+    height = normal_integration.integrate(as_real(normals, real), valid=valid)
+    return near(height[valid], np.zeros(int(valid.sum())), absolute=1e-4)
+
+
+def _empty_mask(real: Real) -> str:
+    from reconstruction import normal_integration
+
+    normals = np.zeros((4, 4, 3))
+    normals[..., 2] = 1.0
+    return refused(
+        lambda: normal_integration.integrate(as_real(normals, real), valid=np.zeros((4, 4), bool)),
+        normal_integration.IntegrationError, "valid",
+    )  # fmt: skip
+
+
+def _flat_height(real: Real) -> str:
+    from reconstruction import normal_histogram
+
+    shares = normal_histogram.histogram(as_real(np.zeros((64, 64)), real), pixel=10.0)
+    near(shares.sum(), 1.0, absolute=1e-9)
+    return near(np.max(shares[31:33, 31:33]), np.max(shares), absolute=0.0)
+
+
+def _steep_height(real: Real) -> str:
+    from reconstruction import normal_histogram
+
+    rows = np.arange(64.0)[:, None] * np.ones((1, 64))
+    shares = normal_histogram.histogram(as_real(1e6 * rows, real), pixel=1.0)
+    near(shares.sum(), 1.0, absolute=1e-9)
+    edge = shares[0].sum() + shares[-1].sum()
+    return near(edge, 1.0, absolute=1e-6)
+
+
+def _one_point(real: Real) -> str:
+    from reconstruction import normal_histogram
+
+    return refused(
+        lambda: normal_histogram.histogram(as_real(np.zeros((1, 1)), real), pixel=1.0),
+        ValueError,
+    )  # fmt: skip
+
+
+def _relief_without_relief(real: Real) -> str:
+    from reconstruction import kernel_fit, normal_histogram
+
+    flat = as_real(np.zeros((64, 64)), real)
+    target = normal_histogram.histogram(flat, pixel=10.0)
+    try:
+        found = kernel_fit.fit_kernel(flat, target, stretch=1.1, axis="x", pixel_um=10.0)
+    except ValueError as error:
+        return f"refused: {error}"
+    return masked(found.valid)
+
+
+def _no_diffuse(real: Real) -> str:
+    from reconstruction import diffuse_albedo
+
+    lights = np.vstack([_ring(20, 0.5), _ring(20, 0.9)])
+    views = np.broadcast_to(UP, lights.shape)
+    samples = np.zeros((1, 40, 3))
+    found = diffuse_albedo.estimate(
+        as_real(samples, real), lights[None], views[None], UP[None], eta=1.4
+    )
+    clean(found.r_d, found.valid, what="R_d")
+    return (
+        within(np.asarray(found.r_d)[np.asarray(found.valid)], -1e-6, 1e-6, what="R_d")
+        if (np.any(found.valid))
+        else masked(found.valid)
+    )
+
+
+def _nothing_to_fill(real: Real) -> str:
+    from reconstruction import texture_fill
+
+    empty = texture_fill.push_pull(as_real(np.zeros((9, 7, 3)), real), np.zeros((9, 7)))
+    one = np.zeros((9, 7))
+    one[4, 3] = 1.0
+    filled = texture_fill.push_pull(as_real(np.full((9, 7, 3), 0.4), real), one)
+    clean(empty.values, np.ones((9, 7), bool), what="empty texture")
+    return near(filled.values, np.full((9, 7, 3), 0.4), relative=1e-5)
+
+
+CASES = (
+    Case("lights in a plane", "photometric stereo", "nine directions of one plane",
+         "a matrix of rank 2", "PhotometricStereoError naming the direction that is not seen",
+         _coplanar),
+    Case("one direction only", "photometric stereo", "five equal lights", "a matrix of rank 1",
+         "PhotometricStereoError", _collinear),
+    Case("lights almost in a plane", "photometric stereo", "0.06 degrees out of it, noise 0.1 %",
+         "condition 1e3 and more", "masked, refused, or an error within 4 stated ones",
+         _nearly_coplanar),
+    Case("every light in shadow", "photometric stereo", "no light at all", "0/0 of the normal",
+         "not valid", _all_shadowed),
+    Case("two lights left", "photometric stereo", "six of eight in shadow", "fewer than unknowns",
+         "not valid", _two_lights_left),
+    Case("light at 89.9 degrees", "photometric stereo", "cosine 0.0017", "division by a cosine",
+         "masked, or within 0.1 degrees", _grazing),
+    Case("light at 1 mm", "photometric stereo", "inverse squares near the skin",
+         "direction differs over the face", "within 0.05 degrees", _near_light),
+    Case("light at 10 km", "photometric stereo", "inverse squares far away",
+         "float32 of squared distances", "within 0.05 degrees", _far_light),
+    Case("units of intensity", "photometric stereo", "1e-12 and 1e12", "thresholds with a unit",
+         "within 0.05 degrees", _scales),
+    Case("a wall", "normal integration", "slope 20 in one column", "one gradient rules all",
+         "a step of about its height, flat beside it", _cliff),
+    Case("a normal on the horizon", "normal integration", "n_z = 0", "infinite slope",
+         "refused, or height finite", _horizontal_normals),
+    Case("islands", "normal integration", "three parts, one of a single pixel",
+         "a constant is free for each", "each flat at 0", _islands),
+    Case("empty mask", "normal integration", "no pixel is valid", "an empty system",
+         "IntegrationError naming valid", _empty_mask),
+    Case("no relief", "normal histogram", "height 0", "all in one bucket", "sum 1, at the middle",
+         _flat_height),
+    Case("cliffs", "normal histogram", "slope 1e6", "normals beyond the last bucket",
+         "sum 1, at the edge", _steep_height),
+    Case("one height", "normal histogram", "1 x 1", "no slope exists", "ValueError", _one_point),
+    Case("kernel of no relief", "kernel fit", "flat skin to flat skin",
+         "every kernel fits the same", "refused, or not valid", _relief_without_relief),
+    Case("no light from inside", "diffuse albedo", "all samples 0", "minimum over nothing",
+         "R_d 0 or masked", _no_diffuse),
+    Case("texture of one texel", "texture fill", "nothing, and one known texel",
+         "division by no weight", "finite; the one value everywhere", _nothing_to_fill),
+)  # fmt: skip

@@ -1,0 +1,287 @@
+"""Extremes of light inside the skin: dipole, diffusion, layers, Monte Carlo, profiles."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from skinrig.extremes.cases import (
+    Case,
+    Real,
+    Unexpected,
+    as_real,
+    clean,
+    masked,
+    near,
+    refused,
+    rising,
+    within,
+)
+
+
+def _albedo_near_one(real: Real) -> str:
+    from model import dipole
+
+    deficit = np.logspace(-15, -1, 57)
+    lost = dipole.absorbed_fraction(as_real(deficit, real), 1.4)
+    said = rising(lost, what="1 - R_d")
+    back = dipole.invert_to_deficit(1.0 - np.asarray(lost[deficit > 1e-12]), 1.4)
+    # 1 - R_d carries the rounding of R_d itself, eps; the deficit goes with its square
+    rounding = np.finfo(np.float64).eps / np.asarray(lost[deficit > 1e-12])
+    single = float(np.finfo(real).eps) * 4
+    away = np.abs(back / np.asarray(as_real(deficit, real), np.float64)[deficit > 1e-12] - 1)
+    if np.any(away > single + 8 * rounding):
+        raise Unexpected(f"the inverse is off by {float(np.max(away)):.2g}")
+    return f"{said}; inverse within {float(np.max(away)):.1g}"
+
+
+def _least_step(real: Real) -> float:
+    """Return the exponent of the smallest 1 - R_d that a precision tells from the next."""
+    return -9.0 if real is np.float64 else -6.5
+
+
+def _reflectance_ends(real: Real) -> str:
+    from model import dipole
+
+    r_d = np.concatenate([np.logspace(-6, -1, 21), 1.0 - np.logspace(-1.2, _least_step(real), 21)])
+    return rising(-dipole.invert_to_deficit(as_real(r_d, real), 1.4), what="alpha' - 1")
+
+
+def _all_light_back(real: Real) -> str:
+    from model import dipole
+
+    return near(
+        [dipole.total_reflectance(real(1.0), eta) for eta in (1.0, 1.3, 1.4, 1.6)],
+        [1.0] * 4, absolute=0.0,
+    )  # fmt: skip
+
+
+def _more_than_all(real: Real) -> str:
+    from model import dipole
+
+    return refused(
+        lambda: dipole.invert_total_reflectance(real(1.02), 1.4),
+        dipole.ReflectanceOutlierError, "1.02",
+    )  # fmt: skip
+
+
+def _no_absorption(real: Real) -> str:
+    from model import dipole
+
+    r = as_real([0.1, 1.0, 10.0], real)
+    clear = dipole.reflectance(r, real(0.0), real(1.0), 1.4)
+    faint = dipole.reflectance(r, real(1e-12), real(1.0), 1.4)
+    return near(faint, clear, relative=1e-4)
+
+
+def _black_medium(real: Real) -> str:
+    from model import dipole, tissue_optics
+
+    inside = tissue_optics.layer_stack_reflectance(
+        as_real([1e3], real), as_real([1.0], real), as_real([math.inf], real)
+    )
+    said = within(inside, 0.0, 2e-3, what="R_d of layers")
+    value = dipole.reflectance(as_real([0.01, 1.0], real), real(1e3), real(1.0), 1.4)
+    return said + "; " + within(value, 0.0, 1e6, what="R(r)")
+
+
+def _radius_ends(real: Real) -> str:
+    from model import diffusion, dipole
+
+    r = as_real([0.0, 1e-9, 1e-3, 1e2, 1e4], real)
+    one = dipole.reflectance(r, real(0.02), real(1.0), 1.4)
+    two = diffusion.reflectance(r, real(0.02), real(1.0), 1.4)
+    near(one[0], one[1], relative=1e-5)
+    return f"dipole {within(one, 0.0, 10.0)}; diffusion {within(two, -1e-9, 10.0)}"
+
+
+def _index_ends(real: Real) -> str:
+    from model import tissue_optics
+
+    found = [
+        float(
+            tissue_optics.layer_stack_reflectance(
+                as_real([0.01], real), as_real([1.0], real), as_real([math.inf], real), eta=eta
+            )
+        )
+        for eta in (1.0, 1.6)
+    ]
+    if not found[0] > found[1]:
+        raise Unexpected(f"got {found}, expected less light to leave a denser medium")
+    return within(found, 0.3, 0.9, what="R_d at eta 1 and 1.6")
+
+
+def _index_not_physical(real: Real) -> str:
+    from model import tissue_optics
+
+    eta = float(real(0.9))
+    return refused(
+        lambda: tissue_optics.layer_stack_reflectance([0.01], [1.0], [math.inf], eta=eta),
+        ValueError, "eta",
+    )  # fmt: skip
+
+
+def _thin_layer(real: Real) -> str:
+    from model import tissue_optics
+
+    bare = tissue_optics.layer_stack_reflectance(
+        as_real([0.02], real), as_real([1.5], real), as_real([math.inf], real)
+    )
+    covered = tissue_optics.layer_stack_reflectance(
+        as_real([5.0, 0.02], real), as_real([1.5, 1.5], real), as_real([1e-9, math.inf], real)
+    )
+    return near(covered, bare, relative=1e-6)
+
+
+def _no_layer_at_all(real: Real) -> str:
+    from model import tissue_optics
+
+    clear = tissue_optics.layer_stack_reflectance(
+        as_real([0.0], real), as_real([0.0], real), as_real([1.0], real)
+    )
+    surface = ((1.4 - 1.0) / (1.4 + 1.0)) ** 2
+    # a pane of glass: what its back reflects, through its front, to and fro
+    return near(clear, surface * (1.0 - surface) ** 2 / (1.0 - surface**2), relative=1e-6)
+
+
+def _stiff_layers(real: Real) -> str:
+    from model import tissue_optics
+
+    fine = tissue_optics.layer_stack_reflectance(
+        as_real([60.0, 0.05], real), as_real([7.0, 3.5], real), as_real([0.25, math.inf], real),
+        directions=16,
+    )  # fmt: skip
+    finer = tissue_optics.layer_stack_reflectance(
+        as_real([60.0, 0.05], real), as_real([7.0, 3.5], real), as_real([0.25, math.inf], real),
+        directions=32,
+    )  # fmt: skip
+    return near(fine, finer, relative=0.01)
+
+
+def _conserving_layers(real: Real) -> str:
+    from model import tissue_optics
+
+    white = tissue_optics.layer_stack_reflectance(
+        as_real([0.0, 0.0], real), as_real([5.0, 1.0], real), as_real([0.25, math.inf], real)
+    )
+    entered = 1.0 - ((1.4 - 1.0) / (1.4 + 1.0)) ** 2  # what the surface does not reflect at once
+    return near(white, entered, absolute=2e-3)
+
+
+def _pigment_ends(real: Real) -> str:
+    from model import tissue_optics
+
+    wavelength = as_real([400.0, 500.0, 600.0, 700.0], real)
+    c_m, c_hd = as_real([0.0, 0.5], real)[:, None, None], as_real([0.0, 0.32], real)[:, None]
+    value = tissue_optics.two_layer_reflectance(wavelength, c_m, c_hd)
+    if not (np.all(value[0] > value[1]) and np.all(value[:, 0] >= value[:, 1])):
+        raise Unexpected("more pigment reflects more")
+    return within(value, 1e-5, 0.95, what="R")
+
+
+def _pigment_beyond(real: Real) -> str:
+    from model import tissue_optics
+
+    return refused(
+        lambda: tissue_optics.two_layer_reflectance(real(500.0), real(-0.01), real(0.05)),
+        ValueError, "c_m",
+    )  # fmt: skip
+
+
+def _table_far(real: Real) -> str:
+    from model import photon_table
+
+    refused(lambda: photon_table.reflectance(real(0.0), 0.05, 1.0), ValueError, "radius_mm")
+    r = as_real([1e-4, 0.5, 20.0, 1e3], real)
+    value = photon_table.reflectance(r, real(0.05), real(1.0))
+    rising(-value[:-1], what="-R(r)")
+    return "r = 0 refused; " + within(value, 0.0, 1e6, what="R(r)")
+
+
+def _profile_flat(real: Real) -> str:
+    from reconstruction import subsurface
+
+    r = np.linspace(1.0, 15.0, 28)
+    fit = subsurface.invert(r, as_real(np.full((1, 28), 1e-3), real))
+    clean(fit.sigma_tr_per_mm, fit.valid, what="sigma_tr")
+    return masked(fit.valid)
+
+
+def _profile_dark(real: Real) -> str:
+    from reconstruction import subsurface
+
+    r = np.linspace(1.0, 15.0, 28)
+    fit = subsurface.invert(
+        r, as_real(np.zeros((1, 28)), real), variance=as_real(np.full((1, 28), 1e-12), real)
+    )
+    clean(fit.sigma_tr_per_mm, fit.valid, what="sigma_tr")
+    return masked(fit.valid)
+
+
+def _profile_broken(real: Real) -> str:
+    from model import photon_table
+    from reconstruction import subsurface
+
+    r = np.linspace(1.0, 15.0, 28)
+    truth = photon_table.reflectance(r, 0.08, 1.2)
+    profile = as_real(np.stack([truth, truth]), real)
+    profile[1, 5] = np.nan
+    fit = subsurface.invert(r, profile, valid=np.isfinite(profile))
+    both = np.asarray(fit.sigma_tr_per_mm)
+    masked(fit.valid, share=(1.0, 1.0))
+    return near(both[1], both[0], relative=5e-3)
+
+
+def _one_photon(real: Real) -> str:
+    from rigsim.tissue_mc import Layer, LayerStack, transport
+
+    stack = LayerStack((Layer(math.inf, 0.1, 10.0, 0.9, float(real(1.4))),))
+    found = transport(stack, photons=1, rng=np.random.default_rng(0))
+    return within(found.reflectance, 0.0, 1.0, what="share reflected")
+
+
+CASES = (
+    Case("reduced albedo to 1", "dipole", "1 - alpha' from 1e-1 down to 1e-15",
+         "R_d has infinite slope at 1: digits are lost", "1 - R_d rises; inverse to rounding",
+         _albedo_near_one),
+    Case("reflectance from 1e-6 to 1 - 1e-9", "dipole", "both ends of R_d at once",
+         "the inverse of eq. (5) stalls or jumps", "alpha' rises with R_d", _reflectance_ends),
+    Case("no loss at all", "dipole", "alpha' = 1 for eta from 1 to 1.6",
+         "0/0 in the boundary's term", "R_d = 1 for every eta", _all_light_back),
+    Case("more light than fell", "dipole", "R_d = 1.02", "a root that does not exist",
+         "ReflectanceOutlierError naming the value", _more_than_all),
+    Case("absorption to zero", "dipole", "sigma_a = 0 and 1e-12", "sigma_tr = 0 under a root",
+         "both profiles agree", _no_absorption),
+    Case("absorption far above scattering", "layers", "sigma_a = 1000, sigma_s' = 1",
+         "exponentials under- and overflow", "R_d below 0.002, finite", _black_medium),
+    Case("distance to zero and infinity", "dipole", "r = 0, 1e-9, 100 and 10,000 mm",
+         "1/r and e^-r", "finite, and smooth at 0", _radius_ends),
+    Case("index 1 and 1.6", "layers", "no boundary, and a strong one", "Fresnel's averages",
+         "less light leaves the denser medium", _index_ends),
+    Case("index below 1", "layers", "eta = 0.9", "total reflection outside", "ValueError",
+         _index_not_physical),
+    Case("layer thinner than a mean free path", "layers", "1e-9 mm over an infinite layer",
+         "doubling from an empty start", "the lower layer alone", _thin_layer),
+    Case("empty layer", "layers", "no absorption, no scattering", "0/0 in the albedo",
+         "a pane's back surface, in closed form", _no_layer_at_all),
+    Case("blue light in the darkest skin", "layers", "sigma_a 60 over 0.05 per mm",
+         "stiff absorption across a boundary", "1 % of twice as many directions", _stiff_layers),
+    Case("white skin without end", "layers", "sigma_a = 0, infinite depth",
+         "doubling never converges", "all that entered comes back", _conserving_layers),
+    Case("pigment at its ends", "two-layer skin", "C_m 0 and 0.5, C_hd 0 and 0.32",
+         "absorption over four decades", "darker with each pigment, in (0, 1)", _pigment_ends),
+    Case("negative pigment", "two-layer skin", "C_m = -0.01", "gain instead of loss",
+         "ValueError naming c_m", _pigment_beyond),
+    Case("photon table beyond its rings", "photon table", "r = 0, 1e-4 and 1000 mm",
+         "a pole at 0, extrapolation off the table", "ValueError at 0, else finite and falling",
+         _table_far),
+    Case("profile without decay", "subsurface fit", "28 equal readings", "sigma_tr runs to zero",
+         "not valid, no NaN", _profile_flat),
+    Case("profile of darkness", "subsurface fit", "28 zeros", "logarithm of 0",
+         "not valid, no NaN", _profile_dark),
+    Case("profile with a dead fibre", "subsurface fit", "one NaN of 28, masked",
+         "NaN spreads through sums", "the fit of the other 27", _profile_broken),
+    Case("one photon", "Monte Carlo", "a single path", "no spread to take an error from",
+         "a share from 0 to 1", _one_photon),
+)  # fmt: skip

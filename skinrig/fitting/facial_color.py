@@ -1,0 +1,194 @@
+"""From flash sessions to a hemoglobin rig that can be blended: `skinrig fit facial-color`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model import facial_color_document, store
+from model.skin import SkinMap
+from reconstruction import facial_color_fit, landmark_table, state_images
+from reconstruction.facial_color_fit import FacialColorFit
+from reconstruction.state_images import Landmarks, Subject
+from skinrig import dynamic_appearance
+from skinrig.dynamic_appearance import FACIAL_COLOR, Part
+from skinrig.simulating.simulation import truth_folder
+
+
+class FacialColorInputError(ValueError):
+    """Landmarks or sessions that cannot be used."""
+
+
+def fit_facial_color(
+    sessions: Sequence[Path],
+    *,
+    out: Path,
+    calibration: Path | None = None,
+    landmarks: Path | None = None,
+    radius_px: float | None = None,
+    stored_size: int | None = 256,
+    progress: Callable[[str], None] | None = None,
+) -> FacialColorFit:
+    """Fit the facial-color part of a dynamic appearance.
+
+    Parameters
+    ----------
+    sessions
+        SESSION/ folders of the flash rig, one subject, with a neutral state.
+    out
+        Folder of the dynamic appearance; other parts in it stay.
+    calibration
+        CALIBRATION/ folder.
+    landmarks
+        Folder with a table ``STATE.csv`` (name, x, y) for each state; None: a simulation's own,
+        otherwise features are matched.
+    radius_px
+        Radius of the disc of the local statistics, px of the maps.
+    stored_size
+        Cells a side of the stored scale and bias maps.
+    progress
+        Called with one line a step.
+
+    Raises
+    ------
+    FacialColorFitError, EvidenceError, LandmarkError, DynamicAppearanceError
+        Naming what is missing or does not fit.
+    """
+    dynamic_appearance.check_target(out)
+    subject = state_images.read(sessions, calibration=calibration, progress=progress)
+    marks, marked_by, unmarked = _landmarks(subject, sessions, landmarks)
+    found = facial_color_fit.fit(
+        subject, radius_px=radius_px, landmarks=marks, stored_size=stored_size, progress=progress
+    )
+    maps, document = facial_color_document.to_maps(found.rig)
+    maps["melanin"] = found.melanin
+    for state, change in found.changes.items():
+        maps[f"change_{state}"] = change
+        maps[f"hemoglobin_{state}"] = found.hemoglobin[state]
+    truths = {
+        state: folder.name
+        for state, folder in _truths(subject, sessions).items()
+        if folder is not None
+    }
+    dynamic_appearance.add(
+        out,
+        FACIAL_COLOR,
+        Part(
+            maps=maps,
+            files={facial_color_document.DOCUMENT: document},
+            parameters={
+                "sessions": [path.name for path in sessions],
+                "states": list(found.hemoglobin),
+                "radius_px": found.rig.radius_px,
+                "landmarks": marked_by,
+                "alignment": facial_color_fit.alignment_document(found),
+                "repeatability": facial_color_fit.repeats_document(found),
+                "storage_error": {n: list(e) for n, e in found.rig.storage_error().items()},
+                "camera": subject.camera,
+                "illuminant": subject.illuminant,
+                "assumed": list(subject.assumed),
+                "consent": [dict(one) for one in subject.consent],
+                "truth": truths,
+            },
+            inputs=subject.inputs,
+            source=subject.source,
+            left_out=(*found.left_out, *unmarked),
+            seed=subject.seed,
+        ),
+    )
+    return found
+
+
+def summary(found: FacialColorFit) -> list[tuple[str, str, str, str, str]]:
+    """Return state, mean change in percent, its share of the neutral's, scale, and alignment."""
+    rows = []
+    neutral = found.hemoglobin["neutral"]
+    errors = {one.image.state: one.alignment for one in found.aligned if one.alignment is not None}
+    for state, change in found.changes.items():
+        both = _both(change, neutral)
+        level = float(neutral.values[both].mean()) if both.any() else float("nan")
+        mean = float(change.values[both].mean()) if both.any() else float("nan")
+        scale = found.rig.states[state]
+        alignment = errors.get(state)
+        error = "" if alignment is None else f"{np.median(alignment.error_px[alignment.valid]):.2f}"
+        rows.append(
+            (
+                state,
+                f"{100 * mean:+.3f}",
+                f"{100 * mean / level:+.1f}",
+                f"{np.median(scale.scale[scale.valid]):.3f}",
+                error,
+            )
+        )
+    return rows
+
+
+def _both(a: SkinMap, b: SkinMap) -> Any:
+    good = np.ones(a.values.shape[:2], bool)
+    for one in (a, b):
+        if one.valid is not None:
+            good &= one.valid
+    return good
+
+
+def _landmarks(
+    subject: Subject, sessions: Sequence[Path], folder: Path | None
+) -> tuple[Mapping[str, Landmarks] | None, str, list[tuple[str, str]]]:
+    """Return the landmarks of each state, where they come from, and which states have none."""
+    found: dict[str, Landmarks] = {}
+    if folder is not None:
+        if not folder.is_dir():
+            raise FacialColorInputError(
+                f"landmarks: {folder} is no folder; expected one with STATE.csv for each state"
+            )
+        found = {
+            state: landmark_table.read(folder / f"{state}.csv")
+            for state in subject.states
+            if (folder / f"{state}.csv").is_file()
+        }
+        if "neutral" not in found:
+            raise FacialColorInputError(f"landmarks: {folder / 'neutral.csv'} is missing")
+        words = "tables"
+    elif subject.source == "simulated":
+        for state, place in _truths(subject, sessions).items():
+            told = {} if place is None else store.read_document(place).parameters
+            points = told.get("landmarks_px")
+            if place is not None and isinstance(points, dict):
+                found[state] = {n: _point(place, n, value) for n, value in points.items()}
+        words = "the simulation's own"
+    if "neutral" not in found or len(found) < 2:
+        return None, "features matched", []
+    missing = [state for state in subject.states if state not in found]
+    return found, words, [(state, "landmarks: none, features were matched") for state in missing]
+
+
+def _truths(subject: Subject, sessions: Sequence[Path]) -> dict[str, Path | None]:
+    """Return the folder with each state's truth, beside the session that shows it first."""
+    return {
+        state: _truth_of(sessions[subject.of(state)[0].session], state) for state in subject.states
+    }
+
+
+def _point(place: Path, name: str, value: Any) -> tuple[float, float]:
+    try:
+        x, y = value
+        return float(x), float(y)
+    except (TypeError, ValueError) as error:
+        raise FacialColorInputError(
+            f"{place}: landmark {name!r} is {json.dumps(value)}, expected two numbers"
+        ) from error
+
+
+def _truth_of(session: Path, state: str) -> Path | None:
+    """Return the folder with a simulated session's truth of a state, where there is one."""
+    first = truth_folder(session)
+    # a session's first state has no name in its folder's
+    for named in (first, first.with_name(f"{first.name}-{state}")):
+        if (named / store.DOCUMENT).is_file():
+            if store.read_document(named).parameters.get("state") == state:
+                return named
+    return None

@@ -1,0 +1,303 @@
+"""From labelled appearances to trait spaces: `skinrig fit traits`."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import store
+from model.texture_space import TextureSpace
+from model.trait_storage import TraitLibrary
+from model.trait_vectors import Contrast
+from model.traits import TraitSpace
+from reconstruction import brdf_basis, common_regions
+from reconstruction.common_parameterization import CommonFrame
+from skinrig import face_textures
+from skinrig.editing import surface_mixtures
+from skinrig.editing.surface_mixtures import SurfaceMixtureError
+from skinrig.face_textures import Face
+from skinrig.traits import albedo_vectors, regions
+from skinrig.traits import labels as trait_labels
+from skinrig.traits.albedo_vectors import VectorKind
+from skinrig.traits.labels import Labels
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+RANK: Final = 8
+"""Lobes of a population's surface (Weyrich et al. 2005, figure 15)."""
+LEAST_PIXELS: Final = 200
+"""Valid pixels of the common map below which a region says nothing."""
+
+
+class TraitFitError(ValueError):
+    """Appearances that no traits can be learned from."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TraitFit:
+    """What was learned.
+
+    Attributes
+    ----------
+    library
+        The spaces.
+    faces, ignored
+        Names of the faces, and of those in the table that were not given.
+    rows
+        Part, trait, faces with and without, p value, expected cosine; one a trait and part.
+    warnings
+        A sentence each.
+    left_out
+        What was not learned, and why.
+    """
+
+    library: TraitLibrary
+    faces: tuple[str, ...]
+    ignored: tuple[str, ...]
+    rows: tuple[tuple[str, str, int, int, float, float], ...]
+    warnings: tuple[str, ...]
+    left_out: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlbedoSample:
+    """One face's albedo in the common map."""
+
+    r_d: Image
+    """(N, N, 3)."""
+    valid: Bools
+    """(N, N)."""
+
+
+def fit_traits(
+    appearances: Sequence[Path],
+    labels: Path,
+    *,
+    out: Path,
+    landmarks: Path | None = None,
+    vectors: VectorKind = "quantiles",
+    contrast: Contrast = "means",
+    size: int | None = None,
+    basis: Path | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> TraitFit:
+    """Learn traits of labelled faces.
+
+    Parameters
+    ----------
+    appearances
+        APPEARANCE/ folders of dome sessions.
+    labels
+        Table, see `trait_labels.read`.
+    out
+        File to write; an older one is replaced when the new is complete.
+    landmarks
+        Folder with a table ``NAME.csv`` for each face; None: those of simulations.
+    vectors
+        What stands for an albedo, see `albedo_vectors`.
+    contrast
+        "means" of those with and without, or "regression" on all traits together.
+    size
+        Pixels a side of the common map; by default what the coarsest texture shows.
+    basis
+        Folder of MERL files that the lobes were fitted with.
+    seed
+        Of the tests of confidence.
+    progress
+        Called with a line a step.
+
+    Raises
+    ------
+    TraitFitError, FaceError, LabelError, TraitError, ParameterizationError
+        Naming what is missing or does not fit.
+    """
+    tell = progress or (lambda text: None)
+    faces = read_faces(appearances, landmarks)
+    table = trait_labels.read(labels, [face.name for face in faces])
+    frame = face_textures.common_frame(faces, size)
+    tell(f"common map: {frame.size} pixels of {frame.pixel_mm:.2f} mm, {len(frame.names)} marks")
+    samples = []
+    for face in faces:
+        samples.append(albedo_sample(face, frame))
+        tell(f"{face.name}: {100 * samples[-1].valid.mean():.0f} % of the common map")
+    left_out: list[tuple[str, str]] = []
+    spaces = albedo_spaces(
+        samples, table, frame, vectors, contrast=contrast, seed=seed, left_out=left_out
+    )
+    texture = spaces.pop("texture")
+    surface = _surface(faces, table, basis, contrast, seed, left_out)
+    if surface is not None:
+        spaces[regions.SURFACE] = surface
+    library = TraitLibrary(
+        spaces,
+        "measured" if all(f.appearance.source == "measured" for f in faces) else "simulated",
+        regions.library_parameters(
+            frame, vectors, contrast=contrast, seed=seed, faces=[face.name for face in faces],
+            labels={n: v.astype(float).tolist() for n, v in
+                    {**table.binary, **table.continuous}.items()},
+            landmarks=sorted({face.marked_by for face in faces}),
+            inputs={"labels": face_textures.digest(labels)}
+            | {f.name: face_textures.digest(f.path / store.DOCUMENT) for f in faces},
+            left_out=[list(row) for row in left_out],
+        ),
+        {regions.TEXTURE_SPACE: regions.texture_bytes(texture)},
+    )  # fmt: skip
+    _write(out, library)
+    rows, warnings = summary(library)
+    return TraitFit(
+        library, tuple(f.name for f in faces), table.ignored, rows, warnings, tuple(left_out)
+    )
+
+
+def albedo_sample(face: Face, frame: CommonFrame) -> AlbedoSample:
+    """Return a face's albedo in the common map."""
+    r_d = face.r_d
+    image, valid = face.chart(frame).gather(r_d.values, face_textures.valid_of(r_d))
+    return AlbedoSample(image, valid)
+
+
+def albedo_spaces(
+    samples: Sequence[AlbedoSample],
+    labels: Labels,
+    frame: CommonFrame,
+    vectors: VectorKind,
+    *,
+    contrast: Contrast = "means",
+    seed: int = 0,
+    left_out: list[tuple[str, str]],
+) -> dict[str, Any]:
+    """Learn the traits of albedo maps, region by region.
+
+    Returns
+    -------
+    dict
+        Name of each space to a `TraitSpace`, and "texture" to the `TextureSpace` common to all.
+    """
+    encoded = [albedo_vectors.encoded(one.r_d, vectors) for one in samples]
+    texture = TextureSpace.fit(encoded, valid=[one.valid for one in samples])
+    found: dict[str, Any] = {"texture": texture}
+    for region in ("face", "beard", "no-beard"):
+        inside = common_regions.region(region, frame)
+        fewest = min(int((inside & one.valid).sum()) for one in samples)
+        if fewest < LEAST_PIXELS:
+            left_out.append((f"albedo of {region}", f"a face shows {fewest} pixels of it"))
+            continue
+        rows = [
+            albedo_vectors.vector(
+                one.r_d, texture, vectors, valid=one.valid, region=inside & one.valid
+            )
+            for one in samples
+        ]
+        found[regions.space_name(region)] = albedo_vectors.fit(
+            rows, labels.binary, labels.continuous, texture, vectors, contrast=contrast, seed=seed
+        ).traits
+    if len(found) == 1:
+        raise TraitFitError("r_d: no region of the face is valid in all appearances")
+    return found
+
+
+def summary(
+    library: TraitLibrary,
+) -> tuple[tuple[tuple[str, str, int, int, float, float], ...], tuple[str, ...]]:
+    """Return a row for each trait and part, and all warnings, each once."""
+    rows = tuple(
+        (part, name, trait.members, trait.others, trait.confidence.p_value,
+         trait.confidence.expected_cosine)
+        for part, space in library.spaces.items()
+        for name, trait in space.traits.items()
+    )  # fmt: skip
+    said = [f"{part}: {w}" for part, space in library.spaces.items() for w in space.warnings]
+    return rows, tuple(dict.fromkeys(said))
+
+
+def read_faces(appearances: Sequence[Path], landmarks: Path | None) -> list[Face]:
+    """Read appearances with their landmarks.
+
+    Raises
+    ------
+    TraitFitError
+        For fewer than two, names that are the same, or faces without landmarks, saying what to do.
+    """
+    if len(appearances) < 2:
+        raise TraitFitError(f"appearances: got {len(appearances)}, expected two or more faces")
+    if landmarks is not None and not landmarks.is_dir():
+        raise TraitFitError(f"landmarks: {landmarks} is no folder; expected one with NAME.csv each")
+    faces: list[Face] = []
+    for path in appearances:
+        name = path.resolve().name.removeprefix("appearance-")
+        table = None if landmarks is None else landmarks / f"{name}.csv"
+        if table is not None and not table.is_file():
+            raise TraitFitError(f"landmarks: {table} is missing")
+        faces.append(face_textures.read(path, table))
+    names = [face.name for face in faces]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise TraitFitError(f"appearances: two are called {twice!r}; labels could not tell them")
+    _require_landmarks(faces)
+    return faces
+
+
+def _require_landmarks(faces: Sequence[Face]) -> None:
+    bare = [face.name for face in faces if not face.landmarks]
+    if bare:
+        raise TraitFitError(
+            f"landmarks: {', '.join(bare[:5])}{', ...' if len(bare) > 5 else ''} have none; mark "
+            f"about 20 points of each face in a table name,x,y (texels of its maps) or name,x,y,z "
+            f"(mm of its mesh), called {bare[0]}.csv, and name their folder: --landmarks DIR. "
+            f"Usual points: {', '.join(list(common_regions.STANDARD_MM)[:6])}, ..."
+        )
+
+
+def _surface(
+    faces: Sequence[Face],
+    labels: Labels,
+    folder: Path | None,
+    contrast: Contrast,
+    seed: int,
+    left_out: list[tuple[str, str]],
+) -> TraitSpace | None:
+    """Learn the traits of mean mixtures, or say why not."""
+    try:
+        found = [surface_mixtures.read(face.appearance) for face in faces]
+    except SurfaceMixtureError as error:
+        left_out.append(("surface", str(error)))
+        return None
+    first = found[0]
+    for face, one in zip(faces, found, strict=True):
+        if (one.materials, one.light_radius_rad) != (first.materials, first.light_radius_rad):
+            left_out.append(("surface", f"{face.name}: its lobes are of other materials"))
+            return None
+    tables = surface_mixtures.materials_of(first.materials, first.light_radius_rad, folder)
+    strength = tables.strength()
+    means = np.array([one.mean(strength) for one in found])
+    products = tables.kinship() * np.outer(strength, strength)
+    rank = min(RANK, len(means) - 1)
+    # the paper's: traits in the space of few non-negative lobes of the population
+    mix = brdf_basis.reduce(means, rank, basis=tables, seed=seed)[1]
+    return TraitSpace.fit(
+        means, labels.binary, continuous=labels.continuous, space="nmf", basis=mix,
+        metric=products, contrast=contrast, names=first.materials, seed=seed,
+    )  # fmt: skip
+
+
+def _write(out: Path, library: TraitLibrary) -> None:
+    """Write a file whole or not at all."""
+    if out.is_dir():
+        raise TraitFitError(f"{out}: is a folder, expected the name of a file such as traits.npz")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    part = out.with_name(f".{out.name}.{uuid.uuid4().hex}.part")
+    try:
+        part.write_bytes(library.to_bytes())
+        os.replace(part, out)
+    finally:
+        part.unlink(missing_ok=True)

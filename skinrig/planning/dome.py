@@ -1,0 +1,286 @@
+"""Plans of the light dome: which of its lights and cameras a subject needs.
+
+The forecast follows a face of the rig's simulation: which points each light and camera reach, how
+much light comes back, how noisy the sensor is. What no sample removes is taken from what the
+reconstruction itself states: samples misplaced by part of a pixel, and relief too fine for it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.plan import Plan
+from capture.plan.dome import EXPOSURES_S, dome_plan
+from capture.plan.rows import lights_of
+from capture.rig import Rig
+from reconstruction import light_selection, surface_estimates
+from reconstruction.light_selection import Prediction
+from skinrig.planning.dome_sight import Sight, sight
+from skinrig.planning.plans import Choice, Forecast, PlanningError, light_of
+
+Floats = NDArray[np.float64]
+
+VALID_SHARE = 0.9
+"""Of the points that the whole dome gives an estimate, so many must keep one."""
+FORECAST_SPREAD = {"normals": 0.2, "r_d": 0.4}
+"""Relative deviation of measured from predicted medians, see docs/planning.md."""
+
+
+def choose(
+    rig: Rig,
+    wants: Mapping[str, float],
+    *,
+    subject: str = "III",
+    seed: int = 0,
+    valid_share: float = VALID_SHARE,
+    most_lights: int | None = None,
+) -> Choice:
+    """Choose the fewest lights, then the fewest cameras, that reach what is wanted.
+
+    Parameters
+    ----------
+    rig
+        A dome.
+    wants
+        By name: "normals" in degrees, "r_d" in percent, both medians over the face; empty: the
+        forecast of the whole dome.
+    subject
+        Preset of the face that is forecast.
+    seed
+        Of that face.
+    valid_share
+        Of the points that the whole dome estimates, so many must keep an estimate.
+    most_lights
+        Largest number of lights.
+    """
+    least = surface_estimates.LEAST_LIGHTS
+    if len(rig.lights) < least or len(rig.views) < surface_estimates.LEAST_VIEWS:
+        raise PlanningError(
+            f"rig: got {len(rig.lights)} lights and {len(rig.views)} cameras, expected at least "
+            f"{least} and {surface_estimates.LEAST_VIEWS}"
+        )
+    look = sight(rig, subject, seed=seed)
+    every_view = range(len(rig.views))
+    every_light = range(len(rig.lights))
+    best = light_selection.predict(look.information(every_view), every_light, least=least)
+    full = dome_plan(rig)
+    if not wants:
+        return _choice(rig, look, list(every_light), list(every_view), best, wants, rig, full)
+    reasons = _out_of_reach(best, look, wants)
+    target = math.radians(wants.get("normals", 90.0))
+    share = valid_share * best.valid_share
+    selected = light_selection.select(
+        look.information(every_view), median_rad=target, valid_share=share, least=least,
+        most=most_lights,
+    )  # fmt: skip
+    lights, prediction = list(selected.lights), selected.prediction
+    while not _r_d_reached(prediction, look, wants) and len(lights) < len(rig.lights):
+        selected = light_selection.select(
+            look.information(every_view), median_rad=0.0, valid_share=2.0, least=least,
+            most=len(lights) + 1, fixed=tuple(lights),
+        )  # fmt: skip
+        lights, prediction = list(selected.lights), selected.prediction
+        if most_lights is not None and len(lights) >= most_lights:
+            break
+    views, prediction = _fewer_views(look, lights, prediction, wants, share)
+    kept = rig.subset(
+        lights=[rig.lights[k].name for k in lights], views=[rig.views[k].name for k in views]
+    )
+    path = tuple(
+        {"lights": float(n), "normals_deg": math.degrees(error), "valid_share": share_now}
+        for n, error, share_now in selected.path
+    )
+    return _choice(
+        rig, look, lights, views, prediction, wants, kept, full, path=path, reasons=reasons
+    )
+
+
+def foresee(
+    rig: Rig, plan: Plan, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0
+) -> Choice:
+    """Return what a plan of the dome will give.
+
+    Parameters
+    ----------
+    rig
+        The dome.
+    plan
+        Whose lights and cameras are looked at.
+    wants, subject, seed
+        As in `choose`.
+    """
+    lit = {name for step in plan.steps if step.kind == "olat" for name in lights_of(step)}
+    seen = {name for step in plan.steps if step.kind == "olat" for name in step.cameras}
+    lights = [k for k, light in enumerate(rig.lights) if light.name in lit]
+    views = [k for k, view in enumerate(rig.views) if view.name in seen]
+    if len(lights) < surface_estimates.LEAST_LIGHTS or len(views) < surface_estimates.LEAST_VIEWS:
+        raise PlanningError(
+            f"plan: got {len(lights)} lights and {len(views)} cameras of this rig, expected at "
+            f"least {surface_estimates.LEAST_LIGHTS} and {surface_estimates.LEAST_VIEWS}"
+        )
+    look = sight(rig, subject, seed=seed)
+    prediction = light_selection.predict(
+        look.information(views), lights, least=surface_estimates.LEAST_LIGHTS
+    )
+    kept = rig.subset(
+        lights=[rig.lights[k].name for k in lights], views=[rig.views[k].name for k in views]
+    )
+    return _choice(rig, look, lights, views, prediction, wants, kept, dome_plan(rig), plan=plan)
+
+
+def confirm(
+    choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Simulate the dome of a choice and its calibration, reconstruct, compare with the truth."""
+    from model import store
+    from reconstruction import pipeline
+    from skinrig.calibrating.calibrate import calibrate
+    from skinrig.evaluating import surface as surface_evaluation
+    from skinrig.simulating.simulation import simulate_session
+
+    width = choice.rig.views[0].width_px
+    sessions = {name: out / f"session-{name}" for name in ("charuco", "mirror", "white")}
+    for target, session in sessions.items():
+        progress(f"simulate {target}")
+        simulate_session(
+            "dome", session, target=target, seed=seed, width_px=width, plan=choice.plan
+        )
+    calibration = out / "calibration"
+    calibrate("geometry", [sessions["charuco"]], calibration)
+    calibrate("lights", [sessions["mirror"], sessions["white"]], calibration)
+    progress(f"simulate the face {subject}")
+    done = simulate_session(
+        "dome", out / "session-face", subject=subject, seed=seed, width_px=width, plan=choice.plan
+    )
+    progress("reconstruct")
+    pipeline.reconstruct(
+        done.session, want=("normals", "r_d"), out=out / "appearance", calibration=calibration,
+        truth=done.truth.name if done.truth else "",
+    )  # fmt: skip
+    appearance, truth = (store.read(out / name) for name in ("appearance", "truth-face"))
+    pairs = surface_evaluation.match(appearance, truth)
+    rows = []
+    for one in choice.forecasts:
+        error = np.abs(surface_evaluation.errors_at(one.name, appearance, truth, pairs))
+        median = float(np.nanmedian(error))
+        rows.append(
+            {
+                "name": one.name, "unit": one.unit, "median": median, "forecast": one.value,
+                "within": one.interval[0] <= median <= one.interval[1],
+                "valid_share": float(np.isfinite(error).mean()),
+            }
+        )  # fmt: skip
+    return rows
+
+
+def _choice(
+    rig: Rig, look: Sight, lights: list[int], views: list[int], prediction: Prediction,
+    wants: Mapping[str, float], kept: Rig, full: Any, *,
+    path: tuple[Mapping[str, float], ...] = (), reasons: tuple[str, ...] = (),
+    plan: Plan | None = None,
+) -> Choice:  # fmt: skip
+    plan = dome_plan(kept) if plan is None else plan
+    forecasts = tuple(
+        Forecast(name, unit, value, _interval(name, value), wants.get(name))
+        for name, unit, value in (
+            ("normals", "deg", math.degrees(prediction.median_rad)),
+            ("r_d", "%", 100.0 * _r_d_error(prediction, look)),
+        )
+    )
+    left_out = []
+    if len(lights) < len(rig.lights):
+        names = [light.name for k, light in enumerate(rig.lights) if k not in lights]
+        left_out.append((
+            f"{len(names)} of {len(rig.lights)} lights: {', '.join(names)}",
+            "the others reach what is wanted",
+        ))  # fmt: skip
+    if len(views) < len(rig.views):
+        names = [view.name for k, view in enumerate(rig.views) if k not in views]
+        left_out.append((
+            f"{len(names)} of {len(rig.views)} cameras: {', '.join(names)}",
+            "two others see each point that is asked for",
+        ))  # fmt: skip
+    return Choice(
+        kept, plan, forecasts, plan.estimated_s(kept), full.estimated_s(rig),
+        {
+            "lights": [rig.lights[k].name for k in sorted(lights)],
+            "views": [rig.views[k].name for k in sorted(views)],
+            "valid_share": prediction.valid_share,
+            "exposures_s": list(EXPOSURES_S),
+        },
+        tuple(left_out), path, reasons, light_of(plan, kept),
+    )  # fmt: skip
+
+
+def _interval(name: str, value: float) -> tuple[float, float]:
+    return value / (1.0 + FORECAST_SPREAD[name]), value * (1.0 + FORECAST_SPREAD[name])
+
+
+def _r_d_error(prediction: Prediction, look: Sight) -> float:
+    """Return the predicted median relative error of R_d."""
+    if not prediction.valid.any():
+        return math.inf
+    sigma = np.sqrt(
+        prediction.log_albedo**2
+        + (surface_estimates.UNRESOLVED_R_D_PER_MM * look.pixel_mm) ** 2
+        + (surface_estimates.R_D_BY_NORMAL * prediction.tilt_rad) ** 2
+    )
+    return 0.6745 * float(np.median(sigma[prediction.valid]))  # median of a normal's magnitude
+
+
+def _r_d_reached(prediction: Prediction, look: Sight, wants: Mapping[str, float]) -> bool:
+    return "r_d" not in wants or 100.0 * _r_d_error(prediction, look) <= wants["r_d"]
+
+
+def _fewer_views(
+    look: Sight, lights: list[int], prediction: Prediction, wants: Mapping[str, float],
+    valid_share: float,
+) -> tuple[list[int], Prediction]:  # fmt: skip
+    """Take off cameras, the one that is missed least first, while what is wanted is reached."""
+    views = list(range(look.variance.shape[2]))
+    least = surface_estimates.LEAST_LIGHTS
+    target = math.radians(wants.get("normals", 90.0))
+    if prediction.median_rad > target or prediction.valid_share < valid_share:
+        return views, prediction
+    while len(views) > surface_estimates.LEAST_VIEWS:
+        tried = []
+        for view in views:
+            rest = [other for other in views if other != view]
+            now = light_selection.predict(look.information(rest), lights, least=least)
+            if (
+                now.median_rad <= target
+                and now.valid_share >= valid_share
+                and _r_d_reached(now, look, wants)
+            ):
+                tried.append((-now.valid_share, now.median_rad, view, now))
+        if not tried:
+            break
+        _, _, view, prediction = min(tried, key=lambda one: one[:3])
+        views.remove(view)
+    return views, prediction
+
+
+def _out_of_reach(best: Prediction, look: Sight, wants: Mapping[str, float]) -> tuple[str, ...]:
+    """Say why no number of lights gives what is wanted, where that is so."""
+    out = []
+    normals = math.degrees(best.median_rad)
+    if normals > wants.get("normals", math.inf):
+        floor = math.degrees(light_selection.median_of_rayleigh(look.systematic_rad))
+        out.append(
+            f"normals: all lights and cameras leave {normals:.2f} degrees, {floor:.2f} of them by "
+            f"misplaced samples and fine relief at {look.pixel_mm:.2g} mm a pixel; "
+            "more pixels would help, more lights will not"
+        )
+    r_d = 100.0 * _r_d_error(best, look)
+    if r_d > wants.get("r_d", math.inf):
+        out.append(
+            f"r_d: all lights and cameras leave {r_d:.2g} %; at {look.pixel_mm:.2g} mm a pixel "
+            "albedo too fine for it is part of that"
+        )
+    return tuple(out)

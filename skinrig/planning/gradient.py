@@ -1,0 +1,419 @@
+"""Plans of the gradient sphere: which patterns, and how long, the normals of skin need.
+
+The forecast propagates the sensor's noise through the reconstruction itself, on the pictures of a
+small patch of simulated skin: moments, Wiener filter and lookup state a standard error for each
+pixel. What measured patches were off beyond it is added, and what the lens takes from the relief is
+told beside.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.plan import Plan, PlanError
+from capture.plan.gradient import DWELL_S, EXPOSURE_S, gradient_plan, state_of
+from capture.plan.steps import PATTERNS
+from capture.rig import Rig
+from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, light_of
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Key = tuple[str, str]
+
+PATCH_PX = 96
+"""Side of the patch that the forecast looks at; a pixel is the rig's, 6 um."""
+SETS: tuple[tuple[str, ...], ...] = (
+    ("x", "-x", "y", "z"), ("full", "x", "y", "z", "-x", "-y", "-z"), tuple(PATTERNS),
+)  # fmt: skip
+"""Patterns that tell light and three gradients: one complement instead of full, which lowers the
+noise more; all complements; and dark."""
+EXPOSURES = (0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
+"""Of the rig's own exposure."""
+SATURATED = 0.98
+"""Of full scale, in the brightest thousandth of the pixels."""
+BEYOND_RAD = math.radians(0.2)
+"""Error of each tilt that is in no standard error: shadows in furrows, a lobe unlike the one that
+is assumed; see docs/planning.md."""
+FORECAST_SPREAD = 0.2
+"""Relative deviation of measured from predicted medians, see docs/planning.md."""
+BORDER_PX = 6
+"""That is not judged: the lens brings in what is beyond it."""
+WHOLE_READOUT_S = DWELL_S - EXPOSURE_S
+"""Between two exposures of patterns: read-out and settling of the LEDs."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What the sphere's camera sees of a patch of skin, and what the reconstruction must know."""
+
+    rates: Mapping[Key, Float32]
+    """By pattern and polarizer, (H, W), full scales per second at full level."""
+    told: Mapping[str, Any]
+    """Lights, views and places, as `reconstruction.gradient_normals.from_patterns` takes them."""
+    chip: Any
+    """The sensor, see `rigsim.sensor.Sensor`."""
+    seen: Floats
+    """(H, W, 3) normals as the lens shows them."""
+    lost_rad: float
+    """Median angle between the relief's normals before and behind the lens."""
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What of a plan the normals of one state hang on."""
+
+    patterns: tuple[str, ...]
+    exposure_s: float
+    darks: int
+    """Frames without light, all in all."""
+    level: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Errors of a patch's normals."""
+
+    median_rad: float
+    noise_rad: float
+    """Median of the errors that noise and lost detail make."""
+    valid_share: float
+
+
+def sight(rig: Rig, subject: str, *, seed: int = 0, side_px: int = PATCH_PX) -> Sight:
+    """Look at a patch of simulated skin, neutral, under all patterns.
+
+    Parameters
+    ----------
+    rig
+        The gradient sphere.
+    subject, seed
+        Pigment and relief of the forehead.
+    side_px
+        Pixels across.
+    """
+    from model.metrics import angular_error_rad
+    from rigsim.microrelief import make_micro_skin
+    from rigsim.scenes.gradient import GradientScene
+    from rigsim.sphere_build import as_drawn
+    from skinrig.benchmarks.gradient_normals import NEUTRAL, lights_of, pixel_geometry
+
+    small = rig.cropped(side_px) if side_px < rig.views[0].width_px else rig
+    size_mm = max(1.2, 0.8 + max(small.views[0].field_mm))
+    skin = make_micro_skin("forehead", seed=seed, size_mm=size_mm, preset=subject)
+    sphere = as_drawn(small)
+    scene = GradientScene(small, skin, sphere=sphere, seed=seed)
+    rates = {
+        (pattern, polarizer): scene.radiance(pattern, grip=NEUTRAL, analyser_deg=reading)
+        for pattern in PATTERNS
+        if pattern != "dark"
+        for polarizer, reading in (("parallel", 0.0), ("crossed", 90.0))
+    }
+    truth = scene.truth_appearance([NEUTRAL]).maps
+    seen, sharp = (
+        np.asarray(truth[name].values, np.float64) for name in ("normals_seen_a000_n0", "normals")
+    )
+    inner = (slice(BORDER_PX, -BORDER_PX),) * 2
+    lost = float(np.median(angular_error_rad(seen[inner], sharp[inner])))
+    told = {"lights": lights_of(sphere), **pixel_geometry(small)}
+    return Sight(rates, told, scene.sensor(), seen, lost, seed)
+
+
+def predict(look: Sight, setting: Setting) -> Prediction:
+    """Return the errors that a scan of one state leaves.
+
+    Parameters
+    ----------
+    look
+        See `sight`.
+    setting
+        Patterns, exposure and darks.
+    """
+    from reconstruction.gradient_normals import estimate_roughness, from_patterns
+    from reconstruction.gradient_stages import SMOOTH_PX
+    from reconstruction.light_selection import median_of_rayleigh
+
+    rng = np.random.default_rng([look.seed, 23])
+    gain, floor = look.chip.noise_profile(setting.exposure_s)
+    values: dict[Key, Float32] = {}
+    variance: dict[Key, Float32] = {}
+    for key, rate in look.rates.items():
+        if key[0] not in setting.patterns:
+            continue
+        light = (setting.level * setting.exposure_s * rate).astype(np.float64)
+        spread = gain * np.maximum(light, 0.0) + floor
+        noisy = light + np.sqrt(spread) * rng.standard_normal(light.shape)
+        values[key] = noisy.astype(np.float32)
+        dark = floor / setting.darks if setting.darks else 0.0
+        variance[key] = (spread + dark).astype(np.float32)
+    told = dict(look.told)
+    alpha = estimate_roughness(
+        values, lights=told["lights"], view=told["view"], variance=variance, smooth_px=SMOOTH_PX
+    )
+    found = from_patterns(values, variance=variance, wiener=True, alpha=alpha, **told)
+    inner = (slice(BORDER_PX, -BORDER_PX),) * 2
+    valid = np.asarray(found.valid)[inner]
+    tilt = np.asarray(found.stderr_rad, np.float64)[inner][valid] / math.sqrt(2.0)
+    return Prediction(
+        median_of_rayleigh(np.hypot(tilt, BEYOND_RAD)), median_of_rayleigh(tilt),
+        float(valid.mean()),
+    )  # fmt: skip
+
+
+def choose(
+    rig: Rig, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0,
+    valid_share: float = 0.9,
+) -> Choice:  # fmt: skip
+    """Choose the quickest scan of the neutral skin that reaches what is wanted.
+
+    Parameters
+    ----------
+    rig
+        The gradient sphere.
+    wants
+        By name: "normals" in degrees, the median over the patch as the lens shows it; empty: the
+        forecast of the rig's own plan.
+    subject, seed
+        The skin that is forecast.
+    valid_share
+        Of the patch so much must have normals.
+    """
+    look = sight(rig, subject, seed=seed)
+    if not wants:
+        plan = gradient_plan(rig)
+        return _choice(rig, look, plan, setting_of(plan), wants)
+    tried: list[tuple[Setting, Plan, Prediction]] = []
+    target = math.radians(wants.get("normals", 90.0))
+    best: Prediction | None = None
+    for setting, plan in candidates(rig, look):
+        found = predict(look, setting)
+        tried.append((setting, plan, found))
+        best = found if best is None or found.median_rad < best.median_rad else best
+        if found.median_rad <= target and found.valid_share >= valid_share:
+            break
+    if best is None:
+        raise PlanningError("rig: got limits that no pattern keeps to")
+    path = tuple(
+        {
+            "patterns": float(len(one.patterns)), "exposure_s": one.exposure_s,
+            "darks": float(one.darks), "seconds": plan.estimated_s(rig),
+            "normals_deg": math.degrees(found.median_rad), "valid_share": found.valid_share,
+        }
+        for one, plan, found in tried
+    )  # fmt: skip
+    setting, plan, found = tried[-1]
+    reasons: tuple[str, ...] = ()
+    if found.median_rad > target:
+        reasons = (_why(best, look),)
+        # the quickest of those that are nearly as good as it gets
+        setting, plan, found = next(
+            one for one in tried if one[2].median_rad <= 1.05 * best.median_rad
+        )
+    return _choice(rig, look, plan, setting, wants, found=found, path=path, reasons=reasons)
+
+
+def foresee(
+    rig: Rig, plan: Plan, wants: Mapping[str, float], *, subject: str = "III", seed: int = 0
+) -> Choice:
+    """Return what a plan of the gradient sphere will give, in its neutral state."""
+    return _choice(rig, sight(rig, subject, seed=seed), plan, setting_of(plan), wants)
+
+
+def confirm(
+    choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Simulate the neutral skin under a choice, and the calibration, reconstruct, compare."""
+    from model import metrics, store
+    from reconstruction import pipeline
+    from skinrig.calibrating.calibrate import calibrate
+    from skinrig.simulating.simulation import simulate_session
+
+    width = min(choice.rig.views[0].width_px, 128)
+    calibration = out / "calibration"
+    progress("simulate flat and ball")
+    simulate_session("gradient", out / "session-flat", target="flat", seed=seed, width_px=width)
+    simulate_session("gradient", out / "session-ball", target="ball", seed=seed)
+    calibrate("sensor", [out / "session-flat"], calibration)
+    for kind in ("lights", "polarization"):
+        calibrate(kind, [out / "session-ball"], calibration)
+    progress(f"simulate the skin {subject}")
+    done = simulate_session(
+        "gradient", out / "session-face", subject=subject, seed=seed, width_px=width,
+        plan=choice.plan,
+    )  # fmt: skip
+    progress("reconstruct")
+    pipeline.reconstruct(
+        done.session, want=("normals",), out=out / "appearance", calibration=calibration,
+        truth=done.truth.name if done.truth else "",
+    )  # fmt: skip
+    appearance, truth = store.read(out / "appearance"), store.read(out / "truth-face")
+    state = next(name for name in map(state_of, choice.plan.steps) if name is not None)
+    made = appearance.maps[f"normals_{state}"]
+    known = np.asarray(truth.maps[f"normals_seen_{state}"].values, np.float64)
+    inner = (slice(BORDER_PX, -BORDER_PX),) * 2
+    good = np.ones(known.shape[:2], bool) if made.valid is None else made.valid
+    error = np.degrees(metrics.angular_error_rad(made.values, known))[inner]
+    median = float(np.median(error[good[inner]]))
+    one = choice.forecasts[0]
+    return [
+        {
+            "name": one.name, "unit": one.unit, "median": median, "forecast": one.value,
+            "within": one.interval[0] <= median <= one.interval[1],
+            "valid_share": float(good[inner].mean()),
+        }
+    ]  # fmt: skip
+
+
+def candidates(rig: Rig, look: Sight | None = None) -> Iterator[tuple[Setting, Plan]]:
+    """Yield scans of the neutral skin that the rig's limits allow, the quickest first.
+
+    Parameters
+    ----------
+    rig
+        The gradient sphere.
+    look
+        Skin that must not be saturated; None: any.
+    """
+    angle = _angles(rig)[0]
+    found: list[tuple[float, int, Setting, Plan]] = []
+    for patterns in SETS:
+        for share in EXPOSURES:
+            exposure_s = share * EXPOSURE_S
+            if look is not None and _brightest(look, exposure_s) > SATURATED:
+                continue
+            for darks in (0, 2):
+                try:
+                    plan = gradient_plan(
+                        rig, angles=[angle], steps=(0, 0), patterns=patterns, darks=darks,
+                        exposure_s=exposure_s, dwell_s=exposure_s + WHOLE_READOUT_S,
+                    )  # fmt: skip
+                except PlanError:
+                    continue  # beyond what an LED may do
+                setting = setting_of(plan)
+                found.append((plan.estimated_s(rig), len(patterns), setting, plan))
+    for _, _, setting, plan in sorted(found, key=lambda one: one[:2]):
+        yield setting, plan
+
+
+def setting_of(plan: Plan) -> Setting:
+    """Return what the normals of a plan's first neutral state hang on.
+
+    Raises
+    ------
+    PlanningError
+        Where its pictures do not tell light and three gradients, in both polarizations.
+    """
+    from reconstruction.gradient_patterns import MissingPatterns, require
+
+    shots = [step for step in plan.steps if step.kind == "gradient" and state_of(step)]
+    neutral = [step for step in shots if int(step.index.get("caliper", 1)) == 0]
+    if not neutral:
+        raise PlanningError("plan: got no neutral state of skin, expected one")
+    state = state_of(neutral[0])
+    own = [step for step in neutral if state_of(step) == state]
+    sets = [
+        {str(step.index["pattern"]) for step in own if step.index["polarizer"] == polarizer}
+        for polarizer in ("parallel", "crossed")
+    ]
+    try:
+        for polarizer, names in zip(("parallel", "crossed"), sets, strict=True):
+            lit = dict.fromkeys(names - {"dark"})
+            require(lit, polarizer=polarizer, purpose="normals")
+    except MissingPatterns as error:
+        raise PlanningError(f"plan: {error}") from error
+    both = sets[0] & sets[1]
+    darks = sum(step.kind == "dark" or step.index.get("pattern") == "dark" for step in plan.steps)
+    first = own[0].settings
+    return Setting(
+        tuple(name for name in PATTERNS if name in both), float(first["exposure_s"]), darks,
+        max(float(step.settings.get("level", 1.0)) for step in own),
+    )  # fmt: skip
+
+
+def _angles(rig: Rig) -> Sequence[float]:
+    if rig.caliper is None:
+        raise PlanningError(
+            f"rig: got {rig.name!r} without a caliper, expected one that holds skin"
+        )
+    return rig.caliper.angles_deg
+
+
+def _brightest(look: Sight, exposure_s: float) -> float:
+    return exposure_s * max(float(np.quantile(rate, 0.999)) for rate in look.rates.values())
+
+
+def _choice(
+    rig: Rig, look: Sight, plan: Plan, setting: Setting, wants: Mapping[str, float], *,
+    found: Prediction | None = None, path: tuple[Mapping[str, float], ...] = (),
+    reasons: tuple[str, ...] = (),
+) -> Choice:  # fmt: skip
+    found = predict(look, setting) if found is None else found
+    full = gradient_plan(rig)
+    value = math.degrees(found.median_rad)
+    forecast = Forecast(
+        "normals", "deg", value, interval_of(value, FORECAST_SPREAD), wants.get("normals")
+    )
+    left_out = []
+    missing = [name for name in PATTERNS if name not in setting.patterns]
+    if missing:
+        left_out.append((
+            f"patterns {', '.join(missing)}",
+            "full light and three gradients are told without them; they would lower the noise",
+        ))  # fmt: skip
+    states, every = ({state_of(s) for s in one.steps} - {None} for one in (plan, full))
+    if len(states) < len(every):
+        left_out.append((
+            f"{len(every) - len(states)} of {len(every)} states of strain",
+            "normals are wanted of neutral skin",
+        ))  # fmt: skip
+    if setting.exposure_s < EXPOSURE_S:
+        left_out.append((
+            f"{1e3 * (EXPOSURE_S - setting.exposure_s):.3g} of {1e3 * EXPOSURE_S:.3g} ms exposed",
+            "what is left reaches what is wanted",
+        ))  # fmt: skip
+    if not setting.darks:
+        left_out.append(
+            (
+                "dark frames",
+                "at this exposure the fixed pattern of the sensor is below its noise",
+            )
+        )
+    lost = math.degrees(look.lost_rad)
+    reasons += (
+        "normals are those that the lens shows; the relief's own are "
+        f"{lost:.2g} degrees off them, which no pattern brings back",
+    )
+    return Choice(
+        rig, plan, (forecast,), plan.estimated_s(rig), full.estimated_s(rig),
+        {
+            "patterns": list(setting.patterns), "polarizers": ["parallel", "crossed"],
+            "states": sorted(str(name) for name in states),
+            "exposure_s": round(setting.exposure_s, 6),
+            "dwell_s": next(
+                round(float(s.settings["dwell_s"]), 6) for s in plan.steps if state_of(s)
+            ),
+            "darks": setting.darks, "level": setting.level, "valid_share": found.valid_share,
+        },
+        tuple(left_out), path, reasons, light_of(plan, rig),
+    )  # fmt: skip
+
+
+def _why(best: Prediction, look: Sight) -> str:
+    floor = math.degrees(BEYOND_RAD * math.sqrt(2.0 * math.log(2.0)))
+    return (
+        f"normals: the best scan leaves {math.degrees(best.median_rad):.2f} degrees; noise and "
+        f"lost detail {math.degrees(best.noise_rad):.2f}, shadows and lobes unlike the assumed one "
+        f"{floor:.2f}; "
+        + (
+            "more patterns or light will not help"
+            if best.noise_rad < math.radians(floor)
+            else "a longer exposure would saturate or ask too much of the LEDs"
+        )
+    )

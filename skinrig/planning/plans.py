@@ -1,0 +1,316 @@
+"""The smallest capture that reaches an error: what is wanted, what was chosen, what was left out.
+
+A plan is judged by what it will give before anybody sits still for it. Each rig has a forecast of
+its own, the Fisher information of its samples with the part of the error that no sample removes,
+and knobs that it may turn; this module reads what is wanted and says what came of it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from capture.plan import Plan
+from capture.rig import Rig, load_rig
+from skinrig.light_safety import light_figures
+
+SCHEMA = "skinrig.plan-choice/1"
+
+UNITS: Mapping[str, Mapping[str, str]] = {
+    "dome": {"normals": "deg", "r_d": "%"},
+    "flash": {"melanin": "%", "hemoglobin": "%"},
+    "gradient": {"normals": "deg"},
+    "probe": {"sigma_tr": "%"},
+}
+"""What can be wanted of each rig, and in which unit."""
+
+_WANT = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
+
+
+class PlanningError(ValueError):
+    """What is wanted cannot be read, or no plan can be made for it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """The predicted error of one quantity."""
+
+    name: str
+    unit: str
+    value: float
+    """Predicted median error, in the unit."""
+    interval: tuple[float, float]
+    """68 % interval of what a capture will show, from how far forecasts were off."""
+    wanted: float | None
+    """What was asked for; None: nothing."""
+
+    @property
+    def reached(self) -> bool:
+        """Whether the forecast keeps to what was asked for."""
+        return self.wanted is None or self.value <= self.wanted
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A plan, why it is as it is, and what it will give."""
+
+    rig: Rig
+    """With the lights and views of the plan only."""
+    plan: Plan
+    forecasts: tuple[Forecast, ...]
+    seconds: float
+    """Of the capture, as the box's times add up."""
+    full_seconds: float
+    """Of the rig's whole plan."""
+    knobs: Mapping[str, Any]
+    """What was chosen: lights, views, repeats, ..."""
+    left_out: tuple[tuple[str, str], ...]
+    """What the plan leaves out of the rig's whole plan, and why."""
+    path: tuple[Mapping[str, float], ...] = ()
+    """What each step of the choice bought."""
+    reasons: tuple[str, ...] = ()
+    """Why what is wanted is not reached, or what the forecast rests on."""
+    light: Mapping[str, Any] = field(default_factory=dict)
+    """Flicker and dose, see `skinrig.light_safety.light_figures`."""
+
+    @property
+    def reached(self) -> bool:
+        """Whether every forecast keeps to what was asked for."""
+        return all(one.reached for one in self.forecasts)
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the JSON document of the choice."""
+        return {
+            "schema": SCHEMA,
+            "rig": self.rig.name,
+            "reached": self.reached,
+            "forecasts": [
+                {
+                    "name": one.name, "unit": one.unit, "median": one.value,
+                    "interval": list(one.interval), "wanted": one.wanted, "reached": one.reached,
+                }
+                for one in self.forecasts
+            ],
+            "knobs": dict(self.knobs),
+            "seconds": self.seconds,
+            "full_seconds": self.full_seconds,
+            "saved_seconds": self.full_seconds - self.seconds,
+            "left_out": [list(item) for item in self.left_out],
+            "path": [dict(step) for step in self.path],
+            "reasons": list(self.reasons),
+            "light": dict(self.light),
+        }  # fmt: skip
+
+
+def read_wants(text: str, rig: str) -> dict[str, float]:
+    """Read what is wanted of a rig.
+
+    Parameters
+    ----------
+    text
+        Such as ``"normals<=1deg,r_d<=3%"``; empty: nothing, the forecast of the plan is asked for.
+    rig
+        Name of the rig.
+
+    Returns
+    -------
+    dict
+        Error by name, in the unit of :data:`UNITS`.
+
+    Raises
+    ------
+    PlanningError
+        Naming the part that cannot be read, and what can be wanted.
+
+    Examples
+    --------
+    >>> read_wants("normals<=1deg, r_d <= 3%", "dome")
+    {'normals': 1.0, 'r_d': 3.0}
+    """
+    units = UNITS.get(rig)
+    if units is None:
+        raise PlanningError(f"rig: got {rig!r}, expected one of {', '.join(UNITS)}")
+    known = ", ".join(f"{name}<=NUMBER{unit}" for name, unit in units.items())
+    wants: dict[str, float] = {}
+    for part in filter(str.strip, text.split(",")):
+        match = _WANT.fullmatch(part)
+        if match is None:
+            raise PlanningError(f"--want: got {part.strip()!r}, expected {known}")
+        name, number, unit = match.groups()
+        if name not in units:
+            close = difflib.get_close_matches(name, units, 1)
+            hint = f"; did you mean {close[0]}?" if close else ""
+            raise PlanningError(f"--want: got {name!r}, expected {known}{hint}")
+        if unit not in (None, units[name]):
+            raise PlanningError(f"--want: got {name} in {unit}, expected {units[name]}")
+        try:
+            value = float(number)
+        except ValueError:
+            value = -1.0
+        if not 0.0 < value < 1e6:
+            raise PlanningError(f"--want: got {name}<={number}, expected a number above 0")
+        if name in wants:
+            raise PlanningError(f"--want: got {name} twice, expected it once")
+        wants[name] = value
+    return wants
+
+
+def light_of(plan: Plan, rig: Rig) -> Mapping[str, Any]:
+    """Return flicker and dose of a plan where its rig has LEDs, else nothing."""
+    return light_figures(plan, rig) if rig.leds is not None or rig.probe is not None else {}
+
+
+def choose(
+    rig_name: str,
+    want: str,
+    *,
+    subject: str = "III",
+    seed: int = 0,
+    width_px: int | None = None,
+    most_lights: int | None = None,
+    valid_share: float = 0.9,
+    forecast: Path | None = None,
+) -> Choice:
+    """Choose the smallest plan of a rig that reaches what is wanted.
+
+    Parameters
+    ----------
+    rig_name
+        Out of :data:`UNITS`.
+    want
+        See `read_wants`.
+    subject, seed
+        The simulated face that is forecast.
+    width_px
+        Pixels across the cameras; None: the rig's own.
+    most_lights
+        See `skinrig.planning.dome.choose`.
+    valid_share
+        Of what the whole rig gives an estimate, so much must keep one.
+    forecast
+        A plan, JSON, of which only the forecast is asked for.
+
+    Raises
+    ------
+    PlanningError
+        For what cannot be read or planned.
+    """
+    wants = read_wants(want, rig_name)
+    own = _planner(rig_name)
+    rig = load_rig(rig_name)
+    if width_px is not None:
+        if rig_name == "probe":
+            raise PlanningError("--width: the probe's spots lie on its camera as it is; leave it")
+        # the gradient sphere keeps its pixels' size and gives up field, as its simulation does
+        rig = rig.cropped(width_px) if rig_name == "gradient" else rig.resized(width_px)
+    if most_lights is not None and rig_name != "dome":
+        raise PlanningError(f"--most-lights: is for the dome, not the {rig_name} rig")
+    if forecast is not None:
+        from skinrig.acquisition import read_plan
+
+        plan = read_plan(forecast)
+        if plan.rig != rig.name:
+            raise PlanningError(f"{forecast}: got a plan of {plan.rig!r}, expected {rig.name!r}")
+        found: Choice = own.foresee(rig, plan, wants, subject=subject, seed=seed)
+        return found
+    options: dict[str, Any] = {"most_lights": most_lights} if rig_name == "dome" else {}
+    chosen: Choice = own.choose(
+        rig, wants, subject=subject, seed=seed, valid_share=valid_share, **options
+    )
+    return chosen
+
+
+def confirmed(
+    choice: Choice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Simulate a choice, reconstruct it, and compare what came out with the forecast.
+
+    Parameters
+    ----------
+    choice
+        Of `choose`.
+    out
+        Folder for sessions, calibration, maps.
+    subject, seed
+        The simulated face.
+    progress
+        Is told each step.
+    """
+    rows: list[dict[str, Any]] = _planner(choice.rig.name).confirm(
+        choice, out, subject=subject, seed=seed, progress=progress
+    )
+    return rows
+
+
+def _planner(rig_name: str) -> Any:
+    """Return the module that plans for a rig: its `choose`, `foresee` and `confirm`."""
+    return importlib.import_module(f"skinrig.planning_{rig_name}")
+
+
+def interval_of(value: float, spread: float) -> tuple[float, float]:
+    """Return the interval of a forecast that is off by a relative spread.
+
+    Examples
+    --------
+    >>> interval_of(1.2, 0.2)
+    (1.0, 1.44)
+    """
+    return value / (1.0 + spread), value * (1.0 + spread)
+
+
+def median_of_normals(scale: ArrayLike) -> float:
+    """Return the median magnitude of a mixture of normal errors; infinite for none.
+
+    Parameters
+    ----------
+    scale : array_like
+        Their standard deviations, each as often as another.
+
+    Examples
+    --------
+    >>> round(median_of_normals([1.0, 1.0]), 4)
+    0.6745
+    """
+    from scipy.special import erf
+
+    s = np.maximum(np.asarray(scale, np.float64).reshape(-1), 1e-300)
+    if not s.size:
+        return math.inf
+    low, high = 0.0, 2.0 * float(s.max())
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        below = float(np.mean(erf(middle / (math.sqrt(2.0) * s))))
+        low, high = (middle, high) if below < 0.5 else (low, middle)
+    return 0.5 * (low + high)
+
+
+def lines(choice: Choice) -> list[str]:
+    """Return a choice as lines for people."""
+    out = []
+    for one in choice.forecasts:
+        asked = "" if one.wanted is None else f", wanted {one.wanted:g} {one.unit}"
+        out.append(
+            f"forecast: {one.name} {one.value:.3g} {one.unit} in the median "
+            f"({one.interval[0]:.3g} to {one.interval[1]:.3g}{asked}"
+            f"{'' if one.reached else ': NOT REACHED'})"
+        )
+    out += [f"why: {reason}" for reason in choice.reasons]
+    for name, value in choice.knobs.items():
+        shown = f"{len(value)}: {', '.join(map(str, value))}" if isinstance(value, list) else value
+        out.append(f"{name}: {shown}")
+    out.append(
+        f"capture: {choice.seconds:.1f} s, {choice.full_seconds - choice.seconds:.1f} s less than "
+        "the whole rig's plan"
+    )
+    out += [f"left out: {what} ({why})" for what, why in choice.left_out]
+    out += [f"light: {name} {value}" for name, value in choice.light.items()]
+    return out

@@ -1,0 +1,1 @@
+"""Pictures of fitted skin models, and how they stand against photographs."""

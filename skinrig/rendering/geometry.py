@@ -1,0 +1,355 @@
+"""A fitted model's maps on a mesh: meshes read, normals carried along, values looked up."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from model.skin import SkinAppearance
+from model.skin_reflectance import SkinReflectance
+from rigsim.atlas import Atlas, spread, unwrap
+from rigsim.mesh import Float32Array, Mesh, MeshError, MeshFileError, build_mesh, load_mesh
+from skinrig.rendering.lookup_kernels import look_up
+
+BoolArray = NDArray[np.bool_]
+
+MESH_FILES: Final = ("mesh.obj", "mesh.ply")
+"""Names under which an appearance holds the mesh that its maps lie on."""
+SAME_MM: Final = 1.0
+"""Median distance from the maps' places up to which a mesh is the one they were made on."""
+FOREIGN_MM: Final = 40.0
+"""Median distance from which on texture coordinates cannot be of the same layout."""
+LEAST_SHARE: Final = 0.2
+"""Least share of a mesh's texels that the maps must hold values for."""
+SPREAD: Final = 4
+AROUND: Final = 8
+"""Nearest texels that stand in where a point has none of its own."""
+SPARSE: Final = 8_000
+"""Texels, drawn at random, that stand in farther away: their mean is smooth."""
+LEAST_BLEND: Final = 0.01
+"""Least share of the four texels around a point that must be of its place."""
+
+
+class GeometryError(ValueError):
+    """A mesh that the maps cannot be laid on."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """What the maps hold at n points."""
+
+    r_d: Float32Array
+    """Shape (n, 3)."""
+    weights: Float32Array
+    """Shares of the lobes, shape (n, K)."""
+    normals: Float32Array
+    """Unit, frame of the mesh, shape (n, 3)."""
+    translucency_mm: Float32Array
+    """1/sigma_tr, shape (n, 3)."""
+    measured: BoolArray
+    """Whether a valid texel lies within a texel's width; others hold the nearest valid one's."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedSurface:
+    """A model's maps on a mesh.
+
+    Attributes
+    ----------
+    model
+        Tables and maps.
+    mesh
+        Its texture coordinates are those of the maps.
+    atlas
+        The mesh laid out in the texture.
+    normals
+        Unit normals of the maps in the frame of the mesh, shape (H, W, 3).
+    carried
+        Whether the mesh has moved against the maps, so that the normals were turned with it.
+    """
+
+    model: SkinReflectance
+    mesh: Mesh
+    atlas: Atlas
+    normals: Float32Array
+    carried: bool
+    _values: Float32Array
+    _known: BoolArray
+    """Texels with a surface and valid maps."""
+    _width_mm: Float32Array
+    _trees: list[tuple[cKDTree, NDArray[np.intp]]] = field(default_factory=list)
+    """Places of the known texels, and of some of them, once they are asked for."""
+
+    @staticmethod
+    def of(model: SkinReflectance, mesh: Mesh, *, rest: Mesh | None = None) -> FittedSurface:
+        """Lay maps on a mesh.
+
+        Parameters
+        ----------
+        model
+            Maps; all of one square size.
+        mesh
+            A mesh with the maps' texture coordinates, at rest or moved.
+        rest
+            The mesh that the maps were made on, needed where `mesh` has moved: object-space
+            normals only fit the mesh that they were measured on.
+
+        Raises
+        ------
+        GeometryError
+            The texture coordinates are of another layout, or the mesh has moved and `rest` is not
+            given.
+        """
+        height, width = model.valid.shape
+        if height != width:
+            raise GeometryError(f"maps: got {height} x {width} texels, expected a square texture")
+        atlas = unwrap(mesh, width)
+        both = atlas.covered & model.valid
+        share = float(np.sum(both)) / max(float(np.sum(atlas.covered)), 1.0)
+        if share < LEAST_SHARE:
+            raise GeometryError(
+                f"mesh: the maps hold values for {100 * share:.0f} % of it, expected at least "
+                f"{100 * LEAST_SHARE:.0f} %; its texture coordinates are not those of the maps: "
+                "export it with the layout of the appearance's own mesh"
+            )
+        apart = np.linalg.norm(atlas.position_mm[both] - model.position_mm[both], axis=-1)
+        median = float(np.median(apart))
+        if median > FOREIGN_MM:
+            raise GeometryError(
+                f"mesh: its points lie {median:.0f} mm (median) from where the maps have them, "
+                f"expected less than {FOREIGN_MM:.0f} mm; its texture coordinates are not those of "
+                "the maps, or it stands elsewhere"
+            )
+        moved = rest is not None and not _same(mesh, rest)
+        if rest is None and median > SAME_MM:
+            raise GeometryError(
+                f"mesh: lies {median:.1f} mm (median) from the maps' own places; normals in the "
+                "rig's frame fit only the mesh that they were measured on: give that one, too"
+            )
+        normals = np.asarray(model.normals, np.float32)
+        if moved and rest is not None:
+            normals = carried_normals(normals, unwrap(rest, width), atlas)
+        depth = np.asarray(model.translucency_mm, np.float32)
+        usual = np.median(
+            depth[model.valid], axis=0
+        )  # where nothing is known light must spread, too
+        layers = [model.r_d, model.weights, normals, np.where(depth > 0.0, depth, usual)]
+        values = np.concatenate([np.asarray(layer, np.float32) for layer in layers], axis=-1)
+        width = np.maximum(*atlas.texel_mm())
+        return FittedSurface(model, mesh, atlas, normals, moved, np.nan_to_num(values), both, width)
+
+    def of_medium(self, sigma_tr_per_mm: ArrayLike) -> FittedSurface:
+        """Return the same surface above a medium of one sigma_tr, three channels, 1/mm."""
+        depth = (1.0 / np.asarray(sigma_tr_per_mm, np.float64)).astype(np.float32)
+        spread_out = np.broadcast_to(depth, self.model.translucency_mm.shape).copy()
+        values = self._values.copy()
+        values[..., -3:] = depth
+        model = dataclasses.replace(
+            self.model, translucency_mm=spread_out, translucency_stderr_mm=None
+        )
+        return dataclasses.replace(self, model=model, _values=values)
+
+    def with_lobes(self, model: SkinReflectance) -> FittedSurface:
+        """Return the same surface with the lobes and shares of another model of the same maps."""
+        values = np.concatenate(
+            [self._values[..., :3], model.weights, self._values[..., -6:]], axis=-1
+        )
+        own = dataclasses.replace(self.model, lobes=model.lobes, weights=model.weights)
+        return dataclasses.replace(self, model=own, _values=values.astype(np.float32))
+
+    def at(self, uv: Float32Array, position_mm: Float32Array, normal: Float32Array) -> Rows:
+        """Look the maps up at points of the mesh.
+
+        Bilinearly among valid texels of the same place. Where there are none, what is known around
+        stands in, with the mesh's normal: a texture filled from its own neighbors would bring in
+        other parts of the face where charts are small.
+
+        Parameters
+        ----------
+        uv
+            Texture coordinates, shape (n, 2), (0, 0) is bottom left.
+        position_mm
+            The points, shape (n, 3), frame of the mesh.
+        normal
+            The mesh's shading normals there, shape (n, 3).
+        """
+        point = np.ascontiguousarray(position_mm, np.float32)
+        rows = np.zeros((len(uv), self._values.shape[-1]), np.float32)
+        share = np.zeros(len(uv), np.float32)
+        look_up(
+            self._values, self._known, self.atlas.position_mm, self._width_mm,
+            np.ascontiguousarray(uv, np.float32), point, rows, share,
+        )  # fmt: skip
+        lobes = self.model.weights.shape[-1]
+        measured = share > LEAST_BLEND
+        lost = np.flatnonzero(~measured)
+        if len(lost):
+            rows[lost], near = self._around(point[lost])
+            measured[lost] = near
+            far = lost[~near]
+            rows[far, 3 + lobes : 6 + lobes] = normal[far]
+        r_d, weights, normals, translucency = np.split(rows, (3, 3 + lobes, 6 + lobes), axis=-1)
+        return Rows(r_d, weights, unit(normals), translucency, measured)
+
+    def _around(self, point: Float32Array) -> tuple[Float32Array, BoolArray]:
+        """Return means of known texels around points, and where one is within its own width."""
+        if not self._trees:
+            every = np.flatnonzero(self._known)
+            some = np.sort(np.random.default_rng(0).permutation(every)[:SPARSE])
+            place = self.atlas.position_mm.reshape(-1, 3).astype(np.float64)
+            self._trees.extend((cKDTree(place[t]), t) for t in (every, some))
+        means, near = self._mean(*self._trees[0], point)
+        far = np.flatnonzero(~near)
+        if len(far):
+            means[far] = self._mean(*self._trees[1], point[far])[0]
+        return means, near
+
+    def _mean(
+        self, tree: cKDTree, texels: NDArray[np.intp], point: Float32Array
+    ) -> tuple[Float32Array, BoolArray]:
+        """Return means of the nearest texels by inverse squares, and where one is near."""
+        count = min(AROUND, len(texels))
+        distance, index = tree.query(point.astype(np.float64), k=range(1, count + 1))
+        found = texels[index]
+        weight = 1.0 / np.maximum(distance, 1e-3) ** 2
+        weight /= weight.sum(axis=1, keepdims=True)
+        values = self._values.reshape(-1, self._values.shape[-1])[found]
+        near = distance[:, 0] < self._width_mm.reshape(-1)[found[:, 0]]
+        return np.einsum("nk,nkc->nc", weight, values).astype(np.float32), near
+
+
+def carried_normals(normals: Float32Array, rest: Atlas, moved: Atlas) -> Float32Array:
+    """Return normals of relief on a surface after the surface has moved below it.
+
+    Relief keeps its height: a normal turns by the inverse transpose of the change of the frame of
+    the two tangents and the smooth normal, so that stretched skin becomes flatter.
+
+    Parameters
+    ----------
+    normals
+        Unit normals in the frame of the resting surface, shape (N, N, 3).
+    rest, moved
+        The same texture before and after, see `rigsim.atlas.unwrap`.
+
+    Returns
+    -------
+    ndarray of float32
+        Unit, shape (N, N, 3); as they were where either has no surface.
+
+    Examples
+    --------
+    >>> from rigsim.mesh import build_mesh
+    >>> faces, uv = [[0, 1, 2], [0, 2, 3]], [[0, 0], [1, 0], [1, 1], [0, 1]]
+    >>> flat = build_mesh([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]], faces, uv)
+    >>> turned = build_mesh([[0, 0, 0], [0, 0, -9], [0, 9, -9], [0, 9, 0]], faces, uv)
+    >>> tilted = np.full((8, 8, 3), (0.6, 0.0, 0.8), np.float32)
+    >>> carried = carried_normals(tilted, unwrap(flat, 8), unwrap(turned, 8))
+    >>> carried[4, 4].round(3).tolist()
+    [0.800000011920929, 0.0, -0.6000000238418579]
+    """
+    before, after = _frames(rest), _frames(moved)
+    # a height in both frames, as long as a side of the texture is, so that none is ill-conditioned
+    height = np.sqrt(np.linalg.norm(np.cross(before[..., 0, :], before[..., 1, :]), axis=-1))
+    for frame in (before, after):
+        frame[..., 2, :] *= height[..., None]
+    good = (np.abs(np.linalg.det(before)) > 1e-9) & (np.abs(np.linalg.det(after)) > 1e-9)
+    whole = good[..., None, None]
+    # frames have their vectors as rows: inverse transpose of the change is after^-1 before
+    slopes = np.einsum("hwij,hwj->hwi", before, normals.astype(np.float64))
+    turned = np.linalg.solve(np.where(whole, after, np.eye(3)), slopes[..., None])[..., 0]
+    return np.where(good[..., None], unit(turned), normals).astype(np.float32)
+
+
+def own_mesh(appearance: SkinAppearance) -> Mesh:
+    """Return the mesh that an appearance's maps lie on.
+
+    Raises
+    ------
+    GeometryError
+        It holds none with texture coordinates.
+    """
+    for name in MESH_FILES:
+        if name in appearance.files:
+            return parse_mesh(appearance.files[name], name)
+    raise GeometryError(
+        f"appearance: holds no {MESH_FILES[0]}; make it with `skinrig reconstruct SESSION --want "
+        "normals,r_d,basis_weight_0`, or name a mesh with --mesh"
+    )
+
+
+def read_mesh(path: str | Path) -> Mesh:
+    """Read a mesh in mm with texture coordinates: .obj, .ply, or .npz of `rigsim.mesh`.
+
+    Raises
+    ------
+    MeshFileError
+        The file is missing, damaged, of another kind, or has no texture coordinates.
+    """
+    path = Path(path)
+    if path.suffix == ".npz":
+        return load_mesh(path)
+    if path.suffix not in (".obj", ".ply"):
+        raise MeshFileError(f"{path}: got suffix {path.suffix!r}, expected .obj, .ply or .npz")
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise MeshFileError(f"{path}: {error.strerror}") from error
+    return parse_mesh(data, str(path))
+
+
+def parse_mesh(data: bytes, name: str) -> Mesh:
+    """Return the mesh in the bytes of an .obj or .ply file; see `read_mesh`."""
+    import trimesh
+
+    kind = Path(name).suffix[1:]
+    try:
+        loaded = trimesh.load(io.BytesIO(data), file_type=kind, process=False, force="mesh")
+        vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+        uv = getattr(loaded.visual, "uv", None)
+    except Exception as error:  # the reader raises whatever its parser meets
+        raise MeshFileError(f"{name}: cannot be read as .{kind}: {error}") from error
+    if uv is None or len(uv) != len(vertices):
+        raise MeshFileError(
+            f"{name}: has no texture coordinates, so no map can be laid on it; export it with "
+            "those of the appearance's own mesh"
+        )
+    try:
+        return build_mesh(vertices, faces, np.clip(uv, *_rounding(np.asarray(uv))))
+    except MeshFileError:
+        raise
+    except MeshError as error:
+        raise MeshError(f"{name}: {error}") from error
+
+
+def unit(vectors: ArrayLike) -> Float32Array:
+    """Return vectors at length 1, shape (..., 3), in float32; (0, 0, 1) for those of none."""
+    given = np.asarray(vectors)
+    length = np.linalg.norm(given, axis=-1, keepdims=True)
+    up = np.array([0.0, 0.0, 1.0])
+    return np.asarray(np.where(length > 1e-9, given / np.maximum(length, 1e-9), up), np.float32)
+
+
+def _frames(atlas: Atlas) -> NDArray[np.float64]:
+    """Return the tangents along u and v and the normal, as rows, shape (N, N, 3, 3)."""
+    layers = np.concatenate([atlas.dp_du_mm, atlas.dp_dv_mm, atlas.normal], axis=-1)
+    wide = spread(layers, atlas.covered, steps=SPREAD)
+    return wide.reshape(atlas.size, atlas.size, 3, 3).astype(np.float64)
+
+
+def _same(one: Mesh, other: Mesh) -> bool:
+    if one.vertices_mm.shape != other.vertices_mm.shape:
+        return False
+    return bool(np.abs(one.vertices_mm - other.vertices_mm).max() < 1e-3)
+
+
+def _rounding(uv: NDArray[np.floating]) -> tuple[float, float]:
+    """Return the range that rounded coordinates are put into; what is farther out stays wrong."""
+    low, high = float(uv.min()), float(uv.max())
+    return (0.0 if low > -1e-5 else low), (1.0 if high < 1.0 + 1e-5 else high)

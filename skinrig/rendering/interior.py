@@ -1,0 +1,175 @@
+"""Light inside a rendered face: what enters everywhere by all lights, and where it comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model import dipole_gather
+from model.dipole_gather import SourceTree
+from model.skin_reflectance import transmitted
+from rigsim.atlas import unwrap
+from rigsim.mesh import Float32Array
+from rigsim.render import Caster, thread_count, visibility
+from skinrig.rendering.geometry import FittedSurface, Rows
+from skinrig.rendering.lights import Light
+
+FloatArray = NDArray[np.float64]
+
+POINTS: Final = 2
+"""Points along each side of a piece that light is looked for at."""
+MANY_LIGHTS: Final = 8
+"""With so many lights one point is enough: their shadows' steps lie in different places."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Interior:
+    """The skin below a surface, ready for any light: S pieces of it that light enters by.
+
+    Attributes
+    ----------
+    laid
+        Surface and maps.
+    position_mm, across_mm, along_mm, normals
+        Middle of each piece, its two sides, and the maps' normal, shape (S, 3).
+    prim
+        Its triangle, shape (S,).
+    tree
+        Places and areas of the pieces.
+    """
+
+    laid: FittedSurface
+    position_mm: Float32Array
+    across_mm: Float32Array
+    along_mm: Float32Array
+    normals: Float32Array
+    prim: NDArray[np.int32]
+    tree: SourceTree
+
+    @staticmethod
+    def of(
+        laid: FittedSurface, *, finer: int = 1, near: tuple[ArrayLike, float] | None = None
+    ) -> Interior:
+        """Divide the skin into texels.
+
+        Parameters
+        ----------
+        laid
+            Surface and maps.
+        finer
+            Pieces along each side of a texel.
+        near
+            A place, mm, and a distance, mm, within which the skin is taken; None: all of it.
+        """
+        atlas = laid.atlas if finer == 1 else unwrap(laid.mesh, laid.atlas.size * finer)
+        chosen = atlas.covered
+        if near is not None:
+            place, far = np.asarray(near[0], np.float32), near[1]
+            chosen = chosen & (np.linalg.norm(atlas.position_mm - place, axis=-1) < far)
+        rows, columns = np.nonzero(chosen)
+        uv = np.stack([(columns + 0.5) / atlas.size, 1.0 - (rows + 0.5) / atlas.size], axis=-1)
+        position, across, along = (
+            layer[chosen] for layer in (atlas.position_mm, atlas.dp_du_mm, atlas.dp_dv_mm)
+        )
+        across, along = across / np.float32(atlas.size), along / np.float32(atlas.size)
+        area = np.linalg.norm(np.cross(across.astype(np.float64), along), axis=-1)
+        held = laid.at(uv.astype(np.float32), position, atlas.normal[chosen])
+        return Interior(
+            laid, position, across, along, held.normals,
+            atlas.prim[chosen], SourceTree.of(position, area),
+        )  # fmt: skip
+
+    def of_surface(self, laid: FittedSurface) -> Interior:
+        """Return the same pieces below other maps on the same mesh with the same normals."""
+        return replace(self, laid=laid)
+
+    def entered(self, lamps: Sequence[Light], shadows: Caster, samples: int) -> FloatArray:
+        """Return what passes the surface by the pieces, over what a white patch shows, (S, 3)."""
+        faces = shadows.face_normals[self.prim]
+        total = np.zeros((len(self.prim), 3))
+        # several points of each piece, or shadows would end in steps
+        points = POINTS if len(lamps) < MANY_LIGHTS else 1
+        offsets = (np.arange(points, dtype=np.float32) + np.float32(0.5)) / points - 0.5
+        for u in offsets:
+            for v in offsets:
+                place = self.position_mm + u * self.across_mm + v * self.along_mm
+                for lamp in lamps:
+                    light = entering(
+                        lamp, place, faces, self.normals, shadows, samples, self.laid.model.eta
+                    )[0]
+                    total += light / points**2
+        return total
+
+    def leaving(
+        self, entered: FloatArray, position_mm: Float32Array, rows: Rows, entered_at: FloatArray,
+        *, tolerance: float = dipole_gather.TOLERANCE,
+    ) -> FloatArray:  # fmt: skip
+        """Return what comes back to the surface from inside at points, before it leaves, (n, 3).
+
+        Parameters
+        ----------
+        entered
+            By the pieces, see `entered`.
+        position_mm, rows
+            Points, shape (n, 3), and what the maps hold there.
+        entered_at
+            What enters at the points themselves, shape (n, 3).
+        tolerance
+            Aimed-at error over the brightest light that entered.
+        """
+        return dipole_gather.gather(
+            self.tree, entered, position_mm, rows.r_d, rows.translucency_mm,
+            eta=self.laid.model.eta, tolerance=tolerance, entered_at=entered_at,
+            workers=min(thread_count(), 4),
+        ).exitance  # fmt: skip
+
+
+def entering(
+    lamp: Light,
+    position_mm: Float32Array,
+    face_normal: Float32Array,
+    normals: Float32Array,
+    shadows: Caster,
+    samples: int,
+    eta: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return what a light brings to points.
+
+    Parameters
+    ----------
+    lamp
+        The light.
+    position_mm, face_normal, normals
+        Points, normals of their triangles and of the maps, shape (n, 3).
+    shadows
+        What casts shadows.
+    samples
+        Points on the light's disc; one where it has no radius.
+    eta
+        Refractive index of the skin.
+
+    Returns
+    -------
+    entered, arriving : ndarray of float64, shape (n, 3)
+        Through the boundary, and before it: over what a white patch that faces the light shows.
+    towards : ndarray of float64, shape (n, 3)
+        Unit vectors to the light.
+    seen : ndarray of float64, shape (n,)
+        Share of the light that is seen; 0 where the point does not face it.
+    """
+    towards, white = lamp.reach(position_mm)
+    cosine = np.einsum("nk,nk->n", normals.astype(np.float64), towards)
+    faced = np.flatnonzero((cosine > 0.0) & (white > 0.0).any(axis=-1))
+    seen = np.zeros(len(cosine))
+    center, radius = lamp.disc()
+    seen[faced] = visibility(
+        shadows, np.ascontiguousarray(position_mm[faced]),
+        np.ascontiguousarray(face_normal[faced]), center,
+        radius_mm=radius, samples=samples if radius > 0.0 else 1,
+    )  # fmt: skip
+    arriving = white * (np.maximum(cosine, 0.0) * seen)[:, None]
+    return arriving * transmitted(cosine, eta)[:, None], arriving, towards, seen

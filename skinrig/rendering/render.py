@@ -1,0 +1,364 @@
+"""Render a fitted model of skin: rays by the renderer, then the fitted maps at what they meet.
+
+Geometry, texture coordinates and shadows come from `rigsim.render`; what a point reflects comes
+from `model.skin_reflectance`, direct light only. Radiance is given over what a perfect white
+Lambertian patch that faces a light of intensity 1 would show, at the place and distance where the
+light's intensity is stated (see `skinrig.rendering.lights`)::
+
+    L = sum over lights of  w V cos(theta) (pi f_surface + F_t(light) F_t(view) R_d)
+
+with w the white patch's value, V the share of the light that the point sees, and R_d F_t(light)
+replaced by the dipole's sum over the skin where light spreads in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.dipole_gather import TOLERANCE
+from model.skin_reflectance import SkinReflectance, lobe_brdf, transmitted
+from rigsim.mesh import Float32Array, Mesh, build_mesh
+from rigsim.render import Caster, GBuffer, trace
+from skinrig.rendering import camera as rendering_camera
+from skinrig.rendering.camera import Camera
+from skinrig.rendering.geometry import FittedSurface, Rows
+from skinrig.rendering.interior import Interior, entering
+from skinrig.rendering.lights import Light
+
+__all__ = [
+    "Camera",
+    "Light",
+    "Rendering",
+    "RenderingError",
+    "Subsurface",
+    "render",
+]
+
+BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+
+Subsurface = Literal["local", "dipole", "none"]
+"""Light from inside leaves where it entered, spreads by the dipole, or is left out."""
+
+BAND_RAYS: Final = 1 << 18
+"""Camera rays worked on at a time; bounds memory."""
+SUBPIXELS: Final = 2
+SHADOW_SAMPLES: Final = 4
+"""Rays to different points of a light's disc, from each ray of a pixel."""
+LIT: Final = 0.999
+"""Share of a light that counts as all of it."""
+FACING: Final = 0.5
+"""Least share of what a camera sees of the mesh that must be its outside."""
+
+
+class RenderingError(ValueError):
+    """What is asked for gives no picture."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rendering:
+    """A picture and what it is made of, averaged over whole pixels; row 0 is the top.
+
+    Attributes
+    ----------
+    radiance
+        Sum of the two below, (H, W, 3); see this module for its unit.
+    diffuse
+        What left the inside of the skin.
+    surface
+        What its surface reflected.
+    coverage
+        Share of each pixel that is skin, (H, W), 0 to 1.
+    covered
+        Pixels wholly on skin that was measured.
+    lit
+        Covered pixels of which every ray sees the whole of a light that it faces.
+    uv
+        Mean texture coordinates, (H, W, 2); (0, 0) beside the skin.
+    camera
+        By which it was rendered.
+    lights
+        Names.
+    subsurface
+        How light from inside was treated.
+    """
+
+    radiance: Float32Array
+    diffuse: Float32Array
+    surface: Float32Array
+    coverage: Float32Array
+    covered: BoolArray
+    lit: BoolArray
+    uv: Float32Array
+    camera: Camera
+    lights: tuple[str, ...]
+    subsurface: Subsurface
+
+
+def render(
+    model: SkinReflectance,
+    mesh: Mesh | FittedSurface,
+    camera: Camera,
+    lights: Light | Sequence[Light],
+    *,
+    subsurface: Subsurface = "local",
+    subpixels: int = SUBPIXELS,
+    shadow_samples: int = SHADOW_SAMPLES,
+    rest: Mesh | None = None,
+    blockers: Mesh | None = None,
+    caster: Caster | None = None,
+    interior: Interior | None = None,
+    tolerance: float = TOLERANCE,
+    progress: Callable[[str], None] | None = None,
+) -> Rendering:
+    """Render a fitted model.
+
+    Parameters
+    ----------
+    model
+        The fitted maps.
+    mesh
+        The mesh with the maps' texture coordinates, mm, rig frame; or the model laid on it
+        already, for several pictures of it (`FittedSurface.of`).
+    camera
+        See `skinrig.rendering.camera`.
+    lights
+        At least one; their light adds up.
+    subsurface
+        "local": R_d F_t F_t / pi; "dipole": light spreads; "none": the surface alone.
+    subpixels
+        Rays along each side of a pixel.
+    shadow_samples
+        Points on the disc of each light that a ray's end is tested against; lights without a
+        radius need one.
+    rest
+        The mesh that the maps were made on, where `mesh` has moved, see `FittedSurface.of`.
+    blockers
+        What else casts shadows but is not seen.
+    caster
+        Of the mesh, where there is one already.
+    interior
+        Of the model on the mesh, where there is one already; for "dipole".
+    tolerance
+        For "dipole": aimed-at error of light from inside, over the brightest that entered.
+    progress
+        Called with a line of text now and then.
+
+    Returns
+    -------
+    Rendering
+
+    Raises
+    ------
+    RenderingError
+        No light, the camera sees nothing of the mesh, or its back.
+    skinrig.rendering.geometry.GeometryError
+        The maps cannot be laid on the mesh.
+    """
+    lamps = _lamps(lights)
+    if subsurface not in get_args(Subsurface):
+        raise RenderingError(
+            f"subsurface: got {subsurface!r}, expected one of {', '.join(get_args(Subsurface))}"
+        )
+    if shadow_samples < 1:
+        raise RenderingError(f"shadow samples: got {shadow_samples}, expected at least 1")
+    laid = mesh if isinstance(mesh, FittedSurface) else FittedSurface.of(model, mesh, rest=rest)
+    rays = Caster(laid.mesh) if caster is None else caster
+    shadows = rays if blockers is None else Caster(joined(laid.mesh, blockers), choice=rays.choice)
+    columns, height = camera.image_size
+    inside = _inside(laid, subsurface, lamps, shadows, shadow_samples, interior, tolerance)
+    film = _Film(height, columns)
+    seen = _Sighting()
+    band = max(1, BAND_RAYS // (columns * subpixels**2))
+    for top in range(0, height, band):
+        part = (top, min(top + band, height))
+        buffers = trace(rays, *rendering_camera.rays(camera, subpixels=subpixels, rows=part))
+        index = seen.outside(buffers)
+        points = _Points.of(laid, buffers, index)
+        shaded = _shade(points, lamps, shadows, shadow_samples, laid, inside)
+        film.put(part, subpixels, index, points, shaded)
+        if progress is not None and part[1] < height:
+            progress(f"render: {100 * part[1] // height} %")
+    seen.require(camera)
+    return Rendering(
+        film.diffuse + film.surface, film.diffuse, film.surface, film.coverage,
+        film.measured & (film.coverage > 1.0 - 1e-6), film.lit & (film.coverage > 1.0 - 1e-6),
+        film.uv, camera, tuple(dict.fromkeys(lamp.name for lamp in lamps)), subsurface,
+    )  # fmt: skip
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    """Return meshes as one, for shadows."""
+    starts = np.cumsum([0, *(len(mesh.vertices_mm) for mesh in meshes[:-1])])
+    return build_mesh(
+        np.concatenate([mesh.vertices_mm for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]),
+        np.concatenate([mesh.uv for mesh in meshes]),
+        np.concatenate([mesh.normals for mesh in meshes]),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Points:
+    """What rays met: n points of the outside."""
+
+    position_mm: Float32Array
+    face_normal: Float32Array
+    view: Float32Array
+    uv: Float32Array
+    rows: Rows
+
+    @staticmethod
+    def of(laid: FittedSurface, buffers: GBuffer, index: NDArray[np.intp]) -> _Points:
+        """Gather the rows of a G-buffer that count, and look the maps up there."""
+
+        def flat(image: Float32Array) -> Float32Array:
+            return image.reshape(-1, image.shape[-1])[index]
+
+        uv, position = flat(buffers.uv), flat(buffers.position_mm)
+        rows = laid.at(uv, position, flat(buffers.normal))
+        return _Points(position, flat(buffers.face_normal), flat(buffers.to_camera), uv, rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shaded:
+    """What n points send to the camera."""
+
+    diffuse: FloatArray
+    surface: FloatArray
+    lit: BoolArray
+
+
+@dataclass(slots=True)
+class _Sighting:
+    """How much of the mesh's outside and inside a camera has met."""
+
+    out: int = 0
+    inside: int = 0
+
+    def outside(self, buffers: GBuffer) -> NDArray[np.intp]:
+        """Return which rays meet the mesh from outside, flat."""
+        facing = np.einsum("hwk,hwk->hw", buffers.face_normal, buffers.to_camera) > 0.0
+        found = buffers.mask & facing
+        self.out += int(np.count_nonzero(found))
+        self.inside += int(np.count_nonzero(buffers.mask & ~facing))
+        return np.flatnonzero(found)
+
+    def require(self, camera: Camera) -> None:
+        """Refuse a camera that misses the mesh or looks at its back."""
+        place = ", ".join(f"{x:.0f}" for x in camera.center_mm)
+        if self.out + self.inside == 0:
+            raise RenderingError(
+                f"view {camera.serial!r}: the camera at {place} mm sees nothing of the mesh; "
+                "turn it towards the face, which stands at the rig's origin and looks along +z"
+            )
+        if self.out < FACING * (self.out + self.inside):
+            raise RenderingError(
+                f"view {camera.serial!r}: the camera at {place} mm stands behind the head and sees "
+                "the inside of the mesh; move it to the front, z > 0"
+            )
+
+
+class _Film:
+    """Pixels that rays are averaged into."""
+
+    def __init__(self, height: int, width: int) -> None:
+        self.diffuse, self.surface = (np.zeros((height, width, 3), np.float32) for _ in range(2))
+        self.uv = np.zeros((height, width, 2), np.float32)
+        self.coverage = np.zeros((height, width), np.float32)
+        self.measured, self.lit = (np.zeros((height, width), np.bool_) for _ in range(2))
+
+    def put(
+        self,
+        part: tuple[int, int],
+        subpixels: int,
+        index: NDArray[np.intp],
+        points: _Points,
+        shaded: _Shaded,
+    ) -> None:
+        """Average the rays of some rows of pixels."""
+        width, tall = self.coverage.shape[1], part[1] - part[0]
+        wide = width * subpixels
+        pixel = index // wide // subpixels * width + index % wide // subpixels
+        count = np.bincount(pixel, minlength=tall * width).astype(np.float64)
+        rows = slice(*part)
+
+        def total(values: NDArray[np.generic]) -> FloatArray:
+            sums = np.bincount(pixel, weights=values, minlength=tall * width)
+            return np.asarray(sums, np.float64)
+
+        for image, values in ((self.diffuse, shaded.diffuse), (self.surface, shaded.surface)):
+            for channel in range(3):
+                mean = total(values[:, channel]) / subpixels**2
+                image[rows, :, channel] = mean.reshape(tall, width)
+        for channel in range(2):
+            mean = total(points.uv[:, channel]) / np.maximum(count, 1.0)
+            self.uv[rows, :, channel] = mean.reshape(tall, width)
+        self.coverage[rows] = (count / subpixels**2).reshape(tall, width)
+        some = count > 0
+        for mask, good in ((self.measured, points.rows.measured), (self.lit, shaded.lit)):
+            mask[rows] = (some & (total(good) == count)).reshape(tall, width)
+
+
+def _inside(
+    laid: FittedSurface,
+    subsurface: Subsurface,
+    lamps: Sequence[Light],
+    shadows: Caster,
+    shadow_samples: int,
+    interior: Interior | None,
+    tolerance: float,
+) -> Callable[[_Points, FloatArray], FloatArray]:
+    """Return what gives the light that comes from inside at points, of what enters there."""
+    if subsurface == "none":
+        return lambda points, entered: np.zeros_like(entered)
+    if subsurface == "local":
+        return lambda points, entered: entered * points.rows.r_d
+    below = Interior.of(laid) if interior is None else interior
+    light = below.entered(lamps, shadows, shadow_samples)
+    return lambda points, entered: below.leaving(
+        light, points.position_mm, points.rows, entered, tolerance=tolerance
+    )
+
+
+def _lamps(lights: Light | Sequence[Light]) -> list[Light]:
+    given = [lights] if isinstance(lights, Light) else list(lights)
+    if not given:
+        raise RenderingError("lights: got none, expected at least one")
+    return [part for light in given for part in light.parts()]
+
+
+def _shade(
+    points: _Points,
+    lamps: Sequence[Light],
+    shadows: Caster,
+    shadow_samples: int,
+    laid: FittedSurface,
+    inside: Callable[[_Points, FloatArray], FloatArray],
+) -> _Shaded:
+    """Return what points send to the camera by all lights."""
+    count = len(points.uv)
+    entered, surface = np.zeros((count, 3)), np.zeros((count, 3))
+    lit = np.zeros(count, np.bool_)
+    rows = points.rows
+    cos_view = np.einsum("nk,nk->n", rows.normals, points.view, dtype=np.float64)
+    for lamp in lamps:
+        through, arriving, towards, seen = entering(
+            lamp, points.position_mm, points.face_normal, rows.normals, shadows, shadow_samples,
+            laid.model.eta,
+        )  # fmt: skip
+        entered += through
+        lit |= seen >= LIT
+        shown = np.flatnonzero((seen > 0.0) & (cos_view > 0.0))
+        lobe = lobe_brdf(
+            laid.model.lobes, rows.weights[shown], towards[shown], points.view[shown],
+            rows.normals[shown],
+        )  # fmt: skip
+        surface[shown] += np.pi * lobe[:, None] * arriving[shown]
+    leaving = transmitted(cos_view, laid.model.eta)[:, None]
+    return _Shaded(leaving * inside(points, entered), surface, lit & (cos_view > 0.0))

@@ -1,0 +1,264 @@
+"""What the words of `skinrig render` mean: views, lights and models."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from capture.calibration import geometry
+from capture.calibration import store as calibration_store
+from capture.calibration.lights import LightTable
+from capture.rig import Rig, RigError, load_rig
+from model import store
+from model.skin import SkinAppearance
+from model.skin_reflectance import SkinReflectance, assemble
+from skinrig.errors import UsageError
+from skinrig.rendering import camera as rendering_camera
+from skinrig.rendering.camera import Camera
+from skinrig.rendering.environment import environment_lights, read_environment
+from skinrig.rendering.lights import Light, LightError, Vector
+
+PLACE: Final = "at:"
+RADIUS_MM: Final = 10.0
+"""Radius of a light's disc, mm at `DISTANCE_MM`, where none is asked for: the dome's LEDs."""
+DISTANCE_MM: Final = 700.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Stage:
+    """A rig, drawn or calibrated, whose views and lights can be named."""
+
+    rig: Rig
+    calibration: Path | None
+    assumed: list[str]
+    """What was taken for granted for want of a calibration; grows."""
+
+    @staticmethod
+    def of(rig: str, calibration: Path | None) -> Stage:
+        """Load a rig by name or TOML file.
+
+        Raises
+        ------
+        UsageError
+            `calibration` is no folder.
+        """
+        if calibration is not None and not calibration.is_dir():
+            raise UsageError(f"--calibration: {calibration} is no folder")
+        return Stage(load_rig(rig), calibration, [])
+
+    def camera(
+        self, text: str, *, size_px: int, target_mm: str = "0,0,0", fov_deg: float = 25.0
+    ) -> Camera:
+        """Return a camera: ``C03``, a view of the rig, or ``0,0,700``, a place in mm.
+
+        Parameters
+        ----------
+        text
+            Name or place, mm.
+        size_px
+            Columns of the picture; a place gives as many rows.
+        target_mm, fov_deg
+            Where a place looks, and the angle that its picture spans.
+
+        Raises
+        ------
+        UsageError
+            It is neither a place nor a view of the rig.
+        """
+        place = numbers(text, 3)
+        if place is not None:
+            target = numbers(target_mm, 3)
+            if target is None:
+                raise UsageError(f"--target: got {target_mm!r}, expected three numbers, mm: 0,0,0")
+            return rendering_camera.looking_at(
+                place, target_mm=target, fov_deg=fov_deg, size_px=(size_px, size_px), name=text
+            )
+        try:
+            view = self.rig.view(text)
+        except RigError as error:
+            raise UsageError(f"--view: {error}; or give a place in mm, as 0,0,700") from error
+        camera = Camera.nominal(view)
+        found = self._calibration("geometry", f"camera {text} stands as the rig's file draws it")
+        if found is not None:
+            camera = geometry.poses_from(found, self.rig.subset(views=[text]))[text]
+        camera = dataclasses.replace(camera, serial=text)
+        return rendering_camera.binned(camera, camera.image_size[0] / size_px)
+
+    def light(self, text: str, *, radius_mm: float | None = None) -> Light:
+        """Return a light: ``L017``, ``1,1,2`` (towards it) or ``at:300,200,600`` (mm).
+
+        A factor after ``*`` is its intensity, one number or red, green, blue: ``L017*0.5``. All
+        show 1 on a white patch that faces them, those at a place at the rig's origin.
+
+        Parameters
+        ----------
+        text
+            What is asked for.
+        radius_mm
+            Of its disc, mm; of a light that is far away at `DISTANCE_MM`. None: the rig's own.
+
+        Raises
+        ------
+        UsageError
+            It is none of these.
+        """
+        what, _, factor = text.partition("*")
+        strength = (1.0, 1.0, 1.0) if not factor else _color(text, factor)
+        radius = RADIUS_MM if radius_mm is None else radius_mm
+        if what.startswith(PLACE):
+            place = numbers(what.removeprefix(PLACE), 3)
+            if place is not None:
+                return Light(name=text, position_mm=place, intensity=strength, radius=radius)
+        direction = numbers(what, 3)
+        if direction is not None:
+            far = radius / DISTANCE_MM
+            return Light(name=text, direction=direction, intensity=strength, radius=far)
+        try:
+            drawn = self.rig.light(what)
+        except RigError as error:
+            raise UsageError(
+                f"--light: {error}; or give a direction, as 1,1,2, or a place in mm, as "
+                "at:300,200,600"
+            ) from error
+        rig = self.rig.subset(lights=[what])
+        table = LightTable.nominal(rig)
+        found = self._calibration("lights", f"light {what} stands as the rig's file draws it")
+        if found is not None:
+            table = LightTable.from_calibration(found, rig)
+        lamp = Light.of_table(
+            table, what, radius_mm=drawn.radius_mm if radius_mm is None else radius_mm
+        )
+        return dataclasses.replace(lamp, name=text, intensity=strength)
+
+    def _calibration(self, kind: str, otherwise: str) -> calibration_store.Calibration | None:
+        if self.calibration is not None:
+            try:
+                return calibration_store.load(self.calibration, kind)
+            except calibration_store.CalibrationMissing:
+                pass
+        if otherwise not in self.assumed:
+            self.assumed.append(otherwise)
+        return None
+
+
+def lights_of(
+    stage: Stage,
+    lights: Sequence[str],
+    *,
+    radius_mm: float | None,
+    environment: Path | None,
+    environment_count: int,
+    seed: int,
+) -> tuple[Light, ...]:
+    """Return all lights that were asked for.
+
+    Raises
+    ------
+    UsageError
+        There is none.
+    """
+    found = [stage.light(text, radius_mm=radius_mm) for text in lights]
+    if environment is not None:
+        rng = np.random.default_rng(seed)
+        try:
+            found += environment_lights(read_environment(environment), environment_count, rng=rng)
+        except LightError as error:
+            raise LightError(f"{environment}: {error}") from error
+    if not found:
+        raise UsageError(
+            "--light: got none; name a light of the rig (L017), a direction (1,1,2) or a place "
+            "(at:300,200,600), or give --environment MAP.exr"
+        )
+    return tuple(found)
+
+
+def read_model(
+    path: Path, *, translucency: str | None = None
+) -> tuple[SkinAppearance, SkinReflectance]:
+    """Read a fitted appearance and put its model together.
+
+    Parameters
+    ----------
+    path
+        An APPEARANCE/ folder of the dome, with lobes and R_d.
+    translucency
+        sigma_tr of red, green and blue in 1/mm, to be used everywhere, as 0.36,0.79,1.52.
+
+    Raises
+    ------
+    UsageError
+        `translucency` is no three numbers above 0.
+    model.skin_reflectance.SkinReflectanceError
+        It lacks what the model is made of; the message names it.
+    """
+    appearance = store.read(path)
+    if translucency is None:
+        return appearance, assemble(appearance)
+    return appearance, assemble(appearance, translucency=1.0 / np.array(sigma_of(translucency)))
+
+
+def sigma_of(text: str) -> Vector:
+    """Return sigma_tr of three channels, 1/mm.
+
+    Raises
+    ------
+    UsageError
+        It is no three numbers above 0.
+
+    Examples
+    --------
+    >>> sigma_of("0.3558,0.7932,1.5173")
+    (0.3558, 0.7932, 1.5173)
+    """
+    found = numbers(text, 3)
+    if found is None or min(found) <= 0.0:
+        raise UsageError(
+            f"--translucency: got {text!r}, expected sigma_tr of red, green and blue in 1/mm, "
+            "above 0, as 0.3558,0.7932,1.5173"
+        )
+    return found
+
+
+def subpixels_of(samples: int) -> int:
+    """Return rays along a pixel's side, of rays in a pixel.
+
+    Raises
+    ------
+    UsageError
+        No square has so many.
+
+    Examples
+    --------
+    >>> subpixels_of(4)
+    2
+    """
+    side = round(samples**0.5) if samples > 0 else 0
+    if side < 1 or side * side != samples or side > 16:
+        raise UsageError(f"--samples: got {samples}, expected 1, 4, 9, 16 ... 256 rays a pixel")
+    return side
+
+
+def numbers(text: str, count: int) -> Vector | None:
+    """Return finite numbers joined by commas, or None where the text is something else."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        return None
+    if len(values) != count or not np.isfinite(values).all():
+        return None
+    x, y, z = values
+    return x, y, z
+
+
+def _color(text: str, factor: str) -> Vector:
+    found = numbers(factor, 3) or numbers(",".join([factor] * 3), 3)
+    if found is None or min(found) < 0.0:
+        raise UsageError(
+            f"--light: got {text!r}, expected after * one number or three, at least 0, as "
+            "L017*0.5 or 1,1,2*1,0.9,0.8"
+        )
+    return found

@@ -1,0 +1,191 @@
+"""A shadow boundary close up, by two media: what translucency does to a face.
+
+The paper's figures 17 and 18 show the subjects of least and greatest *translucency*, and give for
+them the least and greatest *sigma_tr*. Translucency is 1/sigma_tr: so the subject of least sigma_tr
+is the most translucent one. Everything here is labelled by sigma_tr.
+
+References
+----------
+Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10.3.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.skin_reflectance import SkinReflectance
+from rigsim.mesh import Mesh, build_mesh
+from rigsim.render import Caster
+from skinrig.rendering import camera as rendering_camera
+from skinrig.rendering.camera import Camera
+from skinrig.rendering.geometry import FittedSurface
+from skinrig.rendering.interior import Interior
+from skinrig.rendering.lights import Light, Vector
+from skinrig.rendering.render import Rendering, RenderingError, render
+
+FloatArray = NDArray[np.float64]
+
+MOST_TRANSLUCENT: Final = (0.3558, 0.7932, 1.5173)
+LEAST_TRANSLUCENT: Final = (0.9171, 1.5682, 1.6569)
+"""sigma_tr of red, green and blue, 1/mm: least and greatest of the paper's dataset B."""
+WIDTH_MM: Final = 24.0
+"""What the picture spans on the skin."""
+AWAY_MM: Final = 250.0
+CARD_MM: Final = 30.0
+"""How far off the skin the card's edge is."""
+SLANT_RAD: Final = 0.6
+"""Angle of the light to the skin's normal."""
+LIGHT_RAD: Final = 0.002
+"""Angular radius of the light: a half shadow of 0.1 mm."""
+NEAR_MM: Final = 25.0
+"""Light that enters farther away does not reach the picture's middle."""
+FACE_TEXELS: Final = 2048
+"""Pieces that a face is divided into along a side of its texture: 0.15 mm."""
+PATCH_MM: Final = 60.0
+PATCH_TEXELS: Final = 256
+SITE: Final = (0.12, 0.72)
+"""Where on the face: parts of the mesh's width from its middle, and of its height; the forehead."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Boundary:
+    """A piece of skin half in the shadow of a card; the lit side is on the left."""
+
+    name: str
+    laid: FittedSurface
+    camera: Camera
+    light: Light
+    card: Mesh
+    """Casts the shadow; the camera does not see it."""
+    caster: Caster
+    interior: Interior
+
+    @staticmethod
+    def on_face(laid: FittedSurface, *, size_px: int) -> Boundary:
+        """Put the shadow on the forehead of a face.
+
+        Raises
+        ------
+        RenderingError
+            Nothing of the mesh is there.
+        """
+        caster = Caster(laid.mesh)
+        low, high = laid.mesh.vertices_mm.min(axis=0), laid.mesh.vertices_mm.max(axis=0)
+        span = high - low
+        x = 0.5 * (low[0] + high[0]) + SITE[0] * span[0]
+        y = low[1] + SITE[1] * span[1]
+        origin = np.array([[x, y, high[2] + 10.0]])
+        prim, share = caster.first_hit(origin, [[0.0, 0.0, -1.0]])
+        if prim[0] < 0:
+            raise RenderingError(f"mesh: nothing at x {x:.0f}, y {y:.0f} mm to cast a shadow on")
+        corners = laid.mesh.vertices_mm[laid.mesh.faces[prim[0]]].astype(np.float64)
+        one, two = (float(w) for w in share[0])
+        target = np.array([1.0 - one - two, one, two]) @ corners
+        normal = caster.face_normals[prim[0]].astype(np.float64)
+        finer = max(1, FACE_TEXELS // laid.atlas.size)
+        return _boundary("face", laid, caster, target, normal, size_px, finer=finer)
+
+    @staticmethod
+    def on_plane(model: SkinReflectance, *, size_px: int) -> Boundary:
+        """Put the shadow on a flat patch of a model's median skin."""
+        corners = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
+        mesh = build_mesh(PATCH_MM * corners, [[0, 1, 2], [0, 2, 3]], corners[:, :2] + 0.5)
+        shape = (PATCH_TEXELS, PATCH_TEXELS)
+        at = ((np.arange(PATCH_TEXELS) + 0.5) / PATCH_TEXELS - 0.5) * PATCH_MM
+        x, y = np.meshgrid(at, -at)
+
+        def even(name: str) -> NDArray[np.float32]:
+            median = np.median(getattr(model, name)[model.valid], axis=0).astype(np.float32)
+            return np.broadcast_to(median, (*shape, len(median))).copy()
+
+        skin = SkinReflectance(
+            even("r_d"), even("weights"), model.lobes, even("translucency_mm"),
+            np.broadcast_to(np.array([0, 0, 1], np.float32), (*shape, 3)).copy(),
+            np.stack([x, y, np.zeros(shape)], axis=-1).astype(np.float32),
+            np.ones(shape, np.bool_), model.eta,
+        )  # fmt: skip
+        laid = FittedSurface.of(skin, mesh)
+        up = np.array([0.0, 0.0, 1.0])
+        return _boundary("flat patch", laid, Caster(mesh), np.zeros(3), up, size_px)
+
+    def shown(self, sigma_tr_per_mm: Vector | None, *, subpixels: int = 2) -> Rendering:
+        """Render it above a medium; None: light leaves where it entered."""
+        laid = self.laid if sigma_tr_per_mm is None else self.laid.of_medium(sigma_tr_per_mm)
+        return render(
+            laid.model, laid, self.camera, self.light,
+            subsurface="local" if sigma_tr_per_mm is None else "dipole", subpixels=subpixels,
+            blockers=self.card, caster=self.caster,
+            interior=self.interior.of_surface(laid),
+        )  # fmt: skip
+
+
+def _boundary(
+    name: str,
+    laid: FittedSurface,
+    caster: Caster,
+    target: FloatArray,
+    normal: FloatArray,
+    size_px: int,
+    *,
+    finer: int = 1,
+) -> Boundary:
+    """Put camera, light and card around a point of the skin."""
+    up = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
+    up /= np.linalg.norm(up)
+    right = np.cross(up, normal)
+    camera = rendering_camera.looking_at(
+        target + AWAY_MM * normal, target_mm=target, up=up, size_px=(size_px, size_px // 2),
+        fov_deg=math.degrees(2.0 * math.atan(0.5 * WIDTH_MM / AWAY_MM)), name=name,
+    )  # fmt: skip
+    towards = math.cos(SLANT_RAD) * normal - math.sin(SLANT_RAD) * right
+    edge = target + CARD_MM * towards
+    away = np.cross(up, towards)  # across the light, to the right
+    corners = [edge + h * up + w * away for h, w in ((-80, 0), (-80, 90), (80, 90), (80, 0))]
+    card = build_mesh(corners, [[0, 1, 2], [0, 2, 3]], np.zeros((4, 2)))
+    x, y, z = towards.tolist()
+    light = Light(name="card", direction=(x, y, z), radius=LIGHT_RAD)
+    below = Interior.of(laid, finer=finer, near=(target, NEAR_MM))
+    return Boundary(name, laid, camera, light, card, caster, below)
+
+
+def profile(seen: Rendering) -> tuple[FloatArray, FloatArray]:
+    """Return places across the boundary in mm, (W,), and light from inside there, (W, 3).
+
+    The mean over the middle half of the rows; the lit side is at negative places.
+    """
+    height, width = seen.coverage.shape
+    rows = seen.diffuse[height // 4 : height - height // 4].astype(np.float64)
+    place = (np.arange(width) - 0.5 * (width - 1)) * WIDTH_MM / width
+    return place, rows.mean(axis=0)
+
+
+def rise_mm(place_mm: FloatArray, level: FloatArray) -> FloatArray:
+    """Return how far apart 90 % and 10 % of the fall from light to shadow lie, mm, (3,).
+
+    Parameters
+    ----------
+    place_mm
+        Growing, shape (W,).
+    level
+        Falling from light to shadow, shape (W, 3); its ends count as 1 and 0.
+
+    Examples
+    --------
+    >>> place = np.linspace(-10.0, 10.0, 201)
+    >>> ramp = np.clip(0.5 - place / 4.0, 0.0, 1.0)[:, None] * [1.0, 2.0, 3.0]
+    >>> rise_mm(place, ramp).round(6).tolist()
+    [3.2, 3.2, 3.2]
+    """
+    top, bottom = level[:3].mean(axis=0), level[-3:].mean(axis=0)
+    share = (level - bottom) / np.where(top > bottom, top - bottom, 1.0)
+    found = []
+    for channel in range(level.shape[1]):
+        falling = np.minimum.accumulate(share[:, channel])
+        at = [np.interp(-part, -falling, place_mm) for part in (0.9, 0.1)]
+        found.append(at[1] - at[0])
+    return np.array(found)

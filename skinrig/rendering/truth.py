@@ -1,0 +1,124 @@
+"""What is true of a simulated face, in the form of a fitted model: for tests and benchmarks.
+
+The simulator's surface is put on tables at some roughnesses, with and without oil; shares between
+them are linear. Nothing is fitted: what a rendering of it misses is the renderer's own error.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import brdf_tables
+from model.brdf_tables import BrdfBasis
+from model.skin_reflectance import SkinReflectance
+from rigsim import surface_brdf
+from rigsim.atlas import spread
+from rigsim.scenes.dome import DomeScene
+from rigsim.subject import Subject
+from skinrig.rendering.lights import Light
+
+FloatArray = NDArray[np.float64]
+
+ROUGHNESS: Final = np.linspace(0.12, 0.6, 9)
+"""Nodes of the roughness."""
+LEAST_COSINE: Final = 0.02
+"""Tables hold what the surface does at 89 degrees for directions closer to the horizon, too."""
+FUZZ: Final = 1e-3
+"""Optical depth of the table of vellus hair."""
+
+
+@lru_cache(maxsize=1)
+def true_lobes() -> BrdfBasis:
+    """Return tables of facets at `ROUGHNESS`, each without and with oil, and of vellus hair."""
+    materials = {}
+    for roughness in ROUGHNESS:
+        for oil in (0.0, 1.0):
+            materials[f"facets {roughness:.2f} oil {oil:g}"] = partial(_lobe, roughness, oil, 0.0)
+    return brdf_tables.tabulate({**materials, "hair": _hair})
+
+
+def true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflectance:
+    """Return the truth as a fitted model would hold it.
+
+    Parameters
+    ----------
+    scene
+        A dome with a face, still, without light that spreads.
+    view
+        A camera, for its spectral sensitivity.
+    binning
+        Texels of the truth along a side of a texel of the model.
+
+    Returns
+    -------
+    SkinReflectance
+        With brows and lashes; its translucency is 1 mm and means nothing.
+    """
+    if not isinstance(scene.subject, Subject):
+        raise TypeError(f"scene: got the target {scene.subject.name!r}, expected a face")
+    surface, atlas = scene.surface(scene.rig.view(view)), scene.subject.atlas
+    at = (surface.roughness - ROUGHNESS[0]) / (ROUGHNESS[1] - ROUGHNESS[0])
+    hat = np.maximum(1.0 - np.abs(at[..., None] - np.arange(len(ROUGHNESS))), 0.0)
+    oil, bare = surface.oil[..., None], surface.bare[..., None]
+    shares = np.stack([hat * (1.0 - oil), hat * oil], axis=-1).reshape(*at.shape, -1)
+    layers = [surface.r_d, surface.normal, atlas.position_mm]
+    layers += [bare * shares, bare * surface.fuzz[..., None] / FUZZ]
+    covered = atlas.covered
+    values = np.concatenate(layers, axis=-1).astype(np.float32)
+    size = at.shape[0] // binning
+    count = covered.reshape(size, binning, size, binning).sum(axis=(1, 3))
+    total = np.where(covered[..., None], values, 0.0).reshape(size, binning, size, binning, -1)
+    mean = total.sum(axis=(1, 3)) / np.maximum(count, 1)[..., None]
+    wide = spread(mean.astype(np.float32), count > 0)
+    length = np.linalg.norm(wide[..., 3:6], axis=-1, keepdims=True)
+    return SkinReflectance(
+        r_d=wide[..., :3],
+        weights=np.maximum(wide[..., 9:], 0.0),
+        lobes=true_lobes(),
+        translucency_mm=np.ones((size, size, 3), np.float32),
+        normals=wide[..., 3:6] / np.maximum(length, 1e-6),
+        position_mm=wide[..., 6:9],
+        valid=count > 0,
+    )
+
+
+def true_light(scene: DomeScene, index: int, view: str) -> Light:
+    """Return one of a dome's lights, in the unit of the simulator's pictures."""
+    led = scene.rig.lights[index]
+    x, y, z = led.position_mm
+    away = float(np.linalg.norm(led.position_mm))
+    half = 60.0 if led.half_intensity_deg is None else led.half_intensity_deg
+    red, green, blue = (scene.intensity(index, view_name=view) / away**2).tolist()
+    return Light(
+        name=led.name, position_mm=(x, y, z), radius=led.radius_mm, reference_mm=away,
+        intensity=(red, green, blue),
+        exponent=float(np.log(0.5) / np.log(np.cos(np.radians(half)))),
+    )  # fmt: skip
+
+
+def _lobe(
+    roughness: float, oil: float, fuzz: float, light: FloatArray, view: FloatArray
+) -> FloatArray:
+    packed = np.array([0.0, 0.0, 0.0, roughness, oil, fuzz, 1.0], np.float32)
+    up = np.array([0.0, 0.0, 1.0], np.float32)
+    to_light, to_view = (_raised(w.reshape(-1, 3)) for w in (light, view))
+    found = surface_brdf.evaluate(packed, up, to_light, to_view)[1]
+    return np.asarray(found.reshape(light.shape[:-1]), np.float64)
+
+
+def _raised(directions: FloatArray) -> NDArray[np.float32]:
+    """Return directions above the horizon, where hair would glow without end."""
+    up = np.maximum(directions[:, 2:], LEAST_COSINE)
+    across = np.linalg.norm(directions[:, :2], axis=-1, keepdims=True)
+    scale = np.sqrt(1.0 - up**2) / np.maximum(across, 1e-9)
+    flat = np.where(across > np.sqrt(1.0 - LEAST_COSINE**2), directions[:, :2] * scale,
+                    directions[:, :2])  # fmt: skip
+    return np.ascontiguousarray(np.concatenate([flat, up], axis=-1), np.float32)
+
+
+def _hair(light: FloatArray, view: FloatArray) -> FloatArray:
+    return _lobe(0.3, 0.0, FUZZ, light, view) - _lobe(0.3, 0.0, 0.0, light, view)

@@ -1,0 +1,1 @@
+"""Sections, pictures and tables of the report."""

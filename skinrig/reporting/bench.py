@@ -1,0 +1,105 @@
+"""The report's section on benchmarks: error against seconds, by setting and by skin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from skinrig.benchmarks import figures as bench_figures
+from skinrig.benchmarks import table as bench_table
+from skinrig.benchmarks.document import SCHEMA
+from skinrig.reporting import page
+
+FAMILY = SCHEMA.split("/")[0]
+
+
+def is_bench(document: Mapping[str, Any]) -> bool:
+    """Return whether a document is a benchmark's, of whatever version."""
+    return str(document.get("schema", "")).startswith(f"{FAMILY}/")
+
+
+def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
+    """Return plots and tables of a benchmark, and add its limits to the checks.
+
+    Parameters
+    ----------
+    document
+        ``skinrig.bench/2``; of another version only that is said.
+    checks
+        The report's.
+    """
+    body = "<h2>Error against run time</h2>"
+    if document["schema"] != SCHEMA:
+        return body + page.note(
+            f"Measured by another version ({document['schema']}, this one reads {SCHEMA}): "
+            "`skinrig bench` measures anew."
+        )
+    for name, stage in document["stages"].items():
+        for limit in stage["limits"]:
+            got = float("nan") if limit["got"] is None else limit["got"]
+            checks.append(
+                page.Check(
+                    f"{name}: {limit['name']}", got, limit["bound"], limit["sense"],
+                    limit["unit"], worst=_worst(stage),
+                )
+            )  # fmt: skip
+    plots = [
+        bench_figures.error_against_seconds(name, stage)
+        for name, stage in document["stages"].items()
+        if stage["points"]
+    ]
+    body += f'<div class="plots">{"".join(plots)}</div>'
+    body += page.table(
+        ("stage", "setting", "seconds", "cold s", "peak MB", "error", "Cramér-Rao", "efficiency",
+         "place"),
+        [
+            (
+                name, ", ".join(f"{k} {v}" for k, v in point["knobs"].items()), point["seconds"],
+                point["cold_seconds"], _cell(point["peak_memory_mb"]), point["error"],
+                _cell(point["cramer_rao_bound"]), _cell(point.get("efficiency")),
+                "knee" if point["knee"] else "front" if point["on_front"] else "beaten",
+            )
+            for name, stage in document["stages"].items()
+            for point in stage["points"]
+        ],
+        caption="Every setting measured; errors in the unit on each plot's axis; efficiency is "
+        "variance over the Cramér-Rao bound, 1 is perfect; cold: the first call of a process",
+    )  # fmt: skip
+    bands = bench_table.bands(document)
+    if bands:
+        body += page.table(
+            bench_table.BAND_COLUMNS, bands,
+            caption="Error of the usual setting by melanin band; of light: over the lightest one",
+        )  # fmt: skip
+    return body + _left_out(document)
+
+
+def _worst(stage: Mapping[str, Any]) -> str:
+    told = [one for one in stage["by_band"] if one["error"] is not None]
+    if len(told) < 2:
+        return ""
+    worst = max(told, key=lambda one: float(one["error"]))
+    return f"{worst['band']}: {float(worst['error']):.3g}"
+
+
+def _left_out(document: Mapping[str, Any]) -> str:
+    rows = [(f"{what}, all of it", why) for what, why in document.get("left_out", ())]
+    rows += [
+        (f"{name}: {what}", why)
+        for name, stage in document["stages"].items()
+        for what, why in stage.get("left_out", ())
+    ]
+    body = ""
+    if rows:
+        table = page.table(("what", "why"), rows, caption="What was not measured")
+        body += page.folded(f"{len(rows)} left out", table)
+    if document.get("not_judged"):
+        body += page.note(
+            "Measured at small size, so that limits were not judged: "
+            f"{', '.join(document['not_judged'])}."
+        )
+    return body
+
+
+def _cell(value: float | None) -> float | str:
+    return "" if value is None else float(value)

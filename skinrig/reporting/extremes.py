@@ -1,0 +1,73 @@
+"""The table of extremes: run, printed, written, and as a section of the report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from skinrig.console import Console, plain
+from skinrig.extremes.cases import PRECISIONS, SCHEMA, run_cases, to_document
+from skinrig.reporting import page
+
+__all__ = ["SCHEMA", "run_extremes", "section"]
+
+
+def run_extremes(
+    stages: Sequence[str], *, out: Path | None = None, console: Console
+) -> dict[str, Any]:
+    """Try every extreme, print the table and return the document.
+
+    Parameters
+    ----------
+    stages
+        As in `skinrig.extremes.cases.run_cases`; empty: all.
+    out
+        Folder for ``extremes.json``; None writes nothing.
+    console
+        Where results and progress go.
+
+    Raises
+    ------
+    ValueError
+        For a stage without cases.
+    """
+    document = to_document(
+        run_cases(stages, progress=lambda name: console.progress(f"extreme: {name}"))
+    )
+    for case in document["cases"]:
+        console.say(
+            f"{'held' if case['passed'] else 'FAILED'}: {case['stage']}: {case['name']} "
+            f"({case['extreme']}); expected: {case['expected']}"
+        )
+        for name in PRECISIONS:
+            if not case["passed"] or name == "float64":
+                console.say(f"    {name}: {case[name]['got']}")
+    failed = sum(not case["passed"] for case in document["cases"])
+    console.say(f"{len(document['cases'])} extremes, {failed or 'none'} failed")
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(plain(document), indent=1, sort_keys=True)
+        (out / "extremes.json").write_text(text + "\n", encoding="utf-8")
+    return document
+
+
+def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
+    """Return the report's table of extremes, and add to its checks that they held."""
+    cases = document["cases"]
+    failed = sum(not case["passed"] for case in cases)
+    checks.append(page.Check("extremes that failed", failed, 0, "<=", "", f"of {len(cases)}"))
+    rows = [
+        (
+            case["stage"], case["name"], case["extreme"], case["danger"], case["expected"],
+            *(("" if case[name]["passed"] else "FAILED: ") + case[name]["got"]
+              for name in PRECISIONS),
+        )
+        for case in cases
+    ]  # fmt: skip
+    return "<h2>Stiff and extreme cases</h2>" + page.table(
+        ("stage", "case", "extreme", "why it can break", "expected", *PRECISIONS),
+        rows,
+        caption=f"{len(cases)} cases in both precisions, {failed or 'none'} failed",
+    )

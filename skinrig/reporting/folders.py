@@ -1,0 +1,135 @@
+"""What lies at the paths of a report: appearances, truths, calibrations, sessions, documents."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from model import store
+from model.skin import SkinAppearance
+from skinrig.reporting import pictures as pictures_section
+
+
+class ReportError(ValueError):
+    """Nothing at the paths that a report could be made of."""
+
+
+@dataclass(slots=True)
+class Findings:
+    """What lies at the paths of a report."""
+
+    appearances: dict[str, Path] = field(default_factory=dict)
+    truths: dict[str, Path] = field(default_factory=dict)
+    calibrations: list[Path] = field(default_factory=list)
+    sessions: list[Path] = field(default_factory=list)
+    pictures: list[Path] = field(default_factory=list)
+    """Folders of renderings and analyses."""
+    documents: list[Path] = field(default_factory=list)
+    """JSON documents of commands: benchmarks and the demo's own."""
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing to tell of."""
+        return not (self.appearances or self.sessions or self.documents or self.pictures)
+
+    def words(self) -> str:
+        """Return what there is, in a sentence.
+
+        Examples
+        --------
+        >>> Findings(sessions=[Path("one")], truths={"truth": Path("truth")}).words()
+        'About 1 truth and 1 session.'
+        """
+        kinds = (
+            ("set of maps", "sets of maps", len(self.appearances)),
+            ("truth", "truths", len(self.truths)),
+            ("folder of pictures", "folders of pictures", len(self.pictures)),
+            ("calibration", "calibrations", len(self.calibrations)),
+            ("session", "sessions", len(self.sessions)),
+            ("document", "documents", len(self.documents)),
+        )
+        told = [f"{n} {one if n == 1 else many}" for one, many, n in kinds if n]
+        return (
+            "About "
+            + (" and ".join([", ".join(told[:-1]), told[-1]]) if told[1:] else told[0])
+            + "."
+        )
+
+    def truth_of(self, appearance: SkinAppearance) -> SkinAppearance | None:
+        """Return the truth that an appearance names, where it was found."""
+        path = self.truths.get(str(appearance.parameters.get("truth", "")))
+        return store.read(path) if path else None
+
+
+def discover(paths: Sequence[Path]) -> Findings:
+    """Find appearances, truths, calibrations, sessions and documents at or below ``paths``.
+
+    Raises
+    ------
+    ReportError
+        When a path does not exist, or nothing is found at all.
+    """
+    found = Findings()
+    for path in paths:
+        if not path.exists():
+            raise ReportError(f"{path}: does not exist; give a folder that skinrig wrote")
+        below = [path, *sorted(path.iterdir())] if path.is_dir() else [path]
+        for entry in below:
+            if not entry.name.startswith("."):
+                _sort_in(entry, found)
+    if found.empty:
+        raise ReportError(
+            f"{', '.join(map(str, paths))}: holds no session, appearance or benchmark; "
+            "`skinrig demo` makes all of them"
+        )
+    return found
+
+
+def _sort_in(entry: Path, found: Findings) -> None:
+    if entry.is_file() and entry.suffix == ".json" and entry.name != store.DOCUMENT:
+        if (entry.parent / store.DOCUMENT).is_file():
+            return  # of the appearance itself, which its section shows
+        text = entry.read_text(encoding="utf-8", errors="replace")
+        if '"schema"' in text and '"skinrig.' in text and "session" not in entry.name:
+            found.documents.append(entry)
+    elif (entry / store.DOCUMENT).is_file():
+        kind = store.read_document(entry).parameters.get("kind")
+        (found.truths if kind == "truth" else found.appearances)[entry.name] = entry
+    elif (entry / "session.json").is_file():
+        found.sessions.append(entry)
+    elif entry.is_dir() and pictures_section.folder_document(entry) is not None:
+        found.pictures.append(entry)
+    elif entry.is_dir() and entry.name.startswith("calibration"):
+        found.calibrations.append(entry)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a command's JSON document.
+
+    Raises
+    ------
+    ReportError
+        When it is not JSON, or no document of a command.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ReportError(f"{path}: cannot be read as JSON ({error}); write it anew") from error
+    if not isinstance(document, dict) or not isinstance(document.get("schema"), str):
+        raise ReportError(f'{path}: got no "schema", expected a document of a skinrig command')
+    return document
+
+
+def write_page(path: Path, text: str) -> None:
+    """Write a page that is there whole or not at all."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise

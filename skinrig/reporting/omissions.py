@@ -1,0 +1,89 @@
+"""The report's table of what simulated scenes built and left out, and why."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from skinrig.reporting import page
+
+ORDER = ("asked", "negligible", "unmodeled", "absent", "built")
+"""In which verdicts are listed, see `rigsim.scene_needs.MEANING`."""
+
+WORDS = {
+    "asked": "left out as asked",
+    "negligible": "left out, too small",
+    "unmodeled": "not modeled",
+    "absent": "not there",
+    "built": "built",
+}
+
+SESSION_FILE = "session.json"
+
+
+def effects_of(session: Path) -> list[Mapping[str, Any]]:
+    """Return the effects that a session's manifest holds; none where it was measured.
+
+    Parameters
+    ----------
+    session
+        SESSION/ folder.
+    """
+    manifest = session / SESSION_FILE
+    if not manifest.is_file():
+        return []
+    document = json.loads(manifest.read_text(encoding="utf-8"))
+    found = document.get("extra", {}).get("effects", [])
+    return [entry for entry in found if isinstance(entry, dict)]
+
+
+def section(sessions: Sequence[Path]) -> str:
+    """Return what the scenes of simulated sessions hold; empty where no session tells.
+
+    Parameters
+    ----------
+    sessions
+        SESSION/ folders. Those whose scenes are alike share a table.
+
+    Returns
+    -------
+    str
+        HTML, the same for the same sessions in any order.
+    """
+    alike: dict[str, list[str]] = {}
+    for session in sorted(sessions):
+        found = effects_of(session)
+        if found:
+            alike.setdefault(json.dumps(found, sort_keys=True), []).append(session.name)
+    if not alike:
+        return ""
+    body = (
+        "<h2>What simulated scenes leave out</h2><p class=note>A scene builds what changes a pixel "
+        "by a tenth of its noise or more. The last column is the largest change that its rule "
+        "tells, over the noise; <code>skinrig bench --stage omissions</code> renders scenes with "
+        "and without. What is not modeled may change pixels: real photographs hold it and "
+        "simulated ones do not.</p>"
+    )
+    for text, names in alike.items():
+        effects = json.loads(text)
+        rows = sorted((_row(effect) for effect in effects), key=lambda row: _place(row[1]))
+        out = sum(not effect["verdict"] == "built" for effect in effects)
+        title = f"{', '.join(names)}: {len(effects) - out} effects built, {out} not"
+        head = ("effect", "what became of it", "why", "change over noise")
+        body += page.folded(title, page.table(head, rows, caption="Effects of light in the scene"))
+    return body
+
+
+def _row(effect: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    over = effect.get("over_noise")
+    return (
+        str(effect["name"]), WORDS.get(str(effect["verdict"]), str(effect["verdict"])),
+        str(effect["reason"]), "" if over is None else f"{over:.3g}",
+    )  # fmt: skip
+
+
+def _place(words: str) -> int:
+    told = [WORDS[verdict] for verdict in ORDER]
+    return told.index(words) if words in told else len(told)

@@ -1,0 +1,97 @@
+"""The report's section on people: sigma_tr in table 2's layout, measured, simulated, published."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from model.skin import SkinAppearance
+from model.translucency_population import (
+    PopulationTable,
+    SiteMeasurement,
+    summarize,
+    table,
+    weyrich_2005,
+)
+from reconstruction.probe_stages import CHANNELS, SUBSURFACE_FILE
+from skinrig.evaluating.subsurface import document_of, number
+from skinrig.reporting import page
+
+PEOPLE = 87
+"""As many as Weyrich et al. 2005 measured."""
+
+
+def section(appearances: Mapping[str, SkinAppearance]) -> str:
+    """Return the tables of sigma_tr over people; empty where nobody's skin was probed.
+
+    Parameters
+    ----------
+    appearances
+        By name; each that holds fits of a fibre probe counts as a person.
+    """
+    people = {
+        name: fits
+        for name, appearance in appearances.items()
+        if (fits := document_of(appearance, SUBSURFACE_FILE)) is not None
+    }
+    if not people:
+        return ""
+    published = weyrich_2005()
+    drawn = table(published.sample(PEOPLE, rng=np.random.default_rng(0)), sites=published.sites)
+    body = "<h2>sigma_tr over people, 1/mm</h2>" + (
+        "<p class='note'>Deviations are over people. The publication heads its second column "
+        "“Var.”; as variances its numbers would contradict the extremes that it shows, so that "
+        "they are read as standard deviations. The smallest sigma_tr is the most translucent "
+        "skin.</p>"
+    )
+    rows: list[tuple[object, ...]] = []
+    for c, channel in enumerate(CHANNELS):
+        row: list[object] = ["published (Weyrich et al. 2005, table 2)", channel]
+        for s in range(len(published.sites)):
+            row += [
+                float(published.mean_per_mm[s, c]),
+                float(published.deviation_per_mm[s, c]),
+            ]
+        rows.append(tuple(row))
+    rows += _rows(f"simulated, {PEOPLE} people drawn from it", drawn, published.sites)
+    measured = [one for name, fits in people.items() for one in _measured(name, fits)]
+    if measured:
+        found = summarize(measured)
+        rows += _rows(f"measured here, {len(people)} sessions", found, published.sites)
+    columns = [f"{site}, {word}" for site in published.sites for word in ("mean", "deviation")]
+    head = ("who", "channel", *columns)
+    return body + page.table(
+        head, rows, caption="Mean and standard deviation over people, red, green and blue light"
+    )
+
+
+def _rows(who: str, found: PopulationTable, sites: tuple[str, ...]) -> list[tuple[object, ...]]:
+    rows: list[tuple[object, ...]] = []
+    for c, channel in enumerate(found.channels):
+        row: list[object] = [who, channel]
+        for site in sites:
+            s = found.sites.index(site) if site in found.sites else None
+            count = 0 if s is None else int(found.count[s, c])
+            row.append(float(found.mean_per_mm[s, c]) if count else float("nan"))
+            row.append(float(found.deviation_per_mm[s, c]) if count > 1 else float("nan"))
+        rows.append(tuple(row))
+    return rows
+
+
+def _measured(name: str, fits: Mapping[str, Any]) -> list[SiteMeasurement]:
+    """Return the sites of a person that are known in every channel."""
+    by_site: dict[str, list[Mapping[str, Any]]] = {}
+    for entry in fits["sites"]:
+        by_site.setdefault(entry["site"], []).append(entry)
+    return [
+        SiteMeasurement(
+            name,
+            site,
+            tuple(number(entry["sigma_tr_per_mm"]) for entry in own),
+            tuple(number(entry["sigma_tr_stderr"]) for entry in own),
+        )
+        for site, own in by_site.items()
+        if all(entry["sigma_tr_stderr"] is not None for entry in own)
+    ]

@@ -1,0 +1,156 @@
+"""Maps without a truth: what their own standard errors and residuals say, and no more."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.skin import SkinAppearance, SkinMap
+from skinrig.evaluating import flash
+from skinrig.reporting import page
+
+RESIDUALS = ("residual", "misfit", "gamut_distance")
+"""Words in the names of maps that tell how badly a model fits."""
+BANDED = ("melanin", "hemoglobin")
+
+
+MOST_NAMED = 3
+"""Maps of an appearance that are named first: those that know least."""
+
+
+def weaknesses(name: str, appearance: SkinAppearance) -> list[str]:
+    """Return what an appearance without a truth knows least of, by its own standard errors.
+
+    Parameters
+    ----------
+    name
+        Of the appearance.
+    appearance
+        Its maps; those without standard errors say nothing.
+
+    Examples
+    --------
+    >>> thickness = SkinMap(np.full((2, 2), 2.0), "mm", np.full((2, 2), 0.1))
+    >>> weaknesses("cheek", SkinAppearance({"thickness": thickness}, "measured"))
+    ['cheek: thickness, median standard error 5 % of its value']
+    """
+    told: list[tuple[float, str]] = []
+    angles: list[tuple[float, str]] = []
+    for key, one in sorted(appearance.maps.items()):
+        row = _spread(key, one) if one.stderr is not None else None
+        if row is None:
+            continue
+        share = float(str(row[2]))
+        missing = f", {100 - share:.0f} % of pixels without a value" if share < 99.5 else ""
+        if row[1] == "°":
+            angle = float(str(row[4]))
+            text = f"{name}: {key}, median standard error {page.number(angle)}°"
+            angles.append((angle, text + missing))
+        elif np.isfinite(percent := float(str(row[5]))):
+            text = f"{name}: {key}, median standard error {page.number(percent)} % of its value"
+            told.append((percent, text + missing))
+    first = sorted(told, reverse=True)[:MOST_NAMED] + sorted(angles, reverse=True)[:1]
+    return [text for _, text in first]
+
+
+def section(appearance: SkinAppearance) -> str:
+    """Return standard errors and residuals of maps, by melanin band where melanin is among them.
+
+    Parameters
+    ----------
+    appearance
+        Without a truth: errors and coverage of intervals cannot be told, and are not.
+    """
+    spreads = [
+        row
+        for name, one in sorted(appearance.maps.items())
+        if one.stderr is not None and (row := _spread(name, one)) is not None
+    ]
+    residuals = [
+        row
+        for name, one in sorted(appearance.maps.items())
+        if any(word in name for word in RESIDUALS) and (row := _residual(name, one)) is not None
+    ]
+    body = "<h3>Without a truth</h3>" + page.note(
+        "No truth lies beside these maps: standard errors and residuals are all there is to judge "
+        "them by. Whether 68 % intervals hold 68 % of truths is not claimed here; a simulated "
+        "session of the same rig and plan shows how well they do."
+    )
+    if spreads:
+        body += page.table(
+            ("map", "unit", "with a value %", "median", "median standard error",
+             "of the value %", "95th % of standard errors"),
+            spreads,
+            caption="Standard errors, of all pixels that have a value",
+        )  # fmt: skip
+    if residuals:
+        body += page.table(
+            ("map", "unit", "median", "68th %", "95th %"),
+            residuals,
+            caption="Residuals: what models leave of the images",
+        )
+    return body + _by_band(appearance)
+
+
+def _values(one: SkinMap) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    values = one.values.astype(np.float64)
+    good = np.isfinite(values if values.ndim == 2 else values.sum(axis=-1))
+    return values, good if one.valid is None else good & one.valid
+
+
+def _spread(name: str, one: SkinMap) -> tuple[object, ...] | None:
+    values, good = _values(one)
+    if one.stderr is None or not good.any():
+        return None
+    stderr = one.stderr[good].astype(np.float64)
+    share = 100.0 * float(good.mean())
+    if "normals" in name:
+        degrees = np.degrees(stderr)
+        return (name, "°", share, "", float(np.median(degrees)), "",
+                float(np.percentile(degrees, 95)))  # fmt: skip
+    size = np.abs(values[good])
+    relative = stderr[size > 0] / size[size > 0]
+    return (
+        name, page.short_unit(one.unit), share, float(np.median(values[good])),
+        float(np.median(stderr)),
+        100.0 * float(np.median(relative)) if relative.size else float("nan"),
+        float(np.percentile(stderr, 95)),
+    )  # fmt: skip
+
+
+def _residual(name: str, one: SkinMap) -> tuple[object, ...] | None:
+    values, good = _values(one)
+    if not good.any():
+        return None
+    low, middle, high = np.percentile(np.abs(values[good]), [50, 68.27, 95])
+    return (name, page.short_unit(one.unit), float(low), float(middle), float(high))
+
+
+def _by_band(appearance: SkinAppearance) -> str:
+    melanin = appearance.maps.get("melanin")
+    if melanin is None:
+        return ""
+    levels, known = _values(melanin)
+    rows: list[tuple[object, ...]] = []
+    for name in BANDED:
+        one = appearance.maps.get(name)
+        if one is None or one.stderr is None or one.values.shape != levels.shape:
+            continue
+        values, good = _values(one)
+        for low, high in flash.BANDS:
+            inside = known & (levels >= low) & (levels < high)
+            chosen = inside & good & (np.abs(values) > 0)
+            if np.count_nonzero(chosen) < 20:
+                continue
+            relative = 100.0 * one.stderr[chosen] / np.abs(values[chosen])
+            rows.append(
+                (name, f"C_m {low:g}–{high:g}", int(np.count_nonzero(chosen)),
+                 float(np.median(relative)), float(np.percentile(relative, 95)))
+            )  # fmt: skip
+    if not rows:
+        return ""
+    return page.table(
+        ("map", "band", "pixels", "median standard error %", "95th %"),
+        rows,
+        caption="Relative standard errors by band of the estimated melanin fraction C_m",
+    )

@@ -1,0 +1,132 @@
+"""What a report says first: did it work, how good is it, and where is it bad."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from skinrig.reporting import page
+
+NAMED = 3
+"""Checks named that come closest to their limit."""
+MISSED_NAMED = 8
+OVERCONFIDENT, UNDERCONFIDENT = 0.5, 0.9
+"""Share of truths inside 68 % intervals beyond which intervals are called too small or large."""
+MUCH_MASKED = 0.2
+"""Share of pixels without a value that is worth a sentence."""
+
+
+def headline(checks: Sequence[page.Check]) -> str:
+    """Return the verdict as one sentence.
+
+    Examples
+    --------
+    >>> headline([])
+    'No limit was checked: there is no truth and no benchmark here.'
+    >>> headline([page.Check("error", 2.0, 1.0, "<=")])
+    '1 of 1 checks missed their limit.'
+    """
+    missed = sum(not check.passed for check in checks)
+    if not checks:
+        return "No limit was checked: there is no truth and no benchmark here."
+    if missed:
+        return f"{missed} of {len(checks)} checks missed their limit."
+    return f"All {len(checks)} checks kept their limits."
+
+
+def section(checks: Sequence[page.Check], about: str = "", unjudged: Sequence[str] = ()) -> str:
+    """Return the verdict, where it is worst, and all checks.
+
+    Parameters
+    ----------
+    checks
+        All there are.
+    about
+        Of what, as text.
+    unjudged
+        What maps without a truth know least of, in sentences.
+    """
+    kind = "bad" if any(not check.passed for check in checks) else "good"
+    body = f'<p class="verdict {kind if checks else ""}">{page.escape(headline(checks))}</p>'
+    if about:
+        body += f"<p>{page.escape(about)}</p>"
+    weak = weaknesses(checks)
+    if weak:
+        items = "".join(f"<li>{page.escape(text)}</li>" for text in weak)
+        body += f'<h2>Where it is worst</h2><ul class="worst">{items}</ul>'
+    if unjudged:
+        items = "".join(f"<li>{page.escape(text)}</li>" for text in unjudged)
+        body += "<h2>Without a truth: least known</h2>" + page.note(
+            "By their own standard errors; how far they are from the truth is not known."
+        )
+        body += f'<ul class="worst">{items}</ul>'
+    if checks:
+        body += "<h2>Checks</h2>" + page.checks_table(checks)
+    return body
+
+
+def weaknesses(checks: Sequence[page.Check]) -> list[str]:
+    """Return what a reader should look at first, in sentences.
+
+    Missed limits; skin or states whose own error lies beyond the limit that the whole keeps; what
+    comes closest to its limit; intervals that hold far too few or too many truths; maps with many
+    pixels that have no value.
+
+    Examples
+    --------
+    >>> one = page.Check("melanin", 9.0, 10.0, "<=", "%", coverage=0.4, worst="dark: 40 %")
+    >>> for text in weaknesses([one]): print(text)
+    closest to its limit: melanin, 9 % of at most 10 % (90 % of it used); worst at dark: 40 %
+    intervals too small: melanin, 40 % of truths lie inside the 68 % intervals
+    """
+    out = []
+    missed = [check for check in checks if not check.passed]
+    for check in missed[:MISSED_NAMED]:
+        sign = "at most" if check.sense == "<=" else "at least"
+        out.append(f"missed: {check.name}, {_measured(check)}, {sign} {_bound(check)}{_at(check)}")
+    if len(missed) > MISSED_NAMED:
+        out.append(f"missed: {len(missed) - MISSED_NAMED} more, in the table below")
+    told: set[str] = set()
+    for check in checks:
+        beyond = check.passed and check.sense == "<=" and check.worst_got > check.bound
+        if beyond and check.worst not in told:  # channels of a map share their worst place
+            told.add(check.worst)
+            out.append(
+                f"beyond the limit of the whole: {check.name}, {check.worst} where at most "
+                f"{_bound(check)} is allowed over all, and {_measured(check)} found"
+            )
+    close = sorted(
+        (check for check in checks if check.passed and np.isfinite(check.used)),
+        key=lambda check: -check.used,
+    )
+    for check in close[:NAMED]:
+        out.append(
+            f"closest to its limit: {check.name}, {_measured(check)} of at most {_bound(check)} "
+            f"({100 * check.used:.0f} % of it used){_at(check)}"
+        )
+    for check in checks:
+        if check.coverage < OVERCONFIDENT:
+            out.append(f"intervals too small: {_covered(check)}")
+        elif check.coverage > UNDERCONFIDENT:
+            out.append(f"intervals too large: {_covered(check)}")
+    for check in checks:
+        if check.masked > MUCH_MASKED:
+            out.append(f"masked: {check.name}, {100 * check.masked:.0f} % of pixels have no value")
+    return out
+
+
+def _measured(check: page.Check) -> str:
+    return f"{page.number(check.got)} {check.unit}".rstrip()
+
+
+def _bound(check: page.Check) -> str:
+    return f"{page.number(check.bound)} {check.unit}".rstrip()
+
+
+def _at(check: page.Check) -> str:
+    return f"; worst at {check.worst}" if check.worst else ""
+
+
+def _covered(check: page.Check) -> str:
+    return f"{check.name}, {100 * check.coverage:.0f} % of truths lie inside the 68 % intervals"

@@ -1,0 +1,1 @@
+"""Sessions of simulated rigs, through the drivers of real ones."""

@@ -1,0 +1,367 @@
+"""The light dome simulated: a face or a target, a scan of the face, and the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import re
+from typing import TYPE_CHECKING, Any, cast, get_args
+
+import numpy as np
+
+from capture.plan import Plan
+from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
+from capture.plan.rows import lights_of
+from capture.rig import Rig, load_rig
+from model import store
+from model.skin import SkinAppearance
+from skinrig.evaluating.reflection import TEST_FILE, make_test
+from skinrig.light_safety import light_figures, light_lines
+from skinrig.simulating.simulation import (
+    Order,
+    Simulated,
+    SimulationError,
+    drive,
+    effects_of,
+    open_session,
+    truth_folder,
+)
+
+if TYPE_CHECKING:
+    from rigsim.population import Member
+
+TEXELS = 512
+"""Along one side of a face's maps."""
+WIDTHS_PX = {"small": 320, "full": 1300}
+LIGHTS = {"small": 48, "full": None}
+VIEWS = {"small": 6, "full": None}
+SITES = ("forehead", "nose bridge", "cheek left", "cheek right", "chin")
+"""Where the truth keeps pictures of the reflection."""
+BEHIND = -0.3
+"""Cosine from +z beyond which a light stands too far behind the face to be chosen among few."""
+SCAN = "scan.ply"
+TRUE_MESH = "mesh.ply"
+BLEND_SHAPES = "expressions.npz"
+"""The face at rest with the movement of each expression, see `rigsim.mesh.load_mesh`."""
+SCAN_TRIANGLES = {"small": 12_000, "full": 40_000}
+TRACKING_EVERY = 24
+
+
+def simulate_dome(order: Order) -> Simulated:
+    """Simulate a capture with the dome; see `simulation.simulate_session`."""
+    targets = get_args(DomeTarget)
+    if order.target is not None and order.target not in targets:
+        raise SimulationError(f"target: got {order.target!r}, expected one of {', '.join(targets)}")
+    order.refuse(
+        "dome", repeats=1, site=None, angles=None, steps=None, sites=None, all_brackets=False,
+    )  # fmt: skip
+    state = _state(order)
+    conditions = _conditions(order)
+    rig = _rig(order)
+    planned = order.plan if order.target is None else None
+    plan = planned or _plan(rig, order.target, order.size)
+    figures = light_figures(plan, rig)
+    if order.progress is not None:
+        for line in light_lines(plan, rig):
+            order.progress(line)
+    asked = {
+        "rig": "dome", "width_px": rig.views[0].width_px, "subject": order.subject,
+        "target": order.target or "", "mesh": str(order.mesh or ""), "lights": len(rig.lights),
+        "views": len(rig.views), "move": order.move, "state": state, "movement": order.movement,
+        "wrapped": order.wrapped, "plan": "" if order.plan is None else order.plan.to_json(),
+    }  # fmt: skip
+    if order.target is None:
+        asked |= {"subsurface": order.subsurface, "interreflections": order.interreflections}
+        if order.leave_out:
+            asked["leave_out"] = list(order.leave_out)
+    elif order.subsurface or order.interreflections or order.leave_out:
+        raise SimulationError("subsurface, interreflections: are of a face; a target has neither")
+    if conditions:
+        asked["conditions"] = conditions
+    scene = _scene(rig, order)
+    session = open_session(order, plan, rig, asked, scene)
+    try:
+        scan = _attach_scan(session, scene, order) if order.target is None else {}
+    except BaseException:
+        session.release()
+        raise
+
+    def prompt(world: Any, text: str) -> None:
+        # "pose 3" and "sphere 1": the operator puts the target there
+        scene.show(int(text.rpartition(" ")[2]))
+
+    # nobody sits in front of a target; a face is asked to close its eyes where that is needed
+    safe = order.target is not None or figures["open_eyes"] != "allowed"
+    rig_seconds = drive(
+        session, rig, scene, order.seed, prompt, order.progress,
+        eyes="closed" if safe else "open",
+    )  # fmt: skip
+    truth = None
+    if order.target is None:
+        truth = truth_folder(order.out)
+        appearance = scene.truth_appearance()
+        appearance = dataclasses.replace(
+            appearance,
+            parameters={
+                "kind": "truth",
+                "state": state,
+                "movement": order.movement,
+                "subsurface": scene.subsurface,
+                "interreflections": scene.interreflections,
+                **appearance.parameters,
+                **scan,
+                "landmarks_mm": _landmarks(scene.subject),
+            },
+            inputs={"session": session.content_hash},
+            files=_truth_files(scene, appearance, order.seed),
+            seed=order.seed,
+        )
+        store.write(truth, appearance)
+    return Simulated(
+        order.out, truth, len(session.frames()), rig_seconds, tuple(scene.left_out), light=figures,
+        effects=effects_of(scene),
+    )  # fmt: skip
+
+
+def _state(order: Order) -> str:
+    """Return the state of the one face that a session of the dome shows."""
+    from rigsim.perfusion import STATES
+
+    if len(order.states) != 1:
+        raise SimulationError(
+            f"states: got {', '.join(order.states) or 'none'}, expected one; a session of the dome "
+            "shows one face, capture each state into a session of its own"
+        )
+    if order.states[0] not in STATES:
+        raise SimulationError(
+            f"state: got {order.states[0]!r}, expected one of {', '.join(STATES)}"
+        )
+    if order.target is not None and order.states[0] != "neutral":
+        raise SimulationError(f"state: got {order.states[0]!r}, but a target has none")
+    return order.states[0]
+
+
+def _conditions(order: Order) -> dict[str, float]:
+    """Return the conditions of the face, checked."""
+    from rigsim.skin_conditions import ConditionError, checked
+
+    if order.target is not None and order.conditions:
+        raise SimulationError(
+            f"condition: got {', '.join(order.conditions)}, but a target has none"
+        )
+    try:
+        return checked(order.conditions)
+    except ConditionError as error:
+        raise SimulationError(str(error)) from error
+
+
+def _member(order: Order) -> Member | None:
+    """Return the member of the simulated population that is asked for; None: a preset is."""
+    from rigsim.population import PopulationError, member
+
+    if order.target is not None or not re.fullmatch(r"P\d+", order.subject):
+        return None
+    if order.mesh is not None:
+        raise SimulationError(f"mesh: {order.subject} has a head already; leave it out")
+    try:
+        return member(order.subject)
+    except PopulationError as error:
+        raise SimulationError(f"subject: {error}") from error
+
+
+def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, bytes]:
+    """Return the true mesh, its expressions, and how it reflects where no light is."""
+    from rigsim.scan_flaws import binary_ply
+
+    mesh, landmarks = scene.subject.mesh, scene.subject.landmarks_mm()
+    return {
+        TRUE_MESH: binary_ply(mesh.vertices_mm, mesh.faces),
+        BLEND_SHAPES: _blend_shapes(scene.subject),
+        TEST_FILE: make_test(
+            scene,
+            truth,
+            rng=np.random.default_rng([seed, 8]),
+            sites={name: landmarks[name] for name in SITES},
+        ),
+    }
+
+
+def _landmarks(subject: Any) -> dict[str, list[float]]:
+    """Return named points of the skin, x, y, z in mm, rig frame."""
+    points = subject.surface_landmarks()
+    return dict(zip(points.names, points.on(subject.mesh).round(4).tolist(), strict=True))
+
+
+def _blend_shapes(subject: Any) -> bytes:
+    """Return the face at rest and how each expression moves it, as the bytes of an .npz."""
+    rest = subject.mesh if subject.rest is None else subject.rest.mesh
+    shapes = subject.blend_shapes()
+    out = io.BytesIO()
+    np.savez_compressed(
+        out,
+        vertices_mm=rest.vertices_mm,
+        faces=rest.faces,
+        uv=rest.uv,
+        shape_names=np.array(list(shapes)),
+        shape_deltas_mm=np.array(list(shapes.values()), np.float16),
+    )
+    return out.getvalue()
+
+
+def small_dome(
+    rig: Rig, *, lights: int | None = None, views: int | None = None, width_px: int | None = None
+) -> Rig:
+    """Return a dome with fewer lights, cameras and pixels, those kept spread evenly.
+
+    Parameters
+    ----------
+    rig : Rig
+    lights, views : int, optional
+        How many to keep, 1 to all; all by default.
+    width_px : int, optional
+        Pixels across each camera.
+
+    Raises
+    ------
+    SimulationError
+        For a number that the rig cannot give.
+
+    Examples
+    --------
+    >>> small = small_dome(load_rig("dome"), lights=12, views=3, width_px=130)
+    >>> len(small.lights), len(small.views), small.views[0].height_px
+    (12, 3, 104)
+    """
+    kept: dict[str, list[str] | None] = {"lights": None, "views": None}
+    for field, count in (("lights", lights), ("views", views)):
+        rows = getattr(rig, field)
+        if count is None:
+            continue
+        if not 1 <= count <= len(rows):
+            raise SimulationError(f"{field}: got {count}, expected 1 to {len(rows)}")
+        places = np.array([row.position_mm for row in rows])
+        # few lights stand where they reach a face; many stand all around
+        use = np.flatnonzero(places[:, 2] >= BEHIND * np.linalg.norm(places, axis=1))
+        use = use if len(use) >= count else np.arange(len(rows))
+        kept[field] = [rows[use[k]].name for k in spread(places[use], count)]
+    rig = rig.subset(lights=kept["lights"], views=kept["views"])
+    return rig if width_px in (None, rig.views[0].width_px) else rig.resized(int(width_px or 0))
+
+
+def spread(places: np.ndarray[Any, Any], count: int) -> list[int]:
+    """Return the numbers of ``count`` directions, each next one the farthest from those before.
+
+    Parameters
+    ----------
+    places : ndarray
+        (N, 3), any length; the first chosen is the one most towards +z.
+    count : int
+        1 to N.
+
+    Examples
+    --------
+    >>> spread(np.array([[1.0, 0, 0], [0, 0, 1], [-1, 0, 0], [0.9, 0, 0.1]]), 3)
+    [1, 0, 2]
+    """
+    way = places / np.linalg.norm(places, axis=1)[:, None]
+    chosen = [int(np.argmax(way[:, 2]))]
+    while len(chosen) < count:
+        nearest = (way @ way[chosen].T).max(axis=1)
+        nearest[chosen] = np.inf
+        chosen.append(int(np.argmin(nearest)))
+    return chosen
+
+
+def _rig(order: Order) -> Rig:
+    """Return the dome with the lights, cameras and pixels of an order."""
+    width_px = order.width_px or WIDTHS_PX[order.size]
+    if order.plan is None:
+        return small_dome(
+            load_rig("dome"),
+            lights=order.lights or LIGHTS[order.size],
+            views=order.views or VIEWS[order.size],
+            width_px=width_px,
+        )
+    if (order.lights, order.views) != (None, None):
+        raise SimulationError("lights, views: a plan names its own; leave them out")
+    dome = load_rig("dome")
+    if order.plan.rig != dome.name:
+        raise SimulationError(f"plan: got one of {order.plan.rig!r}, expected {dome.name!r}")
+    lit = {name for step in order.plan.steps for name in lights_of(step)}
+    seen = {name for step in order.plan.steps for name in step.cameras}
+    return dome.subset(
+        lights=[x.name for x in dome.lights if x.name in lit],
+        views=[v.name for v in dome.views if v.name in seen],
+    ).resized(width_px)
+
+
+def _plan(rig: Rig, target: str | None, size: str) -> Plan:
+    if target is None:
+        return dome_plan(rig, tracking_every=TRACKING_EVERY)
+    from rigsim.scenes.dome_targets import PLACES, plate_normals
+
+    few = {"charuco": 10, "mirror": 3, "white": 3} if size == "small" else PLACES
+    return dome_calibration_plan(
+        rig, cast(DomeTarget, target), poses=few["charuco"], spheres=few["mirror"],
+        plates=few["white"], plate_normals=plate_normals(),
+    )  # fmt: skip
+
+
+def _scene(rig: Rig, order: Order) -> Any:
+    from rigsim.dome_build import build
+    from rigsim.head_motion import head_motion
+    from rigsim.scenes.dome import DomeScene
+    from rigsim.scenes.dome_targets import target_scene
+    from rigsim.subject import make_subject
+    from rigsim.targets import make_target
+
+    built = build(rig, seed=order.seed)
+    if order.target == "dark":
+        return DomeScene(rig, make_target("dark"), dome=built, seed=order.seed)
+    if order.target is not None:
+        return target_scene(order.target, rig, seed=order.seed, dome=built)  # type: ignore[arg-type]
+    conditions = dict(order.conditions)
+    if (one := _member(order)) is not None:
+        person = one.face(TEXELS)
+        conditions = dict(one.applied) | conditions
+    else:
+        person = make_subject(order.subject, seed=order.seed, size=TEXELS, mesh=order.mesh)
+    motion = head_motion(order.seed) if order.move else None
+    light = _light_of_skin(order)
+    return DomeScene(
+        rig, person, dome=built, motion=motion, state=order.states[0], movement=order.movement,
+        seed=order.seed, subsurface=light["subsurface"], interreflections=light["interreflections"],
+        conditions=conditions,
+    )  # fmt: skip
+
+
+def _light_of_skin(order: Order) -> dict[str, bool | None]:
+    """Return which light from inside and from other skin is built; None: what changes pixels."""
+    asked: dict[str, bool | None] = {
+        "subsurface": order.subsurface or None, "interreflections": order.interreflections or None
+    }  # fmt: skip
+    for name in order.leave_out:
+        if name not in asked:
+            raise SimulationError(f"leave_out: got {name!r}, expected one of {', '.join(asked)}")
+        if asked[name]:
+            raise SimulationError(f"leave_out: {name} was asked for, too")
+        asked[name] = False
+    return asked
+
+
+def _attach_scan(session: Any, scene: Any, order: Order) -> dict[str, Any]:
+    """Scan the face into the session; return what the truth keeps of it."""
+    from rigsim.perfusion import STATES
+    from rigsim.scanner import Scanner, scan_face, wrap_template
+
+    scanner = Scanner(triangles=SCAN_TRIANGLES[order.size])
+    mesh = scene.subject.mesh
+    if order.wrapped:
+        rng = np.random.default_rng([order.seed, 7, STATES.index(order.states[0])])
+        scan = wrap_template(mesh, rng=rng, scanner=scanner)
+    else:
+        scan = scan_face(mesh, rng=np.random.default_rng([order.seed, 7]), scanner=scanner)
+    if SCAN not in session.attachments():
+        kind = "template wrapped onto a scan" if order.wrapped else "scanned mesh"
+        session.attach(SCAN, scan.ply, about={"kind": kind, "unit": "mm"})
+    return {"scan_to_dome": scan.to_dome.tolist()}

@@ -1,0 +1,236 @@
+"""A sequence in time before the flash rig simulated: prompts, blood that follows, its truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.rig import load_rig
+from capture.session import Session
+from model import store
+from skinrig.sequences import SequenceOrder, sequence_lines, sequence_plan
+from skinrig.simulating.flash import (
+    WIDTHS_PX,
+    landmarks_at_superpixels,
+    to_superpixels,
+    truth_of,
+)
+from skinrig.simulating.simulation import (
+    Order,
+    Simulated,
+    SimulationError,
+    drive,
+    effects_of,
+    open_session,
+    truth_folder,
+)
+
+COURSE_FILE = "perfusion_course.json"
+"""In the truth: the blood of each frame at its own time."""
+LANDMARKS_FILE = "landmarks.csv"
+"""In the truth: named points of the face at rest, px of its superpixels."""
+POINTS = {
+    "forehead": "forehead",
+    "cheek": "cheek left",
+    "nose": "nose tip",
+    "chin": "chin",
+    "temple": "temple left",
+}
+"""The five places of Jimenez et al. 2010, figure 7, and the landmarks they lie on."""
+RADIUS_SHARE = 0.02
+"""Radius of a place's disc, of the picture's width."""
+TEXELS = (256, 512)
+"""Of the face's texture: for pictures up to `COARSE_PX` across, and for larger ones."""
+COARSE_PX = 384
+RESUMED_AFTER_S = 10.0
+"""Time on the host's clock that a simulated interruption takes, s."""
+
+
+def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
+    """Simulate a sequence with the flash rig; see `simulation.simulate_session`."""
+    from rigsim.perfusion import STATES
+    from rigsim.perfusion_course import EventCourse, PromptedCourse
+    from rigsim.scenes.flash_course import FlashCourseScene, FlashTime
+    from rigsim.subject import make_subject
+
+    if sequence.state not in STATES or sequence.state == "neutral":
+        expected = ", ".join(state for state in STATES if state != "neutral")
+        raise SimulationError(f"sequence: got {sequence.state!r}, expected one of {expected}")
+    order.refuse(
+        "flash", target=None, lights=None, views=None, move=False, site=None, angles=None,
+        steps=None, sites=None, all_brackets=False, repeats=1, states=("neutral",),
+    )  # fmt: skip
+    width, seed = order.width_px or WIDTHS_PX[order.size], order.seed
+    rig = load_rig("flash").resized(width)
+    constant_s = order.relaxation_s
+    if constant_s is not None and not 0 < constant_s < np.inf:
+        raise SimulationError(f"relaxation: got {constant_s}, expected seconds > 0")
+    asked = {
+        "rig": "flash", "width_px": width, "subject": order.subject,
+        "mesh": str(order.mesh or ""), "sequence": sequence.document(),
+        "relaxation_s": constant_s, "movement": order.movement,
+    }  # fmt: skip
+    if not sequence.prompted:
+        course: Any = EventCourse(sequence.state, constant_s)
+    elif constant_s is None:
+        course = PromptedCourse(sequence.state, seed=seed)
+    else:
+        course = PromptedCourse(sequence.state, rise_s=constant_s, fall_s=constant_s, seed=seed)
+    texels = TEXELS[0] if width <= COARSE_PX else TEXELS[1]
+    person = make_subject(order.subject, seed=seed, size=texels, mesh=order.mesh)
+    plan = sequence_plan(rig, sequence)
+    if order.progress is not None:
+        for line in sequence_lines(plan):
+            order.progress(line)
+    truth = truth_folder(order.out)
+    log: _Log | None = None
+
+    def note(flash: FlashTime) -> None:
+        if log is not None:  # nothing flashes before the session is open
+            log.add(dataclasses.asdict(flash))
+
+    scene = FlashCourseScene(
+        rig, person, course, seed=seed, movement=order.movement, on_flash=note
+    )  # fmt: skip
+    session = open_session(order, plan, rig, asked, scene)
+    log = _Log(truth.with_name(f"{truth.name}.flashes.jsonl"), fresh=not order.resume)
+    before_s = _event_s(session)
+    begun_s = time.time() if before_s is None else _last_s(session) + RESUMED_AFTER_S
+    if before_s is not None and not sequence.prompted:
+        course.tell(before_s - begun_s, sequence.state)  # it was over before this world began
+
+    def prompt(world: Any, text: str) -> None:
+        if text == sequence.state:
+            course.tell(world.now, text)
+
+    def signal(world: Any, text: str) -> None:
+        course.tell(world.now, text)
+
+    rig_seconds = drive(
+        session, rig, scene, seed, prompt, order.progress, signal=signal, begun_s=begun_s
+    )
+    _write_truth(truth, scene, session, sequence, log.read(), seed)
+    log.remove()
+    left_out = tuple(scene.left_out)
+    return Simulated(
+        order.out, truth, len(session.frames()), rig_seconds, left_out, effects=effects_of(scene)
+    )
+
+
+class _Log:
+    """What each flash met, kept beside the session until the truth can be written."""
+
+    def __init__(self, path: Path, *, fresh: bool) -> None:
+        self._path = path
+        if fresh:
+            path.unlink(missing_ok=True)
+
+    def add(self, entry: Mapping[str, Any]) -> None:
+        with self._path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(dict(entry)) + "\n")
+
+    def read(self) -> dict[str, dict[str, Any]]:
+        """Return the entries by the flash's token."""
+        if not self._path.is_file():
+            return {}
+        lines = self._path.read_text(encoding="utf-8").splitlines()
+        return {entry["token"]: entry for entry in map(json.loads, lines)}
+
+    def remove(self) -> None:
+        self._path.unlink(missing_ok=True)
+
+
+def _event_s(session: Session) -> float | None:
+    """Return the host's time of a sequence's time 0, s; None before its first frame."""
+    for record in session.frames("subject"):
+        if "time_s" in record.line.actual:
+            return record.line.t_host_s - float(record.line.actual["time_s"])
+    return None
+
+
+def _last_s(session: Session) -> float:
+    return max(record.line.t_host_s for record in session.frames())
+
+
+def _write_truth(
+    folder: Path,
+    scene: Any,
+    session: Session,
+    sequence: SequenceOrder,
+    flashes: Mapping[str, Mapping[str, Any]],
+    seed: int,
+) -> None:
+    """Write the truth at rest, and with it what each frame's blood was; and that of the state."""
+    poses = sorted({"neutral", *(str(flash["pose"]) for flash in flashes.values())})
+    radius_px = RADIUS_SHARE * session.rig.views[0].width_px / 2
+    places = {pose: landmarks_at_superpixels(scene.landmarks_px(pose)) for pose in poses}
+    points = {
+        pose: {name: places[pose][of] for name, of in POINTS.items() if of in places[pose]}
+        for pose in poses
+    }
+    frames = []
+    for record in session.frames("subject"):
+        actual = record.line.actual
+        met = flashes.get(str(actual.get("token")))
+        if met is None:
+            continue
+        frames.append(
+            {
+                "step": record.step_id,
+                "time_s": actual.get("time_s"),
+                "phase_s": actual.get("phase_s"),
+                "level": met["level"],
+                "pose": met["pose"],
+            }
+        )
+    for pose in poses:
+        chosen = [frame for frame in frames if frame["pose"] == pose]
+        maps = scene.hemoglobin(pose, [float(frame["level"]) for frame in chosen])
+        mask = np.asarray(scene.truth(pose, 0.0)["mask"], bool)
+        for frame, whole in zip(chosen, maps, strict=True):
+            small = to_superpixels(np.asarray(whole, np.float64), mask)
+            valid = to_superpixels(mask.astype(float)) == 1.0
+            frame["hemoglobin"] = {
+                name: disc_mean(small, valid, place, radius_px)
+                for name, place in points[pose].items()
+            }
+    document = {
+        "schema": "skinrig.perfusion-course/1",
+        "state": sequence.state,
+        "constants_s": _constants(scene.course),
+        "points_px": points,
+        "radius_px": radius_px,
+        "frames": frames,
+    }
+    table = ["name,x,y", *(f"{name},{x:.3f},{y:.3f}" for name, (x, y) in places["neutral"].items())]
+    rest = truth_of(scene.at("neutral", 0.0), seed, session.content_hash, "neutral")
+    files = {
+        COURSE_FILE: (json.dumps(document, indent=1) + "\n").encode(),
+        LANDMARKS_FILE: ("\n".join(table) + "\n").encode(),
+    }
+    store.write(folder, dataclasses.replace(rest, files=files))
+    pose = sequence.state if sequence.prompted else "neutral"
+    full = truth_of(scene.at(pose, 1.0), seed, session.content_hash, sequence.state)
+    store.write(folder.with_name(f"{folder.name}-{sequence.state}"), full)
+
+
+def _constants(course: Any) -> dict[str, float]:
+    names = ("rise_s", "fall_s", "reaction_s", "reaction_spread_s", "relaxation_s")
+    return {name: float(getattr(course, name)) for name in names if hasattr(course, name)}
+
+
+def disc_mean(
+    values: NDArray[np.float64], valid: NDArray[np.bool_], place: Sequence[float], radius: float
+) -> float | None:
+    """Return the mean of a map's valid pixels within a disc about (x, y), px; None without any."""
+    rows, columns = np.indices(values.shape)
+    near = (columns - place[0]) ** 2 + (rows - place[1]) ** 2 <= radius**2
+    inside = valid & near
+    return float(values[inside].mean()) if inside.any() else None

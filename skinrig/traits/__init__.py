@@ -1,0 +1,1 @@
+"""What traits of faces are learned from and held against."""

@@ -1,0 +1,144 @@
+"""Which space of a trait library belongs to which region, and how its samples were made."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from model import trait_storage
+from model.texture_space import TextureError, TextureSpace
+from model.trait_storage import TraitLibrary
+from model.traits import TraitSpace
+from reconstruction import common_regions
+from reconstruction.common_parameterization import CommonFrame
+from skinrig.traits.albedo_vectors import KINDS, AlbedoTraits, VectorKind
+
+SURFACE: Final = "surface"
+ALBEDO: Final = "albedo"
+TEXTURE_SPACE: Final = "texture_space.npz"
+SIDE_MM, SIZE = 240.0, 256
+"""Of the common map of a library that does not tell its own."""
+
+
+class TraitLibraryError(ValueError):
+    """A library that lacks what an edit needs."""
+
+
+def space_name(region: str) -> str:
+    """Return what the space of a region's albedo is called.
+
+    Examples
+    --------
+    >>> space_name("face"), space_name("no-beard")
+    ('albedo', 'albedo_no_beard')
+    """
+    return ALBEDO if region == "face" else f"{ALBEDO}_{region.replace('-', '_')}"
+
+
+def library_parameters(frame: CommonFrame, kind: VectorKind, **more: Any) -> dict[str, Any]:
+    """Return what a library says of its samples."""
+    return {"vectors": kind, "frame": frame.document(), **more}
+
+
+def texture_bytes(space: TextureSpace) -> bytes:
+    """Return a texture space as the bytes of a file."""
+    stream = io.BytesIO()
+    np.savez_compressed(
+        stream, mean=space.mean, axes=space.axes, edges=space.edges,
+        counts=np.array([space.levels, space.orientations, space.images]),
+    )  # fmt: skip
+    return stream.getvalue()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LibraryParts:
+    """A library, opened.
+
+    Attributes
+    ----------
+    surface
+        Traits of mean mixtures; None where the library has none.
+    albedo
+        Region to its traits.
+    frame
+        The common map.
+    """
+
+    surface: TraitSpace | None
+    albedo: dict[str, AlbedoTraits]
+    frame: CommonFrame
+
+    @property
+    def traits(self) -> tuple[str, ...]:
+        """All traits, in alphabetical order."""
+        spaces = [one.traits for one in self.albedo.values()]
+        spaces += [] if self.surface is None else [self.surface]
+        return tuple(sorted({name for space in spaces for name in space.traits}))
+
+
+def parts_of(library: TraitLibrary) -> LibraryParts:
+    """Open a library.
+
+    Raises
+    ------
+    TraitLibraryError
+        When its albedo traits come without the texture space that they are of.
+    """
+    told = library.parameters
+    kind = told.get("vectors", "histograms")
+    if kind not in KINDS:
+        raise TraitLibraryError(f"vectors: got {kind!r}, expected {' or '.join(KINDS)}")
+    frame = (
+        CommonFrame.from_document(told["frame"])
+        if isinstance(told.get("frame"), dict)
+        else common_regions.standard_frame(side_mm=SIDE_MM, center_mm=(0.0, 0.0), size=SIZE)
+    )
+    albedo = {}
+    for region in common_regions.REGIONS:
+        if space_name(region) in library.spaces:
+            albedo[region] = AlbedoTraits(
+                kind, _texture(library), library.spaces[space_name(region)]
+            )
+    return LibraryParts(library.spaces.get(SURFACE), albedo, frame)
+
+
+def _texture(library: TraitLibrary) -> TextureSpace:
+    content = library.files.get(TEXTURE_SPACE)
+    if content is None:
+        raise TraitLibraryError(
+            f"files: got {json.dumps(sorted(library.files))}, expected {TEXTURE_SPACE}: traits of "
+            "the albedo mean nothing without the texture space they are of"
+        )
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+            mean, axes, edges = (stored[name] for name in ("mean", "axes", "edges"))
+            levels, orientations, images = (int(n) for n in stored["counts"])
+        return TextureSpace(mean, axes, edges, levels, orientations, images)
+    except (OSError, KeyError, ValueError, EOFError, TextureError) as error:
+        raise TraitLibraryError(f"{TEXTURE_SPACE}: cannot be read: {error}") from error
+
+
+def load(path: Path | None) -> tuple[TraitLibrary, str]:
+    """Read a library and the hash of its file; None: the one that comes with this package.
+
+    Raises
+    ------
+    TraitLibraryError
+        When none comes with it.
+    """
+    if path is not None:
+        return trait_storage.load(path), hashlib.sha256(path.read_bytes()).hexdigest()
+    packaged = resources.files("model").joinpath("data", trait_storage.PACKAGED)
+    if not packaged.is_file():
+        raise TraitLibraryError(
+            "traits: no library comes with this package; name one with --space FILE "
+            "(`skinrig fit traits` learns one)"
+        )
+    return trait_storage.default(), hashlib.sha256(packaged.read_bytes()).hexdigest()
