@@ -1,0 +1,80 @@
+"""The commands that measure error against run time, and that say what is installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from skinrig import errors
+from skinrig.commands import completion
+from skinrig.commands.options import (
+    Json,
+)
+from skinrig.console import Console
+
+
+def bench(
+    stage: Annotated[
+        list[str] | None,
+        typer.Option(help="Stage; repeatable; default all.", autocompletion=completion.stages),
+    ] = None,
+    budget: Annotated[float, typer.Option(help="Seconds to spend, about.")] = 600.0,
+    toy: Annotated[bool, typer.Option("--toy", help="Smallest sizes, no limits judged.")] = False,
+    extremes: Annotated[
+        bool, typer.Option("--extremes", help="Try stiff and extreme cases instead.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for bench.json, a table and plots; or extremes.json."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Measure error against run time; exit code 1 when a limit is missed.
+
+    Without --stage every stage is measured at its small size, and then, the quickest first, at full
+    size as long as the budget lasts. Limits are judged at full size alone.
+
+    Example: skinrig bench --json --out bench
+
+    Example: skinrig bench --stage chromophores --json
+
+    Example: skinrig bench --extremes
+    """
+    console = Console(json)
+    if extremes:
+        from skinrig.reporting.extremes import run_extremes
+
+        document = run_extremes(stage or (), out=out, console=console)
+    else:
+        from skinrig.benchmarks import table as bench_table
+        from skinrig.benchmarks.stages import run_stages
+
+        document = run_stages(stage, budget_s=budget, toy=toy, out=out, console=console)
+        if out is not None:
+            bench_table.write(document, out)
+    console.document(document.pop("schema"), document)
+    if not document["passed"]:
+        raise typer.Exit(errors.LIMIT_MISSED)
+
+
+def doctor(json: Json = False) -> None:
+    """Say what is installed, which renderer runs and why, and how to mend what is not.
+
+    Example: skinrig doctor
+    """
+    from skinrig.doctor import examine
+
+    console = Console(json)
+    findings = examine()
+    console.rows(
+        ("", "what", "state", "to mend"),
+        [("ok" if f.fine else "!!", f.what, f.state, f.mend) for f in findings],
+    )
+    rows: list[dict[str, Any]] = [
+        {"what": f.what, "state": f.state, "fine": f.fine, "mend": f.mend} for f in findings
+    ]
+    console.document("skinrig.doctor/1", {"findings": rows})
+    if not all(f.fine for f in findings):
+        raise typer.Exit(errors.EXTRA_MISSING)

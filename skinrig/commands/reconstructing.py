@@ -1,0 +1,119 @@
+"""The commands that make calibrations, and maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from skinrig.commands import completion
+from skinrig.commands.options import (
+    Json,
+    Out,
+)
+from skinrig.console import Console
+
+
+def calibrate(
+    kind: Annotated[
+        str,
+        typer.Argument(
+            help="Of the flash rig sensor, color, polarization, white; of the dome geometry, "
+            "lights; of the gradient sphere sensor, lights, polarization; of the probe fibre.",
+            autocompletion=completion.calibrations,
+        ),
+    ],
+    sessions: Annotated[list[Path], typer.Argument(help="Sessions of the target.")],
+    out: Out = Path("calibration"),
+    square_mm: Annotated[
+        float, typer.Option(help="Side of the squares of geometry's board, mm.")
+    ] = 36.0,
+    sphere_mm: Annotated[
+        float, typer.Option(help="Radius of the mirror sphere of lights, mm.")
+    ] = 50.0,
+    phantom: Annotated[
+        Path | None, typer.Option(help="Certificate (JSON) of the block fibre was measured on.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Make a calibration from sessions of a target and say how it drifted.
+
+    Example: skinrig calibrate sensor session-flat --out calibration
+    """
+    from skinrig.calibrating.calibrate import calibrate as make
+    from skinrig.calibrating.dome import dome_targets
+
+    console = Console(json)
+    done = make(kind, sessions, out, targets=dome_targets(square_mm, sphere_mm), phantom=phantom)
+    console.rows(("quantity", "value"), done.summary)
+    for text in done.findings:
+        console.say(f"found: {text}")
+    for change in done.drift:
+        if change.change and (change.sigmas is None or abs(change.sigmas) > 2):
+            console.say(f"drift: {change}")
+    console.say(f"{done.path}: valid until {done.calibration.valid_until}")
+    console.document(
+        "skinrig.calibrate/1",
+        {"path": done.path, "values": dict(done.summary), "findings": done.findings,
+         "drift": [str(d) for d in done.drift]},
+    )  # fmt: skip
+
+
+def reconstruct(
+    session: Annotated[Path, typer.Argument(help="SESSION/ folder.")],
+    want: Annotated[
+        str,
+        typer.Option(
+            help="Maps, separated by commas; a wrong name lists those there are.",
+            autocompletion=completion.wants,
+        ),
+    ],
+    out: Out,
+    calibration: Annotated[Path | None, typer.Option(help="CALIBRATION/ folder.")] = None,
+    state: Annotated[str, typer.Option(help="State of the subject.")] = "neutral",
+    scan: Annotated[
+        Path | None, typer.Option(help="Mesh of the face, PLY in mm, instead of a dome session's.")
+    ] = None,
+    basis: Annotated[
+        Path | None, typer.Option(help="Folder of MERL tables to fit a dome's lobes with.")
+    ] = None,
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(help="Table name,x,y of a probe's sites in pixels of its 256 x 256 map."),
+    ] = None,
+    hold_out: Annotated[
+        str | None,
+        typer.Option(help="A dome's frames that no fit sees: lights=L007,L023,views=C03."),
+    ] = None,
+    rank: Annotated[
+        int | None, typer.Option(help="Lobes that a dome's points share; default 4.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Make maps of a session; computes only what is wanted and not there yet.
+
+    Example: skinrig reconstruct session --want melanin,hemoglobin --out appearance
+    """
+    from reconstruction import pipeline
+    from skinrig.demo import truth_beside
+
+    console = Console(json)
+    truth = truth_beside(session)
+    done = pipeline.reconstruct(
+        session, want=[w.strip() for w in want.split(",") if w.strip()], out=out,
+        calibration=calibration, state=state, scan=scan, basis=basis, landmarks=landmarks,
+        progress=console.progress, truth=truth.name if truth else "", hold_out=hold_out, rank=rank,
+    )  # fmt: skip
+    for text in done.assumed:
+        console.say(f"assumed: {text}")
+    console.say(f"run: {', '.join(done.ran) or 'nothing'}")
+    console.say(f"reused: {', '.join(done.reused) or 'nothing'}")
+    for what, why in done.left_out:
+        console.say(f"left out: {what} ({why})")
+    console.say(f"next: skinrig report {out}")
+    console.document(
+        "skinrig.reconstruct/1",
+        {"path": out, "ran": done.ran, "reused": done.reused, "left_out": done.left_out,
+         "assumed": done.assumed, "work": [dict(w) for w in done.work]},
+    )  # fmt: skip
