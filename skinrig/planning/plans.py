@@ -253,7 +253,7 @@ def confirmed(
 
 def _planner(rig_name: str) -> Any:
     """Return the module that plans for a rig: its `choose`, `foresee` and `confirm`."""
-    return importlib.import_module(f"skinrig.planning_{rig_name}")
+    return importlib.import_module(f"skinrig.planning.{rig_name}")
 
 
 def interval_of(value: float, spread: float) -> tuple[float, float]:
