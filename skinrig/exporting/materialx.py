@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
@@ -61,21 +61,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     write_json(
         folder / DOCUMENT,
         {
-            **provenance(appearance),
-            "schema": SCHEMA,
-            "scene_unit": unit,
-            "mm_per_scene_unit": 1.0 / per_mm,
-            "orientation": ORIENTATION,
-            "frame": "+x right, +y up, +z towards the main camera",
-            "base_color": f"{NOTES['base_color']}; {COLOR_NOTE}",
-            "subsurface": {
-                **material.sigma_tr(),
-                "radius_in_scene_units": scale * per_mm,
-                "mapping": NOTES["subsurface_radius"],
-            },
-            "specular_ior": material.eta,
-            "figures": material.figures(),
-            "assumed": material.all_assumed(appearance),
+            **facts(material, appearance, schema=SCHEMA, unit=unit, per_mm=per_mm, scale=scale),
             "files": dict(sorted(out.records.items())),
         },
     )
@@ -100,6 +86,47 @@ def write_textures(material: Material, out: ImageFolder) -> float:
         TEXTURES,
     )  # fmt: skip
     return scale
+
+
+def facts(
+    material: Material,
+    appearance: SkinAppearance,
+    *,
+    schema: str,
+    unit: str,
+    per_mm: float,
+    scale: float,
+) -> dict[str, Any]:
+    """Return what a document beside an exported material says of it.
+
+    Parameters
+    ----------
+    material, appearance
+        What is exported, and what it was made of.
+    schema
+        Of the document.
+    unit, per_mm
+        The scene's unit, and how many of it a millimeter has.
+    scale
+        Radius of subsurface scattering, mm.
+    """
+    return {
+        **provenance(appearance),
+        "schema": schema,
+        "scene_unit": unit,
+        "mm_per_scene_unit": 1.0 / per_mm,
+        "orientation": ORIENTATION,
+        "frame": "+x right, +y up, +z towards the main camera",
+        "base_color": f"{NOTES['base_color']}; {COLOR_NOTE}",
+        "subsurface": {
+            **material.sigma_tr(),
+            "radius_in_scene_units": scale * per_mm,
+            "mapping": NOTES["subsurface_radius"],
+        },
+        "specular_ior": material.eta,
+        "figures": material.figures(),
+        "assumed": material.all_assumed(appearance),
+    }
 
 
 def openpbr_document(material: Material, radius_mm: float, delivery: Delivery) -> str:

@@ -21,9 +21,8 @@ from model.skin import SkinAppearance
 from skinrig.errors import MissingExtra
 from skinrig.exporting import materialx
 from skinrig.exporting.images import ImageFolder
-from skinrig.exporting.material import COLOR_NOTE, NOTES, Material
+from skinrig.exporting.material import Material
 from skinrig.exporting.options import NORMAL_Y, UNITS_M, Delivery
-from skinrig.exporting.provenance import ORIENTATION, provenance
 from skinrig.exporting.sealing import write_json
 
 FILE, DOCUMENT = "skin.usdc", "usd.json"
@@ -80,22 +79,10 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     write_json(
         folder / DOCUMENT,
         {
-            **provenance(appearance),
-            "schema": SCHEMA,
-            "scene_unit": unit,
-            "mm_per_scene_unit": 1.0 / per_mm,
-            "orientation": ORIENTATION,
-            "frame": "+x right, +y up, +z towards the main camera",
-            "base_color": f"{NOTES['base_color']}; {COLOR_NOTE}",
-            "subsurface": {
-                **material.sigma_tr(),
-                "radius_in_scene_units": scale * per_mm,
-                "mapping": NOTES["subsurface_radius"],
-            },
-            "specular_ior": material.eta,
+            **materialx.facts(
+                material, appearance, schema=SCHEMA, unit=unit, per_mm=per_mm, scale=scale
+            ),
             "blend_shapes": names,
-            "figures": material.figures(),
-            "assumed": material.all_assumed(appearance),
             "files": dict(sorted(out.records.items())),
         },
     )
