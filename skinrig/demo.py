@@ -17,6 +17,7 @@ from typing import Any
 from model import store
 from skinrig.console import Console, plain
 from skinrig.demo_rigs import RIGS, Findings
+from skinrig.next_steps import look, suggest
 from skinrig.simulating.simulation import truth_folder
 
 MOST_AT_ONCE = 2
@@ -77,7 +78,6 @@ def run_demo(
         part, seconds = parts[rig]
         found.errors += part.errors
         found.tables += part.tables
-        found.next = part.next
         shares |= seconds
     with _share("measure error against run time", shares, console):
         from skinrig.benchmarks.stages import run_stages
@@ -111,8 +111,9 @@ def run_demo(
     )
     beside = f", {at_once} rigs side by side" if at_once > 1 else ""
     total_s = time.perf_counter() - began
-    console.say(f"\nall of it: {total_s:.1f} s{beside}; open {out / 'report.html'}")
-    console.say(f"next: {found.next}")
+    console.say(f"\nall of it: {total_s:.1f} s{beside}")
+    for step in suggest(look(out), out):
+        console.say(f"next: {step.command}  ({step.why})")
     return {
         "out": out, "seconds": shares, "total_s": total_s, "errors": found.errors,
         "bench_passed": bench["passed"], "report": out / "report.html",

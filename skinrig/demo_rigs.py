@@ -56,7 +56,6 @@ class Findings:
     errors: list[list[Any]] = field(default_factory=list)
     """Subject, map, error, coverage, share masked."""
     tables: list[dict[str, Any]] = field(default_factory=list)
-    next: str = ""
 
 
 Share = Callable[[str], AbstractContextManager[None]]
@@ -112,10 +111,6 @@ def _flash(out: Path, seed: int, share: Share, width_px: int | None, found: Find
         }
     )
     found.tables.append(_left_out("flash rig", captures[0]))
-    found.next = (
-        f"skinrig reconstruct {captures[0].session} --calibration {calibration} --want melanin "
-        "--out maps"
-    )
 
 
 def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
@@ -167,10 +162,6 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
         }
     )
     found.tables.append(_left_out("dome", capture))
-    found.next = (
-        f"skinrig reconstruct {capture.session} --calibration {calibration} --want normals,r_d "
-        "--out maps"
-    )
 
 
 def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
@@ -207,10 +198,6 @@ def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: F
         }
     )
     found.tables.append(_left_out("gradient sphere", capture))
-    found.next = (
-        f"skinrig reconstruct {capture.session} --calibration {calibration} "
-        "--want height,kernels --out maps"
-    )
 
 
 def _probe(out: Path, seed: int, share: Share, width_px: int | None, found: Findings) -> None:
@@ -237,10 +224,6 @@ def _probe(out: Path, seed: int, share: Share, width_px: int | None, found: Find
             )  # fmt: skip
             found.errors += _subsurface_rows(appearance, capture.truth)
     found.tables.append(_left_out("fibre probe", captures[-1]))
-    found.next = (
-        f"skinrig reconstruct {captures[-1].session} --calibration {calibration} "
-        "--want translucency --out maps"
-    )
 
 
 RIGS: Mapping[str, Callable[[Path, int, Share, int | None, Findings], None]] = {
