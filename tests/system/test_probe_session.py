@@ -190,9 +190,9 @@ def test_the_next_command_is_named_and_a_closed_session_is_not_gone_on_with(caps
 
 HOST = """
 import sys
-from skinrig import simulating_probe
+from skinrig.simulating import probe
 from skinrig.cli import main
-simulating_probe.PHOTONS = {"small": 2000}
+probe.PHOTONS = {"small": 2000}
 sys.exit(main(sys.argv[1:]))
 """
 
