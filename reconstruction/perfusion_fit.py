@@ -8,8 +8,8 @@ bound. The noise is that of what the best curve leaves.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -143,7 +143,7 @@ def fit_cycle(
 
 
 def fit_course(
-    time_s: ArrayLike, values: ArrayLike, *, stderr: ArrayLike | None = None
+    time_s: ArrayLike, values: ArrayLike, *, stderr: ArrayLike | None = None, bend: float = 0.0
 ) -> RelaxationFit:
     """Fit blood that relaxes to a new level after an event at time 0.
 
@@ -155,6 +155,10 @@ def fit_course(
         One curve, or several that share the time constant; NaN is left out.
     stderr : array_like, optional
         Standard errors of the values, their shape.
+    bend : float
+        By how much the values may be bent over the change, either way, in [0, 1): a part s of it
+        shows as s +- bend s (1 - s). The best constant is that of no bend; its interval holds those
+        of both bends, its standard error half of what lies between their constants.
 
     Returns
     -------
@@ -164,8 +168,10 @@ def fit_course(
     Raises
     ------
     CurveError
-        For fewer than 5 samples after the event, or a shape that does not fit.
+        For fewer than 5 samples after the event, a shape that does not fit, or a bend outside.
     """
+    if not 0.0 <= bend < 1.0:
+        raise CurveError(f"bend: got {bend}, expected 0 to 1, 1 not among them")
     time = np.asarray(time_s, np.float64)
     after = time >= 0
     time = time[after]
@@ -173,14 +179,43 @@ def fit_course(
     errors = None if stderr is None else np.atleast_2d(np.asarray(stderr, np.float64))[:, after]
     data = _Data.of(time, shown, errors)
 
-    def shape(delay: Floats, constant: Floats) -> Floats:
-        """Part of the way to the new level."""
-        return -np.expm1(-time / constant)
+    def bent_by(amount: float) -> Shape:
+        def shape(delay: Floats, constant: Floats) -> Floats:
+            """Part of the way to the new level, as it shows."""
+            part = -np.expm1(-time / constant)
+            return np.asarray(part + amount * part * (1.0 - part))
+
+        return shape
 
     span = float(np.ptp(time))
     spacing = span / max(1, time.size - 1)
     constants = np.geomspace(spacing / 50, 50 * span, _GRID)
-    return _fit(data, shape, np.zeros(1), constants, np.zeros(0))
+    straight, *bent = (
+        _fit(data, bent_by(amount), np.zeros(1), constants, np.zeros(0))
+        for amount in ((0.0, -bend, bend) if bend else (0.0,))
+    )
+    return _with_bends(straight, bent)
+
+
+def _with_bends(straight: RelaxationFit, bent: Sequence[RelaxationFit]) -> RelaxationFit:
+    """Return a fit whose time constant is as uncertain as what may have bent the values."""
+    if not bent or straight.known == "unknown":
+        return straight
+    every = (straight, *bent)
+    low = min(fit.interval_s[0] for fit in every)
+    high = max(fit.interval_s[1] for fit in every)
+    known: Known = "estimated"
+    if low == 0.0 or np.isinf(high):
+        known = "only below" if low == 0.0 else "only above"
+    constants = [fit.time_constant_s for fit in bent]
+    half = 0.5 * (max(constants) - min(constants))
+    stderr = float(np.hypot(straight.stderr_time_constant_s, half))
+    return replace(
+        straight,
+        interval_s=(low, high),
+        known=known,
+        stderr_time_constant_s=stderr if known == "estimated" else float("nan"),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,7 +28,7 @@ from reconstruction import (
 )
 from reconstruction.evidence import Evidence, EvidenceError
 
-REVISION = 1
+REVISION = 2
 CURVES = "perfusion_curves"
 CURVES_FILE = "perfusion_curves.json"
 MAPS = (*flash_stages.MAPS, CURVES)
@@ -40,6 +40,10 @@ ALIASES = {"cheek": "cheek left", "nose": "nose tip", "temple": "temple left"}
 """Landmarks that stand for a place where a table does not have the place itself."""
 STILL_PX = 0.1
 """A face whose median pixel moves less has not moved."""
+BEND = 0.2
+"""By how much blood may show bent over its change: light that goes from skin to skin, of which the
+inversion knows nothing, is absorbed twice. Four simulated events showed -0.1 to 0.25 at cheek and
+forehead, more than their noise."""
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -310,13 +314,13 @@ def _of_event(
     known = np.isfinite(time)
     usable = [k for k in range(len(names)) if np.isfinite(means.mean[k][known]).sum() >= 5]
     fits = {
-        names[k]: _of_fit(perfusion_fit.fit_course(time[known], means.mean[k][known]), 0)
+        names[k]: _of_fit(perfusion_fit.fit_course(time[known], means.mean[k][known], bend=BEND), 0)
         for k in usable
     }
     before = {names[k]: float(np.nanmean(means.mean[k][~known])) for k in usable if (~known).any()}
     together = None
     if usable:
-        together = perfusion_fit.fit_course(time[known], means.mean[usable][:, known])
+        together = perfusion_fit.fit_course(time[known], means.mean[usable][:, known], bend=BEND)
     return {
         "before": before,
         "fits": fits,

@@ -168,3 +168,24 @@ def test_too_little_to_fit_is_refused():
         fit_cycle(PHASE[:4], PHASE[:4], cycle_s=CYCLE_S)
     with pytest.raises(CurveError, match="shape"):
         fit_cycle(PHASE, PHASE[:4], cycle_s=CYCLE_S)
+
+
+@pytest.mark.parametrize("bent", [-0.2, 0.2])
+def test_a_course_that_shows_bent_is_found_where_bends_are_allowed(bent):
+    """Light absorbed twice bends what is seen of blood, which chance does not cover."""
+    time = np.linspace(1.0, 60.0, 12)
+    part = 1.0 - np.exp(-time / 20.0)
+    seen = 0.044 - 0.015 * (part + bent * part * (1.0 - part))
+    seen += 2e-5 * np.random.default_rng(4).standard_normal(time.size)
+    low, high = fit_course(time, seen).interval_s
+    assert not low <= 20.0 <= high
+    found = fit_course(time, seen, bend=0.2)
+    assert found.interval_s[0] <= 20.0 <= found.interval_s[1]
+    assert found.known == "estimated"
+    assert found.stderr_time_constant_s > fit_course(time, seen).stderr_time_constant_s
+
+
+@pytest.mark.parametrize("bend", [-0.1, 1.0, np.nan])
+def test_a_bend_outside_its_range_is_refused(bend):
+    with pytest.raises(CurveError, match="bend"):
+        fit_course(np.arange(8.0), np.arange(8.0), bend=bend)
