@@ -163,9 +163,12 @@ def suggest(found: Surroundings, folder: Path) -> tuple[Step, ...]:
             Step(after_session(rig, path, None, calibration=where), "maps with standard errors")
         )
     if found.appearances:
-        best = _most_whole(found.appearances)
-        steps.append(Step(f"skinrig view {best}", "a page that shows the skin moving, under light"))
-        steps.append(Step(f"skinrig export {best} --to maps --out export", "for other programs"))
+        seen = _most_whole(found.appearances, ("facial_color.json", "mesh.obj"))
+        steps.append(Step(f"skinrig view {seen}", "a page that shows the skin moving, under light"))
+        given = _most_whole(found.appearances, ("mesh.obj",))
+        measured = found.appearances[given].get("source") == "measured"
+        use = " --use research" if measured else ""
+        steps.append(Step(f"skinrig export {given} --to maps{use} --out export", "other programs"))
     if found.photographs and not found.sessions:
         steps.append(
             Step(f"skinrig import photos {folder} --out session", "photographs become a session")
@@ -226,15 +229,13 @@ def _target(session: Mapping[str, Any]) -> str:
     return next((target for target in targets if target in kinds - {"dark"}), "")
 
 
-def _most_whole(appearances: Mapping[Path, Mapping[str, Any]]) -> Path:
-    """Return the appearance that shows most in the viewer: a whole face before a patch."""
+def _most_whole(appearances: Mapping[Path, Mapping[str, Any]], files: Sequence[str]) -> Path:
+    """Return the appearance that holds the first of some files, else the next, most maps first."""
 
     def rank(path: Path) -> tuple[int, int]:
         document = appearances[path]
-        files: Sequence[str] = tuple(document.get("files", {}))
-        kind = document.get("parameters", {}).get("kind")
-        return (2 if "mesh.obj" in files else 1 if kind == "dynamic" else 0), len(
-            document.get("maps", {})
-        )
+        there = [name in document.get("files", {}) for name in files]
+        first = there.index(True) if any(there) else len(files)
+        return -first, len(document.get("maps", {}))
 
     return max(appearances, key=rank)

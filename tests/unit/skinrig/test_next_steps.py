@@ -70,6 +70,20 @@ def test_a_whole_face_is_viewed_before_a_patch_and_never_a_truth():
     assert "skinrig view b-face" in commands()
 
 
+def test_a_face_whose_blood_moves_is_viewed_and_one_with_a_mesh_exported():
+    appearance(Path("a-face"), files=("mesh.obj",))
+    appearance(Path("b-moving"), kind="dynamic", files=("facial_color.json",))
+    assert "skinrig view b-moving" in commands()
+    assert "skinrig export a-face --to maps --out export" in commands()
+
+
+def test_the_export_of_measured_maps_names_a_use():
+    appearance(Path("a-face"))
+    document = json.loads(Path("a-face/appearance.json").read_text()) | {"source": "measured"}
+    Path("a-face/appearance.json").write_text(json.dumps(document))
+    assert "skinrig export a-face --to maps --use research --out export" in commands()
+
+
 def test_a_demo_below_is_found():
     Path("demo").mkdir()
     session(Path("demo/session-a"))
