@@ -7,6 +7,7 @@ much time passes before. The box must survive, answer each frame once, and light
 Usage: python box_harness.py [libFuzzer options] CORPUS_FOLDER
 """
 
+import resource
 import sys
 
 import atheris
@@ -49,6 +50,10 @@ def one_input(data):
         assert box.armed or not unit.lit
 
 
+MEMORY_BYTES = 2 << 30
+
 if __name__ == "__main__":
+    # In place of libFuzzer's own limit, which reads a peak that is inherited from the parent.
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
     atheris.Setup(sys.argv, one_input)
     atheris.Fuzz()

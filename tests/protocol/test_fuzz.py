@@ -121,7 +121,7 @@ def test_fuzzing_guided_by_coverage_breaks_nothing(tmp_path):
     harness = Path(__file__).with_name("box_harness.py")
     run = subprocess.run(
         [sys.executable, str(harness), "-max_total_time=20", "-timeout=10", "-seed=1",
-         f"-artifact_prefix={tmp_path}/crash-", str(tmp_path)],
+         "-rss_limit_mb=0", f"-artifact_prefix={tmp_path}/crash-", str(tmp_path)],
         capture_output=True, text=True, timeout=200, check=False, cwd=tmp_path,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr[-3000:]
