@@ -2,7 +2,8 @@
 
 Terms of error models, and the factors from 68 to 95 %, were set on subjects of seeds 0 to 19
 (`reconstruction.model_error`); subjects here have seeds from 400 on. Each goes the whole way, from
-calibration targets to maps, with a calibration of its rig's own (`interval_trials`).
+calibration targets to maps, with a calibration of its rig's own (`interval_trials_flash` and
+its like).
 
 A coverage is the mean of the subjects' shares, and its interval is that of the mean of so many
 subjects. A promise is missed where the interval lies wholly outside the promised range. The
@@ -18,7 +19,13 @@ from pathlib import Path
 from typing import Final
 
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, once
-from skinrig.benchmarks import interval_trials
+from skinrig.benchmarks import (
+    interval_trials,
+    interval_trials_dome,
+    interval_trials_flash,
+    interval_trials_gradient,
+    interval_trials_probe,
+)
 from skinrig.benchmarks.interval_coverage import LEVELS, Covered, Trial, by_band
 
 FIRST_SEED: Final = 400
@@ -77,16 +84,20 @@ def _full() -> Mapping[str, Callable[[Path], Trials]]:
     faces = {FIRST_SEED + k: DOME[k] for k in range(len(DOME))}
     media = {FIRST_SEED + k: medium for k, medium in enumerate(MEDIA)}
     return {
-        "flash": lambda folder: interval_trials.flash(folder, flash, width_px=768),
-        "gradient": lambda folder: interval_trials.gradient(folder, sites, width_px=128),
-        "dome": lambda folder: interval_trials.dome(folder, faces, width_px=320),
-        "probe": lambda folder: interval_trials.probe(folder, media),
+        "flash": lambda folder: interval_trials_flash.flash(folder, flash, width_px=768),
+        "gradient": lambda folder: interval_trials_gradient.gradient(folder, sites, width_px=128),
+        "dome": lambda folder: interval_trials_dome.dome(folder, faces, width_px=320),
+        "probe": lambda folder: interval_trials_probe.probe(folder, media),
     }
 
 
 def _small() -> Mapping[str, Callable[[Path], Trials]]:
     faces = {FIRST_SEED + 1: "I"}
-    return {"flash": lambda folder: interval_trials.flash(folder, faces, width_px=96, moving=False)}
+    return {
+        "flash": lambda folder: interval_trials_flash.flash(
+            folder, faces, width_px=96, moving=False
+        )
+    }
 
 
 def _point(row: Covered, timing: Timing) -> Point:

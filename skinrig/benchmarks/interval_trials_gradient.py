@@ -1,0 +1,70 @@
+"""Trials of the gradient sphere's intervals: normals and heights of patches of skin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from model import metrics, store
+from reconstruction import pipeline
+from skinrig.benchmarks.interval_coverage import Trial
+from skinrig.benchmarks.interval_trials import (
+    ANY_BAND,
+    calibrated,
+    forget,
+    of_normals,
+    truth_of,
+    valid_of,
+)
+from skinrig.simulating.simulation import simulate_session
+
+FACTORS_95: Final[Mapping[str, float]] = {"normals": 1.9, "height": 2.1}
+"""Half width of a 95 % interval over that of the 68 % one, to 0.1, set on 6 patches of seeds 0 to
+13 that are not judged: tails are heavier than a Gaussian's."""
+
+
+def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterator[Trial]:
+    """Yield trials of specular normals and heights of patches of skin, at rest.
+
+    Parameters as of `interval_trials_flash.flash`; a subject is a site of the face.
+    """
+    from skinrig.evaluating.microrelief import true_relief
+
+    calibrated("gradient", folder, {"lights": "ball", "polarization": "ball"}, width_px=None)
+    for seed, site in subjects.items():
+        name = f"{site} {seed}"
+        done = simulate_session(
+            "gradient", folder / "session-subject", site=site, seed=seed, width_px=width_px,
+            angles=(0.0,), steps=(0, 0),
+        )  # fmt: skip
+        pipeline.reconstruct(
+            done.session, want=["normals", "height"], out=folder / "maps",
+            calibration=folder / "calibration",
+        )  # fmt: skip
+        found, truth = store.read(folder / "maps"), store.read(truth_of(done))
+        state = next(
+            key.removeprefix("normals_")
+            for key in found.maps
+            if key.startswith("normals_a") and key.endswith("_n0")
+        )
+        normals, seen = found.maps[f"normals_{state}"], truth.maps[f"normals_seen_{state}"]
+        good = valid_of(normals) & valid_of(seen)
+        if normals.stderr is not None:
+            angle = metrics.angular_error_rad(normals.values[good], seen.values[good])
+            yield of_normals(
+                "normals of the gradient sphere", angle,
+                normals.stderr[good][:, 0].astype(np.float64), subject=name,
+                factor_95=FACTORS_95["normals"],
+            )  # fmt: skip
+        height = found.maps[f"height_{state}"]
+        relief = true_relief(found, truth, state)
+        good = valid_of(height) & valid_of(truth.maps[f"height_{state}"])
+        if height.stderr is not None:
+            stderr = height.stderr[good].astype(np.float64)
+            off = np.abs(height.values.astype(np.float64)[good] - relief[good]) / stderr
+            yield Trial("height", name, ANY_BAND, off, float(np.median(stderr)), "um",
+                        FACTORS_95["height"])  # fmt: skip
+        forget(folder, done)
