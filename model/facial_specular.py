@@ -29,16 +29,16 @@ def schlick(cosine: ArrayLike, f0: float = F0) -> FloatArray:
     Parameters
     ----------
     cosine
-        Of the angle to the facet's normal, in [0, 1], any shape.
+        Of the angle to the facet's normal, any shape; what lies outside [0, 1] is clipped.
     f0
-        Reflectance at normal incidence.
+        Reflectance at normal incidence, in [0, 1].
 
     Examples
     --------
     >>> schlick([0.0, 1.0]).tolist()
     [1.0, 0.028]
     """
-    base = 1.0 - np.asarray(cosine, np.float64)
+    base = 1.0 - np.clip(np.asarray(cosine, np.float64), 0.0, 1.0)
     return np.asarray(f0 + (1.0 - f0) * base**5)
 
 
@@ -57,7 +57,7 @@ def kelemen(
     normal, to_light, to_eye
         Unit vectors, (..., 3), that point away from the surface.
     roughness
-        Beckmann's m, > 0.
+        Beckmann's m; see `model.microfacet.facet_density` for its range.
     f0
         Reflectance of a facet at normal incidence.
 
@@ -77,6 +77,6 @@ def kelemen(
     square = np.sum(whole * whole, axis=-1)
     h = whole / np.sqrt(np.maximum(square, 1e-12))[..., None]
     density = facet_density(np.sum(n * h, axis=-1), roughness, "beckmann")
-    fresnel = schlick(np.clip(np.sum(v * h, axis=-1), 0.0, 1.0), f0)
+    fresnel = schlick(np.sum(v * h, axis=-1), f0)
     lit = np.sum(n * light, axis=-1) > 0.0
     return np.asarray(np.where(lit, density * fresnel / np.maximum(square, 1e-12), 0.0))

@@ -26,6 +26,9 @@ Distribution = Literal["ggx", "beckmann", "blinn"]
 LEAST_COSINE = 1e-3
 """Cosines to the horizon below this count as this: the BRDF is finite everywhere."""
 
+ROUGHNESS_RANGE = (1e-6, 1e6)
+"""Smoother facets are a mirror, which has no density; squares of both overflow far beyond."""
+
 
 def facet_density(cos_h: ArrayLike, roughness: float, kind: Distribution = "ggx") -> FloatArray:
     """Return the density D of facet normals, 1/sr; the integral of D cos is 1.
@@ -35,18 +38,25 @@ def facet_density(cos_h: ArrayLike, roughness: float, kind: Distribution = "ggx"
     cos_h
         Cosine between facet and surface normal, in [0, 1], any shape.
     roughness
-        GGX's alpha or Beckmann's m, > 0; the cosine power is matched to it as 2/m^2 - 2.
+        GGX's alpha or Beckmann's m, within :data:`ROUGHNESS_RANGE`; the cosine power is matched to
+        it as 2/m^2 - 2.
     kind
         Which distribution. The cosine power is for m up to 0.5: Smith's shadowing is not its own,
         and wider lobes give back up to 13 % more than they get near grazing.
+
+    Raises
+    ------
+    ValueError
+        For a roughness out of range.
 
     Examples
     --------
     >>> float(facet_density(1.0, 0.5).round(6))
     1.27324
     """
-    if not roughness > 0.0:
-        raise ValueError(f"roughness: got {roughness}, expected more than 0")
+    least, most = ROUGHNESS_RANGE
+    if not least <= roughness <= most:
+        raise ValueError(f"roughness: got {roughness}, expected {least:g} to {most:g}")
     c = np.clip(np.asarray(cos_h, dtype=np.float64), 0.0, 1.0)
     a2 = roughness**2
     if kind == "ggx":

@@ -91,17 +91,17 @@ def scatter(
     Parameters
     ----------
     light
-        (H, W, 3), linear; counts where there is a surface.
+        (H, W, 3), linear; counts where there is a surface, and is finite there.
     depth_mm
-        Distance along the view axis, (H, W), mm; 0 where there is no surface.
+        Distance along the view axis, (H, W), mm, finite; 0 or below where there is no surface.
     variances_mm2
-        Of the Gaussians along one axis, growing, (G,).
+        Of the Gaussians along one axis, growing, (G,), finite.
     weights
-        Of each for red, green and blue, (G, 3).
+        Of each for red, green and blue, (G, 3), finite.
     focal_px
-        Pixels of 1 mm at a distance of 1 mm.
+        Pixels of 1 mm at a distance of 1 mm, > 0.
     width
-        Factor of all standard deviations, a number or (H, W).
+        Factor of all standard deviations, a number or (H, W), finite, > 0 on the surface.
     sampling
         How each Gaussian is summed.
 
@@ -113,22 +113,34 @@ def scatter(
     Raises
     ------
     ScreenScatteringError
-        For shapes that differ or variances that do not grow.
+        For shapes that differ, variances that do not grow, and what is not finite.
     """
     E, z = np.asarray(light, np.float64), np.asarray(depth_mm, np.float64)
     variances, share = np.asarray(variances_mm2, np.float64), np.asarray(weights, np.float64)
     if E.shape != (*z.shape, 3) or z.ndim != 2:
         raise ScreenScatteringError(f"light: got shape {E.shape}, expected {(*z.shape, 3)}")
-    if share.shape != (len(variances), 3) or not np.all(np.diff(variances, prepend=0.0) > 0.0):
+    if (
+        share.shape != (len(variances), 3)
+        or not np.all(np.diff(variances, prepend=0.0) > 0.0)
+        or not np.all(np.isfinite(variances))
+    ):
         raise ScreenScatteringError(
             f"variances_mm2: got {variances.tolist()} and weights {share.shape}, expected growing "
-            "ones above 0 and three weights each"
+            "finite ones above 0 and three weights each"
         )
     how = Sampling() if sampling is None else sampling
     factor = np.where(z > 0.0, np.broadcast_to(np.asarray(width, np.float64), z.shape), 1.0)
-    if not np.all(factor > 0.0):
-        raise ScreenScatteringError(f"width: got {factor.min():g}, expected above 0 on the surface")
+    if not np.all((factor > 0.0) & (factor < np.inf)):
+        raise ScreenScatteringError(
+            f"width: got {factor.min():g} to {factor.max():g}, expected above 0 on the surface, "
+            "finite"
+        )
     blurred, out = np.where(z[..., None] > 0.0, E, 0.0), np.zeros_like(E)
+    for name, values in (("light", blurred), ("depth_mm", z), ("weights", share)):
+        if not np.all(np.isfinite(values)):
+            raise ScreenScatteringError(f"{name}: got NaN or infinity, expected finite values")
+    if not 0.0 < focal_px < np.inf:
+        raise ScreenScatteringError(f"focal_px: got {focal_px}, expected a finite number above 0")
     for variance, weight in zip(np.diff(variances, prepend=0.0), share, strict=True):
         sigma = how.widening * np.sqrt(variance) * factor
         for axis in (1, 0):
@@ -146,7 +158,7 @@ def narrowed(deviation_px: ArrayLike) -> FloatArray:
     Parameters
     ----------
     deviation_px
-        Wanted, px, > 0, any shape.
+        Wanted, px, >= 0, any shape.
 
     Examples
     --------
@@ -154,7 +166,10 @@ def narrowed(deviation_px: ArrayLike) -> FloatArray:
     [0.053, 0.934, 4.999]
     """
     wide = np.asarray(deviation_px, np.float64)
-    return np.asarray(wide**2 / (wide**4 + INTERPOLATION_PX**4) ** 0.25)
+    # wide^2 / (wide^4 + INTERPOLATION_PX^4)^(1/4), written so that no power overflows
+    large = np.maximum(wide, INTERPOLATION_PX)
+    ratio = np.minimum(wide, INTERPOLATION_PX) / large
+    return np.asarray(wide * (wide / large) / (1.0 + ratio**4) ** 0.25)
 
 
 def _blurred(

@@ -25,6 +25,8 @@ TOE_DENOMINATOR: Final = 0.30
 LINEAR_WHITE: Final = 11.2
 """Light, after the bias, that is shown as white."""
 EXPOSURE_BIAS: Final = 2.0
+MOST_LIGHT: Final = 1e20
+"""More is shown as this much: the curve is level there, and its squares overflow far beyond."""
 
 
 def srgb_encoded(linear: ArrayLike) -> FloatArray:
@@ -33,7 +35,7 @@ def srgb_encoded(linear: ArrayLike) -> FloatArray:
     Parameters
     ----------
     linear
-        Linear light; what lies outside [0, 1] is clipped.
+        Linear light; what lies outside [0, 1] is clipped. NaN stays NaN.
 
     Examples
     --------
@@ -50,14 +52,14 @@ def filmic(linear: ArrayLike) -> FloatArray:
     Parameters
     ----------
     linear
-        Linear light, >= 0, any shape.
+        Linear light, any shape, infinite too; what is below 0 counts as 0. NaN stays NaN.
 
     Examples
     --------
     >>> filmic([0.0, 0.18, 5.6]).round(4).tolist()
     [0.0, 0.1283, 1.0]
     """
-    x = EXPOSURE_BIAS * np.maximum(np.asarray(linear, np.float64), 0.0)
+    x = EXPOSURE_BIAS * np.clip(np.asarray(linear, np.float64), 0.0, MOST_LIGHT)
     return np.asarray(_curve(x) / _curve(np.float64(LINEAR_WHITE)))
 
 
