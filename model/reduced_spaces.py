@@ -16,7 +16,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
 from model import nonnegative_kernels
-from model.trait_vectors import Trait, TraitError
+from model.trait_vectors import Trait, TraitError, exponent_of
 
 FloatArray = NDArray[np.float64]
 SpaceKind = Literal["pca", "nmf"]
@@ -116,7 +116,7 @@ def principal(
     Parameters
     ----------
     samples : ndarray, shape (n, d)
-        d may be far larger than n: the work grows with n^2 d.
+        Finite, in any unit; d may be far larger than n: the work grows with n^2 d.
     traits
         What the number of components is chosen for.
     components : int or None
@@ -129,8 +129,11 @@ def principal(
     Raises
     ------
     TraitError
-        When all samples are the same, or have fewer independent differences than asked for.
+        When all samples are the same, have fewer independent differences than asked for, or are
+        not finite.
     """
+    exponent = exponent_of(samples)
+    samples = np.ldexp(samples, -exponent)
     n, d = samples.shape
     center = samples.mean(axis=0)
     off = samples - center
@@ -154,6 +157,7 @@ def principal(
     basis = (u[:, :kept] / s[:kept]).T @ off
     held = np.where(np.arange(rank) < kept, scores, 0.0)
     lost = float(np.sqrt(np.sum(s[kept:] ** 2) / np.sum(s**2)))
+    center, scores, held = (np.ldexp(values, exponent) for values in (center, scores, held))
     return Reduction("pca", center, basis, scores, held, scores[:, :kept].copy(), lost)
 
 
@@ -163,7 +167,7 @@ def choose(scores: FloatArray, traits: Sequence[Trait], *, rng: np.random.Genera
     Parameters
     ----------
     scores : ndarray, shape (n, r)
-        The samples in all their components.
+        The samples in all their components; finite.
     traits
         Binary ones with at least 2 faces on both sides count; without any, all components stay.
     rng
@@ -183,8 +187,9 @@ def choose(scores: FloatArray, traits: Sequence[Trait], *, rng: np.random.Genera
         t for t in traits if t.kind == "binary" and 2 <= t.members <= n - 2
     ]  # fmt: skip
     most = min(n // 2 - 2, rank)
-    if not used or most < 2:
+    if not used or most < 2 or not scores.any():
         return rank
+    scores = np.ldexp(scores, -exponent_of(scores))
     total = np.zeros(most)
     products = scores @ scores.T
     for trait in used:
@@ -221,15 +226,17 @@ def mixtures(
     Parameters
     ----------
     samples : ndarray, shape (n, d)
+        Finite, in any unit.
     basis : array_like, shape (K, d)
-        Values of at least 0, as `reconstruction.brdf_basis.reduce` gives them.
+        Finite values of at least 0, as `reconstruction.brdf_basis.reduce` gives them.
     metric
         See `check_metric`.
 
     Raises
     ------
     TraitError
-        Without a basis, or for one that does not fit the samples.
+        Without a basis, for one that does not fit the samples, and for samples that are all the
+        same or not finite.
     """
     if basis is None:
         raise TraitError(
@@ -237,29 +244,49 @@ def mixtures(
             "reconstruction.brdf_basis.reduce(weights, K)[1]"
         )
     b = np.asarray(basis, np.float64)
-    if b.ndim != 2 or b.shape[1] != samples.shape[1] or not len(b) or not (b >= 0.0).all():
+    fits = b.ndim == 2 and b.shape[1] == samples.shape[1] and len(b) > 0
+    if not fits or not ((b >= 0.0) & (b < np.inf)).all():
         raise TraitError(
-            f"basis: got shape {b.shape}, expected (K, {samples.shape[1]}) of values at least 0"
+            f"basis: got shape {b.shape}, expected (K, {samples.shape[1]}) of finite values, at "
+            "least 0"
         )
     if not (b.max(axis=1) > 0.0).all():
         raise TraitError("basis: got a mixture of nothing")
+    exponent = exponent_of(samples)
+    samples = np.ldexp(samples, -exponent)
     coordinates = mixture_coordinates(samples, b, metric)
-    off = samples - coordinates @ b
+    mixed = coordinates @ b
+    off = samples - mixed
     center = samples.mean(axis=0)
-    spread = float(np.sum(lengths(samples - center, metric) ** 2))
-    gone = off - off.mean(axis=0)
-    lost = float(np.sqrt(np.sum(lengths(gone, metric) ** 2) / spread)) if spread > 0.0 else 0.0
-    if spread == 0.0:
+    spread = float(np.linalg.norm(lengths(samples - center, metric)))
+    rounding = 8.0 * len(samples) * float(lengths(center, metric)) * np.finfo(np.float64).eps
+    if spread <= rounding:
         raise TraitError(f"samples: all {len(samples)} are the same, nothing can be learned")
-    held = framed(coordinates @ b, metric)
-    return Reduction("nmf", center, b, framed(samples, metric), held, coordinates, lost)
+    gone = off - off.mean(axis=0)
+    lost = float(np.linalg.norm(lengths(gone, metric))) / spread
+    whole, held = framed(samples, metric), framed(mixed, metric)
+    center, whole, held, coordinates = (
+        np.ldexp(values, exponent) for values in (center, whole, held, coordinates)
+    )
+    return Reduction("nmf", center, b, whole, held, coordinates, lost)
 
 
 def mixture_coordinates(
     samples: FloatArray, basis: FloatArray, metric: FloatArray | None
 ) -> FloatArray:
-    """Return the non-negative shares (n, K) of a basis (K, d) that come nearest to samples."""
-    products = times_metric(basis, metric)
-    gram = products @ basis.T
-    plain = np.linalg.lstsq(gram, products @ samples.T, rcond=1e-12)[0].T
-    return nonnegative_kernels.nearest(gram, np.ascontiguousarray(plain))
+    """Return the non-negative shares (n, K) of a basis (K, d) that come nearest to samples.
+
+    Both finite, each in any unit.
+
+    Raises
+    ------
+    TraitError
+        For what is not finite.
+    """
+    unit, own = exponent_of(samples), exponent_of(basis)
+    materials = np.ldexp(basis, -own)
+    products = times_metric(materials, metric)
+    gram = products @ materials.T
+    plain = np.linalg.lstsq(gram, products @ np.ldexp(samples, -unit).T, rcond=1e-12)[0].T
+    shares = nonnegative_kernels.nearest(gram, np.ascontiguousarray(plain))
+    return np.asarray(np.ldexp(shares, unit - own))

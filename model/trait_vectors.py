@@ -236,6 +236,33 @@ def _value(name: str, given: ArrayLike, count: int) -> FloatArray:
     return value
 
 
+def exponent_of(*values: FloatArray) -> int:
+    """Return the power of two that scales numbers to sizes up to 1; 0 where all are 0.
+
+    What does not depend on a unit is computed of ``numpy.ldexp(values, -exponent)``, exactly the
+    same numbers but for their unit, whose squares neither overflow nor vanish.
+
+    Parameters
+    ----------
+    *values : ndarray
+        Finite, of any shape.
+
+    Raises
+    ------
+    TraitError
+        For NaN and infinity.
+
+    Examples
+    --------
+    >>> exponent_of(np.array([0.3, -5.0])), exponent_of(np.zeros(3))
+    (3, 0)
+    """
+    if not all(np.isfinite(v).all() for v in values):
+        raise TraitError("samples: got NaN or infinity, expected finite numbers")
+    largest = max((float(np.abs(v).max()) for v in values if v.size), default=0.0)
+    return int(np.frexp(largest)[1])
+
+
 def correlations(traits: tuple[Trait, ...]) -> FloatArray:
     """Return the correlations of the traits' values, (t, t)."""
     centered = np.array([t.values - t.values.mean() for t in traits])
@@ -292,7 +319,7 @@ def confidence(
     trait
         See `traits_of`.
     scores : ndarray, shape (n, r)
-        What the reduced space holds of the samples, in an orthonormal frame.
+        What the reduced space holds of the samples, in an orthonormal frame; finite.
     whole : ndarray, shape (n, r), optional
         The samples in the same frame; as `scores` by default.
     beside
@@ -312,6 +339,8 @@ def confidence(
     c = trait.contrast
     if whole is None:
         whole = scores
+    exponent = exponent_of(scores, whole)
+    scores, whole = (np.ldexp(values, -exponent) for values in (scores, whole))
     vector, true = c @ scores, c @ whole
     base = whole if not beside else residuals(beside[0], whole, beside=beside[1:])[:, :-1]
     length, far = float(np.linalg.norm(vector)), float(np.linalg.norm(true))

@@ -252,7 +252,8 @@ class PopulationTable:
     @property
     def deviation_without_noise_per_mm(self) -> Floats:
         """Deviation over people that the errors of measurement do not explain; 0 where all is."""
-        return np.sqrt(np.maximum(self.deviation_per_mm**2 - self.noise_per_mm**2, 0.0))
+        deviation, noise = self.deviation_per_mm, self.noise_per_mm
+        return np.sqrt(np.maximum(deviation - noise, 0.0)) * np.sqrt(deviation + noise)
 
     def rows(self) -> list[tuple[str, tuple[tuple[float, float], ...]]]:
         """Return table 2's rows: a channel, and for each place mean and deviation, 1/mm."""
@@ -349,6 +350,13 @@ def table(
         raise PopulationError("stderr_per_mm: got a counted value that is not finite, 0 or above")
     n = good.sum(axis=0)
     some = np.maximum(n, 1)
+    # squares and fourth powers in a unit that keeps them from vanishing and from overflowing
+    unit, noise_unit = (
+        int(np.frexp(np.where(good, of, 0.0).max(initial=0.0))[1]) for of in (values, noise)
+    )
+    values, noise = (
+        np.ldexp(np.where(good, of, 0.0), -by) for of, by in ((values, unit), (noise, noise_unit))
+    )
     mean = np.where(good, values, 0.0).sum(axis=0) / some
     off = np.where(good, values - mean, 0.0)
     variance = np.where(n > 1, (off**2).sum(axis=0) / np.maximum(n - 1, 1), 0.0)
@@ -361,12 +369,13 @@ def table(
         sites=tuple(sites),
         channels=tuple(channels),
         count=np.asarray(n, np.int64),
-        mean_per_mm=mean,
-        deviation_per_mm=deviation,
-        mean_stderr_per_mm=deviation / np.sqrt(some),
-        deviation_stderr_per_mm=np.sqrt(of_variance)
-        / np.where(deviation > 0, 2.0 * deviation, 1.0),
-        noise_per_mm=np.sqrt(np.where(good, noise**2, 0.0).sum(axis=0) / some),
+        mean_per_mm=np.ldexp(mean, unit),
+        deviation_per_mm=np.ldexp(deviation, unit),
+        mean_stderr_per_mm=np.ldexp(deviation / np.sqrt(some), unit),
+        deviation_stderr_per_mm=np.ldexp(
+            np.sqrt(of_variance) / np.where(deviation > 0, 2.0 * deviation, 1.0), unit
+        ),
+        noise_per_mm=np.ldexp(np.sqrt((noise**2).sum(axis=0) / some), noise_unit),
     )
 
 
@@ -439,8 +448,10 @@ def _averaged(repeats: list[SiteMeasurement]) -> tuple[Floats, Floats, NDArray[n
         raise PopulationError(
             f"stderr_per_mm: got one of {repeats[0].subject!r} that is not finite and above 0"
         )
-    weights = np.where(told, 1.0 / np.where(told, errors, 1.0) ** 2, 0.0)
-    total = weights.sum(axis=0)
-    some = total > 0
-    total = np.where(some, total, 1.0)
-    return (np.where(told, values, 0.0) * weights).sum(axis=0) / total, total**-0.5, some
+    some = told.any(axis=0)
+    # relative to the least error: squares of errors in a small unit vanish
+    least = np.where(some, np.where(told, errors, np.inf).min(axis=0), 1.0)
+    weights = np.where(told, (least / np.where(told, errors, 1.0)) ** 2, 0.0)
+    total = np.where(some, weights.sum(axis=0), 1.0)
+    mean = (np.where(told, values, 0.0) * (weights / total)).sum(axis=0)
+    return mean, least / np.sqrt(total), some
