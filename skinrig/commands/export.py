@@ -15,8 +15,8 @@ from skinrig.errors import UsageError
 NEXT: Final[Mapping[str, str]] = {
     "maps": "read maps.json: units, ranges and frames; maps.mtlx holds the color spaces",
     "mtlx": "load skin.mtlx on skin.obj; material.json has the scene unit and what was assumed",
-    "gltf": "open skin.glb, for example in Blender by File, Import, glTF 2.0",
-    "usd": "open skin.usdc, for example by usdview; usd.json has what was assumed",
+    "gltf": "open skin.glb; in Blender, run skin_in_blender.py for the light below the surface",
+    "usd": "open skin.usdc, in Blender by skin_in_blender.py; usd.json has what was assumed",
     "spectral": "read spectral.json: what is measured and what is modelled",
     "metahuman": "read delta_maps.json: layout and coding of the deltas",
     "lp": "skinrig import lp DIR --out SESSION reads the folder back",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from datetime import date, datetime
+from importlib import import_module
 from pathlib import Path
 from typing import Final
 
@@ -16,52 +17,27 @@ from skinrig.exporting.sealing import Exported, ExportError, fresh, sealed
 
 Write = Callable[[SkinAppearance, Path, Delivery], list[tuple[str, str]]]
 
-
-def _maps() -> Write:
-    from skinrig.exporting import maps
-
-    return maps.write
-
-
-def _materialx() -> Write:
-    from skinrig.exporting import materialx
-
-    return materialx.write
-
-
-def _gltf() -> Write:
-    from skinrig.exporting import gltf
-
-    return gltf.write
-
-
-def _usd() -> Write:
-    from skinrig.exporting import usd
-
-    return usd.write
-
-
-def _spectral() -> Write:
-    from skinrig.exporting import spectral
-
-    return spectral.write
-
-
-def _metahuman() -> Write:
-    from skinrig.exporting import delta_maps
-
-    return delta_maps.write
-
-
-# each format imports its own libraries only
-FORMATS: Final[Mapping[str, Callable[[], Write]]] = {
-    "maps": _maps,
-    "mtlx": _materialx,
-    "gltf": _gltf,
-    "usd": _usd,
-    "spectral": _spectral,
-    "metahuman": _metahuman,
+FORMATS: Final[Mapping[str, str]] = {
+    "maps": "maps",
+    "mtlx": "materialx",
+    "gltf": "gltf",
+    "usd": "usd",
+    "spectral": "spectral",
+    "metahuman": "delta_maps",
 }
+"""Format to the module of this package whose ``write`` makes it: each imports its own libraries."""
+
+
+def writer(to: str) -> Write:
+    """Return what writes a format of `FORMATS`.
+
+    Examples
+    --------
+    >>> [writer(to).__name__ for to in FORMATS] == ["write"] * len(FORMATS)
+    True
+    """
+    write: Write = import_module(f"skinrig.exporting.{FORMATS[to]}").write
+    return write
 
 
 def export_appearance(
@@ -114,7 +90,7 @@ def export_appearance(
     order = delivery or Delivery()
     if order.onto is not None:
         allowed(order.onto, use, today=today)  # its maps are handed on, too
-    write = FORMATS[to]()
+    write = writer(to)
     return sealed(target, lambda part: write(appearance, part, order), now)
 
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
 from skinrig.errors import UsageError
+from skinrig.exporting import blender
 from skinrig.exporting.images import Image, ImageFolder, coded
 from skinrig.exporting.material import COLOR_NOTE, NOTES, Material
 from skinrig.exporting.options import Delivery
@@ -111,6 +112,8 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             raise UsageError(f"{option}: got {value}, but glTF knows {only} alone; leave it out")
     material = Material.of(appearance, delivery.mesh)
     (folder / FILE).write_bytes(content(material))
+    script = blender.Import.of_channels(FILE, material.usual_radius_mm()).script()
+    (folder / blender.FILE).write_text(script, encoding="utf-8")
     out = ImageFolder(folder, delivery)
     if delivery.with_errors:
         for image in material.error_images():
@@ -125,7 +128,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             "base_color": f"{NOTES['base_color']}; {COLOR_NOTE}; 8 bits, sRGB curve",
             "normal": "tangent space of the TANGENT attribute, +Y, 8 bits; the maps and mtlx "
             "exports hold 16",
-            "subsurface": material.sigma_tr(),
+            "subsurface": {**material.sigma_tr(), "mapping": NOTES["subsurface_radius"]},
             "specular_ior": material.eta,
             "morph_targets": list(material.shapes),
             "figures": material.figures(),
@@ -133,7 +136,12 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             "files": dict(sorted(out.records.items())),
         },
     )
-    left_out = [("subsurface light", "glTF has no place for it: see extras, or take mtlx or usd")]
+    left_out = [
+        (
+            "subsurface light",
+            f"glTF has no place for it: see extras; {blender.FILE} sets it in Blender",
+        )
+    ]
     if not material.shapes:
         left_out.append(("morph targets", "the mesh has no blend shapes; name one with --mesh"))
     return left_out

@@ -144,18 +144,24 @@ class Material:
         found = subsurface_radius.radius_mm(self.translucency_mm, self.base_color, self.deficit)
         return found.astype(np.float32)
 
+    def usual_radius_mm(self) -> list[float]:
+        """Return the median of `radius_mm` over the valid texels, red, green, blue."""
+        shown = self.radius_mm[self.valid] if self.valid.any() else self.radius_mm
+        return [float(r) for r in np.median(shown.reshape(-1, 3), axis=0)]
+
     @property
     def specular_weight(self) -> Floats:
         """The surface's weight, held in [0, 1] as formats demand, (H, W)."""
         return np.clip(self.surface.weight, 0.0, 1.0)
 
     def sigma_tr(self) -> dict[str, Any]:
-        """Return medians of sigma_tr over valid texels, as JSON values for formats without it."""
+        """Return medians over valid texels, as JSON values for formats without subsurface light."""
         shown = self.translucency_mm[self.valid] if self.valid.any() else self.translucency_mm
         depth = np.median(shown.reshape(-1, 3), axis=0)
         return {
             "sigma_tr_per_mm": [float(1.0 / d) for d in depth],
             "translucency_mm": [float(d) for d in depth],
+            "mean_free_path_mm": self.usual_radius_mm(),
             "channels": "red, green, blue; median over the valid texels",
             "assumed": list(self.assumed),
         }

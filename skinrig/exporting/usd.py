@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
 from skinrig.errors import MissingExtra
-from skinrig.exporting import materialx
+from skinrig.exporting import blender, materialx
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.material import Material
 from skinrig.exporting.options import NORMAL_Y, UNITS_M, Delivery
@@ -76,6 +76,13 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     (folder / materialx.FILE).write_text(
         materialx.openpbr_document(material, scale, delivery), encoding="utf-8"
     )
+    textures = (
+        ("Subsurface Radius", _place(delivery, "subsurface_radius_scale", "exr"), 1.0),
+        # Blender's level of 0.5 is the reflection of a dielectric
+        ("Specular IOR Level", _place(delivery, "specular_weight", "exr"), 0.5),
+    )
+    script = blender.Import(FILE, scale, None, textures).script()
+    (folder / blender.FILE).write_text(script, encoding="utf-8")
     write_json(
         folder / DOCUMENT,
         {
@@ -88,7 +95,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     )
     left_out = [
         ("subsurface light and specular weight of UsdPreviewSurface",
-         "it has no place for them: the mtlx network holds both"),
+         f"it has no place for them: the mtlx network holds both; {blender.FILE} sets them"),
     ]  # fmt: skip
     if not material.shapes:
         left_out.append(("blend shapes", "the mesh has none; name one with --mesh"))
@@ -170,10 +177,14 @@ def _materials(stage: Any, material: Material, radius: float, delivery: Delivery
     made.CreateSurfaceOutput("mtlx").ConnectToSource(openpbr.ConnectableAPI(), "out")
 
 
+def _place(delivery: Delivery, name: str, suffix: str) -> str:
+    return f"{materialx.TEXTURES}/{delivery.referred(name, suffix)}"
+
+
 def _texture(delivery: Delivery, name: str, suffix: str) -> Any:
     from pxr import Sdf
 
-    return Sdf.AssetPath(f"./{materialx.TEXTURES}/{delivery.referred(name, suffix)}")
+    return Sdf.AssetPath(f"./{_place(delivery, name, suffix)}")
 
 
 def _preview(stage: Any, place: str, material: Material, delivery: Delivery) -> Any:

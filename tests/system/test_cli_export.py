@@ -71,7 +71,7 @@ def test_one_json_document_says_what_was_written_and_left_out(dome, tmp_path, ca
     code, said = run(capsys, *argv)
     assert code == 0
     told = json.loads(said.out)
-    assert (told["schema"], told["to"], told["files"]) == ("skinrig.export/1", "gltf", 2)
+    assert (told["schema"], told["to"], told["files"]) == ("skinrig.export/1", "gltf", 3)
     assert [what for what, _ in told["left_out"]] == ["subsurface light", "morph targets"]
 
 

@@ -13,6 +13,8 @@ from rigsim.mesh import build_mesh
 from skinrig.exporting import obj
 from skinrig.exporting.tangents import FramedMesh
 
+collect_ignore = ["read_in_blender.py"]  # of Blender's Python
+
 SIDE, GRID = 64, 13
 MATERIALS = ("ggx 0.22 eta 1.4", "ggx 0.4 eta 1.4")
 CONSENT = {"pseudonym": "P042", "consent_scope": ["research"], "consent_expires": "2030-01-01"}
