@@ -3,6 +3,12 @@
 import os
 from pathlib import Path
 
+# Tests run in as many processes as there are cores. Threads of one that wait by spinning take
+# their core from another, which doubles and more what both spend: wait asleep, and leave small
+# matrices to one thread. Read when the libraries are loaded, so before they are imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import numpy as np
 import pytest
 
