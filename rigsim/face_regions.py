@@ -142,18 +142,30 @@ def _balls(
     points: Float32Array, balls: tuple[tuple[str, tuple[float, float, float]], ...]
 ) -> Float32Array:
     total = np.zeros(points.shape[:-1], np.float32)
+    axes = [np.ascontiguousarray(points[..., k]) for k in range(3)]
     for name, radii in balls:
-        q = (points - np.array(_CENTERS[name], np.float32)) / np.array(radii, np.float32)
-        total = np.maximum(total, np.exp(-np.sum(q * q, axis=-1)))
+        # sums over an axis of three elements are the slow way to the same numbers
+        x, y, z = (
+            (axis - np.float32(middle)) / np.float32(radius)
+            for axis, middle, radius in zip(axes, _CENTERS[name], radii, strict=True)
+        )
+        total = np.maximum(total, np.exp(-(x * x + y * y + z * z)))
     return total
 
 
 def _lips(points: Float32Array) -> Float32Array:
+    near = np.abs(points[..., 0]) < 26.0  # elsewhere it is 0
+    masked = np.zeros(points.shape[:-1], np.float32)
+    masked[near] = _lips_within(points[near])
+    return masked
+
+
+def _lips_within(points: Float32Array) -> Float32Array:
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     top, bottom = lip_outline(x)
     border_mm = 0.7  # the vermilion border is crisp
     inside = soft_step((top - y) / border_mm) * soft_step((y - bottom) / border_mm)
-    return np.asarray(inside * soft_step((z + 22.0) / 4.0) * (np.abs(x) < 26.0), np.float32)
+    return np.asarray(inside * soft_step((z + 22.0) / 4.0), np.float32)
 
 
 def soft_step(t: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import color_table, spectra
-from model.coarse_maps import Cells, fitting
 from model.facial_color import GLOBAL_GAINS, NEUTRAL, HemoglobinRig
 from model.tissue_optics import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from skinrig.dynamic_appearance import FACIAL_COLOR, parts_of
+from skinrig.viewer.fine_skin import FineSkin
+from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 if TYPE_CHECKING:
@@ -26,8 +27,6 @@ TABLE_SIZE: Final = 128
 """Nodes along each axis of the color table."""
 RIG_SIZE: Final = 256
 """Cells a side of the scale and bias maps (Jimenez 2010, section 6)."""
-SIMULATED_SIZE: Final = 512
-"""Texels a side of the simulated states that the rig is made from: it is kept smaller yet."""
 RADIUS_OF_SIZE: Final = 24.0 / 512.0
 """Radius of the local statistics' disc, as a part of the map's side."""
 FINE: Final = 8
@@ -116,30 +115,23 @@ def _face(source: SceneSource) -> FaceColor:
         from skinrig.viewer.placed_color import placed
 
         return placed(source, subject)
-    return simulated(subject)
+    return simulated(subject, source.skin or FineSkin(subject, subject.size))
 
 
-def simulated(subject: Subject) -> FaceColor:
+def simulated(person: Subject, skin: FineSkin) -> FaceColor:
     """Return the chromophores of a simulated person, with a rig of all of its states."""
     from rigsim.perfusion import STATES
-    from rigsim.subject import make_subject
 
-    covered = subject.atlas.covered
-    small = subject
-    if subject.size > SIMULATED_SIZE:
-        small = make_subject(
-            subject.preset, seed=subject.seed, size=SIMULATED_SIZE, mesh=subject.mesh
-        )
     rig = HemoglobinRig.from_maps(
-        small.hemoglobin(),
-        {name: small.hemoglobin(name) for name in STATES if name != NEUTRAL},
-        radius_px=RADIUS_OF_SIZE * small.size,
-        valid=small.atlas.covered,
-        stored_size=min(RIG_SIZE, small.size),
+        person.hemoglobin(),
+        {name: person.hemoglobin(name) for name in STATES if name != NEUTRAL},
+        radius_px=RADIUS_OF_SIZE * person.size,
+        valid=person.atlas.covered,
+        stored_size=min(RIG_SIZE, person.size),
     )
     return FaceColor(
-        melanin=filled(subject.melanin, covered),
-        hemoglobin=filled(subject.hemoglobin(), covered),
+        melanin=skin.melanin(),
+        hemoglobin=skin.hemoglobin(),
         states=stored_states(rig),
         global_states=rig.global_states,
         facts={"source": "simulated"},
@@ -154,48 +146,6 @@ def stored_states(rig: HemoglobinRig) -> dict[str, Floats]:
         pair = [filled(maps[name], valid) for maps in (rig.scale, rig.bias)]
         layers[name] = np.stack(pair, axis=-1)
     return layers
-
-
-def filled(values: NDArray[np.floating], valid: Mask) -> Floats:
-    """Return a map whose missing texels hold what surrounds them, so that filters stay clean.
-
-    Means over ever larger cells are interpolated back until nothing is missing.
-
-    Parameters
-    ----------
-    values
-        (H, W); what is not valid may be anything.
-    valid
-        (H, W); where nothing is, the result is 0.
-
-    Examples
-    --------
-    >>> filled(np.array([[1.0, 7.0], [1.0, 1.0]]), np.array([[True, False], [True, True]])).tolist()
-    [[1.0, 1.0], [1.0, 1.0]]
-    """
-    out = np.where(valid, values, 0.0).astype(np.float64)
-    missing = ~valid
-    few = (values.shape[0], values.shape[1])
-    while missing.any() and valid.any():
-        few = (max(1, few[0] // 2), max(1, few[1] // 2))
-        cells = Cells(valid.shape, few)
-        coarse, held = cells.coarsen(out, valid)
-        (up,) = cells.refine(coarse, valid=held)
-        known = missing & np.isfinite(up)
-        out[known] = up[known]
-        missing &= ~known
-    return out
-
-
-def halved(values: Floats, size: int) -> Floats:
-    """Return means over cells, (size, size[, C]), of a larger map; a smaller one as it is."""
-    if values.shape[0] <= size:
-        return values
-    cells = fitting((values.shape[0], values.shape[1]), size)
-    everywhere = np.ones(values.shape[:2], np.bool_)
-    if values.ndim == 2:
-        return cells.coarsen(values, everywhere)[0]
-    return np.stack([cells.coarsen(one, everywhere)[0] for one in np.moveaxis(values, -1, 0)], -1)
 
 
 def _albedo(source: SceneSource) -> Texture | None:

@@ -15,6 +15,7 @@ from model.skin import SkinAppearance
 from skinrig import dynamic_appearance
 from skinrig.viewer import procedural
 from skinrig.viewer.assembling import assemble
+from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.scene import Kind, SceneError, SceneSource, ViewerScene
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ def scene(
         size,
         seed=seed,
         subject=subject,
+        skin=FineSkin(subject, size),
         appearances=appearances,
         paths=folders,
         landmarks=landmarks,

@@ -8,9 +8,7 @@ compresses best.
 
 from __future__ import annotations
 
-import gzip
 import json
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -18,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skinrig.viewer import octaves
+from skinrig.viewer import deflating, octaves
 from skinrig.viewer.scene import Storage, Texture, ViewerMesh, ViewerScene
 
 Float32 = NDArray[np.float32]
@@ -138,7 +136,6 @@ def pack(scene: ViewerScene) -> Packed:
     def put(words: Words) -> dict[str, Any]:
         nonlocal offset
         predictor, data = _predicted(words)
-        chunks.append(data)
         entry = {
             "offset": offset,
             "shape": list(words.shape),
@@ -146,9 +143,9 @@ def pack(scene: ViewerScene) -> Packed:
             "predictor": predictor,
         }
         # typed arrays want offsets in whole words of any size
-        padding = -len(data) % 4
-        chunks.append(b"\0" * padding)
-        offset += len(data) + padding
+        padded = data + b"\0" * (-len(data) % 4)
+        chunks.append(padded)
+        offset += len(padded)
         return entry
 
     mesh = scene.mesh
@@ -197,7 +194,7 @@ def pack(scene: ViewerScene) -> Packed:
         "quantization_error": errors,
         "bytes": offset,
     }
-    payload = gzip.compress(b"".join(chunks), 9, mtime=0)
+    payload = deflating.gzipped(chunks)
     header["packed_bytes"] = len(payload)
     plain = json.loads(json.dumps(header, allow_nan=False, default=dict))
     return Packed(plain, payload, errors)
@@ -243,7 +240,7 @@ def _predicted(words: Words) -> tuple[str, bytes]:
     least = -1
     for predictor in PREDICTORS:
         data = _bytes_of(_differences(flat, predictor))
-        size = len(zlib.compress(data, 1))
+        size = deflating.guessed_size(data)
         if least < 0 or size < least:
             least, best = size, (predictor, data)
     return best

@@ -30,17 +30,17 @@ def as_text(data: bytes) -> str:
     """
     bits = np.unpackbits(np.frombuffer(data, np.uint8))
     groups = np.concatenate([bits, np.zeros(-len(bits) % 7, np.uint8)]).reshape(-1, 7)
-    codes = (groups @ (1 << np.arange(6, -1, -1))).astype(np.uint16)
+    codes = (np.packbits(groups, axis=1)[:, 0] >> 1).astype(np.uint16)
     unsafe = np.full(128, -1, np.int64)
     unsafe[list(UNSAFE)] = np.arange(len(UNSAFE))
     if len(codes) and unsafe[codes[-1]] >= 0:
         codes = np.append(codes, np.uint16(32))  # something for the last to be joined with
+    found = np.flatnonzero(unsafe[codes] >= 0)
+    # of several behind each other every other one is joined to the one before it
+    begins = np.diff(found, prepend=-2) > 1
+    first = found[begins][np.cumsum(begins) - 1] if len(found) else found
+    joining = found[(found - first) % 2 == 0]
+    codes[joining] = (unsafe[codes[joining]] + 1) * 128 + codes[joining + 1]
     keep = np.ones(len(codes), np.bool_)
-    behind = -1  # the last that was joined to one before it
-    for at in np.flatnonzero(unsafe[codes] >= 0):
-        if at == behind:
-            continue
-        behind = int(at) + 1
-        keep[behind] = False
-        codes[at] = (unsafe[codes[at]] + 1) * 128 + codes[behind]
+    keep[joining + 1] = False
     return codes[keep].astype("<u2").tobytes().decode("utf-16-le")

@@ -11,7 +11,9 @@ from model.facial_color import NEUTRAL, HemoglobinRig
 from model.facial_color_document import DOCUMENT
 from skinrig.dynamic_appearance import FACIAL_COLOR, parts_of
 from skinrig.viewer import placing
-from skinrig.viewer.facial_color_assets import RIG_SIZE, FaceColor, Floats, filled
+from skinrig.viewer.facial_color_assets import RIG_SIZE, FaceColor, Floats
+from skinrig.viewer.fine_skin import FineSkin
+from skinrig.viewer.map_filling import filled
 
 if TYPE_CHECKING:
     from rigsim.subject import Subject
@@ -68,10 +70,7 @@ def placed(source: SceneSource, subject: Subject) -> FaceColor:
         melanin = filled(melanin, melanin_known)
     else:
         left_out.append(("melanin of this face", "no map of it is in the folder; simulated"))
-        melanin = filled(
-            subject.melanin[:: max(1, subject.size // size), :: max(1, subject.size // size)],
-            subject.atlas.covered[:: max(1, subject.size // size), :: max(1, subject.size // size)],
-        )
+        melanin = FineSkin(subject, size).melanin()
     cells = fitting((size, size), RIG_SIZE)
     states: dict[str, Floats] = {}
     for name in (NEUTRAL, *rig.states):

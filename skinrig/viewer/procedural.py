@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from skinrig.viewer.assembling import assemble
+from skinrig.viewer.fine_skin import PERSON_SIZE, FineSkin
 from skinrig.viewer.scene import LARGEST_TEXTURE, SceneError, SceneSource, ViewerMesh, ViewerScene
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ def scene(
         size,
         seed=seed,
         subject=subject,
+        skin=FineSkin(subject, size),
     )
     provenance = {"source": "simulated", "kind": source.kind, "preset": preset, "seed": seed}
     if mesh is not None:
@@ -67,10 +69,10 @@ def check_size(size: int) -> None:
 
 
 def simulated(mesh: Mesh | None, *, preset: str, size: int, seed: int) -> Subject:
-    """Return the simulated person that wears a mesh, or the procedural head."""
+    """Return the simulated person that wears a mesh, or the procedural head, coarsely."""
     from rigsim.subject import make_subject
 
-    return make_subject(preset, seed=seed, size=size, mesh=mesh)
+    return make_subject(preset, seed=seed, size=min(size, PERSON_SIZE), mesh=mesh)
 
 
 def load_mesh(path: Path) -> Mesh:

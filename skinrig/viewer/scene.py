@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from model.skin import SkinAppearance
     from rigsim.subject import Subject
+    from skinrig.viewer.fine_skin import FineSkin
 
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
@@ -150,6 +151,8 @@ class SceneSource:
         Of everything that is drawn, where something is.
     subject
         The simulated person, where the face or its textures are simulated.
+    skin
+        Its finest maps at `size`; None: those of the subject.
     appearances
         Fitted folders by kind: "dynamic" (facial color, wrinkles, microstructure), "dome", "model".
     paths
@@ -163,6 +166,7 @@ class SceneSource:
     size: int
     seed: int = 0
     subject: Subject | None = None
+    skin: FineSkin | None = None
     appearances: Mapping[str, SkinAppearance] = field(default_factory=dict)
     paths: Mapping[str, Path] = field(default_factory=dict)
     landmarks: Path | None = None

@@ -6,7 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from skinrig.viewer.facial_color_assets import filled, halved
+from skinrig.viewer.fine_skin import FineSkin
+from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 MAPS_SIZE: Final = 256
@@ -20,8 +21,8 @@ def assets(source: SceneSource) -> Assets:
     subject = source.subject
     if subject is None:
         return {"left_out": (("relief", "nothing of the surface was measured"),)}
-    covered, size = subject.atlas.covered, subject.size
-    height = filled(subject.height_um, covered)[..., None]
+    covered = subject.atlas.covered
+    height = (source.skin or FineSkin(subject, subject.size)).height_um()[..., None]
     # Beckmann's m and GGX's alpha give a peak of the same height, 1 / (pi m^2)
     roughness = halved(filled(subject.roughness, covered), MAPS_SIZE)
     # hair hides the skin's gloss, as the subject's own renderings have it
@@ -38,7 +39,7 @@ def assets(source: SceneSource) -> Assets:
     return {
         "textures": {
             "relief_height": Texture(
-                height.astype(np.float32), "u8", "mipmap", fine=FINE if size >= 2048 else 1
+                height.astype(np.float32), "u8", "mipmap", fine=FINE if len(height) >= 2048 else 1
             ),
             "surface_maps": Texture(maps.astype(np.float32), "u8"),
         },

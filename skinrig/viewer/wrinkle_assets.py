@@ -16,7 +16,7 @@ from model.texture_resampling import resampled
 from model.wrinkle_expressions import as_table
 from model.wrinkle_model import FILE, WrinkleModel
 from model.wrinkles import Layer, decode, encode, mask_textures
-from skinrig.viewer.facial_color_assets import filled
+from skinrig.viewer.map_filling import filled
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 if TYPE_CHECKING:

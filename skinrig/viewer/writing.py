@@ -40,16 +40,18 @@ def compose(
     SceneError
         For landmarks without a picture, and what the sources refuse.
     """
-    from skinrig.viewer import from_appearance, procedural
-
     if progress is not None:
         progress("making textures and tables")
     if appearances:
+        from skinrig.viewer import from_appearance
+
         return from_appearance.scene(appearances, mesh=mesh, landmarks=landmarks, size=size)
     if landmarks is not None:
         raise SceneError(
             "landmarks: got a table but no appearance whose picture it belongs to; name the folder"
         )
+    from skinrig.viewer import procedural
+
     return procedural.scene(preset=preset, size=size, seed=seed, mesh=mesh)
 
 

@@ -1,0 +1,53 @@
+"""Maps without holes, and maps of fewer texels."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.coarse_maps import Cells, fitting
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def filled(values: NDArray[np.floating], valid: Mask) -> Floats:
+    """Return a map whose missing texels hold what surrounds them, so that filters stay clean.
+
+    Means over ever larger cells are interpolated back until nothing is missing.
+
+    Parameters
+    ----------
+    values
+        (H, W); what is not valid may be anything.
+    valid
+        (H, W); where nothing is, the result is 0.
+
+    Examples
+    --------
+    >>> filled(np.array([[1.0, 7.0], [1.0, 1.0]]), np.array([[True, False], [True, True]])).tolist()
+    [[1.0, 1.0], [1.0, 1.0]]
+    """
+    out = np.where(valid, values, 0.0).astype(np.float64)
+    missing = ~valid
+    few = (values.shape[0], values.shape[1])
+    while missing.any() and valid.any():
+        few = (max(1, few[0] // 2), max(1, few[1] // 2))
+        cells = Cells(valid.shape, few)
+        coarse, held = cells.coarsen(out, valid)
+        (up,) = cells.refine(coarse, valid=held)
+        known = missing & np.isfinite(up)
+        out[known] = up[known]
+        missing &= ~known
+    return out
+
+
+def halved(values: Floats, size: int) -> Floats:
+    """Return means over cells, (size, size[, C]), of a larger map; a smaller one as it is."""
+    if values.shape[0] <= size:
+        return values
+    cells = fitting((values.shape[0], values.shape[1]), size)
+    everywhere = np.ones(values.shape[:2], np.bool_)
+    if values.ndim == 2:
+        return cells.coarsen(values, everywhere)[0]
+    return np.stack([cells.coarsen(one, everywhere)[0] for one in np.moveaxis(values, -1, 0)], -1)
