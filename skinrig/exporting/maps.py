@@ -187,9 +187,10 @@ def _tangent_normals(
         return None, str(error)
     axes, covered = FramedMesh.of(mesh).texel_frames(height)
     y = NORMAL_Y[delivery.normal_y]
-    turned = tangents.to_tangent(one.values, axes, covered) * np.array([1.0, y, 1.0], np.float32)
-    green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
     valid = covered if one.valid is None else covered & one.valid
+    turned = tangents.filled(tangents.to_tangent(one.values, axes, covered), valid)
+    turned = turned * np.array([1.0, y, 1.0], np.float32)
+    green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
     image = Image(
         name="normal_tangent", values=turned, unit="1", low=-1.0, high=1.0, valid=valid,
         what=f"{found} in the tangent frames of the mesh's vertices (MikkTSpace's rules), {green}",

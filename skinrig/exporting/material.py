@@ -113,6 +113,7 @@ class Material:
         surface = FittedSurface.of(model, mesh, rest=own)
         framed = FramedMesh.of(mesh)
         axes, covered = framed.texel_frames(surface.atlas.size)
+        turned = tangents.to_tangent(surface.normals, axes, covered)
         inside = 1.0 - fresnel.diffuse_external(model.eta)
         r_d = np.nan_to_num(model.r_d)
         stderr = model.r_d_stderr
@@ -124,7 +125,7 @@ class Material:
             shapes={n: d[framed.source].astype(np.float32) for n, d in mesh.shapes.items()},
             base_color=(inside * r_d).astype(np.float32),
             base_color_stderr=None if stderr is None else (inside * stderr).astype(np.float32),
-            normals=tangents.to_tangent(surface.normals, axes, covered),
+            normals=tangents.filled(turned, model.valid & covered),
             normals_rig=np.asarray(surface.normals, np.float32),
             axes=axes,
             covered=covered,

@@ -160,6 +160,35 @@ def to_tangent(normals: ArrayLike, axes: Floats, covered: Bools) -> NDArray[np.f
     return out
 
 
+def filled(tangent_normals: ArrayLike, valid: Bools) -> NDArray[np.float32]:
+    """Return tangent-space normals with what was not measured filled from around, (H, W, 3).
+
+    In its texel's frame relief goes on beyond an edge. Filled in the frame of the rig instead, the
+    normal of one part of a face would be laid onto the horizon of another.
+
+    Parameters
+    ----------
+    tangent_normals
+        Unit vectors, (H, W, 3).
+    valid
+        Texels that keep theirs, (H, W).
+
+    Examples
+    --------
+    >>> tilted = np.full((8, 8, 3), (0.6, 0.0, 0.8)) * np.eye(8, dtype=bool)[..., None]
+    >>> filled(tilted, np.eye(8, dtype=bool))[0, 7].round(3).tolist()
+    [0.6000000238418579, 0.0, 0.800000011920929]
+    """
+    from reconstruction.texture_fill import push_pull
+
+    given = np.asarray(tangent_normals, np.float32)
+    if not valid.any():
+        return np.broadcast_to(np.array([0.0, 0.0, 1.0], np.float32), given.shape).copy()
+    spread = push_pull(given, valid.astype(np.float32)).values.astype(np.float64)
+    spread[..., 2] = np.maximum(spread[..., 2], LEAST_Z)
+    return np.where(valid[..., None], given, _unit(spread)).astype(np.float32)
+
+
 def from_tangent(tangent_normals: ArrayLike, axes: Floats) -> NDArray[np.float64]:
     """Return unit normals in the frame of the axes, as a renderer decodes a map, (H, W, 3)."""
     return _unit(np.einsum("hwk,hwkc->hwc", np.asarray(tangent_normals, np.float64), axes))

@@ -98,7 +98,8 @@ def test_normals_of_a_dome_keep_the_rig_frame_and_come_in_the_textures_frame_too
     tangent = read(tmp_path / "exr/normal_tangent.exr") * [1.0, -1.0, 1.0]
     axes, covered = FramedMesh.of(patch.mesh()).texel_frames(patch.side)
     back = from_tangent(tangent, axes)
-    assert np.linalg.norm(back - world, axis=-1)[covered].max() < 1e-5
+    known = covered & simulated_face.maps["normals"].valid
+    assert np.linalg.norm(back - world, axis=-1)[known].max() < 1e-5
     assert (tmp_path / "files/mesh.obj").read_bytes() == simulated_face.files["mesh.obj"]
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from rigsim.atlas import unwrap
 from rigsim.mesh import build_mesh
-from skinrig.exporting.tangents import FramedMesh, from_tangent, to_tangent
+from skinrig.exporting.tangents import FramedMesh, filled, from_tangent, to_tangent
 
 SIZE = 48
 
@@ -101,3 +101,22 @@ def test_a_normal_behind_the_surface_is_laid_onto_its_horizon():
     found = to_tangent(np.full((8, 8, 3), (0.6, 0.0, -0.8)), axes, covered)
     assert 0.0 < found[7, 0, 2] < 0.01
     assert found[7, 0, 0] > 0.99
+
+
+def test_relief_goes_on_where_it_was_not_measured_instead_of_lying_on_the_horizon(patch):
+    """What is filled in the rig's frame is laid onto another part's horizon: dark specks."""
+    framed = FramedMesh.of(patch.mesh())
+    axes, covered = framed.texel_frames(SIZE)
+    relief = np.full((SIZE, SIZE, 3), (0.2, 0.1, np.sqrt(1 - 0.05)))
+    measured = covered.copy()
+    measured[10:30, 10:30] = False
+    shown = filled(np.where(measured[..., None], relief, (1.0, 0.0, 1e-3)), measured)
+    np.testing.assert_allclose(shown, relief, atol=1e-4)
+    world = np.where(measured[..., None], from_tangent(relief, axes), (0.0, -1.0, 0.0))
+    old = to_tangent(world, axes, covered)
+    assert old[20, 20, 2] < 0.5
+
+
+def test_where_nothing_was_measured_the_surface_is_smooth():
+    shown = filled(np.full((8, 8, 3), np.nan), np.zeros((8, 8), bool))
+    np.testing.assert_array_equal(shown, np.broadcast_to([0, 0, 1], (8, 8, 3)))
