@@ -1,8 +1,9 @@
 .DEFAULT_GOAL := help
 SKINRIG := .venv/bin/skinrig
 PYTEST := .venv/bin/python -m pytest
-# a process for each core, four at most: kernels use several threads as well; one that ends ends all
-WORKERS := -n auto --maxprocesses 4 --dist loadfile --max-worker-restart 0
+# a process for each core, four at most: kernels use several threads as well; one that ends ends all;
+# files in the order of tests/conftest.py, the longest first, not that of how many tests they have
+WORKERS := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .PHONY: help setup browser demo test test-long lint bench clean
 

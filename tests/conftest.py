@@ -12,9 +12,45 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import pytest
 
+ROOT = Path(__file__).parents[1]
+LONGEST_FIRST = (
+    "tests/recovery/test_dome_rig.py",
+    "tests/system/test_demo.py",
+    "tests/browser/test_controls_hands.py",
+    "tests/browser/test_accessibility.py",
+    "tests/browser/test_viewer_pages.py",
+    "tests/system/test_tour.py",
+    "tests/benchmarks/test_benchmarks.py",
+    "tests/radiometry/test_dome_session.py",
+    "tests/radiometry/test_flash_lateral_reference.py",
+    "tests/recovery/test_gradient_stages.py",
+    "tests/faults/test_damage.py",
+    "tests/recovery/test_held_out_photographs.py",
+    "tests/recovery/test_flash_rig.py",
+    "tests/recovery/test_dome_stages.py",
+    "tests/recovery/test_subsurface_inversion.py",
+    "tests/recovery/test_facial_color_fit.py",
+    "tests/protocol/test_fuzz.py",
+    "tests/faults/test_caliper_stateful.py",
+    "tests/faults/test_dome_stateful.py",
+    "tests/faults/test_wire_stateful.py",
+    "tests/unit/rigsim/test_tissue_mc_skin_table.py",
+    "tests/unit/reconstruction/test_kernel_fit.py",
+)
+"""Files that take 20 s and more, the longest first. One process runs a file from end to end, so one
+of these taken up last would leave the other processes without work."""
+
 
 def pytest_addoption(parser):
     parser.addoption("--device-port", default=None, help="serial URL of a real box")
+
+
+def pytest_collection_modifyitems(items):
+    missing = [name for name in LONGEST_FIRST if not (ROOT / name).is_file()]
+    if missing:
+        raise pytest.UsageError(f"tests/conftest.py: LONGEST_FIRST: no file {', '.join(missing)}")
+    rank = {ROOT / name: number for number, name in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
 
 
 @pytest.fixture
