@@ -23,6 +23,7 @@ from reconstruction import (
     photometric_stereo,
     scan_mesh,
     stages,
+    surface_errors,
 )
 from reconstruction import surface_estimates as estimates
 from reconstruction.calibrated_dome import Dome, apart, calibrated
@@ -38,7 +39,7 @@ from reconstruction.scan_mesh import RefinedScan
 from reconstruction.surface_estimates import PointValues
 from reconstruction.surface_texture import SurfaceTexture
 
-REVISION = 1
+REVISION = 2
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
 RANK: Final = 4
@@ -151,9 +152,10 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
               lambda lumitexels, texture: _half_vectors(dome, lumitexels, texture)),
         stage("normals", ("surface", "lumitexels", "texture"), ("point_normals", "normals"),
               lambda surface, lumitexels, texture: _normals(dome, surface, lumitexels, texture)),
-        stage("albedo", ("lumitexels", "point_normals", "texture"), ("point_r_d", "r_d"),
-              lambda lumitexels, point_normals, texture: _albedo(
-                  dome, lumitexels, point_normals, texture), unscaled),
+        stage("albedo", ("surface", "lumitexels", "point_normals", "texture"),
+              ("point_r_d", "r_d"),
+              lambda surface, lumitexels, point_normals, texture: _albedo(
+                  dome, surface, lumitexels, point_normals, texture), unscaled),
         stage("lobes", ("lumitexels", "point_normals", "point_r_d"),
               ("basis", "weights", "basis_file"),
               lambda lumitexels, point_normals, point_r_d: _lobes(
@@ -302,12 +304,16 @@ def _normals(
         lambda part, samples: estimates.normals_from_shading(samples, surface.normals[part]),
         progress=partial(dome.tell, "normals"),
     )
-    found = estimates.with_misplacement(found, surface, dome.pixel_mm)
+    found = surface_errors.of_normals(found, surface, dome.pixel_mm)
     return {"point_normals": found, "normals": texture.normals(found, "world frame")}
 
 
 def _albedo(
-    dome: Dome, lumitexels: Samples, point_normals: PointValues, texture: SurfaceTexture
+    dome: Dome,
+    surface: RefinedScan,
+    lumitexels: Samples,
+    point_normals: PointValues,
+    texture: SurfaceTexture,
 ) -> Mapping[str, Any]:
     good = point_normals.valid
     typical = float(np.median(point_normals.stderr[good, 0])) if good.any() else 0.02
@@ -316,10 +322,10 @@ def _albedo(
             samples,
             estimates.part_of(point_normals, part),
             stderr_rad=typical,
-            pixel_mm=dome.pixel_mm,
         ),
         progress=partial(dome.tell, "albedo"),
     )
+    found = surface_errors.of_albedo(found, surface, dome.pixel_mm)
     return {
         "point_r_d": found,
         "r_d": texture.map(
@@ -469,5 +475,5 @@ def _refined(
     maps["lobe_residual"] = texture.map(
         fitted.values[:, rank], None, fitted.valid, "1/sr", "weighted RMS of samples - model"
     )
-    found = estimates.with_misplacement(found, surface, dome.pixel_mm)
+    found = surface_errors.of_normals(found, surface, dome.pixel_mm)
     return {"normals_refined": texture.normals(found, "by the whole model, world frame"), **maps}

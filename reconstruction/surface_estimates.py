@@ -22,7 +22,6 @@ from reconstruction import (
 )
 from reconstruction.lumitexel_store import LumitexelStore
 from reconstruction.lumitexels import Lumitexels
-from reconstruction.scan_mesh import RefinedScan
 
 CHUNK_SAMPLES: Final = 3_000_000
 """Samples of a chunk; about 60 bytes each."""
@@ -32,6 +31,8 @@ LEAST_VIEWS: Final = 2
 LEAST_COS_LIGHT: Final = 0.15
 LEAST_COS_VIEW: Final = 0.2
 """Normals are not estimated from flatter samples: the boundary's transmittance bends there."""
+GRAZING_COS: Final = 0.05
+"""Light lower than this over the estimated surface is as good as none."""
 HIGHLIGHT_RAD: Final = np.radians(35.0)
 """Samples whose half vector lies nearer to the normal hold too much of the highlight: skin's
 facets have a Beckmann slope of about 0.3 (Weyrich et al. 2005), of which 98 % lie below this."""
@@ -41,18 +42,8 @@ LOBE_ERROR: Final = 0.1
 """Relative error of a fitted lobe, for the weight of samples in it."""
 LOBE_TILT_RAD: Final = np.radians(0.3)
 """Standard error, in each direction, of normals by highlights: lobes are known no better."""
-MISPLACED_PX: Final = 0.27
-"""Standard deviation of where a sample is on the surface, over the size of a pixel."""
-UNRESOLVED_RAD: Final = np.radians(0.27)
-"""Standard deviation, in each direction, of relief that is too fine for the points."""
-UNRESOLVED_R_D_PER_MM: Final = 0.017
-"""Relative deviation of albedo that is too fine for the points, by the size of a pixel."""
 R_D_BY_NORMAL: Final = 0.5
-"""Relative error of the albedo by that of the normal, 1/rad: lights all around leave so much.
-
-These four are what brings intervals to their nominal coverage on simulated faces of seeds 0 to 2,
-seen at 2.1 mm a pixel; see docs/decisions.
-"""
+"""Relative error of the albedo by that of the normal, 1/rad: lights all around leave so much."""
 
 Double = NDArray[np.float64]
 
@@ -208,9 +199,38 @@ def _of_normals(
     )
 
 
-def albedo(
-    samples: Lumitexels, normals: PointValues, *, stderr_rad: float, pixel_mm: float = 0.0
-) -> PointValues:
+def at_normals(samples: Lumitexels, normals: PointValues) -> Lumitexels:
+    """Return samples whose f_r is that of a surface with these normals, and not of the scan's.
+
+    A sample's radiance was divided by the cosine at the scan's normal, degrees off the true one:
+    by the cosine that the light had, f_r does not change with the light as 1 / cos does.
+
+    Parameters
+    ----------
+    samples
+        Of P points.
+    normals
+        Of the same points; samples of those not valid, and of light below `GRAZING_COS`, are not
+        valid.
+    """
+    cos_light, cos_view = (
+        np.einsum("pmk,pk->pm", way, normals.values.astype(np.float32))
+        for way in (samples.light_dir, samples.view_dir)
+    )
+    good = samples.valid & normals.valid[:, None] & (cos_light > GRAZING_COS)
+    ratio = np.where(good, samples.cos_light / np.maximum(cos_light, GRAZING_COS), 0.0)[..., None]
+    return dataclasses.replace(
+        samples,
+        f=samples.f * ratio,
+        variance=np.where(good[..., None], samples.variance, np.inf)
+        * np.where(good[..., None], np.square(ratio), 1.0),
+        cos_light=np.where(good, cos_light, samples.cos_light),
+        cos_view=np.where(good, cos_view, samples.cos_view),
+        valid=good,
+    )
+
+
+def albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> PointValues:
     """Return R_d of three channels by eq. (6) of Weyrich et al. 2005, see `diffuse_albedo`.
 
     Parameters
@@ -221,9 +241,13 @@ def albedo(
         Of the same points.
     stderr_rad
         Typical standard error of the normals.
-    pixel_mm
-        Size of an image's pixel on the subject: finer albedo is averaged.
+
+    Notes
+    -----
+    The standard errors hold noise and the normals' error, and no albedo finer than an image's
+    pixel: see `surface_errors.of_albedo`.
     """
+    samples = at_normals(samples, normals)
     found = diffuse_albedo.estimate(
         samples.f, samples.light_dir, samples.view_dir,
         np.where(normals.valid[:, None], normals.values, np.nan).astype(np.float32),
@@ -232,8 +256,7 @@ def albedo(
     )  # fmt: skip
     good = found.valid & normals.valid & np.isfinite(found.stderr).all(axis=-1)
     keep = good[:, None]
-    model = np.hypot(UNRESOLVED_R_D_PER_MM * pixel_mm, R_D_BY_NORMAL * normals.stderr[:, :1])
-    spread = np.hypot(found.stderr, model * np.abs(found.r_d))
+    spread = np.hypot(found.stderr, R_D_BY_NORMAL * normals.stderr[:, :1] * np.abs(found.r_d))
     return PointValues(np.where(keep, found.r_d, 0.0), np.where(keep, spread, 0.0), good)
 
 
@@ -241,6 +264,7 @@ def surface_samples(
     samples: Lumitexels, normals: PointValues, r_d: PointValues
 ) -> brdf_basis.SurfaceSamples:
     """Return what is left of the samples when the light from inside is taken off."""
+    samples = at_normals(samples, normals)
     return brdf_basis.surface_samples(
         samples.f, samples.light_dir, samples.view_dir,
         np.where(normals.valid[:, None], normals.values, (0.0, 0.0, 1.0)),
@@ -290,6 +314,7 @@ def normals_from_remainder(
         The reduced basis.
     """
     known = normals.valid & r_d.valid
+    samples = at_normals(samples, normals)
     lobes = mixture_kernels.evaluate(
         basis.table,
         np.where(known[:, None], weights, 0.0),
@@ -379,34 +404,3 @@ def rows_of(samples: Lumitexels, rows: NDArray[np.integer]) -> Lumitexels:
             )
         },
     )  # fmt: skip
-
-
-def with_misplacement(normals: PointValues, surface: RefinedScan, pixel_mm: float) -> PointValues:
-    """Add to the standard errors of normals what misplaced samples do to them.
-
-    Parameters
-    ----------
-    normals
-        At the surface's points.
-    surface
-        With its triangles: they say how fast the normals turn.
-    pixel_mm
-        Size of an image's pixel on the subject: scan, registration and cameras together place a
-        sample within about `MISPLACED_PX` of it, and within it normals are averaged.
-    """
-    edges = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]]])
-    edges = edges[normals.valid[edges].all(axis=1)]
-    turn = np.linalg.norm(normals.values[edges[:, 0]] - normals.values[edges[:, 1]], axis=1)
-    apart = np.linalg.norm(
-        surface.points_mm[edges[:, 0]] - surface.points_mm[edges[:, 1]], axis=1
-    ).astype(np.float64)
-    squared = np.square(turn / np.maximum(apart, 0.25 * pixel_mm))
-    total = np.zeros(len(normals.valid))
-    count = np.zeros(len(normals.valid))
-    for side in (0, 1):
-        np.add.at(total, edges[:, side], squared)
-        np.add.at(count, edges[:, side], 1.0)
-    bend = np.sqrt(total / np.maximum(count, 1.0))  # rad/mm
-    spread = np.hypot(MISPLACED_PX * pixel_mm * bend, UNRESOLVED_RAD)
-    stderr = np.hypot(normals.stderr, spread[:, None])
-    return PointValues(normals.values, np.where(normals.valid[:, None], stderr, 0.0), normals.valid)

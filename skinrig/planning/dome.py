@@ -19,7 +19,7 @@ from capture.plan import Plan
 from capture.plan.dome import EXPOSURES_S, dome_plan
 from capture.plan.rows import lights_of
 from capture.rig import Rig
-from reconstruction import light_selection, surface_estimates
+from reconstruction import light_selection, surface_errors, surface_estimates
 from reconstruction.light_selection import Prediction
 from skinrig.planning.dome_sight import Sight, sight
 from skinrig.planning.plans import Choice, Forecast, PlanningError, light_of
@@ -228,7 +228,7 @@ def _r_d_error(prediction: Prediction, look: Sight) -> float:
         return math.inf
     sigma = np.sqrt(
         prediction.log_albedo**2
-        + (surface_estimates.UNRESOLVED_R_D_PER_MM * look.pixel_mm) ** 2
+        + (surface_errors.UNRESOLVED_R_D_PER_MM * look.pixel_mm) ** 2
         + (surface_estimates.R_D_BY_NORMAL * prediction.tilt_rad) ** 2
     )
     return 0.6745 * float(np.median(sigma[prediction.valid]))  # median of a normal's magnitude

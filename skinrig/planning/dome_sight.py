@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from capture.plan.dome import EXPOSURES_S
 from capture.rig import Rig
-from reconstruction import light_selection, surface_estimates
+from reconstruction import light_selection, surface_errors, surface_estimates
 from reconstruction.light_selection import Information
 
 Floats = NDArray[np.float64]
@@ -120,8 +120,8 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
         seen,
         np.ones(len(place)),
         np.hypot(
-            surface_estimates.MISPLACED_PX * pixel * _bend(face, drawn, pixel),
-            surface_estimates.UNRESOLVED_RAD,
+            surface_errors.MISPLACED_PX * pixel * _bend(face, drawn, pixel),
+            surface_errors.UNRESOLVED_RAD,
         ),
         pixel,
     )

@@ -92,12 +92,13 @@ NOT_DRIVEN = {
                 "reconstruction.rig_transfer": "carried",
                 "reconstruction.scan_registration": "align photometric_normals register",
                 "reconstruction.strain": "measure_strain",
+                "reconstruction.surface_errors": "change_per_mm of_albedo of_normals",
                 "reconstruction.surface_estimates": (
-                    "albedo chunk_points collect lobe_weights "
+                    "albedo at_normals chunk_points collect lobe_weights "
                     "normals_from_all_light normals_from_half_vectors "
                     "normals_from_remainder normals_from_shading part_of "
                     "rows_of sample_counts seen_enough surface_samples "
-                    "transmitted with_misplacement"
+                    "transmitted"
                 ),
             },
         ),

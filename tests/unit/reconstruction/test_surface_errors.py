@@ -1,0 +1,163 @@
+"""Errors that a point's neighbors tell of: samples beside their place, detail within a pixel."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from reconstruction import surface_errors
+from reconstruction.mesh_repair import RepairReport, TriangleMesh
+from reconstruction.scan_mesh import RefinedScan
+from reconstruction.surface_estimates import PointValues
+
+
+def assert_clean(found):
+    assert np.isfinite(found.values).all()
+    assert np.isfinite(found.stderr).all()
+    assert not found.values[~found.valid].any()
+
+
+def sheet(height, side=21, step=2.0):
+    """A surface z = height(x, y) over a square, with the normals of its own triangles' middle."""
+    line = (np.arange(side) - side // 2) * step
+    x, y = np.meshgrid(line, line)
+    z, dx, dy = height(x, y)
+    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    normals = np.stack([-dx, -dy, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    at = np.arange(side * side).reshape(side, side)
+    a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, :-1], at[1:, 1:]
+    faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, d), (a, d, c))]).astype(
+        np.int32
+    )
+    uv = (points[:, :2] / (line[-1] * 2) + 0.5).astype(np.float32)[faces]
+    mesh = TriangleMesh(points, faces.astype(np.int64), uv.astype(np.float64))
+    return RefinedScan(
+        points.astype(np.float32), normals.astype(np.float32), faces, uv, mesh, REPORT
+    )
+
+
+REPORT = RepairReport(**{f.name: 0 for f in dataclasses.fields(RepairReport)})
+
+
+def flat(x, y):
+    return 0.0 * x, 0.0 * x, 0.0 * x
+
+
+def ball(radius):
+    def height(x, y):
+        z = np.sqrt(radius**2 - x * x - y * y)
+        return z, -x / z, -y / z
+
+    return height
+
+
+def plain(surface, stderr=0.0):
+    count = len(surface.points_mm)
+    return PointValues(
+        surface.normals.astype(np.float64), np.full((count, 3), stderr), np.ones(count, bool)
+    )
+
+
+def test_a_planes_normals_get_no_error_from_misplaced_samples_but_the_finest_relief():
+    surface = sheet(flat)
+    found = surface_errors.of_normals(plain(surface), surface, 3.0)
+    np.testing.assert_allclose(found.stderr, surface_errors.UNRESOLVED_RAD, rtol=1e-6)
+    coarse = surface_errors.of_normals(plain(surface), surface, 30.0)
+    np.testing.assert_allclose(coarse.stderr, surface_errors.UNRESOLVED_RAD, rtol=1e-6)
+
+
+def test_the_error_of_misplaced_samples_is_curvature_times_misplacement():
+    """On a ball of radius R normals turn by 1 / R a millimetre in every direction."""
+    pixel = 2.0
+    for radius in (40.0, 80.0, 160.0):
+        surface = sheet(ball(radius), step=1.0)
+        found = surface_errors.of_normals(plain(surface, 0.001), surface, pixel)
+        turn = surface_errors.MISPLACED_PX * pixel / radius
+        expected = np.sqrt(0.001**2 + surface_errors.UNRESOLVED_RAD**2 + turn**2)
+        np.testing.assert_allclose(found.stderr, expected, rtol=0.01)
+
+
+def test_errors_of_normals_without_neighbours_stay_finite():
+    surface = sheet(ball(60.0))
+    normals = plain(surface)
+    here = np.arange(len(normals.valid)) == 200
+    alone = PointValues(here[:, None] * normals.values, here[:, None] * normals.stderr, here)
+    found = surface_errors.of_normals(alone, surface, 3.0)
+    assert_clean(found)
+    assert np.count_nonzero(found.stderr.any(axis=1)) == 1
+    none = dataclasses.replace(normals, valid=np.zeros(len(normals.valid), bool))
+    assert not surface_errors.of_normals(none, surface, 3.0).stderr.any()
+
+
+def skin_like(rng, side, roughness):
+    """Albedo of 0.3 with a spectrum that falls as that of skin, 1 texel a quarter of a pixel."""
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
+    frequency[0, 0] = np.inf
+    field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((side, side))) / frequency**1.2).real
+    return 0.3 * (1.0 + roughness * field / field.std())
+
+
+def seen_and_true(rng, roughness):
+    """What pixels of 4 x 4 texels show, each a little beside its place, and the truth there."""
+    side = 20
+    fine = skin_like(rng, 4 * side + 16, roughness)
+    # light falls into a pixel's neighbors, too
+    blur = np.exp(-0.5 * (np.arange(-8, 9) / 3.0) ** 2)
+    blur /= blur.sum()
+    fine_seen = fine
+    for axis in (0, 1):
+        fine_seen = np.apply_along_axis(np.convolve, axis, fine_seen, blur, "same")
+    rows, columns = np.meshgrid(np.arange(side) * 4 + 8, np.arange(side) * 4 + 8, indexing="ij")
+    off = np.rint(rng.normal(scale=4 * surface_errors.MISPLACED_PX, size=(2, side, side)))
+    off = off.astype(int)
+    return fine_seen[rows + off[0], columns + off[1]].ravel(), fine[rows, columns].ravel()
+
+
+@pytest.mark.parametrize("roughness", [0.02, 0.1, 0.3])
+def test_errors_of_albedo_are_as_large_as_its_own_detail_makes_them(roughness):
+    """68 % intervals over 12 patches: each level of detail has a share of its own, 0.60 to 0.80.
+
+    Nothing else tells them apart: a constant that suits one is 15 times off for another.
+    """
+    rng = np.random.default_rng(11)
+    surface = sheet(flat, side=20)
+    inside, halved = [], []
+    for _ in range(12):
+        seen, true = seen_and_true(rng, roughness)
+        values = np.tile(seen[:, None], (1, 3))
+        found = surface_errors.of_albedo(
+            PointValues(values, np.full(values.shape, 1e-5), np.ones(len(seen), bool)), surface, 2.0
+        )
+        error = np.abs(seen - true)
+        inside.append(np.mean(error <= found.stderr[:, 0]))
+        halved.append(np.mean(error <= 0.5 * found.stderr[:, 0]))
+    assert 0.60 < np.mean(inside) < 0.80
+    # it can fail: intervals of half the width are found out
+    assert np.mean(halved) < 0.55
+
+
+def test_noise_is_no_detail_of_the_albedo():
+    rng = np.random.default_rng(5)
+    surface = sheet(flat)
+    noisy = 0.3 + 0.01 * rng.standard_normal((len(surface.points_mm), 3))
+    good = np.ones(len(noisy), bool)
+    told = surface_errors.of_albedo(
+        PointValues(noisy, np.full(noisy.shape, 0.01), good), surface, 2.0
+    )
+    # what is left after the noise is taken off scatters about nothing
+    assert np.median(told.stderr) < 0.014
+    untold = surface_errors.of_albedo(
+        PointValues(noisy, np.full(noisy.shape, 1e-6), good), surface, 2.0
+    )
+    assert np.median(untold.stderr) > 0.015
+
+
+def test_even_albedo_keeps_the_error_of_its_noise():
+    surface = sheet(ball(60.0))
+    count = len(surface.points_mm)
+    even = PointValues(np.full((count, 3), 0.3), np.full((count, 3), 0.002), np.ones(count, bool))
+    found = surface_errors.of_albedo(even, surface, 2.0)
+    np.testing.assert_allclose(found.stderr, 0.002, rtol=1e-6)
+    none = dataclasses.replace(even, valid=np.zeros(count, bool))
+    assert not surface_errors.of_albedo(none, surface, 2.0).stderr.any()
