@@ -344,6 +344,9 @@ class View:
     """Read noise, electrons rms, >= 0."""
     shutter_lag_s: float = 0.0
     """Time from the trigger's edge until the shutter is fully open, s, >= 0."""
+    focus_mm: float | None = None
+    """Distance from the centre of projection to the plane in focus, mm, > 0; None: that of the
+    target."""
 
     def __post_init__(self) -> None:
         checks = Checks(f"View {self.name!r}", RigError)
@@ -361,6 +364,8 @@ class View:
             f_number=self.f_number,
             full_well_e=self.full_well_e,
         )
+        if self.focus_mm is not None:
+            checks.positive(focus_mm=self.focus_mm)
         step = 1 if self.cfa == "MONO" else 2
         for field in ("width_px", "height_px"):
             size = getattr(self, field)
@@ -393,6 +398,11 @@ class View:
     def distance_mm(self) -> float:
         """Distance from camera to target, mm."""
         return _norm(_minus(self.position_mm, self.target_mm))
+
+    @property
+    def focus_distance_mm(self) -> float:
+        """Distance from the centre of projection to the plane in focus, mm."""
+        return self.distance_mm if self.focus_mm is None else self.focus_mm
 
     @property
     def field_mm(self) -> tuple[float, float]:

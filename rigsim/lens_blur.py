@@ -121,7 +121,7 @@ class Lens:
 
 
 def lens_of(view: View, illuminant: str) -> Lens:
-    """Return the lens of a view whose target is in focus.
+    """Return the lens of a view, focused as the view says.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def lens_of(view: View, illuminant: str) -> Lens:
     >>> round(lens.working_f_number, 2), round(lens.cutoff_period_um, 1)
     (30.67, 17.9)
     """
-    magnification = view.focal_mm / view.distance_mm
+    magnification = view.focal_mm / view.focus_distance_mm
     wavelength = spectra.WAVELENGTH_NM
     signal = spectra.camera_sensitivity(view.spectral_sensitivity).mean(axis=1)
     signal = np.maximum(signal * spectra.illuminant(illuminant), 0.0)
@@ -151,7 +151,7 @@ def lens_of(view: View, illuminant: str) -> Lens:
     nodes = np.interp((np.arange(WAVELENGTHS) + 0.5) / WAVELENGTHS, share, wavelength)
     return Lens(
         view.f_number * (1.0 + magnification),
-        view.distance_mm,
+        view.focus_distance_mm,
         magnification,
         view.pixel_um,
         tuple(float(node) for node in nodes),

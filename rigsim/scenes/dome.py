@@ -27,18 +27,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from capture.rig import Light, Rig, RigError, View
 from model import spectra
-from model.skin import UNITS, SkinAppearance, SkinMap
+from model.skin import SkinAppearance
 from rigsim import skin_conditions, surface_brdf
 from rigsim.atlas import sample, spread, unwrap
 from rigsim.dome_build import BuiltDome
 from rigsim.head_motion import HeadMotion
 from rigsim.led_light import lobe_exponent, white_intensity
 from rigsim.mesh import Float32Array
-from rigsim.render import Caster, GBuffer
+from rigsim.render import Caster
 from rigsim.scene_needs import Noise, SceneNeeds
-from rigsim.scenes import flash_needs, olat
+from rigsim.scenes import dome_truth, dome_views, flash_needs, olat
 from rigsim.scenes.dome_needs import dome_needs, noise_of
-from rigsim.scenes.flash_needs import BOUNCES, LATERAL, SPECTRAL
+from rigsim.scenes.flash_needs import BOUNCES, LATERAL, LENS, SPECTRAL
 from rigsim.scenes.olat import Hits, Lamp
 from rigsim.scenes.olat_vector import VectorLight
 from rigsim.sensor import Sensor, expose, sensor_of
@@ -54,9 +54,6 @@ Float16Array = NDArray[np.float16]
 POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of an LED's energy from pulse to pulse."""
 
-HAIR_LIMIT: Final = 0.02
-"""Pixels with more hair than this part are not skin."""
-
 KEPT_FRAMES: Final = 16
 KEPT_BYTES: Final = 2**28
 """Latest frames that are kept, the more of the two, so that a second exposure costs nothing."""
@@ -67,10 +64,6 @@ other for many lights."""
 
 HALF_RANGE: Final = 1000.0
 """Its greatest value where it is kept with 11 bits, which resolve 1e-10 of that."""
-
-
-COATING: Final = ("film", "film_alpha", "film_eta", "powder")
-"""Names of the maps of a coating, in the order of `rigsim.surface_brdf.SkinSurface.packed`."""
 
 
 class SceneError(ValueError):
@@ -131,6 +124,8 @@ class DomeScene:
         Whether light that went from skin to skin is reflected wavelength by wavelength.
     last_bounce
         Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
+    optics
+        Whether lenses blur what is out of focus, and diffract; ``None`` decides as above.
     subpixels
         Rays along each side of a pixel.
     choice
@@ -153,6 +148,7 @@ class DomeScene:
         subsurface: bool | None = None,
         spectral: bool | None = None,
         last_bounce: float | None = None,
+        optics: bool | None = None,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
     ) -> None:
@@ -210,12 +206,15 @@ class DomeScene:
             subsurface=subsurface,
             interreflections=interreflections,
             spectral=spectral,
+            optics=optics,
+            subpixels=subpixels,
         )
         """What is built, what is not, and why."""
         self.interreflections = self.needs.builds(BOUNCES)
         summed = flash_needs.last_bounce(self.needs[BOUNCES].over_noise or 0.0)
         self._last_bounce = summed if last_bounce is None else last_bounce
         self.subsurface = self.needs.builds(LATERAL)
+        self.optics = self.needs.builds(LENS)
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
@@ -344,27 +343,8 @@ class DomeScene:
             A target stands there; only faces have these maps.
         """
         self._face()
-        view = self._view(view_name)
-        hits, _ = self._seen(view, 0.0)
-        surface = olat.unpack_surface(hits.surface)
-        normals = _unit(hits.scatter(hits.normals()))
-        maps = hits.scatter(surface)
-        hair = hits.scatter(1.0 - surface[:, 6:7])[..., 0]
-        coverage = hits.coverage()
-        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
-        coating = dict(zip(COATING, np.moveaxis(maps, -1, 0)[7:], strict=False))
-        return {
-            **coating,
-            "r_d": maps[..., :3],
-            "normals": normals,
-            "position_mm": hits.scatter(hits.position_mm),
-            "roughness": maps[..., 3],
-            "oil": maps[..., 4],
-            "fuzz": maps[..., 5],
-            "uv": hits.scatter(uv),
-            "hair": hair,
-            "mask": (coverage > 1.0 - 1e-6) & (hair < HAIR_LIMIT),
-        }
+        hits, _ = self._seen(self._view(view_name), 0.0)
+        return dome_truth.maps_of(hits)
 
     def truth_appearance(self, view_name: str | None = None) -> SkinAppearance:
         """Return the truth on the face's own texture, at time 0.
@@ -385,49 +365,10 @@ class DomeScene:
             ``position_at_rest``, of one under conditions its coating (`Coating`); valid on bare
             skin. All is that of the skin under its conditions.
         """
-        subject = self._face()
-        surface = self.surface(self._view(view_name))
-        valid = subject.atlas.covered & (subject.hair < HAIR_LIMIT)
-        floor = np.zeros(valid.shape, np.float32)
-        floor[valid] = surface_brdf.surface_floor(surface.packed()[valid])
-        white = "camera RGB over that of a perfect white, without hair"
-        maps = {
-            "position": (subject.atlas.position_mm, UNITS["position"], "rig frame"),
-            "normals": (surface.normal, UNITS["normals"], "rig frame, with relief"),
-            "r_d": (surface.r_d, "1", f"factor of the diffuse term, {white}"),
-            "r_d_floor": (floor, "1", "least surface term in the unit of r_d, within 70 degrees"),
-            "reflectance": (surface.reflectance, "1", f"at normal incidence, {white}"),
-            "roughness": (surface.roughness, UNITS["roughness"], "Beckmann, skin below the oil"),
-            "oil": (surface.oil, "1", "share covered by oil, GGX of half the roughness"),
-            "fuzz": (surface.fuzz, "1", "optical depth of vellus hair"),
-            "normals_tangent": (
-                subject.tangent_normal(),
-                "1",
-                "texture frame, relief and wrinkles: +x along u, +y along v, +z off the mesh",
-            ),
-        }
-        if surface.coating is not None:
-            on = surface.coating
-            maps |= {
-                "film": (on.film, "1", "share of the surface under a film"),
-                "film_alpha": (on.film_alpha, "1", "GGX alpha of the film"),
-                "film_eta": (on.film_eta, "1", "refractive index of the film"),
-                "powder": (on.powder, "1", "share of the surface under grains"),
-            }
-        if subject.rest is not None:
-            where = "rig frame, the same skin before it moved"
-            maps["position_at_rest"] = (subject.rest.atlas.position_mm, "mm", where)
-        return SkinAppearance(
-            {
-                name: SkinMap(values, unit, valid=valid, description=text)
-                for name, (values, unit, text) in maps.items()
-            },
-            "simulated",
-            parameters={
-                "preset": subject.preset,
-                "subject_seed": subject.seed,
-                "conditions": dict(self.conditions),
-            },
+        return dome_truth.appearance_of(
+            self._face(),
+            self.surface(self._view(view_name)),
+            conditions=self.conditions,
             left_out=tuple(self.left_out),
             seed=self.seed,
         )
@@ -463,7 +404,9 @@ class DomeScene:
         texture = self._texture(self._view(view_name))
         points = np.atleast_2d(np.asarray(uv, np.float32))
         values = sample(texture, points, np.ones(len(points), np.bool_))
-        return surface_brdf.evaluate(values[:, :-3], _unit(values[:, -3:]), to_light, to_camera)
+        return surface_brdf.evaluate(
+            values[:, :-3], dome_views.unit(values[:, -3:]), to_light, to_camera
+        )
 
     # inside -----------------------------------------------------------------------------------
 
@@ -604,8 +547,13 @@ class DomeScene:
             target_mm=_vector((np.asarray(view.target_mm) - shift) @ rotation),
             up=_vector(np.asarray(view.up) @ rotation),
         )
+        how = dome_views.Looking(
+            self.subpixels, self.dome.distortion.get(view.name), self._illuminant, self.optics
+        )
         if isinstance(self.subject, Target):
-            return self._look_at_target(moved, self.subject), self._caster
+            if self.subject.kind == "source":
+                raise SceneError(f"target {self.subject.name!r}: shines itself, no dome holds it")
+            return dome_views.at_target(self._caster, moved, self.subject, how), self._caster
         caster = self._caster
         amount = 0.0 if self.motion is None else self.motion.twitch(t_s)
         texture = self._texture(view)
@@ -615,56 +563,12 @@ class DomeScene:
             # The relief turns with the surface below it.
             turned = spread(unwrap(mesh, atlas.size).normal - atlas.normal, atlas.covered)
             texture = np.concatenate([texture[..., :-3], texture[..., -3:] + turned], axis=-1)
-
-        def look_up(buffers: GBuffer, rows: NDArray[np.int32]) -> tuple[Float32Array, Float32Array]:
-            uv = buffers.uv.reshape(-1, 2)[rows]
-            values = sample(texture, uv, np.ones(len(rows), np.bool_))
-            return _unit(values[:, -3:]), np.maximum(values[:, :-3], 0.0)
-
-        hits = olat.find_hits(
-            caster,
-            moved,
-            look_up,
-            subpixels=self.subpixels,
-            distortion=self.dome.distortion.get(view.name),
-        )
-        return hits, caster
-
-    def _look_at_target(self, view: View, target: Target) -> Hits:
-        if target.kind == "source":
-            raise SceneError(f"target {target.name!r}: shines itself, it has no place in the dome")
-        metal = target.kind == "metal"
-        rgb = target.rgb(view.spectral_sensitivity, self._illuminant)
-
-        def look_up(buffers: GBuffer, rows: NDArray[np.int32]) -> tuple[Float32Array, Float32Array]:
-            uv = buffers.uv.reshape(-1, 2)[rows]
-            surface = np.zeros((len(rows), 7), np.float32)
-            size = rgb.shape[0]
-            column = np.clip((uv[:, 0] * size).astype(np.int64), 0, size - 1)
-            row = np.clip(((1.0 - uv[:, 1]) * size).astype(np.int64), 0, size - 1)
-            surface[:, :3] = rgb[row, column]
-            surface[:, 3] = target.alpha
-            return buffers.normal.reshape(-1, 3)[rows], surface
-
-        kind = olat.METAL if metal else olat.MATT
-        return olat.find_hits(
-            self._caster,
-            view,
-            look_up,
-            subpixels=self.subpixels,
-            kind=kind,
-            distortion=self.dome.distortion.get(view.name),
-        )
+        return dome_views.at_skin(caster, moved, texture, how), caster
 
 
 def _toward_origin(light: Light) -> NDArray[np.float64]:
     place = np.asarray(light.position_mm, np.float64)
     return np.asarray(-place / np.linalg.norm(place))
-
-
-def _unit(vectors: Float32Array) -> Float32Array:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(length, np.float32(1e-6)), np.float32)
 
 
 def _vector(values: NDArray[np.float64]) -> tuple[float, float, float]:

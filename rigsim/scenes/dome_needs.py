@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from capture.rig import Rig, View
-from rigsim.effect_sizes import bounced, defocus_px, edge_loss, exchange_share
+from rigsim.effect_sizes import bounced, edge_loss, exchange_share
 from rigsim.head_motion import HeadMotion
 from rigsim.render import Caster
 from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
 from rigsim.scenes.flash_needs import (
     BOUNCES,
+    FAR_LIGHT,
     LATERAL,
     SHADOWS,
     SPECTRAL,
@@ -18,14 +19,12 @@ from rigsim.scenes.flash_needs import (
     brightest_reflectance,
     color_error,
     further_bounces,
+    lens,
     polarization,
 )
 from rigsim.scenes.skin_glow import typical_kernels
 from rigsim.subject import Subject
 from rigsim.targets import Target
-
-OFF_FOCUS_MM = 60.0
-"""How far a face's relief stands off the plane in focus."""
 
 
 def dome_needs(
@@ -40,6 +39,8 @@ def dome_needs(
     subsurface: bool | None,
     interreflections: bool | None,
     spectral: bool | None,
+    optics: bool | None,
+    subpixels: int,
 ) -> SceneNeeds:
     """Decide what a scene in the dome builds.
 
@@ -55,8 +56,10 @@ def dome_needs(
         Of the sensors. Exposures are not known here: the brightest pixel is taken as full.
     movement, motion
         Whether the face moves with its state, and how the head does.
-    subsurface, interreflections, spectral
+    subsurface, interreflections, spectral, optics
         What is asked for; None lets the sizes decide.
+    subpixels
+        Rays along each side of a pixel.
     """
     view = rig.views[0]
     made = [polarization(rig, view), bands(view)]
@@ -64,13 +67,14 @@ def dome_needs(
         ("ambient light", "the room is dark"),
         ("light from the dome's frame and from other LEDs' lenses", "they are black"),
     ]
+    illuminant = rig.lights[0].illuminant
+    focus = lens(view, illuminant, caster, noise, 1.0, subpixels, optics)
     if isinstance(subject, Target):
         size = 0.0 if exchange_share(caster) == 0.0 else float("inf")
         because = "the target is flat" if size == 0.0 else "the target has hollows"
         flat = decide(BOUNCES, size, None, switch="interreflections", because=because)
         opaque = [(LATERAL, f"{subject.name} is opaque")]
-        return SceneNeeds((*made, flat, *absent([*opaque, *world])))
-    illuminant = rig.lights[0].illuminant
+        return SceneNeeds((*made, flat, focus, *absent([*opaque, *world]), *unmodeled(FAR_LIGHT)))
     brightest = brightest_reflectance(subject, state, view, illuminant)
     pixel_mm = view.distance_mm / view.focal_px
     kernels = typical_kernels(subject, state, view.spectral_sensitivity, illuminant)
@@ -96,12 +100,13 @@ def dome_needs(
             if bounces.built else "there is no such light",
         ),
         further_bounces(bounces, share * brightest),
+        focus,
     ]  # fmt: skip
     made += _movement(subject, movement, motion, view)
     made += absent(
         [*world, ("open eyes, teeth and hair on the head", "the subject has brows alone")]
     )
-    return SceneNeeds((*made, *_limits(view, made)))
+    return SceneNeeds((*made, *_limits(made)))
 
 
 def _movement(
@@ -131,16 +136,9 @@ def _movement(
     ]
 
 
-def _limits(view: View, made: list[Effect]) -> list[Effect]:
-    blur = defocus_px(
-        OFF_FOCUS_MM, f_number=view.f_number, focal_mm=view.focal_mm,
-        distance_mm=view.distance_mm, pixel_um=view.pixel_um,
-    )  # fmt: skip
+def _limits(made: list[Effect]) -> list[Effect]:
     out = [
-        (
-            "depth of field and lens blur",
-            f"at f/{view.f_number:g}, {OFF_FOCUS_MM:.0f} mm off focus: {blur:.1f} pixels",
-        ),
+        *FAR_LIGHT,
         ("dependence of the boundary on its roughness", "light enters a smooth boundary"),
     ]
     built = {effect.name for effect in made if effect.built}

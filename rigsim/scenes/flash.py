@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from capture.rig import Rig, RigError, View
 from model import spectra
 from rigsim import landmarks, shading
+from rigsim.depth_of_field import facing_depths, lens_spread
 from rigsim.effect_sizes import exchange_share
 from rigsim.films import Films, films_of
 from rigsim.lateral import line_spread_mm
@@ -29,7 +30,7 @@ from rigsim.mesh import Float32Array, Mesh
 from rigsim.render import Caster, camera_rays
 from rigsim.scene_needs import Noise, SceneNeeds
 from rigsim.scenes import flash_needs
-from rigsim.scenes.flash_needs import BOUNCES, LATERAL, SPECTRAL
+from rigsim.scenes.flash_needs import BOUNCES, LATERAL, LENS, SPECTRAL
 from rigsim.scenes.picture import Look, Picture
 from rigsim.scenes.skin_glow import SkinGlow, SurfaceLight, light_skin, light_surface
 from rigsim.sensor import Sensor, expose, sensor_of
@@ -46,6 +47,9 @@ FLAT_LEVEL: Final = 0.9
 
 HAIR_LIMIT: Final = 0.02
 """Pixels with more hair than this part are not skin."""
+
+LENS_LIMIT: Final = 0.01
+"""Pixels that get more of their light than this from off the skin, by the lens, are not skin."""
 
 POWER_DEVIATION: Final = 0.002
 """Relative standard deviation of a flash's energy from pop to pop."""
@@ -148,6 +152,8 @@ class FlashScene:
         Whether that light is reflected wavelength by wavelength.
     last_bounce
         Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
+    optics
+        Whether the lens blurs what is out of focus, and diffracts; ``None`` decides as above.
     subpixels
         Rays along each side of a pixel.
     choice
@@ -168,6 +174,7 @@ class FlashScene:
         interreflections: bool | None = None,
         spectral: bool | None = None,
         last_bounce: float | None = None,
+        optics: bool | None = None,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
     ) -> None:
@@ -209,11 +216,14 @@ class FlashScene:
             lateral=lateral,
             interreflections=interreflections,
             spectral=spectral,
+            optics=optics,
+            subpixels=subpixels,
             share=self._stage.share(),
         )
         """What is built, what is not, and why."""
         self.lateral = self.needs.builds(LATERAL)
         self.interreflections = self.needs.builds(BOUNCES)
+        self.optics = self.needs.builds(LENS)
         summed = flash_needs.last_bounce(self.needs[BOUNCES].over_noise or 0.0)
         self._last_bounce = summed if last_bounce is None else last_bounce
 
@@ -323,12 +333,12 @@ class FlashScene:
             at power 1, without specular leak, spreading of light and light from other skin;
             ``irradiance``: light of the flashes on the surface over that on the white reference;
             ``diffuse``, ``specular``: camera RGB without analyser at power 1 in fraction of full
-            scale, light from inside and from the surface, (H, W, 3); crossed is about half the
-            first, parallel half the first and the second;
+            scale, light from inside and from the surface, (H, W, 3), through the lens, which blurs
+            no other map; crossed is about half the first, parallel half the first and the second;
             ``normals``: unit, rig frame, with relief; ``position_mm``: rig frame;
             ``roughness``: GGX alpha; ``uv``: texture coordinates, (H, W, 2);
             ``hair``: part covered by hair (brows, lashes);
-            ``mask``: bool, pixels wholly on skin.
+            ``mask``: bool, pixels wholly on skin, whose light comes from skin within `LENS_LIMIT`.
 
             All are of the face as it has moved. For a state other than "neutral" there are also
             ``melanin_at_rest``, ``hemoglobin_at_rest``: the fractions of this state as they would
@@ -464,7 +474,7 @@ class FlashScene:
         if not isinstance(subject, Subject) or subject.rest is None:
             return {f"{name}_at_rest": moved[name] for name in ("melanin", "hemoglobin", "mask")}
         rest = subject.rest
-        look = Look(self.rig, view, self.films, self._weights, self.subpixels)
+        look = self._look(view, rest.mesh)
         layers = {
             "melanin": rest.melanin,
             "hemoglobin": rest.hemoglobin(self.state),
@@ -478,9 +488,16 @@ class FlashScene:
             "mask_at_rest": _whole_skin(picture),
         }
 
+    def _look(self, view: View, mesh: Mesh) -> Look:
+        spread = None
+        if self.optics:
+            depths = facing_depths(view, mesh)
+            spread = lens_spread(view, self._illuminant, subpixels=self.subpixels, depths_mm=depths)
+        return Look(self.rig, view, self.films, self._weights, self.subpixels, spread)
+
     def _picture(self, view: View) -> Picture:
         if view.name not in self._pictures:
-            look = Look(self.rig, view, self.films, self._weights, self.subpixels)
+            look = self._look(view, self.subject.mesh)
             if isinstance(self.subject, Subject):
                 picture = look.at_skin(
                     self._caster,
@@ -495,8 +512,9 @@ class FlashScene:
 
 
 def _whole_skin(picture: Picture) -> NDArray[np.bool_]:
-    """Return the pixels that are wholly on skin."""
-    return (picture.coverage > 1.0 - 1e-6) & (picture.maps["hair"] < HAIR_LIMIT)
+    """Return the pixels that are wholly on skin, and get light from there alone."""
+    whole = (picture.coverage > 1.0 - 1e-6) & (picture.reached > 1.0 - LENS_LIMIT)
+    return whole & (picture.maps["hair"] < HAIR_LIMIT)
 
 
 def _light_weights(rig: Rig) -> NDArray[np.float64]:

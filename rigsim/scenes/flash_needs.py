@@ -6,7 +6,8 @@ import numpy as np
 
 from capture.rig import Rig, View
 from model import spectra
-from rigsim.effect_sizes import bounced, defocus_px, edge_loss, exchange_share
+from rigsim.depth_of_field import facing_depths, lens_spread
+from rigsim.effect_sizes import bounced, edge_loss, exchange_share
 from rigsim.render import Caster
 from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
 from rigsim.scenes.skin_glow import typical_kernels
@@ -21,9 +22,7 @@ SPECTRAL = "color of light from skin to skin, wavelength by wavelength"
 FURTHER = "bounces after the last that is summed"
 POLARIZATION = "polarization"
 SHADOWS = "shadows"
-
-OFF_FOCUS_MM = 60.0
-"""How far a face's relief stands off the plane in focus."""
+LENS = "depth of field and lens blur"
 
 EVERY = 16
 """Of the texels whose reflectance is looked at."""
@@ -47,6 +46,8 @@ def flash_needs(
     lateral: bool | None,
     interreflections: bool | None,
     spectral: bool | None,
+    optics: bool | None,
+    subpixels: int,
     share: float | None = None,
 ) -> SceneNeeds:
     """Decide what a scene before the flash rig builds.
@@ -65,17 +66,25 @@ def flash_needs(
         What a white plate in the origin gives at power 1, full scales.
     movement
         Whether the face moves with its state.
-    lateral, interreflections, spectral
+    lateral, interreflections, spectral, optics
         What is asked for; None lets the sizes decide.
+    subpixels
+        Rays along each side of a pixel.
     share
         `exchange_share` of the mesh, where it is known already.
     """
     view = rig.views[0]
     made = [polarization(rig, view), bands(view)]
     dark = [("ambient light", "the room is dark and the flash is short")]
-    if isinstance(subject, Target):
-        return SceneNeeds((*made, *_of_target(subject, caster), *absent(dark)))
     illuminant = rig.lights[0].illuminant
+    if isinstance(subject, Target):
+        made += _of_target(subject, caster)
+        if subject.kind not in ("source", "cap"):
+            made.append(lens(view, illuminant, caster, noise, white_level, subpixels, optics))
+            made += unmodeled(FAR_LIGHT)
+        else:
+            made.append(Effect(LENS, "negligible", "all of the picture is alike", 0.0, "optics"))
+        return SceneNeeds((*made, *absent(dark)))
     brightest = brightest_reflectance(subject, state, view, illuminant)
     level = min(1.0, white_level * brightest)
     pixel_mm = view.distance_mm / view.focal_px
@@ -102,8 +111,50 @@ def flash_needs(
             if bounces.built else "there is no such light",
         ),
         further_bounces(bounces, share * brightest),
+        lens(view, illuminant, caster, noise, level, subpixels, optics),
     ]  # fmt: skip
-    return SceneNeeds((*made, *_movement(subject, movement), *absent(dark), *_limits(view)))
+    return SceneNeeds((*made, *_movement(subject, movement), *absent(dark), *_limits()))
+
+
+FAR_LIGHT = [("glare and far rings of the lens", "light goes as far as the nearest rings")]
+
+
+def lens(
+    view: View,
+    illuminant: str,
+    caster: Caster,
+    noise: Noise,
+    level: float,
+    subpixels: int,
+    asked: bool | None,
+) -> Effect:
+    """Return whether a camera's lens blurs: what a pixel loses to its neighbors where it is worst.
+
+    Parameters
+    ----------
+    view, illuminant
+        The camera, and the light's spectrum.
+    caster
+        The mesh; where it faces the camera decides how far it is out of focus.
+    noise
+        Of the sensor.
+    level
+        The brightest pixel, full scales.
+    subpixels
+        Rays along each side of a pixel.
+    asked
+        What is asked for; None lets the size decide.
+    """
+    depths = facing_depths(view, caster.mesh)
+    spread = lens_spread(view, illuminant, subpixels=subpixels, depths_mm=depths)
+    spilled = spread.spilled(depths)
+    far = max(abs(depth) for depth in depths)
+    gained = min(1.0, level) * spilled  # by a black pixel amid bright ones, where noise is least
+    return decide(
+        LENS, gained / float(noise.sigma(gained)), asked, switch="optics",
+        because=f"at f/{view.f_number:g}, up to {far:.0f} mm off focus, "
+        f"{100 * spilled:.0f} % of a pixel's light falls on others",
+    )  # fmt: skip
 
 
 def polarization(rig: Rig, view: View) -> Effect:
@@ -195,21 +246,14 @@ def _movement(subject: Subject, movement: bool) -> list[Effect]:
     return out
 
 
-def _limits(view: View) -> list[Effect]:
-    blur = defocus_px(
-        OFF_FOCUS_MM, f_number=view.f_number, focal_mm=view.focal_mm,
-        distance_mm=view.distance_mm, pixel_um=view.pixel_um,
-    )  # fmt: skip
+def _limits() -> list[Effect]:
     return [
         *absent(
             [("open eyes, teeth and hair on the head", "the subject has none; brows are matt")]
         ),
         *unmodeled(
             [
-                (
-                    "depth of field and lens blur",
-                    f"at f/{view.f_number:g}, {OFF_FOCUS_MM:.0f} mm off focus: {blur:.1f} pixels",
-                ),
+                *FAR_LIGHT,
                 ("highlights of skin on skin", "only light from inside goes on to other skin"),
                 ("lateral kernels that vary over the face", "one profile, of its median skin"),
                 ("polarized single scattering", "light from inside is taken as depolarized"),

@@ -17,12 +17,14 @@ from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
 from capture.rig import View
+from rigsim.depth_of_field import LensPicture, before_focus, lens_spread
 from rigsim.mesh import Float32Array, Int32Array
 from rigsim.render import OFFSET_MM, Caster, GBuffer, g_buffer
 from rigsim.surface_brdf import R_D_LIMIT, boundary, coated_terms, ggx, surface_terms, through
 
 FloatArray = NDArray[np.float64]
 UInt16Array = NDArray[np.uint16]
+UInt8Array = NDArray[np.uint8]
 
 LookUp = Callable[[GBuffer, NDArray[np.int32]], tuple[Float32Array, Float32Array]]
 """Gives the shading normals, shape (n, 3), and the surfaces of a G-buffer's rays, shape (n, 7) or
@@ -93,6 +95,8 @@ class Hits:
     """Shading normals times `NORMAL_SCALE`, shape (n, 3)."""
     prim: Int32Array
     """Triangles, shape (n,)."""
+    slot: UInt8Array
+    """Place in the pixel, row by row, below subpixels^2, shape (n,)."""
     uv: UInt16Array
     """Texture coordinates times `FULL`, shape (n, 2)."""
     surface: UInt16Array
@@ -103,12 +107,17 @@ class Hits:
     """Centre of projection, shape (3,)."""
     kind: int
     """`SKIN`, `MATT` or `METAL`."""
+    lens: LensPicture | None = None
+    """How the lens spreads the rows' light; None: it is sharp everywhere."""
 
     @property
     def megabytes(self) -> float:
         """Memory held by the rows."""
-        arrays = (self.pixel, self.first, self.position_mm, self.normal, self.prim, self.uv)
-        return (sum(a.nbytes for a in arrays) + self.surface.nbytes) / 1e6
+        arrays = (
+            self.pixel, self.first, self.position_mm, self.normal, self.prim, self.slot, self.uv,
+            self.surface,
+        )  # fmt: skip
+        return sum(array.nbytes for array in arrays) / 1e6
 
     def scatter(self, rows: Float32Array) -> Float32Array:
         """Average rows over each pixel's covered part, shape (H, W, C); zero elsewhere."""
@@ -162,6 +171,7 @@ def find_hits(
     subpixels: int,
     kind: int = SKIN,
     distortion: ArrayLike | None = None,
+    illuminant: str | None = None,
 ) -> Hits:
     """Trace a camera's rays and keep what they meet.
 
@@ -179,6 +189,8 @@ def find_hits(
         How rows reflect.
     distortion
         Of the lens, see `rigsim.render.camera_rays`.
+    illuminant
+        Spectrum of the light that the lens spreads; None: the lens is sharp everywhere.
 
     Returns
     -------
@@ -192,41 +204,89 @@ def find_hits(
     for top in range(begin, end, band):
         rows = (top, min(top + band, end))
         buffers = g_buffer(caster, view, subpixels=k, rows=rows, distortion=distortion)
-        # Rows of one pixel stand together: (H, k, W, k) -> (H, W, k, k).
-        tall = rows[1] - rows[0]
-        grid = np.arange(buffers.mask.size, dtype=np.int32).reshape(tall, k, width, k)
-        order = grid.transpose(0, 2, 1, 3).reshape(-1)
-        order = order[buffers.mask.reshape(-1)[order]]
-        across = order % (width * k) // k
-        down = order // (width * k) // k
+        order, pixel, first, slot = pixel_order(buffers.mask, k)
         normal, surface = look_up(buffers, order)
         parts.append(
             (
-                ((top + down) * width + across).astype(np.int32),
+                np.repeat(pixel + np.int32(top * width), np.diff(first)),
                 buffers.position_mm.reshape(-1, 3)[order],
                 np.rint(normal * np.float32(NORMAL_SCALE)).astype(np.int16),
                 buffers.prim.reshape(-1)[order],
+                slot,
                 np.rint(buffers.uv.reshape(-1, 2)[order] * np.float32(FULL)).astype(np.uint16),
                 pack_surface(surface),
             )
         )
-    owner, position, normals, prim, uv, packed = (
+    owner, position, normals, prim, slots, uv, packed = (
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
+    pixels = np.asarray(owner[starts], np.int32)
+    begins = np.append(starts, len(owner)).astype(np.int32)
+    lens = None
+    if illuminant is not None:
+        toward = before_focus(view, np.asarray(position, np.float32))
+        spread = lens_spread(view, illuminant, subpixels=k, depths_mm=_extremes(toward))
+        lens = LensPicture(
+            spread, (height, width), pixels, begins, np.asarray(slots, np.uint8), toward
+        )
     return Hits(
         shape=(height, width),
         subpixels=k,
-        pixel=np.asarray(owner[starts], np.int32),
-        first=np.append(starts, len(owner)).astype(np.int32),
+        pixel=pixels,
+        first=begins,
         position_mm=np.asarray(position, np.float32),
         normal=np.asarray(normals, np.int16),
         prim=np.asarray(prim, np.int32),
+        slot=np.asarray(slots, np.uint8),
         uv=np.asarray(uv, np.uint16),
         surface=np.asarray(packed, np.uint16),
         camera_mm=np.asarray(view.position_mm, np.float64),
         kind=kind,
+        lens=lens,
     )
+
+
+def _extremes(values: Float32Array) -> tuple[float, float]:
+    return float(values.min(initial=0.0)), float(values.max(initial=0.0))
+
+
+def pixel_order(
+    mask: NDArray[np.bool_], subpixels: int
+) -> tuple[Int32Array, Int32Array, Int32Array, UInt8Array]:
+    """Return the samples that meet something, those of one pixel together.
+
+    Parameters
+    ----------
+    mask
+        Samples that do, shape (H k, W k).
+    subpixels
+        The k above.
+
+    Returns
+    -------
+    order : ndarray of int32
+        Index into the flat mask, shape (n,).
+    pixel, first : ndarray of int32
+        Pixels with at least one, index into the flat picture, shape (P,), and the first of each,
+        shape (P + 1,).
+    slot : ndarray of uint8
+        Place in the pixel, row by row, shape (n,).
+
+    Examples
+    --------
+    >>> [part.tolist() for part in pixel_order(np.array([[True, False], [True, True]]), 2)]
+    [[0, 2, 3], [0], [0, 3], [0, 2, 3]]
+    """
+    k, wide = subpixels, mask.shape[1]
+    grid = np.arange(mask.size, dtype=np.int32).reshape(-1, k, wide // k, k)
+    order = grid.transpose(0, 2, 1, 3).reshape(-1)
+    order = order[mask.reshape(-1)[order]]
+    across, down = order % wide, order // wide
+    owner = down // k * (wide // k) + across // k
+    starts = np.flatnonzero(np.diff(owner, prepend=-1))
+    slot = (down % k * k + across % k).astype(np.uint8)
+    return order, owner[starts], np.append(starts, len(owner)).astype(np.int32), slot
 
 
 def _rows_of(caster: Caster, view: View, *, bent: bool) -> tuple[int, int]:
@@ -295,6 +355,8 @@ def sum_rows(
     hits: Hits, red: Float32Array, green: Float32Array, blue: Float32Array, color: Float32Array
 ) -> Float32Array:
     """Sum what rows send, shape (n,) each, times a color, into whole pixels, shape (H, W, 3)."""
+    if hits.lens is not None:
+        return hits.lens.see(np.stack([red, green, blue], axis=1)) * np.asarray(color, np.float32)
     out = np.zeros((hits.shape[0] * hits.shape[1], 3), np.float32)
     share = np.asarray(color, np.float32) / np.float32(hits.subpixels**2)
     _sum_rows(hits.pixel, hits.first, red, green, blue, share, out)
@@ -333,16 +395,15 @@ def light_up(
     ndarray of float32
         Shape (H, W, 3), in full scales per second, averaged over whole pixels.
     """
-    out = np.zeros((hits.shape[0] * hits.shape[1], 3), np.float32)
+    rows = np.zeros((3, len(hits.position_mm)), np.float32)
     extra = np.zeros((0, 3), np.float32) if glow is None else glow
     center = np.ascontiguousarray(lamp.position_mm, np.float64)
     axis = np.ascontiguousarray(lamp.axis, np.float64)
     _shade(
-        hits.pixel, hits.first, hits.position_mm, hits.normal, hits.surface, hits.camera_mm,
-        hits.kind, center, axis, float(lamp.exponent), visible, extra, diffuse,
-        np.asarray(color, np.float64) / hits.subpixels**2, out,
+        hits.position_mm, hits.normal, hits.surface, hits.camera_mm, hits.kind, center, axis,
+        float(lamp.exponent), visible, extra, diffuse, rows,
     )  # fmt: skip
-    return out.reshape(*hits.shape, 3)
+    return sum_rows(hits, rows[0], rows[1], rows[2], color)
 
 
 def disc_points(count: int) -> tuple[Float32Array, Float32Array]:
@@ -423,74 +484,68 @@ def _aim(  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, cache=True)
 def _shade(  # type: ignore[no-untyped-def]
-    pixel, first, position, normal, surface, camera, kind, center, axis, exponent,
-    visible, glow, diffuse, share, out,
+    position, normal, surface, camera, kind, center, axis, exponent, visible, glow, diffuse, out,
 ):  # fmt: skip
     has_glow = glow.shape[0] > 0
-    for p in prange(pixel.shape[0]):
-        red = green = blue = 0.0
-        for i in range(first[p], first[p + 1]):
-            if not visible[i] and not has_glow:
-                continue
-            n0, n1, n2 = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
-            norm = 1.0 / math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-            n0, n1, n2 = n0 * norm, n1 * norm, n2 * norm
-            p0, p1, p2 = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
-            v0, v1, v2 = camera[0] - p0, camera[1] - p1, camera[2] - p2
-            norm = 1.0 / math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-            v0, v1, v2 = v0 * norm, v1 * norm, v2 * norm
-            nv = min(n0 * v0 + n1 * v1 + n2 * v2, 1.0)
-            if nv <= 0.0:
-                continue
-            if has_glow:
-                leaving = through(nv)
-                red += leaving * glow[i, 0]
-                green += leaving * glow[i, 1]
-                blue += leaving * glow[i, 2]
-            if not visible[i]:
-                continue
-            l0, l1, l2 = center[0] - p0, center[1] - p1, center[2] - p2
-            squared = l0 * l0 + l1 * l1 + l2 * l2
-            norm = 1.0 / math.sqrt(squared)
-            l0, l1, l2 = l0 * norm, l1 * norm, l2 * norm
-            nl = min(n0 * l0 + n1 * l1 + n2 * l2, 1.0)
-            if nl <= 0.0:
-                continue
-            strength = nl / squared
-            off = -(axis[0] * l0 + axis[1] * l1 + axis[2] * l2)
-            if off <= 0.0:
-                continue
-            strength *= off**exponent
-            s0, s1, s2 = surface[i, 0] / FULL, surface[i, 1] / FULL, surface[i, 2] / FULL
-            r0, r1, r2 = R_D_LIMIT * s0 * s0, R_D_LIMIT * s1 * s1, R_D_LIMIT * s2 * s2
-            if kind == MATT:
-                red += strength * r0
-                green += strength * r1
-                blue += strength * r2
-                continue
-            h0, h1, h2 = l0 + v0, l1 + v1, l2 + v2
-            length = math.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
-            nh = min((nl + nv) / length, 1.0)
-            rough = surface[i, 3] / FULL
-            if kind == METAL:
-                lobe = math.pi * strength * ggx(nl, nv, nh, rough)
-                red += lobe * r0
-                green += lobe * r1
-                blue += lobe * r2
-                continue
-            oil, fuzz, bare = surface[i, 4] / FULL, surface[i, 5] / FULL, surface[i, 6] / FULL
-            if surface.shape[1] > BARE:
-                lobe = coated_terms(
-                    nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz, surface[i, 7] / FULL,
-                    surface[i, 8] / FULL, 1.0 + surface[i, 9] / FULL, surface[i, 10] / FULL,
-                )  # fmt: skip
-            else:
-                lobe = surface_terms(nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz)
-            gloss = math.pi * strength * bare * lobe
-            inside = strength * boundary(nl, nv) if diffuse else 0.0
-            red += gloss + inside * r0
-            green += gloss + inside * r1
-            blue += gloss + inside * r2
-        out[pixel[p], 0] = share[0] * red
-        out[pixel[p], 1] = share[1] * green
-        out[pixel[p], 2] = share[2] * blue
+    for i in prange(position.shape[0]):
+        if not visible[i] and not has_glow:
+            continue
+        n0, n1, n2 = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
+        norm = 1.0 / math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+        n0, n1, n2 = n0 * norm, n1 * norm, n2 * norm
+        p0, p1, p2 = float(position[i, 0]), float(position[i, 1]), float(position[i, 2])
+        v0, v1, v2 = camera[0] - p0, camera[1] - p1, camera[2] - p2
+        norm = 1.0 / math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+        v0, v1, v2 = v0 * norm, v1 * norm, v2 * norm
+        nv = min(n0 * v0 + n1 * v1 + n2 * v2, 1.0)
+        if nv <= 0.0:
+            continue
+        if has_glow:
+            leaving = through(nv)
+            out[0, i] += leaving * glow[i, 0]
+            out[1, i] += leaving * glow[i, 1]
+            out[2, i] += leaving * glow[i, 2]
+        if not visible[i]:
+            continue
+        l0, l1, l2 = center[0] - p0, center[1] - p1, center[2] - p2
+        squared = l0 * l0 + l1 * l1 + l2 * l2
+        norm = 1.0 / math.sqrt(squared)
+        l0, l1, l2 = l0 * norm, l1 * norm, l2 * norm
+        nl = min(n0 * l0 + n1 * l1 + n2 * l2, 1.0)
+        if nl <= 0.0:
+            continue
+        strength = nl / squared
+        off = -(axis[0] * l0 + axis[1] * l1 + axis[2] * l2)
+        if off <= 0.0:
+            continue
+        strength *= off**exponent
+        s0, s1, s2 = surface[i, 0] / FULL, surface[i, 1] / FULL, surface[i, 2] / FULL
+        r0, r1, r2 = R_D_LIMIT * s0 * s0, R_D_LIMIT * s1 * s1, R_D_LIMIT * s2 * s2
+        if kind == MATT:
+            out[0, i] += strength * r0
+            out[1, i] += strength * r1
+            out[2, i] += strength * r2
+            continue
+        h0, h1, h2 = l0 + v0, l1 + v1, l2 + v2
+        length = math.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
+        nh = min((nl + nv) / length, 1.0)
+        rough = surface[i, 3] / FULL
+        if kind == METAL:
+            lobe = math.pi * strength * ggx(nl, nv, nh, rough)
+            out[0, i] += lobe * r0
+            out[1, i] += lobe * r1
+            out[2, i] += lobe * r2
+            continue
+        oil, fuzz, bare = surface[i, 4] / FULL, surface[i, 5] / FULL, surface[i, 6] / FULL
+        if surface.shape[1] > BARE:
+            lobe = coated_terms(
+                nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz, surface[i, 7] / FULL,
+                surface[i, 8] / FULL, 1.0 + surface[i, 9] / FULL, surface[i, 10] / FULL,
+            )  # fmt: skip
+        else:
+            lobe = surface_terms(nl, nv, nh, 0.5 * length, rough, oil, FUZZ_LIMIT * fuzz)
+        gloss = math.pi * strength * bare * lobe
+        inside = strength * boundary(nl, nv) if diffuse else 0.0
+        out[0, i] += gloss + inside * r0
+        out[1, i] += gloss + inside * r1
+        out[2, i] += gloss + inside * r2

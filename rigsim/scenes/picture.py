@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from capture.rig import Rig, View
 from rigsim import shading
 from rigsim.atlas import BoolArray, sample, spread
+from rigsim.depth_of_field import LensPicture, LensSpread, before_focus
 from rigsim.films import Films, absorbing_axis
 from rigsim.mesh import Float32Array
 from rigsim.render import Caster, GBuffer, RenderError, g_buffer
+from rigsim.scenes.olat import pixel_order
 from rigsim.scenes.skin_glow import SkinGlow, spread_through_pigment, toward
 from rigsim.skin_color import skin_color
 from rigsim.skin_layers import ETA
@@ -39,15 +41,17 @@ class Picture:
     """What a camera gets, averaged over each pixel; light in units of the white reference."""
 
     diffuse: Float32Array
-    """Light from inside, shape (H, W, 3 Stokes, 3 RGB), white-balanced."""
+    """Light from inside, shape (H, W, 3 Stokes, 3 RGB), white-balanced, through the lens."""
     specular: Float32Array
-    """Light from the surface, shape (H, W, 3 Stokes)."""
+    """Light from the surface, shape (H, W, 3 Stokes), through the lens."""
     shading: Float32Array
-    """Light from inside of a skin of reflectance 1, shape (H, W, 3 Stokes)."""
+    """Light from inside of a skin of reflectance 1, shape (H, W, 3 Stokes), without the lens."""
     maps: Parts
     """Truth maps, averaged over each pixel's covered part."""
     coverage: Float32Array
-    """Part of each pixel that is covered, shape (H, W)."""
+    """Part of each pixel that is covered, shape (H, W), without the lens."""
+    reached: Float32Array
+    """Part of each pixel's light that comes from where there is a surface, shape (H, W)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +68,8 @@ class Look:
     """Energy of each light over the sum that a plate at the origin gets, mm^2."""
     subpixels: int
     """Rays along each side of a pixel."""
+    spread: LensSpread | None = None
+    """How the lens spreads light; None: it is sharp everywhere."""
 
     def at_skin(
         self,
@@ -111,11 +117,20 @@ class Look:
     def _in_bands(self, caster: Caster, see: Callable[[GBuffer], Parts]) -> Picture:
         k, view = self.subpixels, self.view
         rows_per_band = max(1, BAND_RAYS // (view.width_px * k * k))
+        around = 0 if self.spread is None else self.spread.radius
         bands = []
         for top in range(0, view.height_px, rows_per_band):
-            rows = (top, min(top + rows_per_band, view.height_px))
+            bottom = min(top + rows_per_band, view.height_px)
+            first = max(top - around, 0)
+            rows = (first, min(bottom + around, view.height_px))
             buffers = g_buffer(caster, view, subpixels=k, rows=rows)
-            bands.append(_shrink(see(buffers), buffers.mask, k))
+            parts = see(buffers)
+            small, coverage = _shrink(parts, buffers.mask, k)
+            small["reached"] = coverage
+            if self.spread is not None:
+                small |= _through_lens(parts, buffers, view, self.spread)
+            inner = slice(top - first, bottom - first)
+            bands.append(({name: part[inner] for name, part in small.items()}, coverage[inner]))
         maps: Parts = {
             name: np.concatenate([band[0][name] for band in bands]) for name in bands[0][0]
         }
@@ -124,7 +139,10 @@ class Look:
             if not np.isfinite(values).all():
                 raise RenderError(f"{name}: rendering gave values that are not finite")
         diffuse, specular, white = (maps.pop(name) for name in _LIGHT_NAMES)
-        return Picture(diffuse.reshape(*coverage.shape, 3, 3), specular, white, maps, coverage)
+        reached = maps.pop("reached")
+        return Picture(
+            diffuse.reshape(*coverage.shape, 3, 3), specular, white, maps, coverage, reached
+        )
 
     def blurred_maps(self, subject: Subject, state: str, glow: SkinGlow) -> dict[str, Float32Array]:
         """Return the fractions and the reflectance of even skin that would look as the skin looks.
@@ -293,6 +311,23 @@ def _scatter(values: Float32Array, inside: NDArray[np.int_], mask: BoolArray) ->
     out = np.zeros((mask.size, *values.shape[1:]), np.float32)
     out[inside] = values
     return out.reshape(*mask.shape, *values.shape[1:])
+
+
+def _through_lens(parts: Parts, buffers: GBuffer, view: View, spread: LensSpread) -> Parts:
+    """Return what of a picture the lens blurs, at the sensor's resolution."""
+    k = spread.subpixels
+    order, pixel, first, slot = pixel_order(buffers.mask, k)
+    shape = (buffers.mask.shape[0] // k, buffers.mask.shape[1] // k)
+    toward = before_focus(view, buffers.position_mm.reshape(-1, 3)[order])
+    lens = LensPicture(spread, shape, pixel, first, slot, toward)
+    light = [parts[name].reshape(buffers.mask.size, -1)[order] for name in ("diffuse", "specular")]
+    seen = lens.see(np.concatenate([*light, np.ones((len(order), 1), np.float32)], axis=1))
+    wide = light[0].shape[1]
+    return {
+        "diffuse": seen[..., :wide].reshape(*shape, *parts["diffuse"].shape[2:]),
+        "specular": seen[..., wide:-1],
+        "reached": seen[..., -1],
+    }
 
 
 def _shrink(parts: Parts, mask: BoolArray, k: int) -> tuple[Parts, Float32Array]:

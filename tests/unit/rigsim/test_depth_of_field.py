@@ -1,0 +1,231 @@
+"""A lens's blur by depth against rays through all of its pupil, Airy's pattern and energy."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy.special import j1
+
+from capture.rig import Rig, load_rig
+from rigsim.depth_of_field import LensPicture, LensSpread, before_focus, lens_spread, spread_of
+from rigsim.lens_blur import BlurError, lens_of
+from rigsim.render import Caster, GBuffer, camera_rays, g_buffer, trace
+from rigsim.scene_needs import Noise
+from rigsim.scenes import flash_needs
+from rigsim.scenes.flash import FlashScene
+from rigsim.scenes.olat import pixel_order
+from rigsim.subject import make_subject
+from rigsim.variant import VariantChoice
+
+EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
+K = 2
+NEAR_MM, FAR_MM = 25.0, -85.0
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig("flash").resized(128)
+
+
+@pytest.fixture(scope="module")
+def caster():
+    return Caster(make_subject("II", seed=0, size=64).mesh, choice=EMBREE)
+
+
+def planes(spread: LensSpread, depth_mm: np.ndarray) -> LensPicture:
+    """Return a picture of what stands at depths given for each sample, NaN for nothing."""
+    order, pixel, first, slot = pixel_order(np.isfinite(depth_mm), K)
+    shape = (depth_mm.shape[0] // K, depth_mm.shape[1] // K)
+    toward = depth_mm.reshape(-1)[order].astype(np.float32)
+    return LensPicture(spread, shape, pixel, first, slot, toward)
+
+
+def see(spread: LensSpread, depth_mm: np.ndarray, light: np.ndarray) -> np.ndarray:
+    order = pixel_order(np.isfinite(depth_mm), K)[0]
+    rows = np.ascontiguousarray(light.reshape(-1, 1)[order], np.float32)
+    return planes(spread, depth_mm).see(rows)[..., 0]
+
+
+def wide_open(rig: Rig, f_number: float) -> LensSpread:
+    view = dataclasses.replace(rig.views[0], f_number=f_number)
+    return lens_spread(view, "D55", subpixels=K, depths_mm=[FAR_MM, NEAR_MM])
+
+
+@pytest.mark.parametrize("depth_mm", [0.0, 25.0, -85.0])
+def test_a_plate_that_is_seen_whole_gives_all_its_light_at_any_depth(rig, depth_mm):
+    spread = wide_open(rig, 2.0)
+    depth = np.full((60, 60), np.nan)
+    depth[20:40, 20:40] = depth_mm
+    picture = see(spread, depth, np.ones((60, 60)))
+    assert picture.sum() == pytest.approx(100.0, rel=1e-5)
+    assert picture[15, 15] == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_black_pixel_gets_more_the_further_its_surroundings_are_out_of_focus(rig):
+    spread = wide_open(rig, 4.0)
+    hole = np.ones((40, 40))
+    hole[20:22, 20:22] = 0.0
+    dark = [see(spread, np.full((40, 40), d), hole)[10, 10] for d in (0.0, 12.0, -40.0, -85.0)]
+    assert (np.diff(dark) > 0.01).all()
+
+
+def test_the_middle_of_a_picture_in_focus_is_airys(rig):
+    """Ratio of what a point sends to its own pixel and to the next, by integrating Airy's pattern.
+
+    The table is renormalized to what the picture holds, which ratios do not see. The sample's
+    square has a 32nd of the pixel's side, the integral 64 x 64 nodes: 1 % together.
+    """
+    view = dataclasses.replace(rig.views[0], f_number=64.0)
+    lens = dataclasses.replace(lens_of(view, "D55"), wavelengths_nm=(550.0,), weights=(1.0,))
+    k = 31
+    spread = spread_of(lens, subpixels=k, depths_mm=[0.0])
+    wide, middle = 2 * spread.radius + 1, k * k // 2
+    table = spread.table[0, :, middle].reshape(wide, wide)[::-1, ::-1]
+    x = (np.arange(64) + 0.5) / 64 - 0.5
+    pixels = lens.pixel_on_subject_um / lens.cutoff_period_um
+
+    def airy(dx: float) -> float:
+        r = np.maximum(np.hypot(x[:, None], x + dx) * math.pi * pixels, 1e-9)
+        return float(((2.0 * j1(r) / r) ** 2).mean())
+
+    row = table[spread.radius, spread.radius :]
+    assert row[1] / row[0] == pytest.approx(airy(1.0) / airy(0.0), rel=0.01)
+
+
+def by_rays(caster, view, shade, *, points: int, k: int) -> np.ndarray:
+    """Return what a thin lens sees: the mean over its pupil of sharp pictures, focused alike."""
+    way = camera_rays(view, subpixels=k)[1]
+    right, up, back = (np.asarray(axis) for axis in view.axes)
+    eye = np.asarray(view.position_mm)
+    focus = eye + way * (view.focus_distance_mm / -(way @ back))[..., None]
+    pupil_mm = 0.5 * view.focal_mm / (1 + view.focal_mm / view.distance_mm) / view.f_number
+    total = np.zeros((view.height_px, view.width_px))
+    for n in range(points):
+        radius, angle = pupil_mm * math.sqrt((n + 0.5) / points), n * math.pi * (3 - 5**0.5)
+        at = eye + radius * (math.cos(angle) * right + math.sin(angle) * up)
+        rays = focus - at
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        start = np.broadcast_to(at.astype(np.float32), rays.shape)
+        light = shade(trace(caster, start, rays.astype(np.float32)))
+        total += light.reshape(view.height_px, k, view.width_px, k).mean(axis=(1, 3)) / points
+    return total
+
+
+def patterned(buffers: GBuffer) -> np.ndarray:
+    x, y = buffers.position_mm[..., 0], buffers.position_mm[..., 1]
+    light = (1.2 + np.sin(0.5 * x) * np.sin(0.6 * y)) * np.clip(buffers.normal[..., 2], 0.1, 1.0)
+    return np.where(buffers.mask, light, 0.0)
+
+
+@pytest.mark.parametrize("f_number", [2.0, 1.4])
+def test_a_face_out_of_focus_is_what_rays_through_the_whole_pupil_see(rig, caster, f_number):
+    """RMS over the face, and where blur shows, against 40 x 16 rays a pixel.
+
+    Diffraction is small there. Both have 16 samples a pixel, since coarse sampling is an error
+    without a lens too; 0.4 of the sharp picture's error is the bound, which that fails by far.
+    """
+    k = 4
+    view = dataclasses.replace(rig.views[0], f_number=f_number)
+    buffers = g_buffer(caster, view, subpixels=k)
+    order, pixel, first, slot = pixel_order(buffers.mask, k)
+    toward = before_focus(view, buffers.position_mm.reshape(-1, 3)[order])
+    spread = lens_spread(view, "D55", subpixels=k, depths_mm=[toward.min(), toward.max()])
+    lens = LensPicture(spread, (view.height_px, view.width_px), pixel, first, slot, toward)
+    light = patterned(buffers)
+    mine = lens.see(light.reshape(-1, 1)[order].astype(np.float32))[..., 0]
+    sharp = light.reshape(view.height_px, k, view.width_px, k).mean(axis=(1, 3))
+    truth = by_rays(caster, view, patterned, points=40, k=k)
+    assert mine.sum() == pytest.approx(sharp.sum(), rel=1e-3)
+    edge = (truth > 0) & (sharp != 0) & (np.abs(sharp - truth) > 0.05)
+    for part in (truth > 0, edge):
+        error, blur = (float(np.sqrt(np.mean((p - truth)[part] ** 2))) for p in (mine, sharp))
+        assert error < 0.4 * blur
+
+
+def test_an_evenly_bright_face_stays_evenly_bright_inside(rig, caster):
+    view = dataclasses.replace(rig.views[0], f_number=2.0)
+    buffers = g_buffer(caster, view, subpixels=K)
+    depth = before_focus(view, buffers.position_mm.reshape(-1, 3)).reshape(buffers.mask.shape)
+    spread = wide_open(rig, 2.0)
+    ones = see(spread, np.where(buffers.mask, depth, np.nan), np.ones(buffers.mask.shape))
+    cover = buffers.mask.reshape(view.height_px, K, view.width_px, K).mean(axis=(1, 3))
+    r = spread.radius
+    around = np.lib.stride_tricks.sliding_window_view(cover, (2 * r + 1, 2 * r + 1))
+    inside = around.min(axis=(2, 3)) == 1.0
+    np.testing.assert_allclose(ones[r:-r, r:-r][inside], 1.0, atol=1e-4)
+    assert ones.max() < 1.05
+
+
+def test_what_is_in_focus_hides_what_is_bright_and_blurred_behind_it(rig):
+    """A black sheet in focus covers the left half of a white wall far behind."""
+    spread = wide_open(rig, 2.0)
+    depth = np.full((40, 60), -85.0)
+    depth[:, :30] = 0.0
+    light = (depth < -1.0).astype(float)
+    picture = see(spread, depth, light)
+    middle = picture[10]
+    r = spread.radius
+    assert middle[: 15 - 1].max() < 0.02  # but for diffraction
+    assert middle[15 + 1] > 0.9  # the hidden wall is as bright as the seen one
+    np.testing.assert_allclose(middle[15 + r :], 1.0, atol=1e-3)
+    bare = spread.table[spread.slices(-85.0)].reshape(2 * r + 1, 2 * r + 1, -1).sum(axis=(0, 2))
+    assert bare[: r + 1 - 1].sum() > 0.1  # spreading alone would have let this much through
+
+
+def test_what_is_blurred_in_front_covers_as_much_as_its_own_circle(rig):
+    """The same wall in focus, the sheet before it: light at the edge follows the sheet's blur."""
+    spread = wide_open(rig, 1.4)
+    depth = np.zeros((40, 60))
+    depth[:, :30] = NEAR_MM
+    picture = see(spread, depth, (depth < 1.0).astype(float))[10]
+    r = spread.radius
+    alone = np.full((40, 60), np.nan)
+    alone[:, :30] = NEAR_MM
+    sheet = see(spread, alone, np.ones((40, 60)))[10]
+    np.testing.assert_allclose(picture[15 - r : 15 + r], 1.0 - sheet[15 - r : 15 + r], atol=0.02)
+    assert 0.02 < picture[14] < 0.5
+
+
+def test_a_scene_blurs_where_its_needs_say_so_and_truth_stays_sharp(rig):
+    face = make_subject("II", seed=0, size=64)
+    plain = {"choice": EMBREE, "lateral": False, "interreflections": False}
+    blurred = FlashScene(rig, face, **plain)
+    sharp = FlashScene(rig, face, optics=False, **plain)
+    assert blurred.needs[flash_needs.LENS].verdict == "built"
+    assert sharp.needs[flash_needs.LENS].verdict == "asked"
+    change = np.abs(blurred.radiance() - sharp.radiance())
+    sigma = Noise.of(blurred.sensor()).sigma(blurred.radiance())
+    over = float((change / sigma).max())
+    told = blurred.needs[flash_needs.LENS].over_noise or 0.0
+    assert 1.0 < over <= told
+    one, two = blurred.truth(), sharp.truth()
+    for name in ("melanin", "reflectance", "shading", "normals"):
+        np.testing.assert_array_equal(one[name], two[name])
+    assert (one["mask"] <= two["mask"]).all()
+    assert one["mask"].sum() > 0.9 * two["mask"].sum()
+
+
+def test_small_holes_and_noisy_sensors_need_no_lens(rig):
+    face = make_subject("II", seed=0, size=64)
+    view = dataclasses.replace(rig.views[0], f_number=90.0, full_well_e=30.0, read_noise_e=300.0)
+    poor = dataclasses.replace(rig, views=(view,))
+    needs = FlashScene(poor, face, choice=EMBREE, lateral=False, interreflections=False).needs
+    assert needs[flash_needs.LENS].verdict == "negligible"
+
+
+def test_depths_behind_the_camera_are_refused(rig):
+    with pytest.raises(BlurError, match="depths_mm"):
+        lens_spread(rig.views[0], "D55", subpixels=2, depths_mm=[0.0, 1000.0])
+    with pytest.raises(BlurError, match="subpixels"):
+        lens_spread(rig.views[0], "D55", subpixels=0, depths_mm=[0.0])
+
+
+def test_focus_goes_through_the_target_unless_the_view_says_otherwise(rig):
+    cam = rig.views[0]
+    nearer = dataclasses.replace(cam, focus_mm=cam.distance_mm - 25.0)
+    tip = np.array([[0.0, 0.0, 25.0]], np.float32)
+    assert before_focus(cam, tip)[0] == pytest.approx(25.0, abs=1e-3)
+    assert before_focus(nearer, tip)[0] == pytest.approx(0.0, abs=1e-3)
