@@ -19,6 +19,7 @@ NEXT: Final[Mapping[str, str]] = {
     "usd": "open skin.usdc, in Blender by skin_in_blender.py; usd.json has what was assumed",
     "spectral": "read spectral.json: what is measured and what is modelled",
     "metahuman": "read delta_maps.json: layout and coding of the deltas",
+    "stokes": "read stokes.json: axis, channels, and what was not measured",
     "lp": "skinrig import lp DIR --out SESSION reads the folder back",
 }
 """What to do with each format."""
@@ -30,7 +31,7 @@ def export(
         str,
         typer.Option(
             help="Of an appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. "
-            "Of a session: mhl, frames, event-model, lp."
+            "Of a session: mhl, frames, event-model, lp, stokes."
         ),
     ],
     out: Out,
@@ -51,7 +52,10 @@ def export(
         bool, typer.Option("--with-errors", help="Standard errors and masks beside the values.")
     ] = False,
     only: Annotated[
-        str | None, typer.Option(help="Names of maps (maps), or of up to three states (metahuman).")
+        str | None,
+        typer.Option(
+            help="Names of maps (maps), of up to three states (metahuman), of states (stokes)."
+        ),
     ] = None,
     mesh: Annotated[
         Path | None,
@@ -75,7 +79,10 @@ def export(
         str | None, typer.Option(help="Whose pictures (lp); default: the one in front.")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="CALIBRATION/ folder of lights and cameras (lp).")
+        Path | None,
+        typer.Option(
+            help="CALIBRATION/ folder of lights and cameras (lp), of the sensor (stokes)."
+        ),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -85,18 +92,18 @@ def export(
 
     Example: skinrig export appearance --to gltf --out delivery
     """
-    from skinrig.exporting import appearances, brdfs, light_lists, sessions
+    from skinrig.exporting import appearances, brdfs, light_lists, sessions, stokes
     from skinrig.exporting.options import Delivery
 
     console = Console(json)
-    known = (*appearances.FORMATS, *brdfs.SUFFIX, *sessions.FORMATS, light_lists.NAME)
+    known = (*appearances.FORMATS, *brdfs.SUFFIX, *sessions.FORMATS, light_lists.NAME, stokes.NAME)
     if to not in known:
         raise UsageError(f"--to: got {to!r}, expected one of {', '.join(known)}")
+    names = () if only is None else tuple(name.strip() for name in only.split(","))
     if to in brdfs.SUFFIX:
         place = brdfs.place_of(at, radius_mm=radius, diffuse=not without_diffuse)
         done = appearances.export_brdfs(source, out, to=to, place=place, use=use)
     elif to in appearances.FORMATS:
-        names = () if only is None else tuple(name.strip() for name in only.split(","))
         delivery = Delivery(
             unit=unit,
             normal_y=normal_y,
@@ -111,6 +118,15 @@ def export(
     elif to == light_lists.NAME:
         done = light_lists.export_light_list(
             source, out, use=sessions.named(use), camera=camera, calibration=calibration
+        )
+    elif to == stokes.NAME:
+        done = stokes.export_stokes(
+            source,
+            out,
+            use=sessions.named(use),
+            only=names,
+            with_errors=with_errors,
+            calibration=calibration,
         )
     else:
         done = sessions.export_session(source, out, to=to, use=sessions.named(use))

@@ -118,8 +118,14 @@ def test_simulated_maps_need_no_use(tmp_path, capsys):
 
 
 def test_the_help_names_every_format():
-    from skinrig.exporting import appearances, brdfs, light_lists, sessions
+    from skinrig.exporting import appearances, brdfs, light_lists, sessions, stokes
 
     text = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).output
-    for name in (*appearances.FORMATS, *brdfs.SUFFIX, *sessions.FORMATS, light_lists.NAME):
+    for name in (
+        *appearances.FORMATS,
+        *brdfs.SUFFIX,
+        *sessions.FORMATS,
+        light_lists.NAME,
+        stokes.NAME,
+    ):
         assert name in text
