@@ -2,7 +2,8 @@
 
 The dome is small, 5 cameras 200 pixels across and 40 lights, so that a pixel of its images (2 x 2
 cells of the sensor) is 3.3 mm on the face. Limits say what follows from that; how accurate a full
-dome is, the benchmarks say.
+dome is, the benchmarks say. Light that spreads sideways in skin blurs less than such a pixel and is
+left out, as in the demo: `test_held_out_photographs.py` has it in its faces.
 """
 
 import dataclasses
@@ -25,6 +26,7 @@ from skinrig.simulating.simulation import simulate_session
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 
 SMALL = {"seed": 0, "width_px": 200, "views": 5, "lights": 40}
+FACE = SMALL | {"leave_out": ("subsurface",)}
 WANT = ("half_vector_normals", "normals", "normals_refined", "r_d", "lobe_residual", "samples")
 PIXEL_MM = 3.3
 
@@ -70,7 +72,7 @@ def dome(tmp_path_factory):
         "lights", [out / "session-mirror", out / "session-white"], out / "calibration"
     ).findings
     assert found == ()
-    simulate_session("dome", out / "session-face", **SMALL)
+    simulate_session("dome", out / "session-face", **FACE)
     return out
 
 
@@ -173,7 +175,9 @@ def test_a_head_that_moved_is_followed_and_errs_less_than_one_whose_motion_is_ig
     far = head_motion.head_motion(0, drift_mm=3.0, drift_deg=1.0)
     with monkeypatch.context() as patch:
         patch.setattr(head_motion, "head_motion", lambda _: far)
-        simulate_session("dome", dome / "session-move", move=True, **SMALL)
+        # light between parts of the face would be worked out for each frame
+        alone = {"leave_out": ("subsurface", "interreflections")}
+        simulate_session("dome", dome / "session-move", move=True, **SMALL, **alone)
     want = ["normals", "r_d"]
     calibration = dome / "calibration"
     pipeline.reconstruct(
@@ -232,7 +236,7 @@ def faulty(dome):
         patch.setattr(dome_build, "build", build)
         for target in ("charuco", "mirror", "white"):
             simulate_session("dome", out / f"session-{target}", target=target, **SMALL)
-        simulate_session("dome", out / "session-face", **SMALL)
+        simulate_session("dome", out / "session-face", **FACE)
     findings = calibrate("geometry", [out / "session-charuco"], calibration).findings
     findings += calibrate(
         "lights", [out / "session-mirror", out / "session-white"], calibration
