@@ -93,7 +93,7 @@ class Lighting:
         if self.furrow_sectors:
             hidden = hidden_share(
                 height_um, patch.normals, margin=margin, pixel_um=pitch_um,
-                sectors=self.furrow_sectors,
+                sectors=self.furrow_sectors, boundaries=True,
             )  # fmt: skip
             entering += self._from_furrows(hidden, entering, patch, 1e-3 * pitch_um)
         right = self.surface.image_right
@@ -158,9 +158,12 @@ class Lighting:
         """Return what enters by way of other walls of the relief, shape (4, H, W)."""
         if not patch.skin.any():
             return np.zeros_like(entering)
-        # out of one wall and into another, each at all angles alike
-        crossed = shading.interior_scale(ETA) * shading.average_transmittance(ETA) ** 2
-        once = crossed * float(patch.albedo[patch.skin].mean()) * hidden * patch.skin
+        once = (
+            shading.interior_scale(ETA)
+            * float(patch.albedo[patch.skin].mean())
+            * hidden
+            * patch.skin
+        )
         further = 1.0 / (1.0 - float(once[patch.skin].mean()))
         return self._spread(np.float32(further) * once.astype(np.float32) * entering, patch.skin,
                             pitch_mm)  # fmt: skip

@@ -6,8 +6,11 @@ import math
 from typing import Final
 
 import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
 
 from capture.rig import Rig
+from rigsim import shading
 from rigsim.effect_sizes import bounced, edge_loss, steepest_slope
 from rigsim.furrow_light import hidden_share
 from rigsim.lens_blur import Lens
@@ -15,7 +18,10 @@ from rigsim.microrelief import MicroSkin
 from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
 from rigsim.scenes.flash_needs import BOUNCES, LATERAL, SHADOWS, bands, polarization
 from rigsim.scenes.gradient_lighting import lateral_kernel
+from rigsim.skin_layers import ETA
 from rigsim.sphere_build import BuiltSphere
+
+FloatArray = NDArray[np.float64]
 
 OPTICS: Final = "diffraction and defocus"
 RELIEF: Final = "relief of the skin"
@@ -121,13 +127,17 @@ def _of_skin(
     lowest = float((place[:, 2] / np.hypot(place[:, 0], place[:, 1])).min())
     length = np.sqrt(1.0 + right**2 + down**2)
     normals = np.stack([-right / length, down / length, 1.0 / length], axis=-1)
-    hidden = hidden_share(
-        part, normals.astype(np.float32), margin=0, pixel_um=skin.texel_um, sectors=SECTORS
-    )
-    share = min(STEEPER * float(np.quantile(hidden, 0.999)), 0.9)
+    hidden = shading.interior_scale(ETA) * hidden_share(
+        part, normals.astype(np.float32), margin=0, pixel_um=skin.texel_um, sectors=SECTORS,
+        boundaries=True,
+    )  # fmt: skip
+    sigmas, weights = lateral_kernel(skin)
+    if lateral is not False:  # what comes from other walls spreads as all light does
+        hidden = _spread(hidden, sigmas, weights, 1e-3 * skin.texel_um)
+    # light that goes along the surface grows with the square of slopes
+    share = min(STEEPER**2 * float(np.quantile(hidden, 0.999)), 0.9)
     brightest = float(skin.albedo.max())
     more = bounced(share, brightest)
-    sigmas, weights = lateral_kernel(skin)
     pixel_mm = 1e-3 * lens.pixel_on_subject_um
     lost = edge_loss(sigmas, weights[None], pixel_mm)
     deg = (math.degrees(math.atan(steepest)), math.degrees(math.atan(lowest)))
@@ -144,6 +154,16 @@ def _of_skin(
         decide(
             BOUNCES, noise.share(more, min(1.0, brightest)), interreflections,
             switch="interreflections",
-            because=f"furrows hide up to {100 * share:.0f} % of the sky from their walls",
+            because=f"walls of furrows get up to {100 * share:.1f} % of what others send out",
         ),
     ]  # fmt: skip
+
+
+def _spread(
+    hidden: NDArray[np.floating], sigmas_mm: FloatArray, weights: FloatArray, texel_mm: float
+) -> FloatArray:
+    """Return the light of a part of the patch after it has spread; beyond it goes on mirrored."""
+    axis = np.arange(len(hidden)) / (2.0 * len(hidden) * texel_mm)
+    square = 2.0 * np.pi**2 * (axis[:, None] ** 2 + axis[None, :] ** 2)
+    kernel = np.tensordot(weights, np.exp(-(sigmas_mm**2)[:, None, None] * square), axes=1)
+    return np.asarray(scipy.fft.idctn(scipy.fft.dctn(hidden) * kernel), np.float64)

@@ -72,6 +72,7 @@ def plain_scene(
     sectors: int = 32,
     table_size: int | None = None,
     shadows: bool = True,
+    interreflections: bool = False,
 ) -> GradientScene:
     """Return the patch under LEDs that are points without films, without lens and spreading."""
     rig = load_rig("gradient").cropped(width_px)
@@ -88,7 +89,7 @@ def plain_scene(
         sectors=sectors,
         table_size=table_size,
         shadows=shadows,
-        interreflections=False,
+        interreflections=interreflections,
     )
 
 
@@ -171,16 +172,26 @@ def picture(scene: GradientScene, pixels: NDArray[np.intp]) -> FloatArray:
     return np.asarray(light.reshape(4, -1)[:, pixels].T, np.float64)
 
 
-def describe(scene: GradientScene, pattern: str) -> dict[str, Any]:
+def describe(
+    scene: GradientScene, pattern: str, *, depth: int = 2, gloss: bool = True
+) -> dict[str, Any]:
     """Return Mitsuba's scene of the patch under a pattern, at half the skin's strength.
 
-    Its blend averages the two parts of the reflection.
+    Its blend averages the two parts of the reflection. Without gloss light from inside is all, at
+    full strength, so that light of many bounces is too; a depth of 2 is direct light.
     """
     view = scene.rig.views[0]
     r_d = ALBEDO * shading.interior_scale(ETA) * plastic_scale(ETA)
+    inside = {
+        "type": "plastic",
+        "int_ior": ETA,
+        "ext_ior": 1.0,
+        "specular_reflectance": 0.0,
+        "diffuse_reflectance": {"type": "rgb", "value": [float(r_d)] * 3},
+    }
     description: dict[str, Any] = {
         "type": "scene",
-        "integrator": {"type": "path", "max_depth": 2},
+        "integrator": {"type": "path", "max_depth": depth, "rr_depth": depth + 1},
         "sensor": {
             "type": "perspective",
             "fov": math.degrees(2.0 * math.atan(0.5 * view.width_px / view.focal_px)),
@@ -203,13 +214,7 @@ def describe(scene: GradientScene, pattern: str) -> dict[str, Any]:
             "bsdf": {
                 "type": "blendbsdf",
                 "weight": 0.5,
-                "inside": {
-                    "type": "plastic",
-                    "int_ior": ETA,
-                    "ext_ior": 1.0,
-                    "specular_reflectance": 0.0,
-                    "diffuse_reflectance": {"type": "rgb", "value": [float(r_d)] * 3},
-                },
+                "inside": inside,
                 # a conductor without absorption reflects as a dielectric does
                 "surface": {
                     "type": "roughconductor",
@@ -218,7 +223,9 @@ def describe(scene: GradientScene, pattern: str) -> dict[str, Any]:
                     "eta": ETA,
                     "k": 0.0,
                 },
-            },
+            }
+            if gloss
+            else inside,
         },
     }
     shares = scene.sphere.weights @ np.array(PATTERN_WEIGHTS[pattern])
@@ -239,7 +246,13 @@ def describe(scene: GradientScene, pattern: str) -> dict[str, Any]:
 
 
 def rendered(
-    scene: GradientScene, pattern: str, *, samples: int, seed: int = 0
+    scene: GradientScene,
+    pattern: str,
+    *,
+    samples: int,
+    seed: int = 0,
+    depth: int = 2,
+    gloss: bool = True,
 ) -> tuple[Float32Array, float]:
     """Render a pattern by Mitsuba's path tracer.
 
@@ -251,6 +264,8 @@ def rendered(
         A lit pattern.
     samples, seed
         Of Mitsuba.
+    depth, gloss
+        See `describe`.
 
     Returns
     -------
@@ -259,14 +274,15 @@ def rendered(
     seconds : float
         Processor time of the second rendering: all is built and compiled before.
     """
-    description = describe(scene, pattern)
+    description = describe(scene, pattern, depth=depth, gloss=gloss)
     light_mm = description["light"]["position"]
     renderer = MovedLight(description, kind="rgb")
     renderer.radiance(light_mm, samples=samples, seed=seed + 1)
     begin = time.process_time()
     image = renderer.radiance(light_mm, samples=samples, seed=seed)
     spent = time.process_time() - begin
-    return np.asarray(2.0 * scene.unit * image[..., 0], np.float32), spent
+    strength = 2.0 if gloss else 1.0
+    return np.asarray(strength * scene.unit * image[..., 0], np.float32), spent
 
 
 def judge(found: FloatArray, reference: FloatArray, seconds: float, *, blocks: int = 40) -> Way:
