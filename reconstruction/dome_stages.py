@@ -325,7 +325,7 @@ def _albedo(
         ),
         progress=partial(dome.tell, "albedo"),
     )
-    found = surface_errors.of_albedo(found, surface, dome.pixel_mm)
+    found = surface_errors.of_albedo(found, point_normals, surface, dome.pixel_mm)
     return {
         "point_r_d": found,
         "r_d": texture.map(

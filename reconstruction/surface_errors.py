@@ -26,15 +26,18 @@ UNRESOLVED_RAD: Final = np.radians(0.27)
 
 This and the one above bring intervals to their nominal coverage on simulated faces of seeds 0 to 2,
 seen at 2.1 mm a pixel; see docs/decisions."""
-UNRESOLVED_R_D_PX: Final = 1.45
+UNRESOLVED_R_D_PX: Final = 1.55
 """Standard error of the albedo over what it changes by in a pixel: misplaced samples, and albedo
 that is too fine for the pixels and the more of it, the more there is that is just not.
 
 Of simulated faces of seeds 0, 1, 1, 2 and 5 and types III, V, II, I and IV, at 2.1 (and the last
-at 3.3) mm a pixel, 68 % of the truths lie within 1.36 to 1.68 of it in each channel."""
+at 3.3) mm a pixel, 68 % of the truths lie within 1.36 to 1.68 of it at each point and channel; a
+map, which lies between the points too, has 6 % more."""
 UNRESOLVED_R_D_PER_MM: Final = 0.017
 """The same for a forecast, where there is no image: relative, of medium skin, by the size of a
 pixel. Of light skin it was 0.011, of dark skin 0.02."""
+R_D_BY_NORMAL: Final = 0.5
+"""Relative error of the albedo by that of the normal, 1/rad: lights all around leave so much."""
 RINGS: Final = 2
 """Rings of neighbors that the albedo's change is averaged over: one point's edges are few."""
 LEAST_SPACING_PX: Final = 0.25
@@ -131,13 +134,17 @@ def of_normals(normals: PointValues, surface: RefinedScan, pixel_mm: float) -> P
     return PointValues(normals.values, np.where(normals.valid[:, None], stderr, 0.0), normals.valid)
 
 
-def of_albedo(r_d: PointValues, surface: RefinedScan, pixel_mm: float) -> PointValues:
-    """Add to the standard errors of the albedo what misplaced samples and pixels do to it.
+def of_albedo(
+    r_d: PointValues, normals: PointValues, surface: RefinedScan, pixel_mm: float
+) -> PointValues:
+    """Add to the standard errors of the albedo what normals, misplaced samples and pixels do to it.
 
     Parameters
     ----------
     r_d
         At the surface's points, with the error that noise leaves.
+    normals
+        Of the same points: neighbors' errors are alike, and no noise of the albedo's change.
     surface
         With its triangles: they say how fast the albedo changes.
     pixel_mm
@@ -153,4 +160,5 @@ def of_albedo(r_d: PointValues, surface: RefinedScan, pixel_mm: float) -> PointV
         pixel_mm=pixel_mm, noise=r_d.stderr, rings=RINGS,
     )  # fmt: skip
     stderr = np.hypot(r_d.stderr, UNRESOLVED_R_D_PX * pixel_mm * change)
+    stderr = np.hypot(stderr, R_D_BY_NORMAL * normals.stderr[:, :1] * np.abs(r_d.values))
     return PointValues(r_d.values, np.where(r_d.valid[:, None], stderr, 0.0), r_d.valid)

@@ -190,6 +190,59 @@ def compare(
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceTest:
+    """What the surface alone gives off at the test's points, by the lobes and in truth.
+
+    Attributes
+    ----------
+    texels
+        Flat indices into the appearance, (S,).
+    fitted, true
+        f_r of the surface times the light's cosine at the appearance's normal, (S, K), 1/sr; 0 for
+        directions below that horizon.
+    """
+
+    texels: NDArray[np.intp]
+    fitted: Double
+    true: Double
+
+
+def surface_test(appearance: SkinAppearance, truth: SkinAppearance) -> SurfaceTest | None:
+    """Return what lobes say of the surface's light at the test's points, beside the truth.
+
+    Parameters
+    ----------
+    appearance
+        With normals, albedo and lobes.
+    truth
+        With the file that `make_test` made.
+
+    Returns
+    -------
+    SurfaceTest or None
+        None where one of the two lacks what it takes.
+    """
+    basis = basis_of(appearance)
+    if basis is None or TEST_FILE not in truth.files or "r_d" not in appearance.maps:
+        return None
+    with np.load(io.BytesIO(truth.files[TEST_FILE]), allow_pickle=False) as stored:
+        test = {name: stored[name] for name in stored.files}
+    at = _texels_for(test["texel"], appearance, truth)
+    known = at >= 0
+    at = at[known]
+    light, view = (test[name][known].astype(np.float64) for name in ("light", "view"))
+    normals = normal_at(appearance, at)
+    cos_light = np.einsum("skc,sc->sk", light, normals)
+    cos_view = np.einsum("skc,sc->sk", view, normals)
+    weights = np.stack(
+        [appearance.maps[name].values.reshape(-1)[at] for name in weight_names(basis.size)], axis=-1
+    ).astype(np.float64)
+    lobes = brdf_basis.evaluate(weights[:, None], basis, light, view, normals[:, None])
+    cosine = np.where((cos_light > 0) & (cos_view > 0), cos_light, 0.0)
+    return SurfaceTest(at, lobes * cosine, test["surface"][known] * cosine)
+
+
 def predict(
     appearance: SkinAppearance,
     basis: BrdfBasis,

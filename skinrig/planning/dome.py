@@ -229,7 +229,7 @@ def _r_d_error(prediction: Prediction, look: Sight) -> float:
     sigma = np.sqrt(
         prediction.log_albedo**2
         + (surface_errors.UNRESOLVED_R_D_PER_MM * look.pixel_mm) ** 2
-        + (surface_estimates.R_D_BY_NORMAL * prediction.tilt_rad) ** 2
+        + (surface_errors.R_D_BY_NORMAL * prediction.tilt_rad) ** 2
     )
     return 0.6745 * float(np.median(sigma[prediction.valid]))  # median of a normal's magnitude
 

@@ -127,7 +127,10 @@ def test_errors_of_albedo_are_as_large_as_its_own_detail_makes_them(roughness):
         seen, true = seen_and_true(rng, roughness)
         values = np.tile(seen[:, None], (1, 3))
         found = surface_errors.of_albedo(
-            PointValues(values, np.full(values.shape, 1e-5), np.ones(len(seen), bool)), surface, 2.0
+            PointValues(values, np.full(values.shape, 1e-5), np.ones(len(seen), bool)),
+            plain(surface),
+            surface,
+            2.0,
         )
         error = np.abs(seen - true)
         inside.append(np.mean(error <= found.stderr[:, 0]))
@@ -143,12 +146,12 @@ def test_noise_is_no_detail_of_the_albedo():
     noisy = 0.3 + 0.01 * rng.standard_normal((len(surface.points_mm), 3))
     good = np.ones(len(noisy), bool)
     told = surface_errors.of_albedo(
-        PointValues(noisy, np.full(noisy.shape, 0.01), good), surface, 2.0
+        PointValues(noisy, np.full(noisy.shape, 0.01), good), plain(surface), surface, 2.0
     )
     # what is left after the noise is taken off scatters about nothing
     assert np.median(told.stderr) < 0.014
     untold = surface_errors.of_albedo(
-        PointValues(noisy, np.full(noisy.shape, 1e-6), good), surface, 2.0
+        PointValues(noisy, np.full(noisy.shape, 1e-6), good), plain(surface), surface, 2.0
     )
     assert np.median(untold.stderr) > 0.015
 
@@ -157,7 +160,10 @@ def test_even_albedo_keeps_the_error_of_its_noise():
     surface = sheet(ball(60.0))
     count = len(surface.points_mm)
     even = PointValues(np.full((count, 3), 0.3), np.full((count, 3), 0.002), np.ones(count, bool))
-    found = surface_errors.of_albedo(even, surface, 2.0)
+    found = surface_errors.of_albedo(even, plain(surface), surface, 2.0)
     np.testing.assert_allclose(found.stderr, 0.002, rtol=1e-6)
+    # normals off by 0.02 rad take 1 % of the albedo along
+    tilted = surface_errors.of_albedo(even, plain(surface, 0.02), surface, 2.0)
+    np.testing.assert_allclose(tilted.stderr, np.hypot(0.002, 0.3 * 0.01), rtol=1e-6)
     none = dataclasses.replace(even, valid=np.zeros(count, bool))
-    assert not surface_errors.of_albedo(none, surface, 2.0).stderr.any()
+    assert not surface_errors.of_albedo(none, plain(surface), surface, 2.0).stderr.any()
