@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, date, datetime
-from typing import Any
+from typing import Any, Protocol
 
 from capture.session import ConsentError, Subject
 from capture.session.manifest import ANY_USE
-from model.skin import SkinAppearance
 from skinrig.errors import UsageError
 
 KEY = "consent"
 """Of an appearance's parameters: what the subject of each measured session agreed to."""
+
+
+class Traced(Protocol):
+    """What says where it is from: an appearance, its document, a library of traits."""
+
+    @property
+    def source(self) -> str:
+        """Return "measured" or "simulated"."""
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """Return how it was made."""
 
 
 def subject_of(
@@ -44,7 +55,7 @@ def subject_of(
     return Subject(pseudonym, tuple(dict.fromkeys(filter(None, words))), day)
 
 
-def recorded(appearance: SkinAppearance) -> list[dict[str, Any]]:
+def recorded(appearance: Traced) -> list[dict[str, Any]]:
     """Return what the subjects of an appearance's measured sessions agreed to, each once.
 
     Parameters
@@ -60,6 +71,7 @@ def recorded(appearance: SkinAppearance) -> list[dict[str, Any]]:
 
     Examples
     --------
+    >>> from model.skin import SkinAppearance
     >>> told = {"pseudonym": "P042", "consent_scope": ["research"], "consent_expires": None}
     >>> recorded(SkinAppearance({}, "measured", {"consent": [told]})) == [told]
     True
@@ -70,13 +82,14 @@ def recorded(appearance: SkinAppearance) -> list[dict[str, Any]]:
     return found
 
 
-def carried(*appearances: SkinAppearance) -> list[dict[str, Any]]:
+def carried(*appearances: Traced) -> list[dict[str, Any]]:
     """Return the record that what is made of several appearances must bear.
 
     One that was measured and says nothing counts as of a subject who agreed to nothing.
 
     Examples
     --------
+    >>> from model.skin import SkinAppearance
     >>> carried(SkinAppearance({}, "measured"))[0]["consent_scope"], carried()
     ([], [])
     """
@@ -89,9 +102,24 @@ def carried(*appearances: SkinAppearance) -> list[dict[str, Any]]:
     return out
 
 
-def require(
-    appearance: SkinAppearance, use: str | None, *, where: str, today: date | None = None
-) -> None:
+def told(records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return records as people read them, a line a subject.
+
+    Examples
+    --------
+    >>> told([{"pseudonym": "P042", "consent_scope": ["research"], "consent_expires": "2031-01-01"},
+    ...       {"pseudonym": "P7", "consent_scope": [], "consent_expires": None}])
+    ['P042: research, until 2031-01-01', 'P7: nothing']
+    """
+    lines = []
+    for one in records:
+        uses = ", ".join(map(str, one.get("consent_scope") or ())) or "nothing"
+        last = one.get("consent_expires")
+        lines.append(f"{one.get('pseudonym')}: {uses}" + (f", until {last}" if last else ""))
+    return lines
+
+
+def require(appearance: Traced, use: str | None, *, where: str, today: date | None = None) -> None:
     """Raise where a subject has not agreed to a use of what was measured of it.
 
     Parameters
@@ -145,13 +173,13 @@ def _day(text: object, where: str) -> date:
         ) from error
 
 
-def _silent(appearance: SkinAppearance) -> bool:
+def _silent(appearance: Traced) -> bool:
     """Return whether anything in it was measured of somebody whose consent is not told."""
     parts = _sources(appearance)
     return any(part.get("source") == "measured" and not part.get(KEY) for part in parts)
 
 
-def _sources(appearance: SkinAppearance) -> list[dict[str, Any]]:
+def _sources(appearance: Traced) -> list[dict[str, Any]]:
     """Return what an appearance, or each part of one that moves, says of where it is from."""
     parts = appearance.parameters.get("parts")
     if isinstance(parts, dict) and parts:

@@ -15,6 +15,7 @@ from skinrig.reporting import (
     calibration,
     chromophore,
     comparison,
+    consents,
     dynamic,
     extremes,
     map_pictures,
@@ -156,6 +157,7 @@ def sections(found: Findings, checks: list[page.Check]) -> str:
     body += _documents(found, checks)
     body += calibration.section(found.calibrations, appearances, sessions, checks)
     body += omissions.section(found.sessions)
+    body += consents.section([found])
     return body + session.section(sessions)
 
 

@@ -26,8 +26,8 @@ def report(
 ) -> None:
     """Write one self-contained HTML page about what lies at PATHS.
 
-    Two sets of maps, two benchmarks or two folders of runs are compared; truths beside them serve
-    both. Anything else is shown one after the other.
+    Two sets of maps, two benchmarks, two folders of pictures or two of runs are compared; truths
+    beside them serve both. Anything else is shown one after the other.
 
     Example: skinrig report demo -o report.html
 

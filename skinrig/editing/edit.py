@@ -17,7 +17,7 @@ from model.skin import SkinAppearance, SkinMap
 from model.trait_storage import TraitLibrary
 from model.trait_vectors import DOUBTFUL_P, TraitVector
 from reconstruction import common_regions
-from skinrig import face_textures
+from skinrig import consent, face_textures
 from skinrig.editing import albedo as editing_albedo
 from skinrig.editing import masks, pigment_spots, surface_mixtures
 from skinrig.editing import spots as editing_spots
@@ -224,9 +224,14 @@ def edited(
     before = source.parameters.get("edit")
     if before is not None:
         record["before"] = before
+    # the people whose traits were used are in the result, too
+    used = () if library is None or not asked else (library,)
+    agreed = consent.carried(source, *used)
     appearance = dataclasses.replace(
         source, maps=work.maps, files=work.files, left_out=tuple(work.left_out),
-        parameters={**source.parameters, "edit": record},
+        parameters={
+            **source.parameters, "edit": record, **({consent.KEY: agreed} if agreed else {}),
+        },
     )  # fmt: skip
     return Edited(appearance, changed, record, tuple(work.warnings))
 

@@ -19,7 +19,7 @@ from model.trait_vectors import Contrast
 from model.traits import TraitSpace
 from reconstruction import brdf_basis, common_regions
 from reconstruction.common_parameterization import CommonFrame
-from skinrig import face_textures
+from skinrig import consent, face_textures
 from skinrig.editing import surface_mixtures
 from skinrig.editing.surface_mixtures import SurfaceMixtureError
 from skinrig.face_textures import Face
@@ -149,6 +149,7 @@ def fit_traits(
             inputs={"labels": face_textures.digest(labels)}
             | {f.name: face_textures.digest(f.path / store.DOCUMENT) for f in faces},
             left_out=[list(row) for row in left_out],
+            consent=consent.carried(*(face.appearance for face in faces)),
         ),
         {regions.TEXTURE_SPACE: regions.texture_bytes(texture)},
     )  # fmt: skip

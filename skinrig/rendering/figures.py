@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance
 from rigsim.render import Caster
+from skinrig import consent
 from skinrig.errors import UsageError
 from skinrig.rendering import folder, shadow
 from skinrig.rendering.bases import RankError, reduced
@@ -81,6 +82,7 @@ class Subject:
             "normals_carried_along": self.laid.carried,
             "lobes": self.model.lobes.size,
             "assumed": list(self.model.assumed),
+            consent.KEY: consent.carried(self.appearance),
             "measured_share": float(valid.sum() / max(self.laid.atlas.covered.sum(), 1)),
         }
 
@@ -408,6 +410,7 @@ def _record(
         **own,
         "appearances": [subject.path for subject in subjects],
         "assumed": list(told),
+        consent.KEY: consent.carried(*(subject.appearance for subject in subjects)),
         "unit": UNIT,
         "view": {
             "name": camera.serial,

@@ -40,9 +40,12 @@ def rows_of(a: Run, b: Run) -> list[CheckRow]:
 
 def _common_name(check: page.Check, run: Run, other: Run) -> str:
     """Return a check's name without the folder's where the two folders are named differently."""
+    name = check.name
     if len(run.appearances) == len(other.appearances) == 1:
-        return check.name.removeprefix(f"{next(iter(run.appearances))}: ")
-    return check.name
+        name = name.removeprefix(f"{next(iter(run.appearances))}: ")
+    if len(run.found.pictures) == len(other.found.pictures) == 1:
+        name = name.removeprefix(f"{run.found.pictures[0].name}: ")
+    return name
 
 
 def table(a: Run, b: Run, rows: Sequence[CheckRow]) -> str:

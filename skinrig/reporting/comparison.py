@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skinrig.front_view import FrontView
-from skinrig.reporting import check_comparison, map_pictures, page, truth_errors
+from skinrig.reporting import (
+    check_comparison,
+    consents,
+    map_pictures,
+    page,
+    picture_comparison,
+    truth_errors,
+)
 from skinrig.reporting import comparison_conditions as conditions
 from skinrig.reporting.map_comparison import MapDifference
 from skinrig.reporting.run_comparison import Pair, Run, alone
@@ -44,6 +51,9 @@ def lead(a: Run, b: Run, found: Sequence[Pair]) -> str:
         sentences.append(
             f"{len(disagree)} of {told} maps differ beyond their combined standard errors."
         )
+    drawn = picture_comparison.sentence(a, b)
+    if drawn:
+        sentences.append(drawn)
     if not sentences:
         sentences.append("Nothing that both have can be judged; see the tables.")
     bad = any(row.changed == "worse" for row in changed)
@@ -84,12 +94,14 @@ def sections(a: Run, b: Run, found: Sequence[Pair]) -> str:
     body = "".join(_pair(a, b, pair) for pair in found)
     body += conditions.benchmarks(a, b) + conditions.seconds(a, b)
     body += conditions.moved_calibrations(a, b)
-    missing = alone(a, b)
+    body += picture_comparison.section(a, b)
+    missing = [*alone(a, b), *picture_comparison.alone(a, b)]
     if missing:
         body += "<h2>Only in one</h2>" + page.table(
-            ("maps", "in"), missing, caption="Folders of maps without one of the same name"
-        )
-    return body
+            ("folder", "in"), missing,
+            caption="Folders of maps or pictures without one of the same name",
+        )  # fmt: skip
+    return body + consents.section([a.found, b.found])
 
 
 def _pair(a: Run, b: Run, pair: Pair) -> str:

@@ -11,12 +11,12 @@ import numpy as np
 
 from model import store
 from model.skin import SkinAppearance
-from skinrig.reporting import folders, map_comparison, page
+from skinrig.reporting import folders, map_comparison, page, pictures
 from skinrig.reporting.folders import Findings, ReportError
 from skinrig.reporting.map_comparison import MapDifference
 
-Kind = Literal["maps", "benchmark", "run", "truth", "other"]
-COMPARABLE: tuple[Kind, ...] = ("maps", "benchmark", "run")
+Kind = Literal["maps", "benchmark", "pictures", "run", "truth", "other"]
+COMPARABLE: tuple[Kind, ...] = ("maps", "benchmark", "pictures", "run")
 SAME_PLACE_MM = 1.0
 """Texels of two meshes whose median distance is larger are not the same places."""
 
@@ -46,7 +46,8 @@ def kind_of(path: Path) -> Kind:
     """Return what a path holds, as far as comparing goes.
 
     "maps": one APPEARANCE/ folder; "truth": a TRUTH/ folder; "benchmark": a document of `skinrig
-    bench`, or a folder that holds one and no maps; "run": a folder with folders of maps.
+    bench`, or a folder that holds one and no maps; "pictures": a folder of a rendering or an
+    analysis; "run": a folder with folders of maps or of pictures.
     """
     if (path / store.DOCUMENT).is_file():
         kind = store.read_document(path).parameters.get("kind")
@@ -55,7 +56,12 @@ def kind_of(path: Path) -> Kind:
         return "benchmark" if _is_bench(path) else "other"
     if not path.is_dir():
         return "other"
-    if any((entry / store.DOCUMENT).is_file() for entry in path.iterdir()):
+    if pictures.folder_document(path) is not None:
+        return "pictures"
+    if any(
+        (entry / store.DOCUMENT).is_file() or pictures.folder_document(entry) is not None
+        for entry in path.iterdir()
+    ):
         return "run"
     return "benchmark" if any(_is_bench(one) for one in sorted(path.glob("*.json"))) else "other"
 
@@ -72,9 +78,9 @@ def _is_bench(path: Path) -> bool:
 def sides(paths: Sequence[Path], *, insist: bool | None = None) -> tuple[Run, Run] | None:
     """Return the two runs that paths ask to compare, or None where they are a collection.
 
-    Exactly two paths of one kind, be it two sets of maps, two benchmarks or two folders of runs,
-    are compared; truths given beside them serve both. Everything else is a collection, shown one
-    after the other.
+    Exactly two paths of one kind, be it two sets of maps, two benchmarks, two folders of pictures
+    or two folders of runs, are compared; truths given beside them serve both. Everything else is a
+    collection, shown one after the other.
 
     Parameters
     ----------
@@ -102,7 +108,8 @@ def sides(paths: Sequence[Path], *, insist: bool | None = None) -> tuple[Run, Ru
             told = ", ".join(f"{path} ({kinds[path]})" for path in paths)
             raise ReportError(
                 f"--compare: got {told}, expected two of one kind: two folders of maps, two "
-                "benchmarks or two folders of runs; truths beside them are welcome"
+                "benchmarks, two folders of pictures or two folders of runs; truths beside them "
+                "are welcome"
             )
         return None
     first, second = _labels(*runs)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from model import store
+from skinrig import consent
 from skinrig.viewer import packing, page
 from skinrig.viewer.scene import SceneError, ViewerScene
 
@@ -19,6 +22,7 @@ def compose(
     *,
     mesh: Path | None = None,
     landmarks: Path | None = None,
+    calibration: Path | None = None,
     preset: str = "III",
     seed: int = 0,
     size: int = 2048,
@@ -30,7 +34,7 @@ def compose(
     ----------
     appearances
         Fitted folders of one face; none: a simulated head.
-    mesh, landmarks, preset, seed, size
+    mesh, landmarks, calibration, preset, seed, size
         As `skinrig.viewer.procedural.scene` and `skinrig.viewer.from_appearance.scene` take them.
     progress
         Called with one line a step.
@@ -45,10 +49,21 @@ def compose(
     if appearances:
         from skinrig.viewer import from_appearance
 
-        return from_appearance.scene(appearances, mesh=mesh, landmarks=landmarks, size=size)
+        scene = from_appearance.scene(
+            appearances, mesh=mesh, landmarks=landmarks, calibration=calibration, size=size
+        )
+        agreed = consent.carried(*map(store.read_document, appearances))
+        if not agreed:
+            return scene
+        told = {**scene.provenance, consent.KEY: consent.told(agreed)}
+        return dataclasses.replace(scene, provenance=told)
     if landmarks is not None:
         raise SceneError(
             "landmarks: got a table but no appearance whose picture it belongs to; name the folder"
+        )
+    if calibration is not None:
+        raise SceneError(
+            "calibration: got a folder but no dome's appearance whose colors it is of; name one"
         )
     from skinrig.viewer import procedural
 

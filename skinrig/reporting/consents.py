@@ -1,0 +1,57 @@
+"""What the people agreed to whose skin a report shows: it is a copy of them, too."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from model import store
+from skinrig import consent
+from skinrig.reporting import page
+from skinrig.reporting import pictures as pictures_section
+from skinrig.reporting.folders import Findings
+
+
+def records_of(found: Findings) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Yield folder and record of each subject that was measured, see :mod:`skinrig.consent`."""
+    for folder in found.appearances.values():
+        for record in consent.carried(store.read_document(folder)):
+            yield folder, record
+    for folder in found.sessions:
+        document = json.loads((folder / "session.json").read_text(encoding="utf-8"))
+        if document.get("source") == "measured":
+            yield folder, dict(document["subject"])
+    for folder in found.pictures:
+        path = pictures_section.folder_document(folder)
+        if path is not None:
+            for record in json.loads(path.read_text(encoding="utf-8")).get(consent.KEY) or ():
+                yield folder, dict(record)
+
+
+def section(sides: Sequence[Findings]) -> str:
+    """Return the table of subjects and what they agreed to; empty where nobody was measured.
+
+    Parameters
+    ----------
+    sides
+        What a report is about; of a comparison, both runs.
+    """
+    rows: dict[str, list[str]] = {}
+    for found in sides:
+        for folder, record in records_of(found):
+            (line,) = consent.told([record])
+            names = rows.setdefault(line, [])
+            if folder.name not in names:
+                names.append(folder.name)
+    if not rows:
+        return ""
+    table = [
+        (line.partition(": ")[0], line.partition(": ")[2], ", ".join(names))
+        for line, names in sorted(rows.items())
+    ]
+    return "<h2>Consent</h2>" + page.table(
+        ("subject", "agreed to", "shown from"), table,
+        caption="This report shows these people: hand it on for nothing else, and not after",
+    )  # fmt: skip

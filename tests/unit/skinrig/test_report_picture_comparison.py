@@ -1,0 +1,115 @@
+"""Two folders of pictures beside each other: light in proportion, codes, sizes, records."""
+
+import json
+
+import numpy as np
+import pytest
+
+from model import store
+from skinrig import report
+from skinrig.reporting import picture_comparison, png, run_comparison
+
+
+def folder(path, radiance, *, shown=None, **told):
+    """Write a rendering: linear light, its picture, and the record."""
+    path.mkdir(parents=True)
+    store.write_exr(path / "radiance.exr", radiance.astype(np.float32))
+    codes = np.rint(255 * np.clip(radiance if shown is None else shown, 0, 1)).astype(np.uint8)
+    (path / "radiance.png").write_bytes(png.encode(codes))
+    document = {"schema": "skinrig.render/1", "view": {"name": "C03"}, "seconds": 1.0, **told}
+    (path / "render.json").write_text(json.dumps(document))
+    return path
+
+
+@pytest.fixture
+def light(rng):
+    return rng.uniform(0.1, 0.5, (24, 32, 3))
+
+
+def test_brighter_light_is_told_by_its_factor_although_both_pictures_look_alike(light, tmp_path):
+    """A picture may be shown at a brightness of its own: codes would say that nothing differs."""
+    a = folder(tmp_path / "a", light, shown=light)
+    b = folder(tmp_path / "b", 1.25 * light, shown=light)
+    (one,), refused = picture_comparison.compared(a, b)
+    assert (one.kind, refused) == ("linear", [])
+    assert one.mean_ratio == pytest.approx(1.25, rel=1e-6)
+    assert one.relative_rms == pytest.approx(0.25, rel=1e-6)
+    (a / "radiance.exr").unlink()
+    (codes,), _ = picture_comparison.compared(a, b)
+    assert (codes.kind, codes.equal) == ("8-bit codes", True)
+
+
+def test_a_spot_that_brightens_is_found_where_it_is_and_in_its_channel(light, tmp_path):
+    other = light.copy()
+    other[5:8, 20:24, 0] += 0.3
+    (one,), _ = picture_comparison.compared(
+        folder(tmp_path / "a", light), folder(tmp_path / "b", other)
+    )
+    spot = np.zeros(light.shape[:2], bool)
+    spot[5:8, 20:24] = True
+    np.testing.assert_allclose(one.difference[spot], 0.1, atol=1e-6)
+    assert np.abs(one.difference[~spot]).max() == 0.0
+    assert one.largest == pytest.approx(0.3, abs=1e-6)
+
+
+def test_colors_of_png_files_keep_their_order(light, tmp_path):
+    a, b = folder(tmp_path / "a", light), folder(tmp_path / "b", light)
+    for one in (a, b):
+        (one / "radiance.exr").unlink()
+    (found,), _ = picture_comparison.compared(a, b)
+    np.testing.assert_allclose(found.a, light, atol=0.51 / 255)
+
+
+def test_pictures_of_other_sizes_or_of_one_run_alone_are_named(light, tmp_path):
+    a, b = folder(tmp_path / "a", light), folder(tmp_path / "b", light[:12])
+    (b / "shadow.png").write_bytes(png.encode(np.zeros((4, 4), np.uint8)))
+    found, refused = picture_comparison.compared(a, b)
+    assert found == []
+    assert dict(refused) == {"radiance": "sizes 24 x 32 x 3 and 12 x 32 x 3", "shadow": "only in B"}
+
+
+def test_a_report_on_two_folders_of_pictures_compares_them(light, tmp_path):
+    a = folder(tmp_path / "monday", light, samples=4)
+    b = folder(tmp_path / "tuesday", 1.1 * light, samples=16, seconds=9.0)
+    done = report.make([a, b])
+    assert done.compared == ("A: monday", "B: tuesday")
+    assert "1 of 1 pictures of both differ" in done.html
+    assert "monday and tuesday" in done.html
+    assert ">samples<" in done.html
+    assert ">seconds<" not in done.html
+    assert done.html == report.make([a, b]).html
+    assert report.make([a, b], compare=False).compared is None
+
+
+def test_pictures_inside_two_runs_belong_together_by_their_folders_name(light, tmp_path):
+    for run, gain in (("x", 1.0), ("y", 1.0)):
+        folder(tmp_path / run / "pictures-front", gain * light)
+    folder(tmp_path / "x" / "pictures-side", light)
+    paths = [tmp_path / "x", tmp_path / "y"]
+    both = run_comparison.sides(paths)
+    assert both is not None
+    assert [name for name, _, _ in picture_comparison.pairs(*both)] == ["pictures-front"]
+    assert picture_comparison.alone(*both) == [("pictures-side", "A: x")]
+    html = report.make(paths).html
+    assert "0 of 1 pictures of both differ" in html
+    assert "all that the records say, is the same" in html
+
+
+def test_a_check_of_photographs_that_failed_only_once_is_told_as_changed(light, tmp_path):
+    row = {"pairs": 2, "median": 0.03, "p68": 0.05, "p95": 0.1, "bias": 0.0, "total_error": 0.04,
+           "ssim": 0.9, "noise": 0.01}  # fmt: skip
+    for name, median in (("a", 0.03), ("b", 0.08)):
+        told = {"full model": {**row, "median": median}, "limit": 0.05, "by_kind": {},
+                "ablation": {}, "by_band": {}}  # fmt: skip
+        folder(tmp_path / name, light, **told)
+    html = report.make([tmp_path / "a", tmp_path / "b"]).html
+    assert "1 of 1 checks of both changed their verdict, 1 for the worse" in html
+
+
+def test_a_damaged_picture_is_named_and_the_rest_is_compared(light, tmp_path):
+    a, b = folder(tmp_path / "a", light), folder(tmp_path / "b", light)
+    for one in (a, b):
+        (one / "broken.png").write_bytes(b"no picture")
+    found, refused = picture_comparison.compared(a, b)
+    assert [one.name for one in found] == ["radiance"]
+    assert refused == [("broken", "cannot be read: is no picture")]
