@@ -6,6 +6,7 @@ tools/judge_flash_rig.py judges 100 to 119.
 
 import dataclasses
 from datetime import date
+from functools import cache
 
 import numpy as np
 import pytest
@@ -36,19 +37,29 @@ def calibration(tmp_path_factory):
     return folder / "store"
 
 
-def reconstructed(folder, calibration, *, subject, seed, **more):
-    done = simulate_session(
-        "flash", folder / "session-flash", subject=subject, seed=seed, width_px=WIDTH_PX, **more
-    )
-    pipeline.reconstruct(done.session, want=WANT, out=folder / "maps", calibration=calibration)
-    return store.read(folder / "maps"), store.read(done.truth)
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    """Captures by subject and seed, each simulated when it is first asked for."""
+
+    @cache
+    def capture(subject, seed):
+        folder = tmp_path_factory.mktemp(f"subject-{subject}")
+        return simulate_session(
+            "flash", folder / "session-flash", subject=subject, seed=seed, width_px=WIDTH_PX
+        )
+
+    return capture
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("subject", "seed"), [("I", 300), ("III", 302), ("IV", 303), ("VI", 305)])
-def test_chromophores_are_recovered_within_their_bounds(tmp_path, calibration, subject, seed, rng):
+def test_chromophores_are_recovered_within_their_bounds(
+    tmp_path, calibration, captured, subject, seed, rng
+):
     """Median relative error over the skin, against the truth with lateral transport in it."""
-    maps, truth = reconstructed(tmp_path, calibration, subject=subject, seed=seed)
+    done = captured(subject, seed)
+    pipeline.reconstruct(done.session, want=WANT, out=tmp_path / "maps", calibration=calibration)
+    maps, truth = store.read(tmp_path / "maps"), store.read(done.truth)
     rows = [r for r in compare(maps, truth, rng=rng) if r.against == "blurred" and r.band is None]
     assert {row.name for row in rows} == {"melanin", "hemoglobin"}
     for row in rows:
@@ -63,16 +74,14 @@ def test_chromophores_are_recovered_within_their_bounds(tmp_path, calibration, s
 
 
 @pytest.mark.long
-def test_a_white_balance_5_percent_off_breaks_the_bounds(tmp_path, calibration, rng):
+def test_a_white_balance_5_percent_off_breaks_the_bounds(tmp_path, calibration, captured, rng):
     """Shows that the test above can fail."""
     white = calibration_store.load(calibration, "white")
     tinted = dataclasses.replace(
         white, maps=dict(white.maps) | {"signal": white.maps["signal"] * np.float32([1.05, 1, 1])}
     )
     calibration_store.save(tinted, tmp_path / "tinted")
-    done = simulate_session(
-        "flash", tmp_path / "session-flash", subject="III", seed=302, width_px=WIDTH_PX
-    )
+    done = captured("III", 302)
     pipeline.reconstruct(
         done.session, want=WANT, out=tmp_path / "maps", calibration=tmp_path / "tinted",
     )  # fmt: skip
@@ -147,9 +156,12 @@ def test_reconstruction_needs_no_truth(tmp_path):
     assert "chromophores" in outcome.ran
 
 
-def test_a_calibration_of_another_day_is_refused_by_name(tmp_path, calibration):
+def test_a_calibration_of_another_day_is_refused_by_name(tmp_path):
     from capture.calibration.store import CalibrationError
 
+    simulate_session("flash", tmp_path / "session-white", target="white", seed=3, width_px=96)
+    calibration = tmp_path / "store"
+    calibrate("white", [tmp_path / "session-white"], calibration, created=TODAY)
     done = simulate_session("flash", tmp_path / "session-flash", seed=112, width_px=96)
     with pytest.raises(CalibrationError, match="valid"):
         pipeline.reconstruct(
