@@ -13,6 +13,8 @@ from model import color_table, spectra
 from model.facial_color import GLOBAL_GAINS, NEUTRAL, HemoglobinRig
 from model.tissue_optics import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from skinrig.dynamic_appearance import FACIAL_COLOR, parts_of
+from skinrig.viewer import camera_color
+from skinrig.viewer.camera_color import CameraColor
 from skinrig.viewer.fine_skin import FineSkin
 from skinrig.viewer.map_filling import filled, halved
 from skinrig.viewer.scene import Assets, SceneSource, Texture
@@ -62,7 +64,8 @@ class FaceColor:
 
 def assets(source: SceneSource) -> Assets:
     """Return chromophores, color table, hemoglobin rig and, where it was measured, the albedo."""
-    found = _face(source)
+    albedo = _albedo(source)
+    found = _face(source, measured=albedo is not None)
     table = color_table.build(
         spectra.LINEAR_SRGB, "D65", size=TABLE_SIZE, anisotropy=ANISOTROPY_SKIN
     )
@@ -82,9 +85,11 @@ def assets(source: SceneSource) -> Assets:
         },
     }
     left_out = list(found.left_out)
-    albedo = _albedo(source)
     if albedo is not None:
-        textures["albedo_map"] = albedo
+        textures["albedo_map"], seen = albedo
+        facts["albedo_color"] = seen.told
+        if not seen.known:
+            left_out.append(("colors of this face", seen.told))
         left_out.append(
             (
                 "chromophores of this face",
@@ -106,7 +111,8 @@ def _fine(size: int) -> int:
     return FINE if size >= 2048 else 1
 
 
-def _face(source: SceneSource) -> FaceColor:
+def _face(source: SceneSource, *, measured: bool) -> FaceColor:
+    """Return the chromophores; beside a measured albedo, coarse: only their changes show."""
     subject = source.subject
     if subject is None:
         raise ValueError("source: got no subject, expected one to stand for what was not measured")
@@ -115,7 +121,9 @@ def _face(source: SceneSource) -> FaceColor:
         from skinrig.viewer.placed_color import placed
 
         return placed(source, subject)
-    return simulated(subject, source.skin or FineSkin(subject, subject.size))
+    if measured or source.skin is None:
+        return simulated(subject, FineSkin(subject, subject.size))
+    return simulated(subject, source.skin)
 
 
 def simulated(person: Subject, skin: FineSkin) -> FaceColor:
@@ -148,7 +156,7 @@ def stored_states(rig: HemoglobinRig) -> dict[str, Floats]:
     return layers
 
 
-def _albedo(source: SceneSource) -> Texture | None:
+def _albedo(source: SceneSource) -> tuple[Texture, CameraColor] | None:
     """Return the measured albedo, (N, N, 3), of the dome's or a fitted model's folder."""
     for kind in ("model", "dome"):
         appearance = source.appearances.get(kind)
@@ -159,5 +167,7 @@ def _albedo(source: SceneSource) -> Texture | None:
         if found.valid is not None:
             valid = valid & found.valid
         values = np.stack([filled(found.values[..., c], valid) for c in range(3)], axis=-1)
-        return Texture(np.clip(halved(values, source.size), 0.0, 1.0).astype(np.float32), "u8")
+        seen = camera_color.of(source)
+        shown = np.clip(seen.convert(halved(values, source.size)), 0.0, 1.0)
+        return Texture(shown.astype(np.float32), "u8"), seen
     return None

@@ -8,18 +8,16 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from model import skin_reflectance, store
 from model.skin import SkinAppearance
 from skinrig import dynamic_appearance
-from skinrig.viewer import procedural
+from skinrig.viewer import patch_charts, procedural
 from skinrig.viewer.assembling import assemble
 from skinrig.viewer.fine_skin import FineSkin
+from skinrig.viewer.patch_charts import ClosedMesh
 from skinrig.viewer.scene import Kind, SceneError, SceneSource, ViewerScene
-
-if TYPE_CHECKING:
-    from rigsim.mesh import Mesh
 
 MESH: Final = "mesh.obj"
 ALBEDO: Final = "r_d"
@@ -30,6 +28,7 @@ def scene(
     *,
     mesh: Path | None = None,
     landmarks: Path | None = None,
+    calibration: Path | None = None,
     size: int = 2048,
 ) -> ViewerScene:
     """Return the scene of fitted folders.
@@ -43,6 +42,9 @@ def scene(
     landmarks
         Table ``name,x,y`` of the neutral picture that the flash rig's maps are drawn on; None: a
         simulation's own, from its TRUTH/ folder beside.
+    calibration
+        Folder with the color calibration of the dome's cameras; None: the one that the maps were
+        made with, where it lies beside and has color, else what is known of the sensor.
     size
         Texels a side of the large textures.
 
@@ -62,7 +64,8 @@ def scene(
         if kind in folders:
             raise SceneError(f"{path}: {folders[kind]} is of the same kind ({kind}); show one")
         appearances[kind], folders[kind] = appearance, path
-    surface, told = _mesh(appearances, mesh)
+    whole, told = _mesh(appearances, mesh)
+    surface = None if whole is None else whole.mesh
     first = next(iter(appearances.values()))
     seed = first.seed if isinstance(first.seed, int) and first.seed >= 0 else 0
     subject = procedural.simulated(surface, preset=procedural.PRESET, size=size, seed=seed)
@@ -78,6 +81,7 @@ def scene(
         appearances=appearances,
         paths=folders,
         landmarks=landmarks,
+        calibration=calibration,
     )
     left_out = [
         (
@@ -86,6 +90,8 @@ def scene(
             "action units",
         )
     ]
+    if whole is not None:
+        left_out = [*whole.told(), *left_out]
     if surface is None:
         left_out.insert(0, ("geometry of this face", f"{told}; --mesh FILE shows another"))
     found = assemble(
@@ -95,9 +101,11 @@ def scene(
             "kind": source.kind,
             "appearances": [path.name for path in paths],
             "mesh": told,
+            **({"closed_holes": len(whole.charts)} if whole is not None and whole.charts else {}),
         },
     )
-    return found.with_assets({"left_out": tuple(left_out)})
+    found = found.with_assets({"left_out": tuple(left_out)})
+    return found if whole is None else whole.painted(found)
 
 
 def kind_of(path: Path, appearance: SkinAppearance) -> str:
@@ -123,10 +131,15 @@ def kind_of(path: Path, appearance: SkinAppearance) -> str:
     )
 
 
-def _mesh(appearances: dict[str, SkinAppearance], asked: Path | None) -> tuple[Mesh | None, str]:
-    """Return the mesh to show, None for the procedural head, and words for it."""
+def _mesh(
+    appearances: dict[str, SkinAppearance], asked: Path | None
+) -> tuple[ClosedMesh | None, str]:
+    """Return the mesh to show, None for the procedural head, and words for it.
+
+    Holes of a scan are closed; another mesh may have them for a reason.
+    """
     if asked is not None:
-        return procedural.load_mesh(asked), asked.name
+        return ClosedMesh(procedural.load_mesh(asked), (), ()), asked.name
     for kind in ("model", "dome"):
         appearance = appearances.get(kind)
         if appearance is not None and MESH in appearance.files:
@@ -135,7 +148,7 @@ def _mesh(appearances: dict[str, SkinAppearance], asked: Path | None) -> tuple[M
             with tempfile.TemporaryDirectory() as folder:
                 copy = Path(folder) / MESH
                 copy.write_bytes(appearance.files[MESH])
-                return load_mesh(copy), f"{MESH} of the {kind}"
+                return patch_charts.closed(load_mesh(copy)), f"{MESH} of the {kind}"
     return None, "the procedural head stands for the face"
 
 

@@ -159,6 +159,8 @@ class SceneSource:
         Those folders.
     landmarks
         Table of named points of the picture that the flash rig's maps are drawn on.
+    calibration
+        Folder with the color calibration of the dome's cameras.
     """
 
     kind: Kind
@@ -170,6 +172,7 @@ class SceneSource:
     appearances: Mapping[str, SkinAppearance] = field(default_factory=dict)
     paths: Mapping[str, Path] = field(default_factory=dict)
     landmarks: Path | None = None
+    calibration: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

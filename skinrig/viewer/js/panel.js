@@ -249,6 +249,7 @@ V.describeScene = () => {
       add(V.capital(V.words(name)), [].concat(value).map(one =>
         typeof one === "object" ? JSON.stringify(one) : String(one)).join(", "));
     }
+    if (facts.albedo_color) add("Color of R_d", facts.albedo_color);
     const vertices = V.scene.mesh.positions.length / 3;
     add("Geometry", `${vertices} vertices, ${V.scene.mesh.faces.length / 3} triangles, ` +
       `${Object.keys(V.scene.mesh.shapes).length} blend shapes`);

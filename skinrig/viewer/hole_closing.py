@@ -1,0 +1,219 @@
+"""Small holes of a scanned mesh closed by smooth patches; its rim stays open.
+
+A hole is a loop of edges that one triangle has. Each gets a disc of new triangles whose vertices go
+where the surface around continues most smoothly: least squares of the discrete bending energy with
+the loop and the ring of vertices around it held (a thin plate). What was not measured stays known
+as such: `Patch` tells which triangles are new and how any value of the loop continues into them.
+
+References
+----------
+Botsch, Kobbelt 2004, An intuitive framework for real-time freeform modeling,
+doi:10.1145/1015706.1015772, section 3 (the energy and its boundary conditions).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+LARGEST_MM: Final = 200.0
+"""Length of a loop that is closed, at most: an eye, a nostril, the underside of a chin."""
+PART_OF_RIM: Final = 0.5
+"""A loop of more than this part of the longest is another rim."""
+ROUNDS: Final = 3
+"""Of the energy's weights, which depend on the shape that it gives."""
+LEAST_WEIGHT: Final = 1e-3
+"""Of an edge, in cotangents: less would let triangles turn over."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patch:
+    """A disc that closes a hole.
+
+    Attributes
+    ----------
+    rim : ndarray of int, shape (n,)
+        Vertices of the mesh along the loop, as the patch's triangles turn.
+    disc : ndarray of float64, shape (n + m, 2)
+        Places of the rim's and the new vertices in the unit disc.
+    faces : ndarray of int, shape (f, 3)
+        Of rim and new vertices in that order, counter-clockwise from outside.
+    inner_mm : ndarray of float64, shape (m, 3)
+        The new vertices.
+    length_mm : float
+        Of the loop.
+    """
+
+    rim: Ints
+    disc: Floats
+    faces: Ints
+    inner_mm: Floats
+    length_mm: float
+
+    def continued(self, values: Floats) -> Floats:
+        """Return values of the rim, (n, C), at rim and new vertices, (n + m, C): harmonic in it.
+
+        None lies beyond those of the rim.
+        """
+        n = len(self.rim)
+        weights = _uniform(self.faces, len(self.disc))
+        inner = weights[n:, n:].tocsc()
+        return np.concatenate([values, splu(inner).solve(-(weights[n:, :n] @ values))])
+
+
+def patches(vertices_mm: NDArray[np.floating], faces: NDArray[np.integer]) -> list[Patch]:
+    """Return what closes the holes of a mesh that are small, the longest loop first.
+
+    Parameters
+    ----------
+    vertices_mm
+        Shape (V, 3); vertices at one place count as one.
+    faces
+        Shape (F, 3).
+
+    Returns
+    -------
+    list of Patch
+        None for the longest loop, which is the rim of a scan, for loops above `LARGEST_MM`, and
+        for those that meet themselves.
+    """
+    points = np.asarray(vertices_mm, np.float64)
+    _, first, place = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    joined = first[place.reshape(-1)][np.asarray(faces, np.int64)]
+    found = [(float(_edges(points[loop]).sum()), loop) for loop in _loops(joined)]
+    found.sort(key=lambda one: -one[0])
+    if not found:
+        return []
+    most = min(LARGEST_MM, PART_OF_RIM * found[0][0])
+    neighbors = _neighbors(joined, len(points))
+    return [_patch(points, neighbors, loop, size) for size, loop in found[1:] if size <= most]
+
+
+def _edges(loop_mm: Floats) -> Floats:
+    return np.asarray(np.linalg.norm(np.roll(loop_mm, -1, axis=0) - loop_mm, axis=1))
+
+
+def _loops(faces: Ints) -> list[Ints]:
+    """Return loops of vertices around holes, in the direction in which a filling triangle turns."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    number = int(faces.max()) + 1
+    alone = ~np.isin(edges[:, 0] * number + edges[:, 1], edges[:, 1] * number + edges[:, 0])
+    open_edges = edges[alone]
+    # the other way round: the patch lies on the other side of the edge
+    starts, counts = np.unique(open_edges[:, 1], return_counts=True)
+    twice = {int(v) for v in starts[counts > 1]}
+    ahead = {int(b): int(a) for a, b in open_edges}
+    loops = []
+    while ahead:
+        start = min(ahead)
+        loop = [start]
+        at = ahead.pop(start)
+        while at != start and at in ahead:
+            loop.append(at)
+            at = ahead.pop(at)
+        if at == start and len(loop) >= 3 and not twice & set(loop):
+            loops.append(np.array(loop, np.int64))
+    return loops
+
+
+def _neighbors(faces: Ints, count: int) -> sparse.csr_matrix:
+    """Return the (V, V) pattern of edges."""
+    i, j = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
+    whole = sparse.coo_matrix((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i])), (count, count))
+    return whole.tocsr()
+
+
+def _patch(points: Floats, neighbors: sparse.csr_matrix, loop: Ints, length: float) -> Patch:
+    disc, faces = _disc(len(loop), np.cumsum(_edges(points[loop])) / length)
+    n, m = len(loop), len(disc) - len(loop)
+    if m == 0:
+        return Patch(loop, disc, faces, np.zeros((0, 3)), length)
+    patch = Patch(loop, disc, faces, np.zeros((m, 3)), length)
+    flat = patch.continued(points[loop])
+    # held besides the loop: vertices around it, each joined to those of the loop as the mesh has it
+    beside = neighbors[loop].tocoo()
+    outer = np.setdiff1d(beside.col, loop)
+    index = {int(v): n + m + k for k, v in enumerate(outer)}
+    around = np.array(
+        [(i, index[int(v)]) for i, v in zip(beside.row, beside.col, strict=True) if int(v) in index]
+    ).reshape(-1, 2)
+    whole = np.concatenate([flat, points[outer]])
+    for _ in range(ROUNDS):
+        whole[n : n + m] = _smoothed(whole, faces, around, n, m)
+    return Patch(loop, disc, faces, whole[n : n + m].copy(), length)
+
+
+def _disc(count: int, way: Floats) -> tuple[Floats, Ints]:
+    """Return points of the unit disc, the rim's first, and their triangles.
+
+    Rings have as many points as their radius has of the rim's.
+    """
+    from scipy.spatial import Delaunay
+
+    angle = 2.0 * np.pi * way
+    points = [np.stack([np.cos(angle), np.sin(angle)], axis=-1)]
+    rings = max(1, round(count / (2.0 * np.pi)))
+    for ring in range(1, rings):
+        radius = 1.0 - ring / rings
+        number = max(4, round(count * radius))
+        turn = 2.0 * np.pi * (np.arange(number) + 0.5 * (ring % 2)) / number
+        points.append(radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
+    if count > 3:
+        points.append(np.zeros((1, 2)))
+    disc = np.concatenate(points)
+    # a little farther out, the rim stays the hull whatever is rounded
+    lifted = np.concatenate([1.001 * points[0], *points[1:]])
+    faces = Delaunay(lifted).simplices.astype(np.int64) if len(disc) > 3 else np.array([[0, 1, 2]])
+    a, b, c = (disc[faces[:, k]] for k in range(3))
+    area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    faces = np.where((area < 0.0)[:, None], faces[:, ::-1], faces)
+    return disc, faces
+
+
+def _uniform(faces: Ints, count: int) -> sparse.csr_matrix:
+    """Return the graph's Laplacian, (count, count)."""
+    pattern = _neighbors(faces, count)
+    pattern.data[:] = 1.0
+    degree = np.asarray(pattern.sum(axis=1)).ravel()
+    return (sparse.diags(degree) - pattern).tocsr()
+
+
+def _smoothed(points: Floats, faces: Ints, around: Ints, n: int, m: int) -> Floats:
+    """Return the m inner points of the least bending energy; the others are held."""
+    total = len(points)
+    rows, columns, values = [], [], []
+    for k in range(3):
+        a, b, c = (points[faces[:, (k + s) % 3]] for s in range(3))
+        one, two = b - a, c - a
+        sine = np.linalg.norm(np.cross(one, two), axis=1)
+        cotangent = 0.5 * (one * two).sum(axis=1) / np.maximum(sine, 1e-12)
+        weight = np.clip(cotangent, LEAST_WEIGHT, 10.0)
+        rows += [faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]]
+        columns += [faces[:, (k + 2) % 3], faces[:, (k + 1) % 3]]
+        values += [weight, weight]
+    # beyond the loop lengths alone are known: weights fall with them
+    size = np.linalg.norm(points[around[:, 0]] - points[around[:, 1]], axis=1)
+    own = np.linalg.norm(points[np.roll(np.arange(n), -1)] - points[:n], axis=1).mean()
+    rows.append(around[:, 0])
+    columns.append(around[:, 1])
+    values.append(own / np.maximum(size, 1e-3 * own))
+    shape = (total, total)
+    weights = sparse.coo_matrix(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape
+    ).tocsr()
+    sums = np.asarray(weights.sum(axis=1)).ravel()
+    bending = (sparse.diags(1.0 / np.maximum(sums, 1e-12)) @ weights - sparse.eye(total)).tocsr()
+    used = bending[: n + m]
+    free = used[:, n : n + m]
+    held = used[:, :n] @ points[:n] + used[:, n + m :] @ points[n + m :]
+    normal = (free.T @ free).tocsc() + 1e-12 * sparse.eye(m, format="csc")
+    return np.asarray(splu(normal).solve(-(free.T @ held)))

@@ -1,0 +1,90 @@
+"""A dome's colors come to linear sRGB by what is known of its camera, and else it is said."""
+
+from __future__ import annotations
+
+from datetime import date
+
+import numpy as np
+import pytest
+
+from capture.calibration import color, store
+from capture.calibration.record import Quantity
+from model import color_table, spectra
+from model.skin import SkinAppearance, SkinMap
+from model.tissue_optics import ANISOTROPY_SKIN
+from skinrig.viewer import camera_color
+from skinrig.viewer.scene import SceneSource, ViewerMesh
+
+CAMERA, LIGHT = "Nikon 5100 (NPL)", "LED-B3"
+MATRIX = np.array([[1.5, 0.2, 0.1], [0.6, 1.2, -0.4], [0.1, -0.4, 1.9]])
+WHITE = np.array([0.48, 0.77, 0.6])
+
+
+def _source(folder, **more):
+    values = np.full((4, 4, 3), 0.4, np.float32)
+    appearance = SkinAppearance(maps={"r_d": SkinMap(values, "1")}, source="simulated", **more)
+    mesh = ViewerMesh(
+        np.eye(3, dtype=np.float32), np.eye(3, dtype=np.float32),
+        np.zeros((3, 2), np.float32), np.array([[0, 1, 2]], np.int32),
+    )  # fmt: skip
+    return SceneSource(
+        "dome", mesh, 64, appearances={"dome": appearance}, paths={"dome": folder / "appearance"}
+    )
+
+
+def _calibration(folder):
+    fit = color.ColorMatrix(
+        MATRIX, np.array([1.5]), np.zeros((3, 3)), "linear", "D55", np.array([1.0])
+    )
+    made = color.to_calibration(
+        fit, Quantity(WHITE, np.zeros(3)), serial="SD-1", rig="dome", source="simulated",
+        created=date(2026, 1, 1), inputs={},
+    )  # fmt: skip
+    store.save(made, folder)
+    return fit
+
+
+@pytest.mark.parametrize("named", [True, False], ids=["named", "found beside by its hash"])
+def test_a_color_calibration_brings_camera_colors_to_srgb(tmp_path, named):
+    import dataclasses
+    import hashlib
+
+    fit = _calibration(tmp_path / "calibration")
+    digest = hashlib.sha256((tmp_path / "calibration" / "color.json").read_bytes()).hexdigest()
+    source = _source(tmp_path, inputs={} if named else {"calibration color": digest})
+    if named:
+        source = dataclasses.replace(source, calibration=tmp_path / "calibration")
+    found = camera_color.of(source)
+    rgb = np.array([[0.5, 0.4, 0.3], [1.0, 1.0, 1.0]])
+    np.testing.assert_allclose(found.convert(rgb), fit.to_linear_srgb(rgb * WHITE), rtol=1e-12)
+    assert found.known
+    assert "1.5 dE2000" in found.told
+    assert np.abs(found.convert(rgb) - rgb).max() > 0.05
+
+
+def test_a_calibration_of_another_session_beside_is_not_taken(tmp_path):
+    _calibration(tmp_path / "calibration")
+    found = camera_color.of(_source(tmp_path, inputs={"calibration color": "0" * 64}))
+    assert not found.known
+    rgb = np.array([0.5, 0.4, 0.3])
+    np.testing.assert_array_equal(found.convert(rgb), rgb)
+    assert "as if it were linear sRGB" in found.told
+
+
+def test_a_tabulated_sensor_sees_skin_as_srgb_does(tmp_path, monkeypatch):
+    """Within 0.01 of skin of another grid; without the matrix it is off by far more."""
+    source = _source(tmp_path, parameters={"session": "session"})
+
+    class Named:
+        class rig:  # noqa: N801
+            views = (type("View", (), {"spectral_sensitivity": CAMERA}),)
+            lights = (type("Light", (), {"illuminant": LIGHT}),)
+
+    monkeypatch.setattr("capture.session.Session.open", lambda _: Named)
+    found = camera_color.of(source)
+    assert found.known
+    assert "no color calibration" in found.told
+    table = color_table.build(CAMERA, LIGHT, size=9, anisotropy=ANISOTROPY_SKIN)
+    wanted = color_table.build(spectra.LINEAR_SRGB, "D65", size=9, anisotropy=ANISOTROPY_SKIN)
+    assert np.abs(found.convert(table.rgb) - wanted.rgb).max() < 0.01
+    assert np.abs(table.rgb - wanted.rgb).max() > 0.03
