@@ -409,8 +409,8 @@ def radiance(
     Raises
     ------
     RenderError
-        A light's radiance is negative, which Mitsuba would render, or the image holds values that
-        are not finite.
+        A light's radiance is negative or not finite, which Mitsuba would render, or the image
+        holds values that are not finite.
     """
     _refuse_negative_light(description)
     mi = load(choose_variant(kind))
@@ -433,9 +433,14 @@ def _refuse_negative_light(description: Mapping[str, Any], where: str = "") -> N
             _refuse_negative_light(entry, f"{where}{name}.")
             value = entry.get("value")
         if name in shines and isinstance(value, (int, float, list, tuple, np.ndarray)):
-            least = float(np.min(np.asarray(value, np.float64), initial=0.0))
-            if least < 0.0:
-                raise RenderError(f"{where}{name}: got a value {least:g}, expected light >= 0")
+            least, most = (
+                float(end(np.asarray(value, np.float64), initial=0.0)) for end in (np.min, np.max)
+            )
+            if not (least >= 0.0 and most < np.inf):
+                raise RenderError(
+                    f"{where}{name}: got values of {least:g} to {most:g}, expected finite light, "
+                    ">= 0"
+                )
 
 
 class MovedLight:
@@ -471,7 +476,13 @@ class MovedLight:
         mi = load(self._choice)
         self._parameters["light.position"] = mi.Point3f(*(float(x) for x in np.ravel(light_mm)))
         self._parameters.update()
-        return np.array(mi.render(self._scene, spp=samples, seed=seed).numpy(), np.float32)
+        image = np.array(mi.render(self._scene, spp=samples, seed=seed).numpy(), np.float32)
+        if not np.isfinite(image).all():
+            raise RenderError(
+                f"light at {np.ravel(light_mm).tolist()} mm: got pixels that are not finite, "
+                "expected none; move it off the surface"
+            )
+        return image
 
 
 def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:

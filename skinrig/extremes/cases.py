@@ -68,12 +68,21 @@ class Result:
 
 def all_cases() -> tuple[Case, ...]:
     """Return every case, in the order of the light: transport, pictures, surface, motion."""
-    from skinrig.extremes import interior, motion, pictures, reflectance, rendering, transport
+    from skinrig.extremes import (
+        arrays,
+        interior,
+        motion,
+        photons,
+        pictures,
+        reflectance,
+        rendering,
+        transport,
+    )
     from skinrig.extremes import surface as extremes_surface
 
     groups = (
-        transport, rendering, pictures, extremes_surface,
-        reflectance, interior, motion,
+        transport, photons, rendering, pictures, extremes_surface,
+        reflectance, interior, motion, arrays,
     )  # fmt: skip
     return tuple(case for group in groups for case in group.CASES)
 

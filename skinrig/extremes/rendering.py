@@ -55,6 +55,22 @@ def _shadow_off_origin(_: Real) -> str:
     return "places that differ: " + within(share, 0.0, 0.01, what="share")
 
 
+def _fine_shadow_off_origin(_: Real) -> str:
+    # furrows of 60 um under light at 80 degrees, where the renderer's own offsets are 90 um
+    def furrows(x, y):  # type: ignore[no-untyped-def]
+        return 0.03 * np.cos(2.0 * np.pi * x / 0.2)
+
+    away = np.array([100.0, 100.0, 1000.0])
+    light = 500.0 * _tilted(80.0)
+    here = _seen(_sheet(furrows, side=101, pitch_mm=0.02), light)
+    there = _seen(_sheet(furrows, away, side=101, pitch_mm=0.02), light + away)
+    shadowed = float(np.mean(here == 0))
+    if not 0.2 < shadowed < 0.9:
+        raise Unexpected(f"got {shadowed:.2g} in shadow, expected furrows that shade each other")
+    share = float(np.mean(here != there))
+    return f"{shadowed:.2g} in shadow; places that differ: " + within(share, 0, 0.02, what="share")
+
+
 def _no_self_shadow(_: Real) -> str:
     lit = _seen(_sheet(lambda x, y: 0.0 * x), (5700.0, 0.0, 10.0))  # 0.1 degrees over the sheet
     return "lit " + within(lit, 1.0, 1.0, what="share")
@@ -77,7 +93,7 @@ def _zero_triangles(_: Real) -> str:
     normals = vertex_normals(points, faces)
     near(np.linalg.norm(normals, axis=-1)[[0, 1, 2]], np.ones(3), absolute=1e-5)
     lit = _seen(build_mesh(points, faces, points[:, :2] / 80.0), (0, 0, 300))
-    return within(lit, 0.0, 1.0, what="lit")
+    return "corners of those with area: lit " + within(lit[:3], 1.0, 1.0, what="share")
 
 
 def _wrong_unit(_: Real) -> str:
@@ -105,9 +121,22 @@ def _tilted(degrees: float) -> NDArray[np.float64]:
 
 
 def _grazing(real: Real) -> str:
+    from model import microfacet
+
     values = [_surface(_tilted(d), 0.3, real)[0] for d in (0.0, 60.0, 89.0, 89.9)]
     cosine = math.cos(math.radians(89.9))
     within(values[-1] * cosine, 0.0, 1e3, what="radiance")
+    up, low = real(1.0), real(cosine)
+    half = real(math.cos(math.radians(89.9 / 2)))
+    there, back = (
+        microfacet.brdf(a, b, half, half, roughness=0.3, eta=1.4, kind="ggx")
+        for a, b in ((up, low), (low, up))
+    )
+    near(there, back, relative=1e-6)
+    # a mirror's whole light: the lobe's share of it rises to all at grazing
+    flat = microfacet.brdf(low, low, up, low, roughness=0.3, eta=1.4, kind="ggx")
+    lobe = float(flat) * cosine * 4 * math.pi * 0.3**2 * cosine
+    within(lobe, 0.0, 1.0, what="share of a mirror's light")
     return within(values, 0.0, 1e6, what="f_r")
 
 
@@ -122,7 +151,10 @@ def _roughness_ends(real: Real) -> str:
     flat = microfacet.brdf(
         real(1.0), real(1.0), real(1.0), real(1.0), roughness=1.0, eta=1.4, kind="ggx"
     )
-    return f"peak {float(sharp):.4g}; " + within(flat, 1e-3, 1e-2, what="at 1")
+    # D = 1 / pi everywhere
+    return f"peak {float(sharp):.4g}; at 1 " + near(
+        flat, (0.4 / 2.4) ** 2 / (4 * math.pi), relative=1e-4
+    )
 
 
 def _furnace(real: Real) -> str:
@@ -138,7 +170,7 @@ def _furnace(real: Real) -> str:
     for degrees in (0.0, 45.0, 80.0):
         total, _ = surface_brdf.evaluate(packed, [0.0, 0.0, 1.0], light, _tilted(degrees))
         back.append(float(np.pi * np.mean(np.asarray(total, np.float64)[:, 0])))
-    return within(back, 0.0, 1.01, what="share reflected")
+    return within(back, 0.7, 1.01, what="share reflected")
 
 
 def _chip() -> Sensor:
@@ -187,6 +219,8 @@ CASES = (
     Case("shadow far from the origin", "ray casting", "300 mm off",
          "offsets of rays grow with the distance from the origin", "the same shadow",
          _shadow_off_origin),
+    Case("shadow of furrows far from the origin", "ray casting", "60 um deep, 1000 mm off",
+         "offsets of rays wider than the relief", "the same shadows", _fine_shadow_off_origin),
     Case("light along a plane", "ray casting", "0.1 degrees above it",
          "a flat sheet shadows itself", "all lit", _no_self_shadow),
     Case("light on the skin", "ray casting", "1 mm away", "rays shorter than their offset",
@@ -198,11 +232,12 @@ CASES = (
     Case("mesh in metres", "mesh", "an extent of 0.1", "offsets larger than the face",
          "MeshError saying millimetres", _wrong_unit),
     Case("light and view at 89.9 degrees", "surface reflection", "cosines of 0.0017",
-         "1/(4 cos cos)", "finite", _grazing),
+         "1/(4 cos cos)",
+         "finite, the same both ways, no more than a mirror", _grazing),
     Case("roughness 0.01 and 1", "microfacets", "a mirror and chalk", "overflow of 1/alpha^4",
          "closed forms", _roughness_ends),
     Case("white furnace", "surface reflection", "R_d 1 under films of oil",
-         "lobes that add up to more than all light", "at most 1 (1 % for the random directions)",
+         "lobes that add up to more than all light", "0.7 to 1 (1 % for the random directions)",
          _furnace),
     Case("light that is none", "sensor", "negative, NaN, infinite", "noise of a negative mean",
          "SensorError", _bad_light),

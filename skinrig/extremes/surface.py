@@ -46,7 +46,7 @@ def _coplanar(real: Real) -> str:
     lights = np.array([[np.sin(t), 0.0, np.cos(t)] for t in np.linspace(-0.6, 0.6, 9)])
     return refused(
         lambda: stereo.estimate_normals(_lit(lights, UP, real), lights),
-        stereo.PhotometricStereoError, "plane",
+        stereo.PhotometricStereoError, "plane", "along (0.0, -1.0, 0.0);",
     )  # fmt: skip
 
 
@@ -56,7 +56,7 @@ def _collinear(real: Real) -> str:
     lights = np.repeat(UP[None], 5, axis=0)
     return refused(
         lambda: stereo.estimate_normals(_lit(lights, UP, real), lights),
-        stereo.PhotometricStereoError,
+        stereo.PhotometricStereoError, "line", "(0.0, -1.0, 0.0) and (-1.0, 0.0, 0.0)",
     )  # fmt: skip
 
 
@@ -277,7 +277,7 @@ CASES = (
          "a matrix of rank 2", "PhotometricStereoError naming the direction that is not seen",
          _coplanar),
     Case("one direction only", "photometric stereo", "five equal lights", "a matrix of rank 1",
-         "PhotometricStereoError", _collinear),
+         "PhotometricStereoError naming both directions that are not seen", _collinear),
     Case("lights almost in a plane", "photometric stereo", "0.06 degrees out of it, noise 0.1 %",
          "condition 1e3 and more", "masked, refused, or an error within 4 stated ones",
          _nearly_coplanar),

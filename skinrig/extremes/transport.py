@@ -82,8 +82,13 @@ def _black_medium(real: Real) -> str:
         as_real([1e3], real), as_real([1.0], real), as_real([math.inf], real)
     )
     said = within(inside, 0.0, 2e-3, what="R_d of layers")
-    value = dipole.reflectance(as_real([0.01, 1.0], real), real(1e3), real(1.0), 1.4)
-    return said + "; " + within(value, 0.0, 1e6, what="R(r)")
+    value = dipole.reflectance(as_real([0.0, 0.01, 0.1, 1.0, 10.0], real), real(1e3), real(1.0),
+                               1.4)  # fmt: skip
+    rising(-np.asarray(value, np.float64), strictly=False, what="-R(r)")
+    # of 1000 / 1001 that is absorbed at each event hardly anything comes back
+    total = dipole.total_reflectance(1.0 / 1001.0, 1.4)
+    within(total, 0.0, 2e-3, what="dipole's R_d")
+    return said + "; " + within(value, 0.0, 1e3, what="R(r)")
 
 
 def _radius_ends(real: Real) -> str:
@@ -93,6 +98,11 @@ def _radius_ends(real: Real) -> str:
     one = dipole.reflectance(r, real(0.02), real(1.0), 1.4)
     two = diffusion.reflectance(r, real(0.02), real(1.0), 1.4)
     near(one[0], one[1], relative=1e-5)
+    far = as_real([1e30], real)
+    within(dipole.reflectance(far, real(0.02), real(1.0), 1.4), 0.0, 0.0, what="at 1e30 mm")
+    refused(lambda: dipole.reflectance(real(np.inf), real(0.02), real(1.0), 1.4), ValueError,
+            "radius_mm")  # fmt: skip
+    rising(-np.asarray(one, np.float64)[1:], strictly=False, what="-R(r)")
     return f"dipole {within(one, 0.0, 10.0)}; diffusion {within(two, -1e-9, 10.0)}"
 
 
@@ -255,8 +265,8 @@ CASES = (
          "both profiles agree", _no_absorption),
     Case("absorption far above scattering", "layers", "sigma_a = 1000, sigma_s' = 1",
          "exponentials under- and overflow", "R_d below 0.002, finite", _black_medium),
-    Case("distance to zero and infinity", "dipole", "r = 0, 1e-9, 100 and 10,000 mm",
-         "1/r and e^-r", "finite, and smooth at 0", _radius_ends),
+    Case("distance to zero and infinity", "dipole", "r = 0, 1e-9, 100, 10,000 and 1e30 mm",
+         "1/r and e^-r", "finite, smooth at 0, none far away; infinity refused", _radius_ends),
     Case("index 1 and 1.6", "layers", "no boundary, and a strong one", "Fresnel's averages",
          "less light leaves the denser medium", _index_ends),
     Case("index below 1", "layers", "eta = 0.9", "total reflection outside", "ValueError",

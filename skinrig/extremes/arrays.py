@@ -1,0 +1,248 @@
+"""Extremes of what is handed over: no numbers, single pixels, 8K pictures, singular systems."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from skinrig.extremes.cases import (
+    Case,
+    Real,
+    Unexpected,
+    as_real,
+    clean,
+    masked,
+    near,
+    refused,
+    rising,
+    within,
+)
+
+NO_NUMBERS = (np.nan, np.inf, -np.inf)
+
+
+def _ring(count: int, tilt_rad: float):  # type: ignore[no-untyped-def]
+    turn = np.arange(count) * (2.0 * np.pi / count)
+    across = math.sin(tilt_rad)
+    return np.stack(
+        [across * np.cos(turn), across * np.sin(turn), np.full(count, math.cos(tilt_rad))], -1
+    )
+
+
+def _no_numbers_in_light(real: Real) -> str:
+    from reconstruction import photometric_stereo as stereo
+
+    lights = _ring(8, 0.6)
+    for bad in NO_NUMBERS:
+        seen = as_real(np.tile(lights[:, 2:, None], (1, 2, 2)), real)
+        seen[3, 0, 1] = bad
+        seen[:, 1, 0] = bad
+        found = stereo.estimate_normals(seen, lights)
+        if found.valid.tolist() != [[True, True], [False, True]]:
+            raise Unexpected(f"valid: got {found.valid.tolist()} with {bad} in one light, and all")
+        near(found.normals[found.valid], np.tile([0.0, 0.0, 1.0], (3, 1)), absolute=1e-5)
+        clean(found.normals, np.ones((2, 2), bool), what="normals")
+    return "one light left out, the pixel without any masked"
+
+
+def _no_numbers_in_normals(real: Real) -> str:
+    from reconstruction import normal_integration
+
+    y, x = np.mgrid[0:12, 0:12]
+    normals = np.stack([-0.3 + 0.0 * x, 0.1 + 0.0 * y, np.ones((12, 12))], -1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    whole = normal_integration.integrate(as_real(normals, real))
+    holed = as_real(normals, real)
+    holed[5, 5], holed[7, 2] = np.nan, np.inf
+    found = normal_integration.integrate(holed)
+    kept = np.ones((12, 12), bool)
+    kept[5, 5] = kept[7, 2] = False
+    off = (found - whole)[kept]
+    return "off by " + within(off - off.mean(), -0.02, 0.02, what="pixels")
+
+
+def _no_numbers_in_statistics(real: Real) -> str:
+    from model import facial_color
+
+    plain = as_real(0.1 + 0.01 * np.random.default_rng(0).random((12, 12)), real)
+    told = []
+    for bad in NO_NUMBERS:
+        broken = plain.copy()
+        broken[6, 6] = bad
+        mean, deviation = facial_color.local_statistics(broken, 3.0)
+        clean(mean, np.ones_like(mean, bool), what="mean")
+        clean(deviation, np.ones_like(mean, bool), what="deviation")
+        told.append(np.max(np.abs(mean - facial_color.local_statistics(plain, 3.0)[0])))
+    return "means move by " + within(told, 0.0, 1e-3, what="at most")
+
+
+def _each_refused(calls: list[tuple[str, Callable[[float], object]]]) -> str:
+    for word, call in calls:
+        for bad in NO_NUMBERS:
+            refused(lambda call=call, bad=bad: call(bad), ValueError, word)  # type: ignore[misc]
+    return f"ValueError naming it, for {len(calls)} inputs and 3 values each"
+
+
+def _no_numbers_in_media(real: Real) -> str:
+    from model import diffusion, dipole, tissue_optics
+
+    def stack(value: float) -> object:
+        return tissue_optics.layer_stack_reflectance(
+            as_real([value], real), as_real([1.0], real), as_real([math.inf], real)
+        )
+
+    return _each_refused([
+        ("radius_mm", lambda v: dipole.reflectance(real(v), real(0.1), real(1.0), 1.4)),
+        ("sigma_a_per_mm", lambda v: dipole.reflectance(real(1.0), real(v), real(1.0), 1.4)),
+        ("sigma_s_prime", lambda v: diffusion.reflectance(real(1.0), real(0.1), real(v), 1.4)),
+        ("sigma_a_per_mm", stack),
+        ("c_m", lambda v: tissue_optics.two_layer_reflectance(500.0, real(v), 0.05)),
+        ("wavelength", lambda v: tissue_optics.two_layer_reflectance(real(v), 0.02, 0.05)),
+    ])  # fmt: skip
+
+
+def _single_pixels(real: Real) -> str:
+    from model import facial_color
+    from reconstruction import normal_integration, polarization, texture_fill
+
+    near(normal_integration.integrate(as_real([[[0.0, 0.6, 0.8]]], real)), [[0.0]])
+    one = as_real(np.full((1, 1, 3), 0.5), real)
+    masked(polarization.separate(one, 0.4 * one).valid, share=(1.0, 1.0))
+    mean, deviation = facial_color.local_statistics(one[..., 0], 2.0)
+    near(mean, [[0.5]], relative=1e-6)
+    near(deviation, [[0.0]], absolute=1e-9)
+    near(texture_fill.push_pull(one, np.ones((1, 1))).values, one, relative=1e-6)
+    return "heights, polarizations, statistics and textures of 1 x 1"
+
+
+def _eight_thousand(_: Real) -> str:
+    from capture import hdr
+
+    shape = (4320, 7680)
+    dn = np.empty((2, *shape), np.uint16)
+    dn[0], dn[1] = 9000, 2634
+    dn[:, -1, -1] = 16383, 16383
+    dn[0, 0] = 16383
+    told = {"gain": 0.5, "read_noise": 3.0, "black": 512.0, "white": 16383.0}
+    radiance, variance, valid = hdr.merge(dn, (1.0, 0.25), **told)
+    small = hdr.merge(dn[:, :2, :2], (1.0, 0.25), **told)
+    for whole, part in zip((radiance, variance), small, strict=False):
+        near(whole[:2, :2], part, relative=1e-6)
+        inner = whole[1:-1]
+        near([inner.min(), inner.max()], [part[1, 0], part[1, 0]], relative=1e-6)
+    if valid[-1, -1] or not valid[:-1].all():
+        raise Unexpected("valid: expected all but the last pixel, which every frame saturates")
+    return f"{radiance.size / 1e6:.3g} million pixels, as in a small picture"
+
+
+def _missed_range(_: Real) -> str:
+    from capture import hdr
+
+    # rows: below the noise of all, saturated in all, in all but the shortest, in none
+    dn = np.array([
+        [512, 16383, 16383, 9000], [512, 16383, 16383, 2634], [512, 16383, 3000, 1042],
+    ], np.uint16)[:, :, None]  # fmt: skip
+    radiance, variance, valid = hdr.merge(
+        dn, (1.0, 0.25, 0.0625), gain=0.5, read_noise=3.0, black=512.0, white=16383.0
+    )
+    if valid[:, 0].tolist() != [True, False, True, True]:
+        raise Unexpected(f"valid: got {valid[:, 0].tolist()}, expected all but the second")
+    clean(radiance, valid, what="radiance")
+    near(radiance[2, 0], (3000 - 512) / 0.0625, relative=1e-5)
+    within(radiance[0, 0] / np.sqrt(variance[0, 0]), -1.0, 1.0, what="darkness over its error")
+    return masked(valid, share=(0.75, 0.75))
+
+
+def _mirror_and_chalk(real: Real) -> str:
+    from reconstruction import photometric_stereo as stereo
+
+    lights = np.concatenate([_ring(24, 0.6), _ring(12, 0.3)])
+    seen = np.zeros((36, 1, 3))
+    seen[5, 0, 0] = 1.0  # a mirror: one light of all is seen in it
+    seen[:, 0, 1] = lights[:, 2]  # chalk
+    seen[:, 0, 2] = lights[:, 2]
+    seen[7, 0, 2] += 50.0  # chalk under varnish
+    found = stereo.estimate_normals(as_real(seen, real), lights)
+    if found.valid.tolist() != [[False, True, True]]:
+        raise Unexpected(f"valid: got {found.valid.tolist()}, expected all but the mirror")
+    off = np.arccos(np.clip(found.normals[0, 1:, 2], -1.0, 1.0))
+    return "mirror masked; chalk and varnish off by " + within(
+        np.degrees(off), 0.0, 0.1, what="degrees"
+    )
+
+
+def _conditions(real: Real) -> str:
+    from model import reduced_spaces
+
+    rng = np.random.default_rng(0)
+    one = rng.random(20)
+    told, worst = [], []
+    for apart in (1.0, 1e-3, 1e-6, 1e-9, 1e-12):
+        each = np.concatenate([[0.0], np.full(5, apart)])[:, None] * rng.random((6, 20))
+        basis = np.asarray(as_real(one + each, real), np.float64)
+        told.append(float(np.linalg.cond(basis)))
+        samples = rng.random((5, 6)) @ basis
+        got = reduced_spaces.mixture_coordinates(samples, basis, None)
+        within(got, 0.0, 1e3, what="shares")
+        worst.append(np.max(np.abs(got @ basis - samples)) / samples.max())
+    rising(told[: 2 if real is np.float32 else 5], what="conditions")
+    return f"conditions {told[0]:.2g} to {max(told):.2g}: samples again within " + within(
+        worst, 0.0, 1e-6, what="share"
+    )
+
+
+def _light_in_renderer(_: Real) -> str:
+    from rigsim import render
+
+    def scene(emitter: dict[str, object]) -> dict[str, object]:
+        film = {"type": "hdrfilm", "width": 4, "height": 4}
+        return {
+            "type": "scene", "sensor": {"type": "perspective", "film": film},
+            "shape": {"type": "sphere", "center": [0.0, 0.0, 5.0]}, "light": emitter,
+            "integrator": {"type": "path"},
+        }  # fmt: skip
+
+    emitters: list[dict[str, object]] = []
+    for bad in (np.nan, np.inf, -1.0):
+        value = {"type": "rgb", "value": [1.0, float(bad), 1.0]}
+        emitters += [
+            {"type": "constant", "radiance": value},
+            {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": value},
+            {"type": "envmap", "bitmap": np.full((4, 8, 3), bad, np.float32)},
+        ]
+    for emitter in emitters:
+        refused(
+            lambda emitter=emitter: render.radiance(scene(emitter), kind="rgb", samples=1),  # type: ignore[misc]
+            render.RenderError, "light",
+        )  # fmt: skip
+    return f"RenderError naming light, for {len(emitters)} lights"
+
+
+CASES = (
+    Case("no numbers in light", "photometric stereo", "NaN and infinities, in one light and in all",
+         "NaN spreads through sums", "the others' normal; the pixel without any masked",
+         _no_numbers_in_light),
+    Case("mirror, chalk and varnish", "photometric stereo", "a pixel that shows one light of 36",
+         "a highlight passes for shape", "the mirror masked, chalk and varnish within 0.1 degrees",
+         _mirror_and_chalk),
+    Case("no numbers in normals", "normal integration", "a NaN and an infinity",
+         "one hole spoils the whole height", "the plane beside the holes", _no_numbers_in_normals),
+    Case("no numbers in a map", "local statistics", "a NaN, an infinity",
+         "running sums keep a NaN for ever", "means of the others", _no_numbers_in_statistics),
+    Case("no numbers in a medium", "dipole", "NaN and infinities for each coefficient",
+         "NaN without a mask", "ValueError naming the argument", _no_numbers_in_media),
+    Case("single pixels", "pictures", "1 x 1", "differences of neighbors that do not exist",
+         "values of that pixel", _single_pixels),
+    Case("8K pictures", "hdr", "7680 x 4320, two exposures", "indices and memory",
+         "the values of a small picture", _eight_thousand),
+    Case("brackets that miss the range", "hdr", "darker than all noise, brighter than the shortest",
+         "0/0 of weights", "darkness within its error; saturated pixels masked", _missed_range),
+    Case("conditions 1 to 1e12", "non-negative mixtures", "six materials ever more alike",
+         "a Gram matrix squares the condition", "samples again within 1e-6, shares bounded",
+         _conditions),
+    Case("light that no lamp gives", "renderer", "negative, NaN, infinite",
+         "the renderer draws it without a word", "RenderError naming the light",
+         _light_in_renderer),
+)  # fmt: skip

@@ -1,0 +1,117 @@
+"""Extremes of the photons' random walks: no absorption, nothing else, thin and stiff layers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from skinrig.extremes.cases import Case, Real, Unexpected, as_real, near, within
+
+STAGE = "Monte Carlo"
+Matter = tuple[float, float, float, float]
+"""Thickness, sigma_a, sigma_s (mm, 1/mm) and g."""
+
+
+def _walked(real: Real, *layers: Matter, eta: float = 1.4, photons: int = 40_000):  # type: ignore[no-untyped-def]
+    """Return what becomes of photons in layers."""
+    from rigsim.tissue_mc import Layer, LayerStack, transport
+
+    made = []
+    for one in layers:
+        depth, absorption, scattering, g = (float(real(value)) for value in one)
+        made.append(Layer(depth, absorption, scattering, g, float(real(eta))))
+    stack = LayerStack(tuple(made))
+    found = transport(stack, photons=photons, rng=np.random.default_rng(7))
+    near(found.balance, 1.0, absolute=1e-9)
+    return found
+
+
+def _z_of_layers(real: Real, *layers: Matter, eta: float = 1.4) -> str:
+    """Return how far the walks are from the doubled layers, in standard errors."""
+    from model import tissue_optics
+
+    depth, absorption, scattering, g = np.array(layers, np.float64).T
+    if np.any(g != 0.0):
+        raise ValueError("g: expected 0, for which sigma_s' is sigma_s")
+    found = _walked(real, *layers, eta=eta)
+    told = float(
+        tissue_optics.layer_stack_reflectance(
+            as_real(absorption, real), as_real(scattering, real), as_real(depth, real),
+            eta=float(real(eta)), directions=32,
+        )
+    )  # fmt: skip
+    # the layers' own error: half a percent of what comes back
+    error = math.hypot(found.reflectance_stderr, 0.005 * told)
+    z = (found.reflectance - told) / error
+    return f"R {found.reflectance:.4g}, layers {told:.4g}: " + within(z, -4.0, 4.0, what="z")
+
+
+def _nothing_absorbed(real: Real) -> str:
+    said = []
+    for absorption in (0.0, 1e-30, 1e-12):
+        found = _walked(real, (1.0, absorption, 10.0, 0.9), photons=4000)
+        within(found.absorbed, 0.0, 1e-9, what="absorbed")
+        near(found.specular + found.reflectance + found.transmittance, 1.0, absolute=1e-9)
+        said.append(found.reflectance + found.transmittance)
+    return within(said, 0.9, 1.0, what="R + T")
+
+
+def _all_absorbed(real: Real) -> str:
+    found = _walked(real, (math.inf, 1e3, 1.0, 0.0))
+    surface = (0.4 / 2.4) ** 2
+    near(found.specular, surface, relative=1e-6)
+    near(found.absorbed.sum(), 1.0 - surface, relative=1e-3)
+    return within(found.reflectance, 0.0, 5e-4, what="R")
+
+
+def _albedo_to_one(real: Real) -> str:
+    return _z_of_layers(real, (20.0, 1e-5, 1.0, 0.0))
+
+
+def _thin(real: Real) -> str:
+    bare = _walked(real, (math.inf, 0.2, 1.5, 0.0))
+    covered = _walked(real, (1e-7, 50.0, 1.5, 0.0), (math.inf, 0.2, 1.5, 0.0))
+    error = math.hypot(bare.reflectance_stderr, covered.reflectance_stderr)
+    if error <= 0.0:
+        raise Unexpected("got no standard error")
+    within(covered.absorbed[0], 0.0, 1e-4, what="absorbed by the film")
+    z = (covered.reflectance - bare.reflectance) / error
+    return within(z, -4.0, 4.0, what="z")
+
+
+def _stiff(real: Real) -> str:
+    return _z_of_layers(real, (0.25, 60.0, 7.0, 0.0), (math.inf, 0.05, 3.5, 0.0))
+
+
+def _stiff_below(real: Real) -> str:
+    return _z_of_layers(real, (0.25, 0.001, 7.0, 0.0), (math.inf, 60.0, 3.5, 0.0))
+
+
+def _no_boundary(real: Real) -> str:
+    return _z_of_layers(real, (math.inf, 0.05, 1.5, 0.0), eta=1.0)
+
+
+def _strong_boundary(real: Real) -> str:
+    return _z_of_layers(real, (math.inf, 0.05, 1.5, 0.0), eta=1.6)
+
+
+AGREE = "the layers' reflectance (z of both errors, 6e-5 false alarms)"
+CASES = (
+    Case("photons that nothing absorbs", STAGE, "sigma_a 0, 1e-30 and 1e-12",
+         "roulette and weights of walks without an end", "all light comes back or goes through",
+         _nothing_absorbed),
+    Case("photons that are absorbed at once", STAGE, "sigma_a 1000, sigma_s' 1",
+         "weights that underflow", "the surface's reflection, and hardly more", _all_absorbed),
+    Case("single-scattering albedo to 1", STAGE, "sigma_a 1e-5, sigma_s' 1, 20 mm",
+         "walks cut short lose light", AGREE, _albedo_to_one),
+    Case("film on the skin", STAGE, "0.1 nm of sigma_a 50", "steps longer than the layer",
+         "bare skin's reflectance (z, 6e-5 false alarms)", _thin),
+    Case("dark layer on a light one", STAGE, "sigma_a 60 over 0.05 per mm",
+         "steps that cross a stiff boundary", AGREE, _stiff),
+    Case("light layer on a dark one", STAGE, "sigma_a 0.001 over 60 per mm",
+         "steps that cross a stiff boundary", AGREE, _stiff_below),
+    Case("walks without a surface", STAGE, "eta 1", "Fresnel's 0/0", AGREE, _no_boundary),
+    Case("walks under a strong surface", STAGE, "eta 1.6", "many total reflections", AGREE,
+         _strong_boundary),
+)  # fmt: skip
