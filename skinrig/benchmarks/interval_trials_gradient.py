@@ -1,7 +1,8 @@
-"""Trials of the gradient sphere's intervals: normals and heights of patches of skin."""
+"""Trials of the gradient sphere's intervals: normals, heights and stretch of patches of skin."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
@@ -10,39 +11,47 @@ import numpy as np
 
 from model import metrics, store
 from reconstruction import pipeline
-from skinrig.benchmarks.interval_coverage import Trial
+from skinrig.benchmarks.interval_coverage import GAUSSIAN_95, Trial
 from skinrig.benchmarks.interval_trials import (
     ANY_BAND,
-    calibrated,
     forget,
     of_normals,
     truth_of,
     valid_of,
 )
+from skinrig.calibrating.calibrate import calibrate
 from skinrig.simulating.simulation import simulate_session
 
-FACTORS_95: Final[Mapping[str, float]] = {"normals": 1.9, "height": 2.1}
+FACTORS_95: Final[Mapping[str, float]] = {"normals": 1.9, "height": 2.1, "stretch": GAUSSIAN_95}
 """Half width of a 95 % interval over that of the 68 % one, to 0.1, set on 6 patches of seeds 0 to
 13 that are not judged: tails are heavier than a Gaussian's."""
 
 
+STRETCH_STEP: Final = 1
+"""Steps of the caliper to either side of neutral at which the skin's stretch is told."""
+
+
 def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Iterator[Trial]:
-    """Yield trials of specular normals and heights of patches of skin, at rest.
+    """Yield trials of specular normals and heights at rest, and of stretch to either side.
 
-    Parameters as of `interval_trials_flash.flash`; a subject is a site of the face.
+    Each seed has a sphere of its own, built off the drawing, with its own calibration. Parameters
+    as of `interval_trials_flash.flash`; a subject is a site of the face.
     """
-    from skinrig.evaluating.microrelief import true_relief
+    from skinrig.evaluating.microrelief import compare_stretch, true_relief
 
-    calibrated("gradient", folder, {"lights": "ball", "polarization": "ball"}, width_px=None)
     for seed, site in subjects.items():
         name = f"{site} {seed}"
+        ball, calibration = folder / "session-ball", folder / "calibration"
+        simulate_session("gradient", ball, target="ball", seed=seed)
+        for kind in ("lights", "polarization"):
+            calibrate(kind, [ball], calibration)
         done = simulate_session(
             "gradient", folder / "session-subject", site=site, seed=seed, width_px=width_px,
-            angles=(0.0,), steps=(0, 0),
+            angles=(0.0,), steps=(-STRETCH_STEP, STRETCH_STEP),
         )  # fmt: skip
         pipeline.reconstruct(
-            done.session, want=["normals", "height"], out=folder / "maps",
-            calibration=folder / "calibration",
+            done.session, want=["normals", "height", "strain"], out=folder / "maps",
+            calibration=calibration,
         )  # fmt: skip
         found, truth = store.read(folder / "maps"), store.read(truth_of(done))
         state = next(
@@ -67,4 +76,12 @@ def gradient(folder: Path, subjects: Mapping[int, str], *, width_px: int) -> Ite
             off = np.abs(height.values.astype(np.float64)[good] - relief[good]) / stderr
             yield Trial("height", name, ANY_BAND, off, float(np.median(stderr)), "um",
                         FACTORS_95["height"])  # fmt: skip
+        rows = [row for row in compare_stretch(found, truth) if row.stderr > 0]
+        spread = np.array([row.stderr for row in rows])
+        width = float(100.0 * np.median(spread)) if rows else float("nan")
+        yield Trial("stretch ratio", name, ANY_BAND,
+                    np.array([abs(row.error) for row in rows]) / spread, width, "%",
+                    FACTORS_95["stretch"])  # fmt: skip
         forget(folder, done)
+        for place in (ball, calibration):
+            shutil.rmtree(place)

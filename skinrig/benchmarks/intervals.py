@@ -40,6 +40,9 @@ MEDIA: Final = (
     "homogeneous:0.5,1.8,0.82", "homogeneous:0.08,0.9,0.9",
 )  # fmt: skip
 """Fractions in 1/mm of absorption and reduced scattering, and g."""
+SKIN: Final = ("II", "IV", "VI", "I", "III", "V")
+"""Presets under the probe: a band of melanin each, twice."""
+DIRECTED: Final = "anisotropic:0.25,2,-1,0"
 DOME: Final = ("I", "III", "V", "II", "IV", "VI")
 
 Trials = Iterable[Trial]
@@ -83,11 +86,17 @@ def _full() -> Mapping[str, Callable[[Path], Trials]]:
     sites = {FIRST_SEED + k: SITES[k % len(SITES)] for k in range(6)}
     faces = {FIRST_SEED + k: DOME[k] for k in range(len(DOME))}
     media = {FIRST_SEED + k: medium for k, medium in enumerate(MEDIA)}
+    skin = {FIRST_SEED + k: SKIN[k] for k in range(len(SKIN))}
     return {
         "flash": lambda folder: interval_trials_flash.flash(folder, flash, width_px=768),
         "gradient": lambda folder: interval_trials_gradient.gradient(folder, sites, width_px=128),
         "dome": lambda folder: interval_trials_dome.dome(folder, faces, width_px=320),
-        "probe": lambda folder: interval_trials_probe.probe(folder, media),
+        "probe": lambda folder: interval_trials_probe.probe(
+            folder,
+            media,
+            skin=skin,
+            directed=dict.fromkeys(range(FIRST_SEED, FIRST_SEED + 2), DIRECTED),
+        ),
     }
 
 
