@@ -1,10 +1,10 @@
 """The pack of maps that digital humans are driven by: neutral maps, and what expressions change.
 
 Laid out as engines' face materials want it: a base color with up to three animated color maps
-(cm1 to cm3), a normal map with up to three animated wrinkle maps (wm1 to wm3), and masks of their
-zones. Animated maps are deltas: colors of 512 x 512, normals of 1024 x 1024. How deltas are coded
-is ours, since no engine publishes a coding; ``delta_maps.json`` says it, and the EXR files hold
-the numbers themselves.
+(cm1 to cm3), a normal map with up to three animated wrinkle maps (wm1 to wm3), masks of their
+zones, and cavity, scatter and micro normal maps. Animated maps are deltas: colors of 512 x 512,
+normals of 1024 x 1024. How deltas are coded is ours, since no engine publishes a coding;
+``delta_maps.json`` says it, and the EXR files hold the numbers themselves.
 
 Colors come from the hemoglobin rig, whose maps lie on the flash camera's picture. They lie on a
 face's texture only where another appearance and landmarks of both tell how one lies on the other.
@@ -25,8 +25,8 @@ from model.texture_resampling import resampled
 from model.wrinkle_model import FILE as WRINKLE_FILE
 from model.wrinkle_model import WrinkleModel
 from skinrig import dynamic_appearance
-from skinrig.dynamic_appearance import FACIAL_COLOR, WRINKLES
-from skinrig.exporting import color_deltas
+from skinrig.dynamic_appearance import FACIAL_COLOR, MICROSTRUCTURE, WRINKLES
+from skinrig.exporting import color_deltas, detail_maps
 from skinrig.exporting.images import Image, ImageFolder
 from skinrig.exporting.options import NORMAL_Y, Delivery
 from skinrig.exporting.provenance import ORIENTATION, provenance
@@ -69,11 +69,11 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         For a folder that holds neither part, or states that it lacks.
     """
     parts = dynamic_appearance.parts_of(appearance)
-    if not {FACIAL_COLOR, WRINKLES} & set(parts):
+    if not {FACIAL_COLOR, WRINKLES, MICROSTRUCTURE} & set(parts):
         raise ExportError(
             f"metahuman: got {', '.join(parts) or 'maps that nothing was fitted to'}, expected "
-            "facial_color or wrinkles; `skinrig fit facial-color` and `skinrig fit wrinkles` "
-            "make them"
+            "facial_color, wrinkles or microstructure; `skinrig fit facial-color`, `skinrig fit "
+            "wrinkles` and `skinrig fit microstructure` make them"
         )
     out = ImageFolder(folder, delivery)
     left_out: list[tuple[str, str]] = []
@@ -89,14 +89,23 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         told["wrinkles"], rows = _write_wrinkles(appearance, parts, out, delivery, left_out)
         known |= set(rows)
     else:
-        left_out.append(("normal, wm1 to wm3, masks", "the folder holds no wrinkles: run "
+        left_out.append(("normal, wm1 to wm3, masks, cavity", "the folder holds no wrinkles: run "
                          "`skinrig fit wrinkles`"))  # fmt: skip
+    if MICROSTRUCTURE in parts:
+        details, rest = detail_maps.micro_normals(appearance, parts[MICROSTRUCTURE], out, delivery)
+        told |= details
+        left_out += rest
+    else:
+        left_out.append(("micro normals", "the folder holds no microstructure: run "
+                         "`skinrig fit microstructure`"))  # fmt: skip
+    details, rest = detail_maps.scatter(delivery, out)
+    told |= details
+    left_out += rest
     unknown = [name for name in delivery.only if name not in known]
     if unknown:
         raise ExportError(
             f"--only: got {unknown[0]!r}, expected of {', '.join(sorted(known)) or 'no state'}"
         )
-    left_out.append(("cavity, scatter and micro maps", "nothing in the folder is measured of them"))
     green = "+Y (OpenGL)" if NORMAL_Y[delivery.normal_y] > 0 else "-Y (DirectX)"
     write_json(
         folder / DOCUMENT,
@@ -157,12 +166,14 @@ def _write_wrinkles(
             out.png(Image(name=name, values=sized, unit="1", low=0.0, high=1.0,
                           what=f"zone {told}"))  # fmt: skip
             masks[name] = told
+    hollows, rest = detail_maps.cavity(np.asarray(model.base, np.float64), known, NORMAL_SIZE, out)
+    left_out += rest
     if delivery.with_errors:
         out.exr(Image(name="normal_mask", values=valid.astype(float), unit="1"))
     return {
         "size": NORMAL_SIZE, "layout": "the dome's texture", "maps": names, "masks": masks,
         "measured_size": list(model.base.shape[:2]), "clipped_share": clipped,
-        "valid_share": float(valid.mean()),
+        "valid_share": float(valid.mean()), **hollows,
     }, have  # fmt: skip
 
 

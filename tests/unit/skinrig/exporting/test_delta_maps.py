@@ -138,7 +138,7 @@ def test_a_folder_without_wrinkles_or_color_says_what_is_missing(moving, tmp_pat
         files=dict(moving.files),
     )  # fmt: skip
     left_out = dict(delta_maps.write(alone, tmp_path, Delivery()))
-    assert "skinrig fit wrinkles" in left_out["normal, wm1 to wm3, masks"]
+    assert "skinrig fit wrinkles" in left_out["normal, wm1 to wm3, masks, cavity"]
     with pytest.raises(ExportError, match="nothing was fitted to"):
         delta_maps.write(SkinAppearance({}, "simulated"), tmp_path, Delivery())
 
