@@ -83,10 +83,7 @@ def write(path: str | Path, appearance: SkinAppearance) -> Path:
         When ``path`` exists and is something else, or a map's name cannot be a file's.
     """
     target = Path(path)
-    if target.exists() and not (target / DOCUMENT).is_file() and any(_entries(target)):
-        raise StoreError(
-            f"{target}: exists and is no APPEARANCE/ folder; nothing was written: name another"
-        )
+    require_free(target)
     for name in appearance.maps:
         if not _NAME.fullmatch(name):
             raise StoreError(f"map name: got {name!r}, expected lower case letters, digits and _")
@@ -116,6 +113,33 @@ def write(path: str | Path, appearance: SkinAppearance) -> Path:
         shutil.rmtree(fresh, ignore_errors=True)
         raise
     return target
+
+
+def require_free(path: str | Path) -> None:
+    """Refuse a folder that `write` would refuse, before anything is computed for it.
+
+    Parameters
+    ----------
+    path
+        A new or empty folder, or an APPEARANCE/ folder.
+
+    Raises
+    ------
+    StoreError
+        When ``path`` exists and is something else, or nothing can be written beside it.
+    """
+    target = Path(path)
+    if target.exists() and not (target / DOCUMENT).is_file() and any(_entries(target)):
+        raise StoreError(
+            f"{target}: exists and is no APPEARANCE/ folder; nothing was written: name another"
+        )
+    beside = next(folder for folder in target.absolute().parents if folder.exists())
+    if not beside.is_dir():
+        raise StoreError(f"{target}: {beside} is a file, expected a folder; name another")
+    if not os.access(beside, os.W_OK | os.X_OK):
+        raise StoreError(
+            f"{target}: {beside} cannot be written to; name another, or give the right"
+        )
 
 
 def read(path: str | Path, *, only: tuple[str, ...] | None = None) -> SkinAppearance:

@@ -126,7 +126,7 @@ class DomeImages:
                 continue
             self._shots.setdefault(key, []).append(record)
         if not self._shots:
-            raise EvidenceError(f"session {session.id}: has no frames of kind {kind!r}")
+            raise EvidenceError(f"{session.path}: has no frames of kind {kind!r}")
         views = {view for view, _ in self._shots}
         lights = {light for _, light in self._shots}
         self.views = tuple(v.name for v in session.rig.views if v.name in views)
@@ -183,7 +183,7 @@ class DomeImages:
         if exposure >= 0:
             shots = [record for record in shots if record.index.get("exposure", 0) == exposure]
         if not shots:
-            raise EvidenceError(f"session {self._session.id}: lacks camera {view}, light {light}")
+            raise EvidenceError(f"{self._session.path}: lacks camera {view}, light {light}")
         return shots
 
     def _dark(self, view: str) -> tuple[Float32, Float32] | None:

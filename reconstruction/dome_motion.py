@@ -121,7 +121,7 @@ def follow_head(
     )
     if not found.usable.any():
         raise EvidenceError(
-            f"session {session.id}: no tracking frame tells where the head was; is the scan of "
+            f"{session.path}: no tracking frame tells where the head was; is the scan of "
             "this subject, and are the cameras calibrated?"
         )
     # the scan was laid onto all images together: it stands where the head was on average
@@ -137,7 +137,7 @@ def follow_head(
     still = bool(usable.all() and apart.max(initial=0.0) < STILL_PX * pixel_mm)
     if not usable.any():
         raise EvidenceError(
-            f"session {session.id}: no image lies between two tracking frames that tell where the "
+            f"{session.path}: no image lies between two tracking frames that tell where the "
             "head was; capture again, with the face at rest"
         )
     return Motion(poses, usable, found, apart, still)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.calibration import store as calibration_store
+from capture.calibration.record import KINDS
 from capture.session import Session
 from reconstruction.hold_out import NOTHING, HoldOut
 
@@ -97,14 +99,21 @@ class Evidence:
         Raises
         ------
         EvidenceError
-            When ``calibration`` or ``basis`` is no folder.
+            When ``calibration`` or ``basis`` is no folder, the first holds no calibration or
+            those of other rigs alone, or ``scan`` is no PLY.
         """
         if calibration is not None and not Path(calibration).is_dir():
             raise EvidenceError(
                 f"calibration: {calibration} is no folder; `skinrig calibrate` makes one"
             )
+        if calibration is not None:
+            _require_some(Path(calibration), session.rig.name)
         hashes = {"session": session.content_hash}
         mesh = None if scan is None else Path(scan).read_bytes()
+        if mesh is not None and not mesh.startswith(b"ply"):
+            raise EvidenceError(
+                f"scan: got no PLY mesh in {scan}; `skinrig import mesh` takes .obj and .ply"
+            )
         if mesh is not None:
             hashes["scan"] = hashlib.sha256(mesh).hexdigest()
         tables = None if basis is None else Path(basis)
@@ -162,6 +171,27 @@ class Evidence:
                 return found
         self.assumed.append(otherwise)
         return None
+
+
+def _require_some(folder: Path, rig: str) -> None:
+    """Refuse a folder without a calibration of a rig: else everything would be assumed."""
+    files = [path for kind in KINDS if (path := folder / f"{kind}.json").is_file()]
+    if not files:
+        raise EvidenceError(
+            f"calibration: {folder} holds none, expected {', '.join(KINDS)} or some of them "
+            "(.json); `skinrig calibrate` makes them"
+        )
+    rigs = set()
+    for path in files:
+        try:
+            rigs.add(str(json.loads(path.read_bytes())["rig"]))
+        except (ValueError, KeyError, TypeError):
+            return  # what is wrong with it is said where it is needed
+    if rig not in rigs:
+        raise EvidenceError(
+            f"calibration: those in {folder} were made on rig {', '.join(sorted(rigs))}, the "
+            f"session is of rig {rig}; leave --calibration out, or give that rig's folder"
+        )
 
 
 def _digest_of(folder: Path) -> str:

@@ -177,10 +177,11 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
             np.logical_and.reduce([image.valid for image in linear]),
         )
     if images["crossed"] is None:
-        states = sorted({str(r.index.get("state")) for r in session.frames("subject")})
+        crossed = session.frames("subject", polarizer="crossed")
+        states = sorted({str(record.index.get("state")) for record in crossed})
         raise EvidenceError(
-            f"session {session.id}: has no crossed frame of state {inputs.state!r}; "
-            f"it has the states {', '.join(states) or 'none'}"
+            f"{session.path}: has no crossed frame of state {inputs.state!r}; it has "
+            f"{'those of ' + ', '.join(states) if states else 'none at all: is it finished?'}"
         )
     return images
 
@@ -324,8 +325,9 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     rgb = np.where(_valid(diffuse)[..., None], diffuse.values, np.nan)
     variance = np.square(_stderr(diffuse))
     found = chromophore_posterior.weigh(
-        rgb, table, prior=prior, variance=variance, model_error=model_error.load()
-    )
+        rgb, table, prior=prior, variance=variance,
+        model_error=model_error.of_picture(diffuse.values, variance, _valid(diffuse)),
+    )  # fmt: skip
     noise_alone = chromophore_posterior.weigh(rgb, table, prior=prior, variance=variance)
     usable = found.valid
 

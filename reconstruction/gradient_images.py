@@ -135,12 +135,12 @@ class GradientImages:
             key = str(index["pattern"]), str(index["polarizer"])
             self._records.setdefault(name, {}).setdefault(key, []).append(record)
         if not found:
-            raise EvidenceError(f"session {session.id}: has no frames of kind 'gradient'")
+            raise EvidenceError(f"{session.path}: has no frames of kind 'gradient'")
         states = list(found.values())
         first = next((state for state in states if state.step == 0), None)
         if first is None:
             raise EvidenceError(
-                f"session {session.id}: has no neutral state, caliper step 0, that the others "
+                f"{session.path}: has no neutral state, caliper step 0, that the others "
                 "could be compared with"
             )
         self.states = (first, *(state for state in states if state is not first))

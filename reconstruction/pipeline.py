@@ -98,7 +98,7 @@ def recipe_of(session: Session) -> Recipe:
         if kind in kinds:
             return recipe()
     raise EvidenceError(
-        f"session {session.id}: shows {', '.join(sorted(kinds))}, expected steps of kind "
+        f"{session.path}: shows {', '.join(sorted(kinds))}, expected steps of kind "
         f"{' or '.join(RECIPES)}; `skinrig calibrate` takes sessions of targets"
     )
 
@@ -167,10 +167,11 @@ def reconstruct(
     """
     opened = Session.open(session)
     recipe = recipe_of(opened)
+    store.require_free(out)
     if hold_out is not None or rank is not None:
         if recipe.maps_of_rank is None:
             raise EvidenceError(
-                f"hold-out, rank: session {opened.id} is none of the dome; leave them out"
+                f"hold-out, rank: {opened.path} is no session of the dome; leave them out"
             )
         if rank is not None and rank < 1:
             raise EvidenceError(f"rank: got {rank}, expected 1 or more")

@@ -80,7 +80,7 @@ class ProbeImages:
             if placement is not None:
                 self._records.setdefault(placement, []).append(record)
         if not self._records:
-            raise EvidenceError(f"session {session.id}: has no frames of kind {kind!r}")
+            raise EvidenceError(f"{session.path}: has no frames of kind {kind!r}")
         self.measurements = tuple(
             Measurement(
                 placement, len(records), _level(records), _mean(records, "suction_mbar"),
@@ -103,7 +103,7 @@ class ProbeImages:
             records = self._session.frames("dark")
             if not records:
                 raise EvidenceError(
-                    f"session {self._session.id}: has no frames of kind 'dark'; the camera's dark "
+                    f"{self._session.path}: has no frames of kind 'dark'; the camera's dark "
                     "current is not known: capture with darks"
                 )
             temperature = _mean(records, "camera_c")

@@ -128,7 +128,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     probe = evidence.session.rig.probe
     if probe is None:
         raise EvidenceError(
-            f"session {evidence.session.id}: its rig has no probe, expected one with fibres"
+            f"{evidence.session.path}: its rig has no probe, expected one with fibres"
         )
     serial = evidence.session.rig.views[0].serial
     nominal = "the camera's gain and read noise are those of the rig file"

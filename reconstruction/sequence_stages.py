@@ -60,7 +60,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     refused = ""
     if not _timed(session):
         refused = (
-            f"session {session.id}: has no frames with a time, expected a sequence, such as "
+            f"{session.path}: has no frames with a time, expected a sequence, such as "
             "`skinrig capture flash --sequence smile` makes"
         )
 
@@ -111,7 +111,7 @@ def _curves(evidence: Evidence) -> dict[str, Any]:
     means = blood.means
     if not means.valid.any():
         raise EvidenceError(
-            f"session {session.id}: no place of {', '.join(places)} shows a color of skin in "
+            f"{session.path}: no place of {', '.join(places)} shows a color of skin in "
             "enough frames; "
             + ("check the landmarks" if inputs.white else "give it a calibration of white")
         )

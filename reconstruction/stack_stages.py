@@ -100,7 +100,7 @@ def _stack(session: Session) -> Stack:
     records = tuple(session.frames("olat"))
     if len(records) < 3:
         raise EvidenceError(
-            f"session {session.id}: has {len(records)} frames under a light each, expected 3"
+            f"{session.path}: has {len(records)} frames under a light each, expected 3"
         )
     exposures = [
         float(r.settings.get("exposure_s", 0.0)) * float(r.settings.get("iso", 100.0))
@@ -138,7 +138,7 @@ def _stack(session: Session) -> Stack:
         data = np.frombuffer(session.attachment("mask.png"), np.uint8)
         mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
         if mask is None or mask.shape != inside.shape:
-            raise EvidenceError(f"session {session.id}: its mask does not fit its pictures")
+            raise EvidenceError(f"{session.path}: its mask does not fit its pictures")
         inside = np.asarray(mask > 127)
     return Stack(gray, usable, inside, records, gain, folder)
 
@@ -148,7 +148,7 @@ def _lights(evidence: Evidence, stack: Stack) -> Lights:
     session = evidence.session
     listed = session.manifest.extra["light_list"]
     if not isinstance(listed, dict):
-        raise EvidenceError(f"session {session.id}: its light list is no table")
+        raise EvidenceError(f"{session.path}: its light list is no table")
     vectors = np.array(
         [session.rig.light(str(r.index["light"])).position_mm for r in stack.records], np.float64
     )

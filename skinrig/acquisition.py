@@ -166,7 +166,7 @@ def sequence_of(
 
 def read_plan(file: Path) -> Plan:
     """Return the plan in a JSON file, as ``--plan-out`` and `skinrig plan` write it."""
-    return Plan.from_json(file.read_text(encoding="utf-8"), where=str(file))
+    return Plan.from_json(file.read_bytes(), where=str(file))
 
 
 def choose_plan(

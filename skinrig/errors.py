@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+
 DONE = 0
 LIMIT_MISSED = 1
 USAGE = 2
@@ -50,6 +52,18 @@ def exit_code(error: BaseException) -> int:
     return BUG
 
 
+_ADVICE = {
+    errno.ENOENT: "check the name, and the folder that the command runs in",
+    errno.EEXIST: "something of that name is there already; name another",
+    errno.ENOTDIR: "a part of this path is a file, expected a folder; name another",
+    errno.EISDIR: "is a folder, expected a file; name another",
+    errno.EACCES: "no right to it; change its rights, or name another",
+    errno.EPERM: "no right to it; change its rights, or name another",
+    errno.EROFS: "the disk is mounted for reading alone; name another",
+    errno.ENOSPC: "free space, or name another disk, then run the same command again",
+    errno.EDQUOT: "free space, or name another disk, then run the same command again",
+}
+"""What to do, by the number of the system's error."""
 _OWN = ("capture", "reconstruction", "model", "rigsim", "skinrig")
 
 
@@ -58,7 +72,13 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, KeyboardInterrupt):
         return "interrupted; a capture or simulation goes on with --resume"
     if isinstance(error, OSError) and error.strerror and error.filename:
-        return f"{error.filename}: {error.strerror}"
+        advice = _ADVICE.get(error.errno or 0, "")
+        return f"{error.filename}: {error.strerror}" + (f"; {advice}" if advice else "")
+    if isinstance(error, UnicodeDecodeError):
+        return (
+            f"a file that was to be UTF-8 text is not (byte {error.start} of it is "
+            f"{error.object[error.start]:#04x}); is another file meant?"
+        )
     text = str(error).strip() or type(error).__name__
     if exit_code(error) == BUG:
         return (

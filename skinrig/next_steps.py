@@ -7,6 +7,7 @@ answers at once.
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +33,9 @@ UNCALIBRATED: Final = ("flash", "photographs")
 """Rigs whose maps need no calibration; without one something is assumed, and said."""
 PHOTOGRAPHS: Final = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".tif",
                       ".tiff", ".jpg", ".jpeg")  # fmt: skip
+REPORT_HEAD: Final = b"content=\"default-src 'none'; img-src data:; style-src 'sha256-"
+"""How the policy of a report's page begins; that of a live page allows a script."""
+OPENER: Final = {"darwin": "open", "win32": "start"}.get(sys.platform, "xdg-open")
 DEMO: Final = "demo"
 MOST: Final = 4
 """Next steps that are named at once."""
@@ -130,7 +134,7 @@ def look(folder: Path) -> Surroundings:
                 appearances[entry] = document
         elif entry.name.startswith("calibration") and entry.is_dir():
             calibrations.append(entry)
-    reports = [e for e in entries if e.suffix == ".html" and e.is_file()]
+    reports = [e for e in entries if e.suffix == ".html" and _is_report(e)]
     photographs = sum(e.suffix.lower() in PHOTOGRAPHS for e in entries)
     return Surroundings(
         sessions, appearances, tuple(truths), tuple(calibrations), tuple(reports), photographs
@@ -149,7 +153,9 @@ def suggest(found: Surroundings, folder: Path) -> tuple[Step, ...]:
     """
     steps: list[Step] = []
     if found.reports:
-        steps.append(Step(f"open {found.reports[0]}", "in a browser: maps, errors, checks"))
+        steps.append(
+            Step(f"{OPENER} {found.reports[0]}", "the report in a browser: maps, errors, checks")
+        )
     elif found.appearances:
         steps.append(Step(f"skinrig report {folder}", "one page of all that lies here"))
     used = {d.get("parameters", {}).get("session") for d in found.appearances.values()}
@@ -217,6 +223,16 @@ def _document(path: Path) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     return found if isinstance(found, dict) else None
+
+
+def _is_report(path: Path) -> bool:
+    """Tell a report, which runs no script, from a live page and from pages of others."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(1000)
+    except OSError:
+        return False
+    return REPORT_HEAD in head
 
 
 def _target(session: Mapping[str, Any]) -> str:

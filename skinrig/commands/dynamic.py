@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from skinrig.commands.help import Subcommands
-from skinrig.commands.options import Json, Out
+from skinrig.commands.options import Json, NewMaps
 from skinrig.console import Console
 
 Weights = Annotated[
@@ -38,7 +38,7 @@ apply_app = typer.Typer(
 @fit_app.command("facial-color")
 def fit_facial_color(
     sessions: Annotated[list[Path], typer.Argument(help="Flash sessions of one subject.")],
-    out: Out,
+    out: NewMaps,
     calibration: Annotated[Path | None, typer.Option(help="CALIBRATION/ folder.")] = None,
     landmarks: Annotated[
         Path | None, typer.Option(help="Folder with STATE.csv (name,x,y) for each state.")
@@ -84,7 +84,7 @@ def fit_wrinkles(
     appearances: Annotated[
         list[Path], typer.Argument(help="Maps of dome sessions: neutral and expressions.")
     ],
-    out: Out,
+    out: NewMaps,
     mask: Annotated[
         list[Path] | None, typer.Option(help="RGBA picture of four zones; twice for eight.")
     ] = None,
@@ -116,7 +116,7 @@ def fit_microstructure(
     appearances: Annotated[
         list[Path], typer.Argument(help="Maps of caliper sessions with heights and kernels.")
     ],
-    out: Out,
+    out: NewMaps,
     paper_table: Annotated[
         bool, typer.Option("--paper-table", help="The paper's forehead where kernels are too few.")
     ] = False,
@@ -142,7 +142,7 @@ def fit_microstructure(
 def apply_expression(
     appearance: Annotated[Path, typer.Argument(help="Folder that `skinrig fit` made.")],
     weights: Weights,
-    out: Out,
+    out: NewMaps,
     mesh: Mesh = None,
     parts: Annotated[
         str | None, typer.Option(help="Of facial_color,wrinkles,microstructure; default: all.")
@@ -207,7 +207,7 @@ def apply_microstructure(
     appearance: Annotated[Path, typer.Argument(help="Folder that `skinrig fit` made.")],
     mesh: Annotated[Path, typer.Option(help="Mesh with blend shapes: .npz, OBJ or glTF.")],
     weights: Annotated[str, typer.Option(help="Blend shapes or states: jawOpen=0.5,smile=1.")],
-    out: Out,
+    out: NewMaps,
     size: Size = 4096,
     site: At = None,
     synthesize: Synthesize = "patches",

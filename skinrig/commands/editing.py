@@ -7,14 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig.commands.options import Json, Seed
+from skinrig.commands.options import Json, NewMaps, Seed
 from skinrig.console import Console
 from skinrig.errors import UsageError
 
 
 def edit(
     appearance: Annotated[Path, typer.Argument(help="Fitted maps of the dome.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder to write.")],
+    out: NewMaps,
     trait: Annotated[
         str | None,
         typer.Option(help="Amounts, joined by commas: lotion=0.6,tan=-1; 1 is all of a trait."),

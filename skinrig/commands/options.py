@@ -19,6 +19,19 @@ Rig = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on stdout.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything that is drawn.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder to write.")]
+
+
+def _free(context: typer.Context, out: Path) -> Path:
+    """Refuse a folder that maps cannot go to before minutes are spent on them."""
+    if not context.resilient_parsing:
+        from model.store import require_free
+
+        require_free(out)
+    return out
+
+
+NewMaps = Annotated[Path, typer.Option("--out", callback=_free, help="Folder to write.")]
+"""An APPEARANCE/ folder, new or to be replaced."""
 Site = Annotated[
     str | None,
     typer.Option(help="Where the gradient rig's skin is from: forehead (default), cheek or chin."),

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from skinrig.commands.options import Json, Out
+from skinrig.commands.options import Json, NewMaps
 from skinrig.console import Console
 
 
 def fit_reflectance(
     dome: Annotated[Path, typer.Argument(help="Maps of a dome session: normals, r_d, lobes.")],
-    out: Out,
+    out: NewMaps,
     probe: Annotated[
         Path | None, typer.Argument(help="Maps of a fibre probe session on the same subject.")
     ] = None,

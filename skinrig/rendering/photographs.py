@@ -84,7 +84,7 @@ class Photographs:
         opened = Session.open(session)
         if not any(step.kind == "olat" for step in opened.plan.steps):
             raise PhotographsError(
-                f"session {opened.id}: has no photographs under one light each; give one of the "
+                f"{opened.path}: has no photographs under one light each; give one of the "
                 "dome with a face"
             )
         evidence = Evidence.of(opened, calibration, state="neutral", on_date=None)
@@ -93,7 +93,7 @@ class Photographs:
         held = _held_out(appearance) if same else HoldOut()
         if same and not held:
             raise PhotographsError(
-                f"session {opened.id}: the model was fitted to all of its photographs; fit again "
+                f"{opened.path}: the model was fitted to all of its photographs; fit again "
                 "with `skinrig reconstruct --hold-out lights=NAMES,views=NAMES`, or compare with "
                 "another session of the same face"
             )
@@ -105,7 +105,7 @@ class Photographs:
             if light in good and (not same or held.holds(light, view))
         ]
         if not shots:
-            raise PhotographsError(f"session {opened.id}: none of its lights is calibrated")
+            raise PhotographsError(f"{opened.path}: none of its lights is calibrated")
         assumed = list(evidence.assumed)
         away = tuple(float(r) for r in np.linalg.norm(dome.table.position_mm, axis=1))
         if not same:

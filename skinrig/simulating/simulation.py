@@ -271,6 +271,9 @@ def simulate_session(
     """
     if rig_name not in RIGS:
         raise SimulationError(f"rig: got {rig_name!r}, expected one of {', '.join(RIGS)}")
+    for name, number in (("width", width_px), ("lights", lights), ("views", views)):
+        if number is not None and number < 1:
+            raise SimulationError(f"{name}: got {number}, expected a number above 0, or none")
     order = Order(
         out=Path(out), size=size, seed=seed, subject=subject, mesh=mesh, target=target,
         states=tuple(states), repeats=repeats, resume=resume, width_px=width_px, lights=lights,

@@ -35,7 +35,7 @@ NOT_DRIVEN = {
                 "model.facial_color_document": "from_maps_and_document to_maps",
                 "model.merl": "read read_mean write",
                 "model.rgl": "read write",
-                "model.store": "read read_document read_exr write write_exr",
+                "model.store": "read read_document read_exr require_free write write_exr",
                 "model.tensor_file": "read write",
                 "model.trait_storage": "from_bytes load",
                 "model.wrinkle_expressions": "read_table",

@@ -172,3 +172,56 @@ def test_a_broken_rig_file_is_refused_with_its_faults(text, says, tmp_path, caps
     err = capsys.readouterr().err.lower()
     assert says in err
     assert "traceback" not in err
+
+
+def test_a_calibration_folder_without_calibrations_of_this_rig_is_refused(
+    session, tmp_path, capsys
+):
+    order = ["reconstruct", str(session), "--want", "melanin", "--out", str(tmp_path / "maps")]
+    assert main([*order, "--calibration", str(session)]) == 3
+    assert f"{session} holds none, expected sensor, color" in capsys.readouterr().err
+    other = tmp_path / "calibration-dome"
+    other.mkdir()
+    (other / "lights.json").write_text('{"rig": "dome"}')
+    assert main([*order, "--calibration", str(other)]) == 3
+    assert "made on rig dome, the session is of rig flash" in capsys.readouterr().err
+    assert not (tmp_path / "maps").exists()
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        ["reconstruct", "SESSION", "--want", "melanin", "--out", "OUT"],
+        ["fit", "facial-color", "SESSION", "--out", "OUT"],
+        ["apply", "expression", "nothing", "--weights", "anger=1", "--out", "OUT"],
+        ["edit", "nothing", "--trait", "tan=1", "--out", "OUT"],
+    ],
+    ids=lambda order: " ".join(order[:2]),
+)
+def test_a_folder_that_maps_cannot_go_to_is_refused_before_anything_is_computed(
+    order, session, tmp_path, capsys
+):
+    taken = tmp_path / "notes.txt"
+    taken.write_text("mine")
+    for out in (taken, taken / "below"):
+        known = {"SESSION": str(session), "OUT": str(out)}
+        assert main([known.get(word, word) for word in order]) == 3
+        told = capsys.readouterr().err
+        assert str(out) in told
+        assert " s] " not in told  # no line of progress
+    assert taken.read_text() == "mine"
+
+
+def test_a_plan_that_is_no_text_is_named(tmp_path, capsys):
+    plan = tmp_path / "plan.json"
+    plan.write_bytes(b"\xff\xfe\x00")
+    assert main(["capture", "flash", "--plan", str(plan), "--dry-run"]) == 3
+    assert f"{plan}: is not JSON" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--lights", "--views", "--width"])
+def test_none_of_something_is_not_taken_for_the_default(option, tmp_path, capsys):
+    out = tmp_path / "session"
+    assert main(["simulate", "dome", option, "0", "--out", str(out)]) == 3
+    assert f"{option[2:]}: got 0, expected a number above 0" in capsys.readouterr().err
+    assert not out.exists()

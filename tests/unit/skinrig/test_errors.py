@@ -30,3 +30,29 @@ def test_a_fault_of_ours_is_owned_up_to_in_one_line():
     text = errors.sentence(ZeroDivisionError("division by zero"))
     assert "fault of skinrig" in text
     assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (FileNotFoundError(2, "No such file or directory", "a.ply"), "check the name"),
+        (FileExistsError(17, "File exists", "out"), "name another"),
+        (NotADirectoryError(20, "Not a directory", "file/out"), "expected a folder"),
+        (IsADirectoryError(21, "Is a directory", "out"), "expected a file"),
+        (PermissionError(13, "Permission denied", "out"), "rights"),
+        (OSError(30, "Read-only file system", "out"), "name another"),
+        (OSError(28, "No space left on device", "out"), "free space"),
+    ],
+)
+def test_what_the_system_refuses_is_told_with_the_file_and_what_to_do(error, words):
+    text = errors.sentence(error)
+    assert text.startswith(f"{error.filename}: {error.strerror}")
+    assert words in text
+
+
+def test_a_file_that_is_no_text_is_told_without_the_words_of_a_codec():
+    with pytest.raises(UnicodeDecodeError) as caught:
+        b"ok\xff".decode()
+    assert errors.sentence(caught.value) == (
+        "a file that was to be UTF-8 text is not (byte 2 of it is 0xff); is another file meant?"
+    )

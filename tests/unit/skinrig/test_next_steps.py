@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from skinrig.cli import main
-from skinrig.next_steps import CALIBRATIONS, after_session, look, suggest, welcome
+from skinrig.next_steps import CALIBRATIONS, OPENER, after_session, look, suggest, welcome
+from skinrig.reporting.page import document
 
 
 def session(path, rig="flash", kinds=("dark", "subject"), target=""):
@@ -25,6 +26,10 @@ def appearance(path, session="", kind="appearance", files=()):
 
 def commands(folder=Path()):
     return [step.command for step in suggest(look(folder), folder)]
+
+
+def report_page():
+    return document("a report", "<p>All checks.</p>", "<h2>Maps</h2>")
 
 
 @pytest.fixture(autouse=True)
@@ -87,10 +92,20 @@ def test_the_export_of_measured_maps_names_a_use():
 def test_a_demo_below_is_found():
     Path("demo").mkdir()
     session(Path("demo/session-a"))
-    Path("demo/report.html").touch()
+    Path("demo/report.html").write_text(report_page())
     text = welcome(Path(), "1")
     assert "In demo: 1 session, 1 report" in text
-    assert f"open {Path('demo/report.html')}" in text
+    assert f"{OPENER} {Path('demo/report.html')}" in text
+
+
+def test_a_live_page_and_a_page_of_others_are_no_reports():
+    session(Path("session-a"))
+    live = report_page().replace("img-src data:;", "script-src 'sha256-x'; img-src data:;")
+    Path("face.html").write_text(live)
+    Path("notes.html").write_text("<html>about reports</html>")
+    assert not look(Path()).reports
+    Path("zone.html").write_text(report_page())
+    assert look(Path()).reports == (Path("zone.html"),)
 
 
 def test_damaged_documents_do_not_stop_it():
