@@ -6,7 +6,6 @@ scatter of the translucency of a fitted model, micro normals of relief from the 
 References
 ----------
 Max 1988, Horizon Mapping, doi 10.1007/BF01905562 (light that relief leaves).
-Moisan 2011, Periodic Plus Smooth Image Decomposition, doi 10.1007/s10851-010-0227-1 (tiles).
 """
 
 from __future__ import annotations
@@ -33,6 +32,8 @@ SCATTER_SIZE: Final = 512
 SCATTER_MM: Final = 16.0
 """Translucency of the PNG code 65535."""
 UM_MM: Final = 0.001
+FADE: Final = 8
+"""One part of so many of a tile is faded into what lies beyond its other end."""
 
 
 def cavity(
@@ -224,7 +225,7 @@ def micro_normals(
         filled = push_pull(np.nan_to_num(relief.values), valid.astype(np.float32)).values
         height = np.asarray(filled, np.float64).reshape(relief.values.shape)
         pixel_um = float(entry["pixel_um"])
-        tile = periodic(height)
+        tile = periodic(height - height.mean())
         normals = periodic_normals(tile, pixel_um)
         name = f"micro_normal_{site}"
         image = Image(
@@ -236,48 +237,50 @@ def micro_normals(
         slope = normals[..., :2] / normals[..., 2:]
         told[name] = {
             "site": site,
-            "tile_mm": [UM_MM * pixel_um * n for n in reversed(height.shape)],
+            "tile_mm": [UM_MM * pixel_um * n for n in reversed(tile.shape)],
             "pixel_um": pixel_um,
             "slope_rms": float(np.sqrt(np.mean(np.sum(slope**2, axis=-1)))),
             "height_rms_um": float(tile.std()),
-            # what had to be taken off so that it repeats
-            "seam_rms_um": float((height - height.mean() - tile).std()),
+            "measured_mm": [UM_MM * pixel_um * n for n in reversed(height.shape)],
+            "faded_share": 1.0 - (1.0 - 1.0 / FADE) ** 2,  # so that it repeats
             "valid_share": float(valid.mean()),
-            "state": "at rest: kernels over stretch are in the appearance's files",
         }
     return ({"micro": told} if told else {}), left_out
 
 
 def periodic(image: ArrayLike) -> Floats:
-    """Return the part of an image that repeats without a seam, mean 0 (Moisan 2011, eqs. 10, 11).
+    """Return an image that repeats without a seam: what is beyond its end fades into its beginning.
+
+    By weights whose squares sum to 1, so that relief of independent places keeps its variance.
 
     Parameters
     ----------
     image
-        (H, W), finite.
+        (H, W), finite, mean 0; 8 pixels and more a side.
+
+    Returns
+    -------
+    ndarray
+        Smaller by an eighth along each axis; beyond the faded eighth its values are the image's.
 
     Examples
     --------
-    A ramp has nothing that repeats, a wave all:
-
-    >>> ramp = np.broadcast_to(np.arange(8.0), (8, 8))
-    >>> wave = np.cos(2 * np.pi * np.arange(64) / 64) * np.ones((64, 1))
-    >>> bool(np.ptp(periodic(ramp)) < 0.4 * np.ptp(ramp)), float(np.ptp(periodic(wave)).round(2))
-    (True, 2.0)
+    >>> image = np.random.default_rng(0).normal(size=(64, 80))
+    >>> tile = periodic(image)
+    >>> tile.shape, np.array_equal(tile[8:, 10:], image[8:56, 10:70])
+    ((56, 70), True)
     """
-    u = np.asarray(image, np.float64)
-    border = np.zeros(u.shape)
-    border[0] += u[-1] - u[0]
-    border[-1] -= u[-1] - u[0]
-    border[:, 0] += u[:, -1] - u[:, 0]
-    border[:, -1] -= u[:, -1] - u[:, 0]
-    rows, columns = (2.0 * np.cos(2.0 * np.pi * np.fft.fftfreq(n)) for n in u.shape)
-    laplacian = rows[:, None] + columns[None, :] - 4.0
-    laplacian[0, 0] = 1.0  # the mean, which the smooth part has none of
-    waves = np.fft.fft2(border) / laplacian
-    waves[0, 0] = 0.0
-    found = u - np.fft.ifft2(waves).real
-    return np.asarray(found - found.mean())
+    found = np.asarray(image, np.float64)
+    for axis in (0, 1):
+        found = np.moveaxis(found, axis, 0)
+        band = len(found) // FADE
+        size = len(found) - band
+        # 0 with a slope of 0 at the beginning, 1 with a slope of 0 at the end
+        share = np.sin(0.5 * np.pi * np.sin(0.5 * np.pi * np.arange(band) / band) ** 2)
+        rise, fall = share[:, None], np.sqrt(1.0 - share**2)[:, None]
+        faded = rise * found[:band] + fall * found[size:]
+        found = np.moveaxis(np.concatenate([faded, found[band:size]]), 0, axis)
+    return found
 
 
 def periodic_normals(height_um: Floats, pixel_um: float) -> Floats:
