@@ -18,7 +18,7 @@ EXCHANGE_PATCHES = 32
 """Texels along one side of the coarse texture on which exchange between skin is estimated."""
 
 
-def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> float:
+def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> NDArray[np.float64]:
     """Return how much of a lit pixel's light spreads out of it across the edge of a shadow.
 
     Parameters
@@ -31,8 +31,8 @@ def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> floa
 
     Returns
     -------
-    float
-        Part of the pixel's light, of the channel that loses most, 0 to 0.5.
+    ndarray
+        Part of the pixel's light in each channel, shape (C,), 0 to 0.5.
 
     Notes
     -----
@@ -42,23 +42,23 @@ def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> floa
 
     Examples
     --------
-    >>> round(edge_loss([1.0], [[1.0]], 100.0), 5)
-    0.00399
-    >>> round(edge_loss([1.0], [[1.0]], 1e-4), 3)
-    0.5
+    >>> edge_loss([1.0], [[1.0]], 100.0).round(5).tolist()
+    [0.00399]
+    >>> edge_loss([1.0], [[1.0]], 1e-4).round(3).tolist()
+    [0.5]
     """
     sigma = np.asarray(sigmas_mm, np.float64)
     weight = np.atleast_2d(np.asarray(weights, np.float64))
     if not pixel_mm > 0.0:
         raise ValueError(f"pixel_mm: got {pixel_mm}, expected > 0")
     if sigma.size == 0:
-        return 0.0
+        return np.zeros(len(weight))
     q = pixel_mm / sigma
     # int_0^q Q(t) dt / q with Q the upper tail of the normal distribution
     tail = np.array([0.5 * math.erfc(t / math.sqrt(2.0)) for t in q])
     density = np.exp(-0.5 * q * q) / math.sqrt(2.0 * math.pi)
     mean = tail + (1.0 / math.sqrt(2.0 * math.pi) - density) / q
-    return float((weight @ mean).max())
+    return np.asarray(weight @ mean, np.float64)
 
 
 def exchange_share(caster: Caster) -> float:
@@ -122,30 +122,16 @@ def steepest_slope(slope_x: NDArray[np.floating], slope_y: NDArray[np.floating])
     return float(np.hypot(slope_x, slope_y).max(initial=0.0))
 
 
-def defocus_px(
-    depth_mm: float, *, f_number: float, focal_mm: float, distance_mm: float, pixel_um: float
-) -> float:
-    """Return the diameter of the circle of confusion of a thin lens, pixels.
+def nearness(mesh: Mesh, place_mm: ArrayLike) -> float:
+    """Return how much brighter a light shines on a mesh than in the origin at most, >= 1.
 
     Parameters
     ----------
-    depth_mm
-        Distance from the plane in focus towards the camera, mm, below ``distance_mm``.
-    f_number
-        Of the lens focused at infinity.
-    focal_mm, distance_mm
-        Image distance (the focal length of a pinhole model) and distance of the plane in focus, mm.
-    pixel_um
-        Side of a pixel, um.
-
-    Examples
-    --------
-    >>> round(defocus_px(60, f_number=11, focal_mm=87, distance_mm=1000, pixel_um=7.5), 1)
-    5.4
+    mesh
+        The mesh, around the origin.
+    place_mm
+        The light, shape (3,).
     """
-    if not depth_mm < distance_mm:
-        raise ValueError(f"depth_mm: got {depth_mm}, expected below {distance_mm}")
-    magnification = focal_mm / distance_mm
-    aperture_mm = focal_mm / (1.0 + magnification) / f_number
-    blur_mm = aperture_mm * magnification * abs(depth_mm) / (distance_mm - depth_mm)
-    return blur_mm * 1e3 / pixel_um
+    place = np.asarray(place_mm, np.float64)
+    nearest = np.linalg.norm(place - np.asarray(mesh.vertices_mm, np.float64), axis=1).min()
+    return max(float(place @ place) / max(float(nearest) ** 2, 1e-12), 1.0)

@@ -16,6 +16,7 @@ from typing import Final, Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.plan import Plan
 from rigsim.sensor import Sensor
 
 Verdict: TypeAlias = Literal["built", "negligible", "absent", "asked", "unmodeled"]
@@ -235,6 +236,29 @@ def decide(
     if over_noise < ENOUGH:
         return Effect(name, "negligible", size, over_noise, switch)
     return Effect(name, "asked", f"{switch}=False asks for it; {size}", over_noise, switch)
+
+
+def longest_on_s(plan: Plan) -> float | None:
+    """Return how long lights are on at most in one exposure of a plan, s; None: they never are.
+
+    Parameters
+    ----------
+    plan
+        Of LEDs; an on-time counts by its level, 0 to 1.
+
+    Examples
+    --------
+    >>> from capture.plan.gradient import gradient_plan
+    >>> from capture.rig import load_rig
+    >>> longest_on_s(gradient_plan(load_rig("gradient")))
+    0.018
+    """
+    lit = [
+        float(step.settings["level"]) * float(step.settings["exposure_s"])
+        for step in plan.steps
+        if "level" in step.settings and "exposure_s" in step.settings
+    ]
+    return max(lit, default=0.0) or None
 
 
 def absent(reasons: Sequence[tuple[str, str]]) -> list[Effect]:

@@ -124,6 +124,9 @@ class DomeScene:
         Whether light that went from skin to skin is reflected wavelength by wavelength.
     last_bounce
         Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
+    on_s
+        Longest on-time at full level of one light in the plan's exposures, s, by which sizes are
+        told; ``None``: such that the brightest skin is at full scale.
     optics
         Whether lenses blur what is out of focus, and diffract; ``None`` decides as above.
     subpixels
@@ -149,6 +152,7 @@ class DomeScene:
         spectral: bool | None = None,
         last_bounce: float | None = None,
         optics: bool | None = None,
+        on_s: float | None = None,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
     ) -> None:
@@ -201,6 +205,7 @@ class DomeScene:
             state,
             caster=self._caster,
             noise=noise_of([Noise.of(sensor) for sensor in self._sensors.values()]),
+            white_rgb=None if on_s is None else on_s * self._white_in_origin(),
             movement=movement,
             motion=motion,
             subsurface=subsurface,
@@ -240,6 +245,14 @@ class DomeScene:
         if led.name in self.dome.dead:
             return np.zeros(3, np.float32)
         return white_intensity(led, self._view(view_name)).astype(np.float32)
+
+    def _white_in_origin(self) -> NDArray[np.float64]:
+        """Return full scales per second of a white plate that faces the brightest light."""
+        each = [
+            white_intensity(light, self.rig.views[0]) / float(np.square(light.position_mm).sum())
+            for light in self.rig.lights
+        ]
+        return np.asarray(np.max(each, axis=0), np.float64)
 
     def sensor(self, view_name: str | None = None) -> Sensor:
         """Return the sensor of a view."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from capture.rig import Rig, View
-from rigsim.effect_sizes import bounced, edge_loss, exchange_share
+from model import spectra
+from rigsim.effect_sizes import bounced, edge_loss, exchange_share, nearness
 from rigsim.head_motion import HeadMotion
 from rigsim.render import Caster
 from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
@@ -16,11 +18,12 @@ from rigsim.scenes.flash_needs import (
     SHADOWS,
     SPECTRAL,
     bands,
-    brightest_reflectance,
+    brightest_rgb,
     color_error,
     further_bounces,
     lens,
     polarization,
+    textures,
 )
 from rigsim.scenes.skin_glow import typical_kernels
 from rigsim.subject import Subject
@@ -34,6 +37,7 @@ def dome_needs(
     *,
     caster: Caster,
     noise: Noise,
+    white_rgb: NDArray[np.floating] | None,
     movement: bool,
     motion: HeadMotion | None,
     subsurface: bool | None,
@@ -53,7 +57,10 @@ def dome_needs(
     caster
         The mesh.
     noise
-        Of the sensors. Exposures are not known here: the brightest pixel is taken as full.
+        Of the sensors.
+    white_rgb
+        What a white plate in the origin gets in the plan's longest exposure from the brightest
+        light, full scales, shape (3,); None: the brightest skin is taken as full.
     movement, motion
         Whether the face moves with its state, and how the head does.
     subsurface, interreflections, spectral, optics
@@ -75,31 +82,39 @@ def dome_needs(
         flat = decide(BOUNCES, size, None, switch="interreflections", because=because)
         opaque = [(LATERAL, f"{subject.name} is opaque")]
         return SceneNeeds((*made, flat, focus, *absent([*opaque, *world]), *unmodeled(FAR_LIGHT)))
-    brightest = brightest_reflectance(subject, state, view, illuminant)
+    brightest = brightest_rgb(subject, state, view, illuminant)
+    if white_rgb is None:
+        white = spectra.camera_white(view.spectral_sensitivity, illuminant)
+        level = white * brightest / (white * brightest).max()
+    else:
+        near = max(nearness(caster.mesh, light.position_mm) for light in rig.lights)
+        level = np.minimum(1.0, near * white_rgb * brightest)
     pixel_mm = view.distance_mm / view.focal_px
     kernels = typical_kernels(subject, state, view.spectral_sensitivity, illuminant)
     lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
     share = exchange_share(caster)
-    more = bounced(share, brightest)
-    unseen = more / float(noise.sigma(more))  # where nothing else shines
+    more = level * [bounced(share, float(reflectance)) for reflectance in brightest]
+    unseen = more / noise.sigma(more)  # where nothing else shines
     bounces = decide(
-        BOUNCES, unseen, interreflections, switch="interreflections",
+        BOUNCES, float(unseen.max()), interreflections, switch="interreflections",
         because=f"hollows get {100 * share:.0f} % of what their surroundings send out",
     )  # fmt: skip
-    off = unseen * color_error(subject, state, view, illuminant) if bounces.built else 0.0
+    off = unseen * color_error(subject, state, view, illuminant) if bounces.built else np.zeros(1)
     made += [
+        *textures(subject, view, illuminant),
         Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0)),
         decide(
-            LATERAL, noise.share(lost), subsurface, switch="subsurface",
-            because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost:.1f} % at a shadow's edge",
+            LATERAL, float((lost * level / noise.sigma(level)).max()), subsurface,
+            switch="subsurface",
+            because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
         ),
         bounces,
         decide(
-            SPECTRAL, off, spectral, switch="spectral",
+            SPECTRAL, float(off.max()), spectral, switch="spectral",
             because="a channel's mean of squares is not the square of its mean"
             if bounces.built else "there is no such light",
         ),
-        further_bounces(bounces, share * brightest),
+        further_bounces(bounces, share * float(brightest.max())),
         focus,
     ]  # fmt: skip
     made += _movement(subject, movement, motion, view)

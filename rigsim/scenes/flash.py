@@ -152,6 +152,8 @@ class FlashScene:
         Whether that light is reflected wavelength by wavelength.
     last_bounce
         Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
+    power
+        Highest power of a flash in the plan, above 0 to 1, by which sizes are told.
     optics
         Whether the lens blurs what is out of focus, and diffracts; ``None`` decides as above.
     subpixels
@@ -175,6 +177,7 @@ class FlashScene:
         spectral: bool | None = None,
         last_bounce: float | None = None,
         optics: bool | None = None,
+        power: float = 1.0,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
     ) -> None:
@@ -185,6 +188,8 @@ class FlashScene:
             )
         if subpixels < 1:
             raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
+        if not 0.0 < power <= 1.0:
+            raise SceneError(f"power: got {power}, expected above 0 to 1")
         if movement and isinstance(subject, Subject) and subject.pose is None:
             subject = subject.posed(state)
         self.rig = rig
@@ -211,7 +216,7 @@ class FlashScene:
             state,
             caster=self._caster,
             noise=Noise.of(self._sensors[rig.views[0].name]),
-            white_level=METER_LEVEL,
+            white_rgb=np.asarray(self.white_rgb(), np.float64) * power,
             movement=movement,
             lateral=lateral,
             interreflections=interreflections,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numpy.typing import NDArray
 
 from capture.rig import Rig, View
 from model import spectra
 from rigsim.depth_of_field import facing_depths, lens_spread
-from rigsim.effect_sizes import bounced, edge_loss, exchange_share
+from rigsim.effect_sizes import bounced, edge_loss, exchange_share, nearness
 from rigsim.render import Caster
 from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
 from rigsim.scenes.skin_glow import typical_kernels
@@ -23,12 +26,20 @@ FURTHER = "bounces after the last that is summed"
 POLARIZATION = "polarization"
 SHADOWS = "shadows"
 LENS = "depth of field and lens blur"
+BANDS = "bands of the camera"
+RELIEF = "relief of the skin"
+PIGMENT = "pattern of pigment"
 
 EVERY = 16
 """Of the texels whose reflectance is looked at."""
 
 LAST_BOUNCE = 1e-3
 """The last bounce that is summed is at most this share of the first."""
+
+EVEN = 1e-5
+EVEN_DEG = 1e-3
+"""Relative change of reflectance, and tilt of normals, that no sensor tells: full scale is at most
+some thousand times its noise, of which a tenth counts."""
 
 REST = 0.05
 """Of the noise: what further bounces may add at most, about."""
@@ -41,7 +52,7 @@ def flash_needs(
     *,
     caster: Caster,
     noise: Noise,
-    white_level: float,
+    white_rgb: NDArray[np.floating],
     movement: bool,
     lateral: bool | None,
     interreflections: bool | None,
@@ -62,8 +73,8 @@ def flash_needs(
         The mesh.
     noise
         Of the sensor.
-    white_level
-        What a white plate in the origin gives at power 1, full scales.
+    white_rgb
+        What a white plate in the origin gives at the plan's highest power, full scales, shape (3,).
     movement
         Whether the face moves with its state.
     lateral, interreflections, spectral, optics
@@ -80,38 +91,42 @@ def flash_needs(
     if isinstance(subject, Target):
         made += _of_target(subject, caster)
         if subject.kind not in ("source", "cap"):
-            made.append(lens(view, illuminant, caster, noise, white_level, subpixels, optics))
+            made.append(
+                lens(view, illuminant, caster, noise, float(white_rgb.max()), subpixels, optics)
+            )
             made += unmodeled(FAR_LIGHT)
         else:
             made.append(Effect(LENS, "negligible", "all of the picture is alike", 0.0, "optics"))
         return SceneNeeds((*made, *absent(dark)))
-    brightest = brightest_reflectance(subject, state, view, illuminant)
-    level = min(1.0, white_level * brightest)
+    brightest = brightest_rgb(subject, state, view, illuminant)
+    near = max(nearness(caster.mesh, light.position_mm) for light in rig.lights)
+    level = np.minimum(1.0, near * white_rgb * brightest)
     pixel_mm = view.distance_mm / view.focal_px
     kernels = typical_kernels(subject, state, view.spectral_sensitivity, illuminant)
     lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
     share = exchange_share(caster) if share is None else share
-    more = level * bounced(share, brightest)
-    unseen = more / float(noise.sigma(more))  # where nothing else shines
+    more = level * [bounced(share, float(reflectance)) for reflectance in brightest]
+    unseen = more / noise.sigma(more)  # where nothing else shines
     bounces = decide(
-        BOUNCES, unseen, interreflections, switch="interreflections",
+        BOUNCES, float(unseen.max()), interreflections, switch="interreflections",
         because=f"hollows get {100 * share:.0f} % of what their surroundings send out",
     )  # fmt: skip
-    off = unseen * color_error(subject, state, view, illuminant) if bounces.built else 0.0
+    off = unseen * color_error(subject, state, view, illuminant) if bounces.built else np.zeros(1)
     made += [
-        Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0, level)),
+        *textures(subject, view, illuminant),
+        Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0, float(level.max()))),
         decide(
-            LATERAL, noise.share(lost, level), lateral, switch="lateral",
-            because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost:.1f} % at a shadow's edge",
+            LATERAL, float((lost * level / noise.sigma(level)).max()), lateral, switch="lateral",
+            because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
         ),
         bounces,
         decide(
-            SPECTRAL, off, spectral, switch="spectral",
+            SPECTRAL, float(off.max()), spectral, switch="spectral",
             because="a channel's mean of squares is not the square of its mean"
             if bounces.built else "there is no such light",
         ),
-        further_bounces(bounces, share * brightest),
-        lens(view, illuminant, caster, noise, level, subpixels, optics),
+        further_bounces(bounces, share * float(brightest.max())),
+        lens(view, illuminant, caster, noise, float(level.max()), subpixels, optics),
     ]  # fmt: skip
     return SceneNeeds((*made, *_movement(subject, movement), *absent(dark), *_limits()))
 
@@ -170,17 +185,45 @@ def polarization(rig: Rig, view: View) -> Effect:
 
 def bands(view: View) -> Effect:
     """Return how many colors are kept."""
-    name = "bands of the camera"
     if view.cfa == "MONO":
-        return Effect(name, "built", "one: the sensor has no filters")
-    return Effect(name, "built", "three: those of the sensor's filters")
+        return Effect(BANDS, "built", "one: the sensor has no filters")
+    return Effect(BANDS, "built", "three: those of the sensor's filters")
 
 
-def brightest_reflectance(subject: Subject, state: str, view: View, illuminant: str) -> float:
-    """Return the largest reflectance of a face's skin in any channel."""
+def textures(subject: Subject, view: View, illuminant: str) -> list[Effect]:
+    """Return whether a face needs its relief and its map of pigment.
+
+    Parameters
+    ----------
+    subject
+        The face.
+    view, illuminant
+        Whose colors.
+    """
+    covered = subject.atlas.covered
+    cosine = np.einsum("ij,ij->i", subject.normal[covered], subject.atlas.normal[covered])
+    tilt = math.degrees(math.acos(min(max(float(cosine.min()), -1.0), 1.0)))
+    melanin = subject.melanin[covered]
+    ends = np.array([melanin.min(), np.median(melanin), melanin.max()], np.float32)
+    blood = np.full_like(ends, np.median(subject.hemoglobin("neutral")[covered]))
+    rgb = skin_color(view.spectral_sensitivity, illuminant).rgb(ends, blood)
+    least, most = float((rgb[2] / rgb[1]).min()), float((rgb[0] / rgb[1]).max())
+    flat, even = tilt < EVEN_DEG, max(most - 1.0, 1.0 - least) < EVEN
+    return [
+        Effect(RELIEF, "negligible" if flat else "built", f"it tilts up to {tilt:.0f} degrees"),
+        Effect(
+            PIGMENT, "negligible" if even else "built",
+            f"reflectance is {least:.2g} to {most:.2g} times its median's",
+        ),
+    ]  # fmt: skip
+
+
+def brightest_rgb(subject: Subject, state: str, view: View, illuminant: str) -> NDArray[np.float64]:
+    """Return the largest white-balanced reflectance of a face's skin in each channel, (3,)."""
     covered = subject.atlas.covered
     melanin, blood = subject.melanin[covered][::EVERY], subject.hemoglobin(state)[covered][::EVERY]
-    return float(skin_color(view.spectral_sensitivity, illuminant).rgb(melanin, blood).max())
+    rgb = skin_color(view.spectral_sensitivity, illuminant).rgb(melanin, blood)
+    return np.asarray(rgb.reshape(-1, 3).max(axis=0), np.float64)
 
 
 def last_bounce(over_noise: float) -> float:
@@ -217,14 +260,17 @@ def _of_target(target: Target, caster: Caster) -> list[Effect]:
     ]
 
 
-def color_error(subject: Subject, state: str, view: View, illuminant: str) -> float:
-    """Return by how much a channel's mean of R^2 is off the square of its mean, of typical skin."""
+def color_error(subject: Subject, state: str, view: View, illuminant: str) -> NDArray[np.float64]:
+    """Return by how much each channel's mean of R^2 is off the square of its mean, shape (3,).
+
+    Of typical skin.
+    """
     table = SkinTable.load()
     weights = spectra.band_weights(view.spectral_sensitivity, illuminant, table.wavelength_nm)
     covered = subject.atlas.covered
     blood = subject.hemoglobin(state)
     skin = table.spectra(np.median(subject.melanin[covered]), np.median(blood[covered]))
-    return float(np.abs((skin**2 @ weights) / (skin @ weights) ** 2 - 1.0).max())
+    return np.asarray(np.abs((skin**2 @ weights) / (skin @ weights) ** 2 - 1.0), np.float64)
 
 
 def _movement(subject: Subject, movement: bool) -> list[Effect]:

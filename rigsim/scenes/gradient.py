@@ -11,6 +11,7 @@ the parallel analyser as behind the crossed one.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Final, Literal, Protocol, TypeAlias
@@ -130,6 +131,9 @@ class GradientScene:
         Whether light goes from furrow to furrow.
     optics
         Whether lens and pixels blur; without, every pixel is the mean of its samples.
+    on_s
+        Longest exposure of the plan, s, by which sizes are told; None: such that the brightest
+        skin is at full scale.
     sectors
         Directions in which horizons are found, a multiple of 4.
     subpixels
@@ -153,6 +157,7 @@ class GradientScene:
         optics: bool | None = None,
         lateral: bool | None = None,
         interreflections: bool | None = None,
+        on_s: float | None = None,
         sectors: int = 32,
         subpixels: int = 1,
         table_size: int | None = None,
@@ -186,6 +191,7 @@ class GradientScene:
             self.sphere,
             self.lens,
             noise=Noise.of(self._sensor),
+            white=math.inf if on_s is None else METER_RATE_PER_S * on_s,
             moving=motion is not None,
             shadows=shadows,
             lateral=lateral,

@@ -42,6 +42,7 @@ def gradient_needs(
     lens: Lens,
     *,
     noise: Noise,
+    white: float,
     moving: bool,
     shadows: bool | None,
     lateral: bool | None,
@@ -57,7 +58,10 @@ def gradient_needs(
     subject
         A patch of skin, or the name of a target.
     noise
-        Of the sensor. Exposures are not known here: the brightest pixel is taken as full.
+        Of the sensor. Highlights are taken as full.
+    white
+        What a white patch gets under all LEDs in the plan's longest exposure, full scales; inf:
+        so much that the brightest skin is full.
     moving
         Whether the patch moves.
     shadows, lateral, interreflections, optics
@@ -76,7 +80,7 @@ def gradient_needs(
             made.append(decide(name, 0.0, None, switch=switch, because=flat))
         made.append(Effect(LATERAL, "absent", f"{subject} is glass, gray or nothing"))
         return SceneNeeds((*made, *absent(world), *unmodeled(limits)))
-    made += _of_skin(subject, sphere, lens, noise, shadows, lateral, interreflections)
+    made += _of_skin(subject, sphere, lens, noise, white, shadows, lateral, interreflections)
     if moving:
         made.append(Effect("movement of the patch", "built", "it drifts and jumps", None, "motion"))
         pixel_um = lens.pixel_on_subject_um
@@ -112,6 +116,7 @@ def _of_skin(
     sphere: BuiltSphere,
     lens: Lens,
     noise: Noise,
+    white: float,
     shadows: bool | None,
     lateral: bool | None,
     interreflections: bool | None,
@@ -139,7 +144,8 @@ def _of_skin(
     brightest = float(skin.albedo.max())
     more = bounced(share, brightest)
     pixel_mm = 1e-3 * lens.pixel_on_subject_um
-    lost = edge_loss(sigmas, weights[None], pixel_mm)
+    lost = float(edge_loss(sigmas, weights[None], pixel_mm).max())
+    level = min(1.0, white * brightest)
     deg = (math.degrees(math.atan(steepest)), math.degrees(math.atan(lowest)))
     return [
         Effect(RELIEF, "built", f"pixels of {1e3 * pixel_mm:.1f} um resolve it"),
@@ -148,11 +154,11 @@ def _of_skin(
             because=f"slopes up to {deg[0]:.0f} degrees, LEDs down to {deg[1]:.0f}",
         ),
         decide(
-            LATERAL, noise.share(lost), lateral, switch="lateral",
+            LATERAL, noise.share(lost, level), lateral, switch="lateral",
             because=f"pixels of {1e3 * pixel_mm:.1f} um lose {100 * lost:.0f} % at a shadow's edge",
         ),
         decide(
-            BOUNCES, noise.share(more, min(1.0, brightest)), interreflections,
+            BOUNCES, noise.share(more, level), interreflections,
             switch="interreflections",
             because=f"walls of furrows get up to {100 * share:.1f} % of what others send out",
         ),

@@ -128,14 +128,15 @@ class ProbeScene:
         self.white = spectra.camera_white(self._view.spectral_sensitivity, rig.lights[0].illuminant)
         images = unit_images(self.build, self._view)
         self._images = np.ascontiguousarray(images.reshape(len(images), -1).T)
-        self._hot_e_per_s = _hot_pixels(self._sensor, images.shape[1:])
+        self.hot_e_per_s = _hot_pixels(self._sensor, images.shape[1:])
+        """What hot pixels add to the dark current at `DARK_C`, electrons/s, shape (H, W)."""
         full_e = self._sensor.gain_e_per_dn * (self._sensor.white - self._sensor.black)
         self.needs: SceneNeeds = probe_needs(
             rig,
             tissue,
             self.build,
             noise=Noise.of(self._sensor),
-            hot=float(self._hot_e_per_s.max()) * LONGEST_S / full_e,
+            hot=float(self.hot_e_per_s.max()) * LONGEST_S / full_e,
         )
         """What is built, what is not, and why."""
 
@@ -267,7 +268,7 @@ class ProbeScene:
         light = self.image(total)
         sensor = self.sensor(camera_c=head.camera_c)
         full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
-        hot = self._hot_e_per_s * np.float32(exposure_s * _warmth(head.camera_c) / full_e)
+        hot = self.hot_e_per_s * np.float32(exposure_s * _warmth(head.camera_c) / full_e)
         light += hot[..., None]
         return expose(light, sensor=sensor, rng=rng, exposure_s=exposure_s)
 

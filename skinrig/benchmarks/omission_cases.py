@@ -135,9 +135,15 @@ def flash_face(preset: str, *, width_px: int, texels: int = FACE_TEXELS) -> Iter
         "flash", preset, scene, Noise.of(scene.sensor()), render,
         {
             "lateral": (True, False), "interreflections": (True, False),
-            "spectral": (True, False), "last_bounce": (1e-7, None),
+            "spectral": (True, False), "last_bounce": (1e-7, None), "optics": (True, False),
         },
     )  # fmt: skip
+
+    def look(subject: Any) -> Pictures:
+        made = FlashScene(rig, subject)
+        return Pictures(np.stack([made.radiance(name) for name in ("parallel", "crossed")]))
+
+    yield from _plainer("flash", preset, scene, look)
 
 
 def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
@@ -162,9 +168,74 @@ def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
         "dome", preset, scene, Noise.of(scene.sensor()), render,
         {
             "subsurface": (True, False), "interreflections": (True, False),
-            "spectral": (True, False), "last_bounce": (1e-7, None),
+            "spectral": (True, False), "last_bounce": (1e-7, None), "optics": (True, False),
         },
     )  # fmt: skip
+
+    def look(subject: Any) -> Pictures:
+        return Pictures(DomeScene(rig, subject).radiance(view) / brightest)
+
+    yield from _plainer("dome", preset, scene, look)
+
+
+def _plainer(
+    rig: str, preset: str, scene: Any, look: Callable[[Any], Pictures]
+) -> Iterator[Omission]:
+    """Compare a face with one of even pigment, with one without relief, and three bands with one.
+
+    Parameters
+    ----------
+    rig, preset
+        Names.
+    scene
+        The face's own.
+    look
+        Returns the pictures of a subject, in full scales.
+    """
+    from model import spectra
+    from rigsim.scene_needs import Noise
+    from rigsim.scenes.flash_needs import BANDS, PIGMENT, RELIEF
+
+    face, noise = scene.subject, Noise.of(scene.sensor())
+    begin = time.process_time()
+    have = look(face)
+    with_s = time.process_time() - begin
+    covered = face.atlas.covered
+    even = np.full_like(face.melanin, np.median(face.melanin[covered]))
+    for name, plain in (
+        (RELIEF, dataclasses.replace(face, normal=face.atlas.normal)),
+        (PIGMENT, dataclasses.replace(face, melanin=even)),
+    ):
+        begin = time.process_time()
+        lack = look(plain)
+        spent = time.process_time() - begin
+        yield _changed(rig, preset, scene.needs[name], have, lack, noise, (with_s, spent))
+    view = scene.rig.views[0]
+    white = spectra.camera_white(view.spectral_sensitivity, scene.rig.lights[0].illuminant)
+    gray = np.asarray(white / white.mean(), np.float32)
+    begin = time.process_time()
+    one = Pictures(have.light.mean(axis=-1, keepdims=True) * gray)
+    spent = time.process_time() - begin
+    # a band alone would be a third of the sums over colors, which are not timed apart
+    yield _changed(rig, preset, scene.needs[BANDS], have, one, noise, (spent, spent))
+
+
+def _changed(
+    rig: str,
+    subject: str,
+    effect: Any,
+    have: Pictures,
+    lack: Pictures,
+    noise: Any,
+    seconds: tuple[float, float],
+) -> Omission:
+    """Compare two pictures that one effect tells apart."""
+    sigma = noise.sigma(have.light)
+    change = float((np.abs(have.light.astype(np.float64) - lack.light) / sigma).max())
+    rounded = ROUNDING * float(np.max(have.light / sigma))
+    return Omission(
+        rig, subject, effect.name, effect.verdict, effect.over_noise, change, rounded, *seconds
+    )
 
 
 def gradient_skin(site: str, *, width_px: int) -> Iterator[Omission]:
@@ -267,12 +338,43 @@ def gray_tissue() -> Iterator[Omission]:
         pictures.append(Pictures(light))  # of stored photons: the same for both
     brightest = np.float32(pictures[0].light.max())
     noise = Noise.of(scene.sensor())
-    have, lack = (part.light / brightest for part in pictures)
-    sigma = noise.sigma(have)
-    change = np.abs(have - lack) / sigma
-    place = np.unravel_index(int(np.argmax(change)), change.shape)
+    have, lack = (Pictures(part.light / brightest) for part in pictures)
     effect = scene.needs[COLOR]
-    yield Omission(
-        "probe", "gray medium", effect.name, effect.verdict, effect.over_noise,
-        float(change[place]), float(ROUNDING * have[place] / sigma[place]), *seconds,
+    yield _changed(
+        "probe", "gray medium", effect, have, lack, noise, (seconds[0], seconds[1])
+    )  # fmt: skip
+    yield from _probe_build(scene, head, noise)
+
+
+def _probe_build(scene: Any, head: Any, noise: Any) -> Iterator[Omission]:
+    """Compare the probe as built with one without cross-talk, wings, or dark current."""
+    from rigsim.scenes.probe import LONGEST_S, ProbeScene
+    from rigsim.scenes.probe_needs import CROSSTALK, DARK, WINGS
+
+    profile = scene.profile(head)
+    build = scene.build
+
+    def picture(made: Any) -> tuple[Pictures, float]:
+        begin = time.process_time()
+        light = made.image(made.through_fibres(profile.reflectance_per_mm2))
+        return Pictures(light), time.process_time() - begin
+
+    have, with_s = picture(scene)
+    unit = np.float32(have.light.max())
+    plain = {
+        CROSSTALK: dataclasses.replace(build, crosstalk=np.eye(len(build.crosstalk))),
+        WINGS: dataclasses.replace(build, wings=0.0),
+    }
+    for name, without in plain.items():
+        lack, spent = picture(ProbeScene(scene.rig, scene.tissue, build=without))
+        yield _changed(
+            "probe", "gray medium", scene.needs[name], Pictures(have.light / unit),
+            Pictures(lack.light / unit), noise, (with_s, spent),
+        )  # fmt: skip
+    sensor = scene.sensor()
+    full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
+    hot = np.asarray(scene.hot_e_per_s * LONGEST_S / full_e, np.float32)
+    yield _changed(
+        "probe", "gray medium", scene.needs[DARK], Pictures(hot), Pictures(np.zeros_like(hot)),
+        noise, (0.0, 0.0),
     )  # fmt: skip

@@ -78,7 +78,7 @@ def simulate_dome(order: Order) -> Simulated:
         raise SimulationError("subsurface, interreflections: are of a face; a target has neither")
     if conditions:
         asked["conditions"] = conditions
-    scene = _scene(rig, order)
+    scene = _scene(rig, order, plan)
     session = open_session(order, plan, rig, asked, scene)
     try:
         scan = _attach_scan(session, scene, order) if order.target is None else {}
@@ -307,9 +307,10 @@ def _plan(rig: Rig, target: str | None, size: str) -> Plan:
     )  # fmt: skip
 
 
-def _scene(rig: Rig, order: Order) -> Any:
+def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
     from rigsim.dome_build import build
     from rigsim.head_motion import head_motion
+    from rigsim.scene_needs import longest_on_s
     from rigsim.scenes.dome import DomeScene
     from rigsim.scenes.dome_targets import target_scene
     from rigsim.subject import make_subject
@@ -331,7 +332,7 @@ def _scene(rig: Rig, order: Order) -> Any:
     return DomeScene(
         rig, person, dome=built, motion=motion, state=order.states[0], movement=order.movement,
         seed=order.seed, subsurface=light["subsurface"], interreflections=light["interreflections"],
-        conditions=conditions,
+        conditions=conditions, on_s=longest_on_s(plan),
     )  # fmt: skip
 
 

@@ -55,8 +55,8 @@ def simulate_flash(order: Order) -> Simulated:
         **({} if order.plan is None else {"plan": order.plan.to_json()}),
     }  # fmt: skip
     # what cannot be built must fail before a folder is made
-    scenes = _scenes(rig, order)
     plan = order.plan or _plan(rig, target, states, order.repeats)
+    scenes = _scenes(rig, order, plan)
     first = next(iter(scenes.values()))
     session = open_session(order, plan, rig, asked, first)
 
@@ -87,18 +87,20 @@ def _plan(rig: Rig, target: str | None, states: tuple[str, ...], repeats: int) -
     return flash_calibration_plan(rig, target)  # type: ignore[arg-type]
 
 
-def _scenes(rig: Rig, order: Order) -> dict[str, Any]:
+def _scenes(rig: Rig, order: Order, plan: Plan) -> dict[str, Any]:
     from rigsim import targets
     from rigsim.scenes.flash import FlashScene
     from rigsim.subject import make_subject
 
     seed = order.seed
+    powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]
+    power = max(powers, default=0.0) or 1.0
     if order.target is not None:
         state = "white" if order.target == "white" else ""
-        return {state: FlashScene(rig, targets.make_target(order.target), seed=seed)}
+        return {state: FlashScene(rig, targets.make_target(order.target), seed=seed, power=power)}
     person = make_subject(order.subject, seed=seed, mesh=order.mesh)
     return {
-        state: FlashScene(rig, person, state=state, movement=order.movement, seed=seed)
+        state: FlashScene(rig, person, state=state, movement=order.movement, seed=seed, power=power)
         for state in order.states
     }
 

@@ -133,6 +133,7 @@ def make_scene(
     """
     from rigsim.microrelief import make_micro_skin
     from rigsim.patch_motion import PatchMotion
+    from rigsim.scene_needs import longest_on_s
     from rigsim.scenes.gradient import GradientScene
     from rigsim.skin_stretch import size_for
     from rigsim.sphere_build import build_sphere
@@ -146,7 +147,8 @@ def make_scene(
         angle_deg=angles.pop() if len(angles) == 1 else None, shift_mm=SHIFT_MM,
     )  # fmt: skip
     skin = make_micro_skin(site or SITE, seed=seed, size_mm=size_mm, preset=preset)
-    return GradientScene(rig, skin, sphere=sphere, motion=PatchMotion(seed), seed=seed)
+    on_s = None if plan is None else longest_on_s(plan)
+    return GradientScene(rig, skin, sphere=sphere, motion=PatchMotion(seed), seed=seed, on_s=on_s)
 
 
 class GripLog:
