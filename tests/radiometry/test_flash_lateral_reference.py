@@ -61,7 +61,7 @@ def test_stripes_look_as_the_full_walk_says_within_5_percent(wavelength_nm):
         np.tile(c_hd, (side, 1)),
         pixel_mm=pixel_mm,
         wavelength_nm=wavelength_nm,
-        photons=600_000,
+        photons=300_000,
         rng=np.random.default_rng(12345),
     )
     profile = walk.reflectance.mean(axis=0)
