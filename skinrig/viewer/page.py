@@ -22,6 +22,8 @@ SCRIPTS: Final = (
     "camera.js",
     "color.js",
     "shading.js",
+    "shadow.js",
+    "crowd.js",
     "strain.js",
     "wrinkles.js",
     "detail.js",

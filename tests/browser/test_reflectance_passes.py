@@ -25,8 +25,9 @@ from skinrig.viewer.trait_assets import LobeTraits
 pytestmark = pytest.mark.long
 
 Floats = NDArray[np.floating]
-FLAT = {"relief": 0, "wrinkles": 0, "microstructure": 0, "hybrid_normals": 0, "detail": 0}
-"""Nothing that tilts the normals of the mesh."""
+FLAT = {"relief": 0, "wrinkles": 0, "microstructure": 0, "hybrid_normals": 0, "detail": 0,
+        "shadows": 0}  # fmt: skip
+"""Nothing that tilts the normals of the mesh or takes light from it."""
 HALF = 2.0**-11
 """Relative rounding of a half float."""
 
@@ -134,8 +135,13 @@ def towards_the_eye(params: dict[str, Any], shape: tuple[int, int]) -> Floats:
     return np.asarray(-away / np.linalg.norm(away, axis=-1, keepdims=True))
 
 
-def expected_specular(page: FittedPage, shares: Floats, params: dict[str, Any]) -> Floats:
-    """Return what the model reflects at each pixel of the face, and 0 beside it."""
+def expected_specular(
+    page: FittedPage, shares: Floats, params: dict[str, Any], *, slope: Floats | None = None
+) -> Floats:
+    """Return what the model reflects at each pixel of the face, and 0 beside it.
+
+    A slope tilts the normals of the lobes, not the surface that takes the light.
+    """
     viewer = page.viewer
     inspect, normal = viewer.read("inspect"), viewer.read("normal")
     on = viewer.read("albedo")[..., 3] > 0
@@ -144,7 +150,13 @@ def expected_specular(page: FittedPage, shares: Floats, params: dict[str, Any]) 
     light = direction(params["light_azimuth_deg"], params["light_elevation_deg"])
     eye = towards_the_eye(params, on.shape)[on]
     weights = sampled(shares, inspect[..., :2][on])
-    brdf = skin_reflectance.lobe_brdf(page.traits.lobes.lobes, weights, light, eye, n)
+    m = n
+    if slope is not None:
+        t = np.cross(n, [0.31, 0.82, 0.48])
+        t /= np.linalg.norm(t, axis=-1, keepdims=True)
+        m = n - slope[0] * t - slope[1] * np.cross(n, t)
+        m /= np.linalg.norm(m, axis=-1, keepdims=True)
+    brdf = skin_reflectance.lobe_brdf(page.traits.lobes.lobes, weights, light, eye, m)
     maps = as_packed(page.scene).textures["surface_maps"].values
     brdf *= sampled(maps[..., 1:2], inspect[..., :2][on])[:, 0]  # brows reflect less
     out = np.zeros(on.shape)
@@ -164,6 +176,31 @@ def test_the_page_reflects_what_the_fitted_lobes_reflect(fitted, azimuth):
     assert np.median(relative) < 1e-3
     assert np.percentile(relative, 99.0) < 0.02  # nearest slabs of phi_d differ at ties
     assert np.abs(found[..., 0] - wanted).max() < 0.05 * wanted.max()
+
+
+def test_slopes_that_no_pixel_shows_widen_the_fitted_lobes(fitted):
+    """The mean over normals, by 11 x 11 Gauss-Hermite nodes; the page takes seven."""
+    rms = 0.1
+    params = fitted.viewer.set(specular_model="fitted", lobe_slope_rms=rms)
+    found = fitted.viewer.read("specular")[..., 0]
+    x, w = np.polynomial.hermite_e.hermegauss(11)
+    w = w / w.sum()
+    wanted = np.zeros(found.shape)
+    for i in range(len(x)):
+        for j in range(len(x)):
+            if w[i] * w[j] > 1e-5:
+                slope = rms * np.array([x[i], x[j]])
+                wanted += (
+                    w[i]
+                    * w[j]
+                    * expected_specular(fitted, fitted.traits.lobes.shares, params, slope=slope)
+                )
+    lit = wanted > 0.05 * wanted.max()
+    relative = np.abs(found[lit] - wanted[lit]) / wanted[lit]
+    assert np.median(relative) < 0.03
+    plain = expected_specular(fitted, fitted.traits.lobes.shares, params)
+    assert found.max() < 0.9 * plain.max()
+    assert np.median(np.abs(plain[lit] - wanted[lit]) / wanted[lit]) > 2.0 * np.median(relative)
 
 
 def test_the_analytic_formula_is_not_taken_for_the_fitted_lobes(fitted):

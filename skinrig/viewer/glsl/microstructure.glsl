@@ -325,6 +325,7 @@ void adjustMicrostructure(inout SurfacePoint s) {
     total = (total - drawn) * (mode > 1.5 ? factor : 1.0);
   }
   s.specularNormal = tilted(s, s.slope - onSurface(s, derivatives));
+  s.unseen += total - p_microstructure_variance.x;
   float m2 = s.roughness * s.roughness + 2.0 * (total - p_microstructure_variance.x);
   float least = min(s.roughness, LEAST_ROUGHNESS);
   s.roughness = sqrt(max(m2, least * least));

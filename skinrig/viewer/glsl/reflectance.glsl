@@ -63,8 +63,25 @@ float fittedBrdf(vec2 uv, vec3 n, vec3 l, vec3 v) {
   return total;
 }
 
+// The lobes were fitted to skin with all of its slopes. What further slopes a pixel does not show
+// widens them: the mean over normals of that variance, by seven of them (exact for polynomials of
+// the slope up to the fifth degree). Slopes that are drawn, or that a stretch flattens, would have
+// to sharpen the lobes, which a mean cannot.
 vec3 fittedSpecular(SurfacePoint s) {
-  return vec3(fittedBrdf(s.uv, s.specularNormal, s.toLight, s.toEye));
+  float variance = max(s.unseen, 0.0) + p_lobe_slope_rms * p_lobe_slope_rms;
+  float own = fittedBrdf(s.uv, s.specularNormal, s.toLight, s.toEye);
+  if (variance < 1e-6) return vec3(own);
+  vec3 n = s.specularNormal;
+  vec3 t = normalize(s.tangent - dot(s.tangent, n) * n);
+  vec3 b = cross(n, t);
+  float sum = 0.5 * own;
+  for (int i = 0; i < 6; i++) {
+    float turn = float(i) * 1.04719755120;
+    vec2 slope = 2.0 * sqrt(variance) * vec2(cos(turn), sin(turn));
+    vec3 tiltedNormal = normalize(n - slope.x * t - slope.y * b);
+    sum += fittedBrdf(s.uv, tiltedNormal, s.toLight, s.toEye) / 12.0;
+  }
+  return vec3(sum);
 }
 
 // Share of light that passes the surface, for R_d F_t F_t / pi (model.fresnel, unpolarized).

@@ -10,6 +10,7 @@ struct SurfacePoint {
   mat3 diffuseNormals;  // columns: of red, green, blue
   vec3 specularNormal;
   float roughness;      // Beckmann m
+  float unseen;         // variance of slopes along one axis that no pixel shows, beyond neutral skin's
   float intensity;      // of the specular reflection
   vec3 toLight;
   vec3 toEye;
@@ -76,6 +77,7 @@ void main() {
   s.diffuseNormals = mat3(n, n, n);
   s.specularNormal = n;
   s.roughness = p_roughness;
+  s.unseen = 0.0;
   s.intensity = p_specular_intensity;
 #ifdef HAS_surface_maps
   vec4 maps = sample_surface_maps(v_uv);
@@ -83,11 +85,12 @@ void main() {
   s.intensity *= maps.g;
 #endif
   adjustSurface(s);
-  vec3 cosines = clamp(s.toLight * s.diffuseNormals, 0.0, 1.0);
+  float lit = litShare(v_position, s.normal);
+  vec3 cosines = lit * clamp(s.toLight * s.diffuseNormals, 0.0, 1.0);
   vec3 irradiance = p_light_intensity * cosines + p_ambient * (0.6 + 0.4 * s.normal.y);
   o_irradiance = vec4(irradiance, v_depth);
   o_albedo = vec4(skinAlbedo(v_uv), 1.0);
-  float facing = clamp(dot(s.specularNormal, s.toLight), 0.0, 1.0);
+  float facing = lit * clamp(dot(s.specularNormal, s.toLight), 0.0, 1.0);
   o_specular = vec4(PI * p_light_intensity * facing * s.intensity * surfaceSpecular(s),
     surfaceWidth(v_uv));
 }

@@ -47,6 +47,7 @@ void adjustWrinkles(inout SurfacePoint s) {
   // half-float moments of a single texel differ by rounding
   variance -= min(variance, moments.zw * 2e-3);
   s.roughness = sqrt(s.roughness * s.roughness + variance.x + variance.y);
+  s.unseen += 0.5 * (variance.x + variance.y);
 }
 
 //@chunk hybrid_source_fragment

@@ -142,7 +142,8 @@ V.updateControls = p => V.updates?.forEach(update => update(p));
 // Parameters that belong to how one looks, not to the face: both sides of a comparison share them.
 V.SHARED = ["camera_yaw_deg", "camera_pitch_deg", "camera_distance_mm", "camera_fov_deg",
   "camera_target_mm", "light_azimuth_deg", "light_elevation_deg", "light_intensity", "ambient",
-  "exposure", "background", "view", "view_low", "view_high", "split", "compare", "heads"];
+  "exposure", "background", "view", "view_low", "view_high", "split", "compare", "heads", "crowd",
+  "shadows", "shadow_px", "shadow_softness_mm"];
 
 // Parameters that passes keep for themselves.
 V.transient = name => /^(microstructure_(place|side_px|virtual_px|margin_px|variance|split_px)|detail_wrinkles)$/.test(name);

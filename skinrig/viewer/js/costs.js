@@ -57,6 +57,24 @@ V.collect = async timer => {
   }
 };
 
+// Forget what was drawn, so that the next frame draws all of it.
+V.forgetDrawn = side => {
+  side.keys.clear();
+  side.crowd?.forEach(one => one.keys.clear());
+};
+
+// Texture reads and bytes of a pass, for all heads that have it for themselves.
+V.costOf = (pass, p) => {
+  const {taps, bytes} = pass.cost ? pass.cost(p) : {taps: 0, bytes: 0};
+  if (!V.ownPasses().has(pass.name)) return {taps, bytes};
+  return V.otherHeads(p).reduce((sum, i) => {
+    const own = V.headParams(p, i);
+    if (!V.enabled(pass, own)) return sum;
+    const more = pass.cost ? pass.cost(own) : {taps: 0, bytes: 0};
+    return {taps: sum.taps + more.taps, bytes: sum.bytes + more.bytes};
+  }, {taps, bytes});
+};
+
 // Costs of n frames with every pass drawn anew, and of a frame in which only the light moved.
 V.measure = async (n = 3) => {
   V.drawFrame();
@@ -65,7 +83,7 @@ V.measure = async (n = 3) => {
   const frames = [];
   V.profile = timer;
   for (let i = 0; i < n; i++) {
-    V.sideA.keys.clear();
+    V.forgetDrawn(V.sideA);
     const begun = performance.now();
     V.drawFrame();
     V.finish();
@@ -84,7 +102,7 @@ V.measure = async (n = 3) => {
   V.params = {...V.params, light_azimuth_deg: azimuth};
   V.drawFrame();
   const rows = V.ordered().filter(pass => V.sideA.targets.has(pass.name)).map(pass => {
-    const {taps, bytes} = pass.cost ? pass.cost(V.params) : {taps: 0, bytes: 0};
+    const {taps, bytes} = V.costOf(pass, V.params);
     const buffers = Object.values(pass.targets(V.params));
     return {name: pass.name, size: buffers[0]?.size ?? V.screen(), taps, bytes,
       ms: (timer.spent.get(pass.name) ?? 0) / n};

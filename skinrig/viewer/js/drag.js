@@ -32,7 +32,7 @@ V.moveLight = (right, up) => V.set({
   light_elevation_deg: V.limit(V.params.light_elevation_deg + up, -89, 89),
 });
 V.zoom = factor => V.set({
-  camera_distance_mm: V.limit(V.params.camera_distance_mm * factor, 45, 1200),
+  camera_distance_mm: V.limit(V.params.camera_distance_mm * factor, 45, V.FARTHEST_MM),
 });
 // Move what is looked at along the screen, by parts of the picture's height.
 V.pan = (right, up) => {

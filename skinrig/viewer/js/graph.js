@@ -29,6 +29,9 @@
 // scattering.js) are joints where other scripts add slopes, normals, specular models, widths.
 // V.start functions may add passes and set joints; V.merged, V.set and V.readNow are in main.js.
 //
+// Several heads: V.headSide(side, p, i) and V.headParams(p, i) (crowd.js) are the buffers and
+// parameters of head i; the passes that the surface reads are drawn for each.
+//
 // In GLSL these names are declared by the program builder where they are used:
 //   p_name                  parameter (number or boolean: float; array of 2 to 4: vec)
 //   sample_name(vec2 uv)    scene texture, in its own unit (layers: sample_name(vec3(uv, layer)))
@@ -69,10 +72,16 @@ V.ordered = () => {
 // One side of an A/B comparison keeps its own buffers and caches.
 V.newSide = () => ({buffers: new Map(), targets: new Map(), keys: new Map(), versions: new Map()});
 
-// Draw what changed. `demand` holds names of buffers that are wanted though nobody shows them.
+// Draw what changed, of other heads first. `demand` holds names of buffers that are wanted though
+// nobody shows them.
 V.drawGraph = (side, p, demand = new Set()) => {
+  V.drawCrowd(side, p);
+  V.drawPasses(side, p, demand);
+};
+V.drawPasses = (side, p, demand, only = null) => {
   const wanted = V.wantedPasses(p, demand);
   for (const pass of V.ordered()) {
+    if (only && !only.has(pass.name)) continue;
     const record = (V.statistics.passes[pass.name] ??= {draws: 0, skipped: 0});
     if (!wanted.has(pass.name)) {
       V.dropPass(side, pass);

@@ -66,7 +66,7 @@ V.bench = (n, {light = false} = {}) => {
   const before = {draws: V.statistics.draws, skipped: V.statistics.skipped};
   for (let i = 0; i < n; i++) {
     if (light) V.params.light_azimuth_deg += 1;
-    else V.sideA.keys.clear();
+    else V.forgetDrawn(V.sideA);
     const begun = performance.now();
     V.drawFrame();
     V.finish();
@@ -75,7 +75,7 @@ V.bench = (n, {light = false} = {}) => {
   const passes = {};
   for (const pass of V.ordered()) {
     if (!V.sideA.targets.has(pass.name)) continue;
-    passes[pass.name] = pass.cost ? pass.cost(V.params) : {taps: 0, bytes: 0};
+    passes[pass.name] = V.costOf(pass, V.params);
   }
   const draws = (V.statistics.draws - before.draws) / n;
   const skipped = (V.statistics.skipped - before.skipped) / n;

@@ -130,7 +130,7 @@ V.movedMesh = (side, p) => {
     gl.vertexAttribPointer(V.ATTRIBUTES[name], width, gl.FLOAT, false, 0, 0);
   }
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, V.staticBuffers.faces);
-  side.mesh = {...mesh, key, positions, normals, tangent, bitangent};
+  side.mesh = {vao: mesh.vao, buffers: mesh.buffers, key, positions, normals, tangent, bitangent};
   return side.mesh;
 };
 

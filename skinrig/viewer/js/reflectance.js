@@ -1,6 +1,6 @@
 // Fitted reflectance (Weyrich et al. 2006): shares of tabulated lobes under the surface traits, the
 // albedo under its own, and the fitted lobes beside the analytic specular part.
-Object.assign(V.defaults, {traits: {}, measured_translucency: false});
+Object.assign(V.defaults, {traits: {}, measured_translucency: false, lobe_slope_rms: 0});
 
 V.profileName = p => p.measured_translucency && V.profiles.fitted ? "fitted" : "default";
 
@@ -35,7 +35,7 @@ V.albedoAmounts = p => (V.scene.facts.albedo_traits?.layers ?? [])
   .map(({name, end}) => Math.max(0, end * (p.traits[name] ?? 0)));
 
 V.start.push(() => {
-  V.surface.keys.push(p => p.measured_translucency);
+  V.surface.keys.push(p => [p.measured_translucency, p.lobe_slope_rms].join());
   if (V.scene.facts.profile) V.profiles.fitted = V.scene.facts.profile;
   if (V.scene.textures.translucency) {
     V.surface.chunks.push("translucency_width");

@@ -38,15 +38,27 @@ V.headShifts = p => Array.from({length: p.heads}, (_, i) => {
   return [185 * at, 0, -40 * Math.abs(at)];
 });
 
-V.drawHeads = (ctx, program, uniforms) => {
-  for (const shift of V.headShifts(ctx.p)) {
-    const camera = V.camera(ctx.p, ctx.size, shift);
-    ctx.mesh(program, {u_view: camera.view, u_projection: camera.projection, u_eye: camera.eye,
-      ...uniforms});
-  }
+// The camera's distance from which so many heads are seen whole.
+V.FARTHEST_MM = 3000;
+V.framed = heads => {
+  const [width, height] = V.screen();
+  const wide = 185 * (heads - 1) + 230;
+  const away = Math.max(wide * height / width, 310) * 0.5 / Math.tan(0.5 * V.params.camera_fov_deg * V.RAD);
+  return {camera_distance_mm: Math.min(5 * Math.round(away / 5), V.FARTHEST_MM)};
 };
 
-V.meshKey = p => [V.weightsKey(p), V.cameraKey(p), p.heads].join();
+V.drawHeads = (ctx, program, uniforms) => {
+  V.headShifts(ctx.p).forEach((shift, i) => {
+    const camera = V.camera(ctx.p, ctx.size, shift);
+    const p = V.headParams(ctx.p, i);
+    const side = V.headSide(ctx.side, ctx.p, i);
+    V.use(program, side, p, {u_view: camera.view, u_projection: camera.projection,
+      u_eye: camera.eye, ...V.lightFrame(side, p), ...uniforms});
+    V.drawMesh(side, p);
+  });
+};
+
+V.meshKey = p => [V.weightsKey(p), V.cameraKey(p), p.heads, p.crowd].join();
 V.screen = () => [V.canvas.width, V.canvas.height];
 
 V.start.push(() => {
@@ -65,12 +77,13 @@ V.start.push(() => {
     draw: ctx => {
       ctx.clear(0, 0, 0, 0);
       const program = V.program(["mesh_attributes", "mesh_vertex"], ["surface_varyings",
-        "surface_point", "skin_color", "kelemen_specular", ...V.surface.chunks,
+        "surface_point", "skin_color", "kelemen_specular", "shadow_lookup",
+        ...V.surface.chunks,
         V.surfaceJoin(ctx.p), "surface_fragment"], V.surfaceDefines());
       V.drawHeads(ctx, program,
         {u_to_light: V.direction(ctx.p.light_azimuth_deg, ctx.p.light_elevation_deg)});
     },
-    cost: () => ({taps: 8 * V.screen()[0] * V.screen()[1], bytes: 32 * V.screen()[0] * V.screen()[1]}),
+    cost: p => ({taps: (8 + 25 * V.shadowed(p)) * V.screen()[0] * V.screen()[1], bytes: 32 * V.screen()[0] * V.screen()[1]}),
   });
   V.passes.push({
     name: "inspect", after: ["hemoglobin_rig", "albedo_traits"], depth: true, demanded: true,

@@ -1,0 +1,71 @@
+// Several heads, each with an expression of its own: blood, wrinkles, strain, shadow and mesh are
+// every head's own, drawn again only where its weights changed; screen passes are shared.
+//
+// The head in the middle is the one that the controls move. The others add what the table says to
+// its weights: emotions and global states of the presets. Microstructure follows the middle of the
+// picture; on the other heads all of its slopes are in the roughness.
+Object.assign(V.defaults, {crowd: 1});
+V.CROWD = ["happiness", "anger and surprise", "sad smile", "exercise", "surprise", "alcohol"];
+
+V.crowdOf = p => p.heads > 1 && p.crowd > 0.5;
+V.middleHead = p => Math.floor(0.5 * (p.heads - 1));
+
+// Weights that head i adds to the controls', and what they are called.
+V.crowdOffset = (p, i) => {
+  const middle = V.middleHead(p);
+  if (!V.crowdOf(p) || i === middle) return {name: "", weights: {}};
+  const presets = V.scene.presets ?? {};
+  const names = [...V.CROWD.filter(name => name in presets),
+    ...Object.keys(presets).filter(name => name !== "neutral" && !V.CROWD.includes(name))];
+  if (!names.length) return {name: "", weights: {}};
+  const name = names[(i - (i > middle)) % names.length];
+  return {name, weights: presets[name].weights ?? {}};
+};
+
+// Parameters of head i: the middle one has those of all.
+V.headParams = (p, i) => {
+  if (!V.crowdOf(p) || i === V.middleHead(p)) return p;
+  const weights = {...p.weights};
+  for (const [name, weight] of Object.entries(V.crowdOffset(p, i).weights)) {
+    weights[name] = Math.min((weights[name] ?? 0) + weight, 1.5);
+  }
+  const [full] = p.microstructure_variance;
+  return {...p, heads: 1, weights, microstructure_variance: [full, 0],
+    microstructure_place: [...p.microstructure_place.slice(0, 3), 0]};
+};
+
+V.headSide = (side, p, i) => !V.crowdOf(p) || i === V.middleHead(p) ? side
+  : ((side.crowd ??= [])[i] ??= V.newSide());
+
+// Passes that each head has for itself: those the surface reads, in the texture or from the light.
+V.ownPasses = () => {
+  const byName = new Map(V.passes.map(pass => [pass.name, pass]));
+  const own = new Set();
+  const add = name => {
+    if (own.has(name) || !byName.has(name)) return;
+    own.add(name);
+    byName.get(name).after.forEach(add);
+  };
+  V.surface.after.forEach(add);
+  return own;
+};
+
+// Heads that are drawn besides the middle one.
+V.otherHeads = p => V.crowdOf(p)
+  ? Array.from({length: p.heads}, (_, i) => i).filter(i => i !== V.middleHead(p)) : [];
+
+V.drawCrowd = (side, p) => {
+  const others = V.otherHeads(p);
+  (side.crowd ?? []).forEach((one, i) => {
+    if (!one || others.includes(i)) return;
+    V.passes.forEach(pass => V.dropPass(one, pass));
+    if (one.mesh) {
+      one.mesh.buffers.forEach(buffer => V.gl.deleteBuffer(buffer));
+      V.gl.deleteVertexArray(one.mesh.vao);
+    }
+    delete side.crowd[i];
+  });
+  if (!others.length) return;
+  const own = V.ownPasses();
+  for (const i of others) V.drawPasses(V.headSide(side, p, i), V.headParams(p, i), new Set(), own);
+};
