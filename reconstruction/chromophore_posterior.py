@@ -17,7 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from model.color_table import ColorTable
 from reconstruction import chromophore_ridge as ridge
 from reconstruction.chromophore_start import LOWEST
-from reconstruction.chromophores import invert, model_covariance, without_brightness
+from reconstruction.chromophores import (
+    RELATIVE_NOISE,
+    ChromophoreError,
+    invert,
+    model_covariance,
+    without_brightness,
+)
 from reconstruction.shading_prior import ShadingPrior
 
 Map = NDArray[np.float32]
@@ -76,7 +82,8 @@ def weigh(
     variance
         Noise variance of `rgb`, broadcast to its shape. None: 1 percent of each channel.
     model_error
-        Relative error of the table's colors, see `reconstruction.chromophores.invert`.
+        Relative error of the table's colors, see `reconstruction.chromophores.invert`; or a
+        covariance for each pixel, shape (..., 3, 3).
     valid
         Shape (...): False where a pixel is masked otherwise. None: all may be used.
 
@@ -111,7 +118,8 @@ def weigh(
     ['0.80', '0.80']
     """
     colors = np.asarray(rgb, dtype=np.float32)
-    fitted = invert(colors, table, variance=variance, model_error=model_error, valid=valid)
+    usual, covariances = _covariances(model_error, colors.shape[:-1], variance is None)
+    fitted = invert(colors, table, variance=variance, model_error=usual, valid=valid)
     shape = fitted.melanin.shape
     pixels = fitted.melanin.size
     usable = np.isfinite(fitted.melanin) & np.isfinite(fitted.hemoglobin)
@@ -126,7 +134,7 @@ def weigh(
         np.ascontiguousarray(np.broadcast_to(noise, colors.shape), np.float32).reshape(-1, 3),
         usable.reshape(-1),
         np.ascontiguousarray(begin, dtype=np.float32).reshape(-1, 2),
-        without_brightness(model_covariance(model_error, variance is None) + FINEST**2 * np.eye(3)),
+        np.ascontiguousarray(covariances),
         lines.log_rgb,
         lines.by_a,
         lines.by_b,
@@ -144,3 +152,33 @@ def weigh(
         outside=fitted.outside,
         valid=usable & ~fitted.outside,
     )
+
+
+_UPPER = np.triu_indices(3)
+
+
+def _covariances(
+    model_error: ArrayLike | None, shape: tuple[int, ...], default_noise: bool
+) -> tuple[ArrayLike | None, NDArray[np.float64]]:
+    """Return the usual model error, and the upper triangles that pixels are weighed by, (m, 6).
+
+    A rough fit by the usual one only finds where to begin.
+    """
+    each = np.asarray(0.0 if model_error is None else model_error, dtype=np.float64)
+    if each.ndim < 3:
+        usual = model_covariance(model_error, default_noise)
+        covariances = without_brightness(usual + FINEST**2 * np.eye(3))[None]
+        return model_error, covariances[(..., *_UPPER)]
+    if each.shape != (*shape, 3, 3):
+        raise ChromophoreError(
+            f"model_error: expected shape {(*shape, 3, 3)} for the pixels, got {each.shape}"
+        )
+    each = each.reshape(-1, 3, 3)
+    diagonal = np.einsum("nii->ni", each)
+    if not (np.isfinite(each).all() and (diagonal >= 0.0).all()):
+        raise ChromophoreError("model_error: expected finite covariances without negatives")
+    floor = (RELATIVE_NOISE**2 if default_noise else 1e-12) + FINEST**2
+    brightness = diagonal.mean(axis=1) + floor + 1e-6
+    triangles = each[(slice(None), *_UPPER)] + brightness[:, None]
+    triangles[:, [0, 3, 5]] += floor
+    return each.mean(axis=0) if len(each) else None, triangles

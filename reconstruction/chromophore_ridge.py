@@ -193,7 +193,7 @@ def _given(dtype: types.Type, axes: int) -> types.Array:
         _given(float32, 2),  # variance (n, 3)
         _given(boolean, 1),  # usable (n,)
         _given(float32, 2),  # where to begin: fractions of the axes (n, 2)
-        _given(float64, 2),  # covariance of the model's relative error (3, 3)
+        _given(float64, 2),  # upper triangles of the model error's covariances (n, 6) or (1, 6)
         _given(float64, 3),  # log color of the lines (LINES, NODES, 3)
         _given(float64, 3),  # its derivative by melanin
         _given(float64, 3),  # its derivative by blood
@@ -229,6 +229,7 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
 ):
     """Weigh the chromophores of every pixel; the shapes are in the signature above."""
     pixels = rgb.shape[0]
+    each_model = model.shape[0] > 1
     for task in prange((pixels + block - 1) // block):
         cost, slope = np.empty(LINES), np.empty(LINES)
         blood, blood_slope = np.empty(LINES), np.empty(LINES)
@@ -249,10 +250,11 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
             d0, d1, d2 = float64(rgb[n, 0]), float64(rgb[n, 1]), float64(rgb[n, 2])
             l0, l1, l2 = math.log(d0), math.log(d1), math.log(d2)
             # Weights of the relative errors, with the brightness projected out of them.
-            a00 = variance[n, 0] / (d0 * d0) + model[0, 0]
-            a11 = variance[n, 1] / (d1 * d1) + model[1, 1]
-            a22 = variance[n, 2] / (d2 * d2) + model[2, 2]
-            a01, a02, a12 = model[0, 1], model[0, 2], model[1, 2]
+            q = n if each_model else 0
+            a00 = variance[n, 0] / (d0 * d0) + model[q, 0]
+            a11 = variance[n, 1] / (d1 * d1) + model[q, 3]
+            a22 = variance[n, 2] / (d2 * d2) + model[q, 5]
+            a01, a02, a12 = model[q, 1], model[q, 2], model[q, 4]
             c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
             scale = 1.0 / (a00 * c00 + a01 * c01 + a02 * c02)
             w0, w1, w2 = c00 * scale, c01 * scale, c02 * scale

@@ -1,4 +1,17 @@
-"""How far the layered model is from transport, and how faces are lit, as data with its recipe."""
+"""How far the layered model is from what a camera sees, and how faces are lit.
+
+Three things part the color of a pixel from the model's color of its chromophores, apart from noise:
+
+- the layered model is not transport of light (`ColorErrors.transport`);
+- the sites of a color filter array stand beside each other: what is finer than a pixel shows as
+  color. How much there is of it, the picture itself tells: by what neighboring pixels differ after
+  all that is smooth is taken away. So it follows skin and resolution (`ColorErrors.fine`);
+- in hollows skin is lit by skin, whose light has its color. The part is the larger, the lighter
+  skin is (`ColorErrors.bounced`).
+
+All are relative errors of white-balanced camera RGB, fitted on simulated subjects of seeds 0 to 19
+at two resolutions by ``tools/fit_model_error.py``; judge them on others.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +20,34 @@ import json
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 FILE = "data/chromophore_model_error.json"
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.floating[Any]]
+
+SMOOTH: Final = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
+"""Fourth differences, 1 at the middle: what is cubic over 5 pixels leaves nothing."""
+AROUND_PX: Final = 1.5
+"""Standard deviation of the window that squares of differences are averaged in, px."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColorErrors:
+    """Terms of the relative error of a pixel's color."""
+
+    transport: Floats
+    """(3, 3): covariance of what every pixel has."""
+    fine: Floats
+    """(3, 3): covariance over the mean square of fine structure."""
+    bounced: float
+    """Standard deviation of the light from other skin, over the light and reflectance of a pixel;
+    the light is that on a white tile."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,14 +64,141 @@ class Histogram:
 
 @lru_cache(maxsize=1)
 def load() -> NDArray[np.float64]:
-    """Return the covariance of log color that the model leaves unexplained, (3, 3).
+    """Return the covariance of log color that the model leaves unexplained, (3, 3), of all pixels.
 
-    Of the logarithm of white-balanced camera RGB, between what the table predicts for the true
+    For where there is no picture to tell fine structure by; elsewhere `of_picture` knows more. Of
+    the logarithm of white-balanced camera RGB, between what the table predicts for the true
     chromophores and what a capture shows with its noise taken away; scaled so that with
-    noise 68 % of errors lie inside the 68 % ellipse. Fitted on simulated subjects of seeds 0 to 19
-    by ``tools/fit_model_error.py``; judge it on others.
+    noise 68 % of errors lie inside the 68 % ellipse.
     """
     return np.array(_document()["log_covariance"], np.float64)
+
+
+@lru_cache(maxsize=1)
+def color_errors() -> ColorErrors:
+    """Return the terms of a pixel's error."""
+    found = _document()["by_picture"]
+    return ColorErrors(
+        np.array(found["transport"], np.float64),
+        np.array(found["fine"], np.float64),
+        float(found["bounced"]),
+    )
+
+
+def of_picture(
+    rgb: Image,
+    variance: Image,
+    valid: NDArray[np.bool_],
+    *,
+    errors: ColorErrors | None = None,
+    fine: bool = True,
+) -> Floats:
+    """Return the covariance of each pixel's relative error beside noise, (H, W, 3, 3).
+
+    Parameters
+    ----------
+    rgb
+        (H, W, 3): diffuse reflectance, white-balanced linear camera RGB, a white tile is 1.
+    variance
+        (H, W, 3): its noise, which is no structure.
+    valid
+        (H, W): pixels of skin; others count for nothing and get the transport term alone.
+    errors
+        The terms; None: those of the shipped data.
+    fine
+        Whether what is finer than a pixel counts; where it is counted by `of_sampling`, it does
+        not.
+
+    Notes
+    -----
+    The part common to the channels is left out: it is brightness, which shading leaves open.
+
+    Examples
+    --------
+    >>> even = np.full((9, 9, 3), [0.5, 0.3, 0.2])
+    >>> found = of_picture(even, 0.0 * even, np.ones((9, 9), bool))
+    >>> found.shape, bool(np.ptp(found[..., 0, 0]) < 1e-12)
+    ((9, 9, 3, 3), True)
+    """
+    terms = color_errors() if errors is None else errors
+    good = usable_pixels(rgb, valid)
+    structure = fine_structure(rgb, variance, good) if fine else np.zeros(good.shape)
+    color = np.where(good[..., None], rgb, 0.0).astype(np.float64)
+    color -= color.mean(axis=-1, keepdims=True)
+    color *= terms.bounced
+    covariance: Floats = terms.transport + structure[..., None, None] * terms.fine
+    covariance += color[..., :, None] * color[..., None, :]
+    return covariance
+
+
+def of_sampling(
+    rgb: Image, variance: Image, valid: NDArray[np.bool_], *, errors: ColorErrors | None = None
+) -> Floats:
+    """Return the relative variance of each channel by what is finer than a pixel, (H, W, 3).
+
+    Of pictures whose skin has moved against the pixels: each meets the sites of the color filter
+    array anew, so that this part errs like noise. Parameters as of `of_picture`; as variances of
+    channels that err apart, it has the same sum in the plane without brightness.
+    """
+    terms = color_errors() if errors is None else errors
+    good = usable_pixels(rgb, valid)
+    structure = fine_structure(rgb, variance, good)
+    # of channels that err apart a third is brightness, which the covariance has not
+    return np.asarray(1.5 * structure[..., None] * np.diag(terms.fine))
+
+
+def usable_pixels(rgb: Image, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return where a picture has a color that has a logarithm, (H, W)."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(valid & np.isfinite(rgb).all(axis=-1) & (rgb > 0.0).all(axis=-1))
+
+
+def fine_structure(rgb: Image, variance: Image, valid: NDArray[np.bool_]) -> Floats:
+    """Return the mean square of log color's fourth differences around each pixel, (H, W).
+
+    Parameters
+    ----------
+    rgb, variance, valid
+        As of `of_picture`; rgb is positive where valid.
+
+    Returns
+    -------
+    ndarray of float64
+        Mean over the channels and over both directions, less what noise gives, not below 0; the
+        picture's mean where no five pixels in a row are valid near by; 0 where not valid.
+
+    Examples
+    --------
+    >>> rows = np.arange(12.0)[:, None, None]
+    >>> smooth = np.exp(-0.1 * rows + 0.01 * rows**2) * np.ones((12, 12, 3))
+    >>> bool(fine_structure(smooth, 0.0 * smooth, np.ones((12, 12), bool)).max() < 1e-24)
+    True
+    """
+    safe = np.where(valid[..., None], rgb, 1.0).astype(np.float64)
+    log_rgb = np.log(safe)
+    noise = np.where(valid, (variance / safe**2).mean(axis=-1), 0.0)
+    squares, count = np.zeros(valid.shape), np.zeros(valid.shape)
+    reach = SMOOTH.size // 2
+    for axis in (0, 1):
+        length = valid.shape[axis] - 2 * reach
+        if length <= 0:
+            continue
+        parts = [
+            tuple(slice(k, k + length) if a == axis else slice(None) for a in (0, 1))
+            for k in range(SMOOTH.size)
+        ]
+        step = sum(weight * log_rgb[part] for weight, part in zip(SMOOTH, parts, strict=True))
+        noise_here = sum(w**2 * noise[part] for w, part in zip(SMOOTH, parts, strict=True))
+        whole = np.logical_and.reduce([valid[part] for part in parts])
+        here = parts[reach]
+        squares[here] += np.where(whole, np.mean(np.square(step), axis=-1) - noise_here, 0.0)
+        count[here] += whole
+    around = gaussian_filter(count, AROUND_PX, mode="constant")
+    known = around > 1e-6
+    mean = gaussian_filter(squares, AROUND_PX, mode="constant") / np.where(known, around, 1.0)
+    total = count.sum()
+    mean = np.where(known, mean, squares.sum() / total if total else 0.0)
+    return np.where(valid, np.maximum(mean, 0.0), 0.0)
 
 
 def shading_histogram() -> Histogram:

@@ -127,7 +127,9 @@ def weigh(
         Noise variance of `rgb`, broadcast to its shape. None: 1 percent. A misplaced pixel is
         brighter or darker rather than of another color: that is the light's, not the noise's.
     model_error : array_like, optional
-        Relative error of the table's colors, as of `reconstruction.chromophores.invert`.
+        Relative error of the table's colors, as of `reconstruction.chromophores.invert`; or a
+        covariance for each pixel, shape (..., 3, 3): melanin is weighed by each pixel's, blood
+        given melanin by their mean.
     valid : array_like of bool, shape (S, ...), optional
         Where each state may be used; a state that is not leaves out.
     reference : int
@@ -181,7 +183,7 @@ def weigh(
     log_rgb = np.log(np.where(usable[..., None], colors, 1.0), dtype=np.float32)
     relative = np.where(usable[..., None], relative, 1.0).astype(np.float32)
 
-    whole = model_covariance(model_error, default_noise=False)
+    by_pixel, whole = _model_errors(model_error, shape)
     common = whole * (1.0 - own_share)
     own = np.diag(own_share * np.diag(whole)) + FINEST**2 * np.eye(3)
     cells = np.ascontiguousarray(table.cells, np.float64)
@@ -192,7 +194,8 @@ def weigh(
         table,
         prior=prior,
         variance=mean_variance * mean_rgb**2,
-        model_error=common + np.diag(np.diag(own)) / np.maximum(usable.sum(axis=0).max(), 1),
+        model_error=by_pixel * (1.0 - own_share)
+        + np.diag(np.diag(own)) / np.maximum(usable.sum(axis=0).max(), 1),
     )
     ends = np.array([table.c_m_max, table.c_hd_max])
     begin = _fractions(np.stack([found.melanin, found.hemoglobin], axis=-1), ends)
@@ -236,6 +239,23 @@ def weigh(
         valid_states=each.reshape(states, *shape),
         reference=reference % states,
     )
+
+
+def _model_errors(
+    model_error: ArrayLike | None, shape: tuple[int, ...]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the covariances that the mean color is weighed by, and the usual one, (3, 3)."""
+    given = np.asarray(0.0 if model_error is None else model_error, np.float64)
+    if given.ndim < 3:
+        usual = model_covariance(model_error, default_noise=False)
+        return usual, usual
+    if given.shape != (*shape, 3, 3):
+        raise ChromophoreError(
+            f"model_error: expected shape {(*shape, 3, 3)} for the pixels, got {given.shape}"
+        )
+    flat = given.reshape(-1, 3, 3)
+    usual = flat.mean(axis=0) if len(flat) else np.zeros((3, 3))
+    return flat, model_covariance(usual, default_noise=False)
 
 
 def _mean_color(

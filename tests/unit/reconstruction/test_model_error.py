@@ -1,0 +1,161 @@
+"""What a picture tells of how far its colors are from the model's."""
+
+import numpy as np
+import pytest
+
+from model import color_table
+from model.tissue_optics import ANISOTROPY_SKIN
+from reconstruction import model_error
+from reconstruction.chromophore_posterior import weigh
+from reconstruction.chromophores import ChromophoreError
+from reconstruction.shading_prior import lognormal
+
+SIZE = 48
+
+
+@pytest.fixture(scope="module")
+def table():
+    return color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+
+
+def picture(table, melanin=0.02, shading=1.0):
+    color = table.lookup(np.full((SIZE, SIZE), melanin), np.full((SIZE, SIZE), 0.02))
+    return color * np.broadcast_to(shading, (SIZE, SIZE))[..., None]
+
+
+def everywhere():
+    return np.ones((SIZE, SIZE), bool)
+
+
+def test_shading_that_a_cubic_follows_over_five_pixels_is_no_fine_structure(table):
+    rows, columns = np.indices((SIZE, SIZE)) / SIZE
+    rgb = picture(table, shading=np.exp(-2.0 * rows**2 + columns**3))
+    assert model_error.fine_structure(rgb, 0.0 * rgb, everywhere()).max() < 1e-20
+
+
+def test_texture_of_a_pixel_is_fine_structure_and_the_same_texture_over_ten_is_hardly_any(
+    table, rng
+):
+    fine = picture(table, shading=np.exp(0.02 * rng.standard_normal((SIZE, SIZE))))
+    rows, columns = np.indices((SIZE, SIZE))
+    wave = np.sin(2 * np.pi * rows / 20) * np.sin(2 * np.pi * columns / 20)
+    coarse = picture(table, shading=np.exp(0.04 * wave))
+    found = [
+        np.median(model_error.fine_structure(rgb, 0.0 * rgb, everywhere()))
+        for rgb in (fine, coarse)
+    ]
+    # white texture of 2 %: 70 / 36 of its square
+    assert found[0] == pytest.approx(70 / 36 * 0.02**2, rel=0.2)
+    assert found[1] < 0.01 * found[0]
+
+
+def test_noise_of_the_stated_variance_is_no_fine_structure(table, rng):
+    """The mean over the picture is 0 within 4 standard errors, and is not if noise is denied."""
+    rgb = picture(table)
+    noisy = rgb * (1.0 + 0.01 * rng.standard_normal(rgb.shape))
+    texture = rgb * np.exp(0.02 * rng.standard_normal((SIZE, SIZE)))[..., None]
+    both = texture * (1.0 + 0.01 * rng.standard_normal(rgb.shape))
+    with_noise = model_error.fine_structure(both, (0.01 * both) ** 2, everywhere()).mean()
+    without = model_error.fine_structure(texture, 0.0 * rgb, everywhere()).mean()
+    denied = model_error.fine_structure(both, 0.0 * rgb, everywhere()).mean()
+    error = 70 / 36 * (0.02**2 + 0.01**2) * np.sqrt(2 * 2 / SIZE**2)
+    assert abs(with_noise - without) < 4 * error < denied - without
+    left = model_error.fine_structure(noisy, (0.01 * noisy) ** 2, everywhere())
+    assert np.median(left) < 0.2 * 70 / 36 * 0.01**2
+
+
+def test_pixels_that_are_not_skin_count_for_nothing_and_keep_the_transport_term(table, rng):
+    rgb = picture(table, shading=np.exp(0.02 * rng.standard_normal((SIZE, SIZE))))
+    valid = everywhere()
+    valid[:, 20:] = False
+    wild = rgb.copy()
+    wild[:, 20:] = np.nan
+    wild[:, 30:] = -1.0
+    for other in (rgb, wild):
+        found = model_error.of_picture(other, 0.0 * rgb, valid)
+        assert np.isfinite(found).all()
+        np.testing.assert_allclose(
+            found[:, 20:], np.broadcast_to(model_error.color_errors().transport, (SIZE, 28, 3, 3))
+        )
+    assert np.median(found[:, :20, 0, 0]) > 1.5 * model_error.color_errors().transport[0, 0]
+
+
+def test_light_from_other_skin_matters_more_on_light_skin_than_on_dark(table):
+    transport = model_error.color_errors().transport
+    spreads = []
+    for melanin in (0.006, 0.05, 0.4):
+        rgb = picture(table, melanin)
+        found = model_error.of_picture(rgb, 0.0 * rgb, everywhere())[5, 5] - transport
+        spreads.append(np.trace(found))
+        # all of it is of the skin's own color, less brightness
+        own = rgb[5, 5] - rgb[5, 5].mean()
+        np.testing.assert_allclose(found @ own, np.trace(found) * own, rtol=1e-9, atol=1e-20)
+    assert spreads[0] > 2 * spreads[1] > 4 * spreads[2]
+
+
+def test_the_error_of_colors_has_no_brightness(table, rng):
+    rgb = picture(table, shading=np.exp(0.03 * rng.standard_normal((SIZE, SIZE))))
+    found = model_error.of_picture(rgb, 0.0 * rgb, everywhere())
+    size = np.trace(found, axis1=-2, axis2=-1)
+    assert np.abs(found.sum(axis=-1)).max() < 1e-6 * size.max()
+    assert np.linalg.eigvalsh(found).min() > -1e-9 * size.max()
+
+
+def test_skin_that_moves_meets_the_sites_anew_with_as_much_variance(table, rng):
+    rgb = picture(table, shading=np.exp(0.03 * rng.standard_normal((SIZE, SIZE))))
+    channels = model_error.of_sampling(rgb, 0.0 * rgb, everywhere())
+    whole = model_error.of_picture(rgb, 0.0 * rgb, everywhere())
+    rest = model_error.of_picture(rgb, 0.0 * rgb, everywhere(), fine=False)
+    plane = np.eye(3) - 1.0 / 3.0
+    as_noise = np.einsum("ij,hwj,ji->hw", plane, channels, plane)
+    np.testing.assert_allclose(as_noise, np.trace(whole - rest, axis1=-2, axis2=-1), rtol=1e-4)
+
+
+def test_each_pixel_is_weighed_by_its_own_error(table):
+    rgb = np.repeat(table.lookup([[0.01]], [[0.03]]), 2, axis=1)
+    prior, variance = lognormal(0.7, 0.6), (1e-3 * rgb) ** 2
+    errors = np.stack([model_error.load(), 9.0 * model_error.load()])[None]
+    found = weigh(rgb, table, prior=prior, variance=variance, model_error=errors)
+    for k in range(2):
+        alone = weigh(
+            rgb[:, k], table, prior=prior, variance=variance[:, k], model_error=errors[0, k]
+        )
+        np.testing.assert_allclose(found.melanin[:, k], alone.melanin, rtol=1e-3)
+        np.testing.assert_allclose(found.stderr_melanin[:, k], alone.stderr_melanin, rtol=1e-3)
+    assert found.stderr_melanin[0, 1] > 1.5 * found.stderr_melanin[0, 0]
+
+
+def test_errors_drawn_by_each_pixels_covariance_are_covered_and_twice_as_large_ones_are_not(
+    table, rng
+):
+    """68 % of 2304 pixels within 4 sigma of a share, and 5 points for the bend of the table."""
+    texture = np.where(np.arange(SIZE) < SIZE // 2, 0.005, 0.03)[None, :]
+    rgb = picture(table, shading=np.exp(texture * rng.standard_normal((SIZE, SIZE))))
+    covariance = model_error.of_picture(rgb, 0.0 * rgb, everywhere())
+    values, vectors = np.linalg.eigh(covariance)
+    drawn = rng.standard_normal((SIZE, SIZE, 3)) * np.sqrt(np.maximum(values, 0.0))
+    error = np.einsum("hwij,hwj->hwi", vectors, drawn)
+    shares = []
+    for factor in (1.0, 2.0):
+        seen = rgb * np.exp(factor * error)
+        found = weigh(
+            seen, table, prior=lognormal(1.0, 0.6), variance=(1e-4 * seen) ** 2,
+            model_error=covariance,
+        )  # fmt: skip
+        inside = np.abs(found.melanin - 0.02) < found.stderr_melanin
+        shares.append(inside.mean())
+        if factor == 1.0:
+            # in smooth and in textured skin alike
+            halves = inside[:, : SIZE // 2].mean(), inside[:, SIZE // 2 :].mean()
+            assert abs(halves[0] - halves[1]) < 0.12
+    assert abs(shares[0] - 0.683) < 0.04 + 0.05
+    assert shares[1] < 0.5
+
+
+@pytest.mark.parametrize(
+    "errors", [np.zeros((3, 3, 3)), np.full((4, 3, 3), np.nan), -np.ones((4, 3, 3))]
+)
+def test_covariances_that_do_not_fit_the_pixels_are_refused(table, errors):
+    rgb = np.repeat(table.lookup([0.01], [0.03]), 4, axis=0)
+    with pytest.raises(ChromophoreError, match="model_error"):
+        weigh(rgb, table, prior=lognormal(0.7, 0.6), variance=1e-6, model_error=errors)
