@@ -16,6 +16,7 @@ import importlib
 import importlib.metadata
 import json
 import logging
+import os
 import secrets
 import threading
 import time
@@ -369,8 +370,11 @@ class Port:
         except _LINK_FAILURES as exc:
             busy = getattr(exc, "errno", None) in (errno.EAGAIN, errno.EBUSY, errno.EACCES)
             kind = PortBusy if busy and "xclusive" in str(exc) else LinkLost
-            hint = "another program holds it" if kind is PortBusy else "is it plugged in?"
-            raise kind(f"cannot open {self.url}: {exc}; {hint}") from exc
+            number = getattr(exc, "errno", None)
+            reason = os.strerror(number) if number and kind is LinkLost else str(exc)
+            raise kind(
+                f"cannot open {self.url}: {reason}; {_hint(self.url, kind, number)}"
+            ) from exc
         self._splitter.clear()
         self._lines.clear()
 
@@ -495,3 +499,14 @@ def _load_handler(url: str) -> None:
         importlib.import_module(f"{entry_point.value}.protocol_{entry_point.name}")
         if entry_point.value not in serial.protocol_handler_packages:
             serial.protocol_handler_packages.append(entry_point.value)
+
+
+def _hint(url: str, kind: type[Exception], number: int | None) -> str:
+    """Return what to do about a port that does not open."""
+    if kind is PortBusy:
+        return "another program holds it"
+    if number == errno.EACCES:
+        return "no right to it: on Debian join the group dialout and log in again"
+    if "://" in url:
+        return "does a server listen there?"
+    return "is it plugged in?"

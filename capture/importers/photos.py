@@ -201,7 +201,8 @@ def _inspect(files: Sequence[Path]) -> list[_Entry]:
         try:
             photo = read_photo(file)
         except InputError as exc:
-            reason = "; ".join([exc.what, *(str(fault) for fault in exc.faults)])
+            found = "; ".join(f"{fault.path}: {fault.got}" for fault in exc.faults)
+            reason = f"one that {exc.what}" + (f" ({found})" if found else "")
             faults.append(Fault(file.name, reason, "a photograph"))
             continue
         entries.append(_entry(file, photo))

@@ -43,6 +43,10 @@ def bench(
     Example: skinrig bench --extremes
     """
     console = Console(json)
+    if not budget > 0:
+        raise errors.UsageError(f"--budget: got {budget:g}, expected seconds above 0")
+    if out is not None and out.exists() and not out.is_dir():
+        raise errors.UsageError(f"--out: {out} is a file, expected a folder, new or to be replaced")
     if extremes:
         from skinrig.reporting.extremes import run_extremes
 

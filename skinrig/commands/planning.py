@@ -57,6 +57,10 @@ def plan(
     from skinrig.planning.plans import choose, confirmed, lines
 
     console = Console(json)
+    if not 0 < valid_share <= 1:
+        raise errors.UsageError(f"--valid-share: got {valid_share:g}, expected above 0, up to 1")
+    if out is not None and out.is_dir():
+        raise errors.UsageError(f"--out: {out} is a folder, expected a file, such as plan.json")
     choice = choose(
         rig, want, subject=subject, seed=seed, width_px=width, most_lights=most_lights,
         valid_share=valid_share, forecast=forecast,
@@ -75,7 +79,9 @@ def plan(
             )
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json_text.dumps(choice.plan.to_json(), indent=1) + "\n", encoding="utf-8")
+        part = out.with_name(f".{out.name}.part")
+        part.write_text(json_text.dumps(choice.plan.to_json(), indent=1) + "\n", encoding="utf-8")
+        part.replace(out)
         console.say(f"next: skinrig capture {rig} --plan {out} --out session")
     console.document(document.pop("schema"), document)
     if not reached:

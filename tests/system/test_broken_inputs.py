@@ -225,3 +225,50 @@ def test_none_of_something_is_not_taken_for_the_default(option, tmp_path, capsys
     assert main(["simulate", "dome", option, "0", "--out", str(out)]) == 3
     assert f"{option[2:]}: got 0, expected a number above 0" in capsys.readouterr().err
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        (["bench", "--budget", "-1"], "--budget: got -1, expected seconds above 0"),
+        (["bench", "--budget", "nan"], "--budget: got nan, expected seconds above 0"),
+        (["bench", "--out", "FILE"], "is a file, expected a folder"),
+        (["plan", "flash", "--valid-share", "7"], "--valid-share: got 7, expected above 0"),
+        (["plan", "flash", "--valid-share", "nan"], "--valid-share: got nan"),
+        (["plan", "flash", "--out", "FOLDER"], "is a folder, expected a file"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_wrong_numbers_and_places_are_refused_before_the_work(order, words, tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("mine")
+    known = {"FILE": str(tmp_path / "notes.txt"), "FOLDER": str(tmp_path)}
+    assert main([known.get(word, word) for word in order]) == 2
+    told = capsys.readouterr()
+    assert words in told.err
+    assert not told.out
+    assert [entry.name for entry in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_text_that_calls_itself_a_photograph_is_told_in_one_sentence(tmp_path, capsys):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.jpg").write_text("no photograph")
+    assert main(["import", "photos", str(tmp_path / "in"), "--out", str(tmp_path / "s")]) == 3
+    told = capsys.readouterr().err
+    assert "a.jpg: got one that is not a raw file (LibRaw: " in told
+    assert told.count("expected") == 1
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("/dev/no-such-port", "cannot open /dev/no-such-port: No such file or directory; is it"),
+        ("socket://127.0.0.1:9", "does a server listen there?"),
+    ],
+)
+def test_a_port_that_does_not_open_is_named_once_with_what_to_look_at(url, words, tmp_path, capsys):
+    order = ["capture", "flash", "--camera", f"cam=hotfolder:{tmp_path}", "--out"]
+    assert main([*order, str(tmp_path / "s"), "--port", f"flash={url}"]) == 4
+    told = capsys.readouterr().err
+    assert words in told
+    assert told.count(url) == 1 + url.startswith("socket")
+    assert not (tmp_path / "s").exists()
