@@ -21,6 +21,7 @@ from model.skin import SkinAppearance
 from skinrig.exporting import color_deltas
 from skinrig.exporting.images import Image, ImageFolder
 from skinrig.exporting.options import NORMAL_Y, Delivery
+from skinrig.exporting.seamless import FADE, periodic, periodic_normals
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -32,8 +33,6 @@ SCATTER_SIZE: Final = 512
 SCATTER_MM: Final = 16.0
 """Translucency of the PNG code 65535."""
 UM_MM: Final = 0.001
-FADE: Final = 8
-"""One part of so many of a tile is faded into what lies beyond its other end."""
 
 
 def cavity(
@@ -163,8 +162,9 @@ def scatter(delivery: Delivery, out: ImageFolder) -> tuple[dict[str, Any], list[
         return {}, [("scatter", f"{delivery.onto.name} holds no translucency: `skinrig fit "
                      "reflectance` makes it")]  # fmt: skip
     values = np.asarray(depth.values, np.float64)
-    known = np.isfinite(values).all(axis=-1)
-    known &= True if depth.valid is None else depth.valid
+    known: Bools = np.asarray(np.isfinite(values).all(axis=-1), np.bool_)
+    if depth.valid is not None:
+        known &= depth.valid
     if not known.any():
         return {}, [("scatter", f"no translucency of {delivery.onto.name} is known")]
     shown, valid = color_deltas.sized(values, known, SCATTER_SIZE)
@@ -237,64 +237,18 @@ def micro_normals(
         slope = normals[..., :2] / normals[..., 2:]
         told[name] = {
             "site": site,
-            "tile_mm": [UM_MM * pixel_um * n for n in reversed(tile.shape)],
+            "tile_mm": _size_mm(tile, pixel_um),
             "pixel_um": pixel_um,
             "slope_rms": float(np.sqrt(np.mean(np.sum(slope**2, axis=-1)))),
             "height_rms_um": float(tile.std()),
-            "measured_mm": [UM_MM * pixel_um * n for n in reversed(height.shape)],
+            "measured_mm": _size_mm(height, pixel_um),
             "faded_share": 1.0 - (1.0 - 1.0 / FADE) ** 2,  # so that it repeats
             "valid_share": float(valid.mean()),
         }
     return ({"micro": told} if told else {}), left_out
 
 
-def periodic(image: ArrayLike) -> Floats:
-    """Return an image that repeats without a seam: what is beyond its end fades into its beginning.
-
-    By weights whose squares sum to 1, so that relief of independent places keeps its variance.
-
-    Parameters
-    ----------
-    image
-        (H, W), finite, mean 0; 8 pixels and more a side.
-
-    Returns
-    -------
-    ndarray
-        Smaller by an eighth along each axis; beyond the faded eighth its values are the image's.
-
-    Examples
-    --------
-    >>> image = np.random.default_rng(0).normal(size=(64, 80))
-    >>> tile = periodic(image)
-    >>> tile.shape, np.array_equal(tile[8:, 10:], image[8:56, 10:70])
-    ((56, 70), True)
-    """
-    found = np.asarray(image, np.float64)
-    for axis in (0, 1):
-        found = np.moveaxis(found, axis, 0)
-        band = len(found) // FADE
-        size = len(found) - band
-        # 0 with a slope of 0 at the beginning, 1 with a slope of 0 at the end
-        share = np.sin(0.5 * np.pi * np.sin(0.5 * np.pi * np.arange(band) / band) ** 2)
-        rise, fall = share[:, None], np.sqrt(1.0 - share**2)[:, None]
-        faded = rise * found[:band] + fall * found[size:]
-        found = np.moveaxis(np.concatenate([faded, found[band:size]]), 0, axis)
-    return found
-
-
-def periodic_normals(height_um: Floats, pixel_um: float) -> Floats:
-    """Return unit normals of relief that repeats, (H, W, 3), +Y up, row 0 at the top.
-
-    Examples
-    --------
-    >>> x = np.arange(64)
-    >>> relief = np.sin(2 * np.pi * x / 64) * np.ones((4, 1))
-    >>> normals = periodic_normals(relief, 1.0)
-    >>> round(float(-normals[0, 0, 0] / normals[0, 0, 2]), 3), float(normals[0, 16, 0].round(6))
-    (0.098, -0.0)
-    """
-    along_x = (np.roll(height_um, -1, 1) - np.roll(height_um, 1, 1)) / (2.0 * pixel_um)
-    along_y = (np.roll(height_um, 1, 0) - np.roll(height_um, -1, 0)) / (2.0 * pixel_um)
-    normals = np.stack([-along_x, -along_y, np.ones(height_um.shape)], axis=-1)
-    return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+def _size_mm(height: Floats, pixel_um: float) -> list[float]:
+    """Return width and height of a map on the skin, mm."""
+    rows, columns = height.shape
+    return [UM_MM * pixel_um * columns, UM_MM * pixel_um * rows]

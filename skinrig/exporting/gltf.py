@@ -111,6 +111,11 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         if value != only:
             raise UsageError(f"{option}: got {value}, but glTF knows {only} alone; leave it out")
     material = Material.of(appearance, delivery.mesh)
+    if material.tiles[1:]:
+        raise UsageError(
+            f"--mesh: reaches over tiles {', '.join(map(str, material.tiles))}, but glTF knows one "
+            "alone; take mtlx or usd, or a mesh of tile 1001"
+        )
     (folder / FILE).write_bytes(content(material))
     script = blender.Import.of_channels(FILE, material.usual_radius_mm()).script()
     (folder / blender.FILE).write_text(script, encoding="utf-8")

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skinrig.exporting.options import Delivery
+from skinrig.exporting.options import FIRST_TILE, Delivery
 from skinrig.reporting import png
 
 Floats = NDArray[np.floating[Any]]
@@ -27,6 +27,8 @@ DATA: Final = "data"
 REC709: Final = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """Chromaticities of sRGB's primaries and D65, for headers."""
 CODES: Final = 65535
+EMPTY_SIDE: Final = 8
+"""Texels a side of a tile where nothing was measured."""
 RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "melanin": (0.0, 0.5),
     "hemoglobin": (0.0, 0.25),
@@ -57,6 +59,8 @@ class Image:
         Values of PNG codes 0 and 65535; None: the least and largest valid value.
     valid
         (H, W); values elsewhere mean nothing. None: all mean something.
+    filler
+        Value on tiles where nothing was measured; None: the median of what is valid.
     """
 
     name: str
@@ -67,6 +71,21 @@ class Image:
     low: float | None = None
     high: float | None = None
     valid: Bools | None = None
+    filler: tuple[float, ...] | None = None
+
+    def on_empty_tile(self) -> Image:
+        """Return the image of a tile where nothing was measured, of one value."""
+        layers = self.values if self.values.ndim == 3 else self.values[..., None]
+        rows = layers[self.valid] if self.valid is not None else layers.reshape(-1, layers.shape[2])
+        known = rows[np.isfinite(rows).all(axis=-1)]
+        usual = np.median(known, axis=0) if len(known) else np.zeros(layers.shape[2])
+        value = usual if self.filler is None else np.array(self.filler)
+        values = np.empty((EMPTY_SIDE, EMPTY_SIDE, *self.values.shape[2:]), np.float32)
+        values[...] = value if self.values.ndim == 3 else value[0]
+        return replace(
+            self, values=values, valid=np.zeros(values.shape[:2], np.bool_),
+            what=f"nothing was measured on this tile: one value; {self.what}",
+        )  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -81,37 +100,49 @@ class ImageFolder:
         Names of tiles.
     records
         File name to what the file holds, JSON values.
+    tiles
+        UDIM tiles of the mesh; images are of the first.
     """
 
     root: Path
     delivery: Delivery
     records: dict[str, dict[str, Any]] = field(default_factory=dict)
+    tiles: tuple[int, ...] = (FIRST_TILE,)
 
     def exr(self, image: Image, folder: str = "exr") -> str:
-        """Write a float32 EXR; return its name below the root."""
-        file = self._place(folder, image.name, "exr")
-        write_exr(
-            self.root / file, image.values,
-            {"unit": image.unit, "colorSpace": image.space, "comments": image.what},
-            rec709=image.space == SRGB,
-        )  # fmt: skip
-        self._record(file, image, {"encoding": "32-bit float, the value itself"})
-        return file
+        """Write a float32 EXR a tile; return the first's name below the root."""
+        names = []
+        for tile, one in self._by_tile(image):
+            names.append(self._place(folder, image.name, "exr", tile))
+            write_exr(
+                self.root / names[-1], one.values,
+                {"unit": one.unit, "colorSpace": one.space, "comments": one.what},
+                rec709=one.space == SRGB,
+            )  # fmt: skip
+            self._record(names[-1], one, {"encoding": "32-bit float, the value itself"})
+        return names[0]
 
     def png(self, image: Image, folder: str = "png", *, depth: int = 16) -> str:
-        """Write a PNG of 16 or 8 bits; return its name below the root.
+        """Write a PNG of 16 or 8 bits a tile; return the first's name below the root.
 
         Colors in `SRGB` are coded by sRGB's curve, all else in proportion.
         """
-        file = self._place(folder, image.name, "png")
-        codes, told = coded(image, depth=depth)
-        (self.root / file).write_bytes(png.encode(codes, quick=True))
-        self._record(file, image, told)
-        return file
+        low, high = coded_range(image)
+        names = []
+        for tile, one in self._by_tile(replace(image, low=low, high=high)):
+            names.append(self._place(folder, image.name, "png", tile))
+            codes, told = coded(one, depth=depth)
+            (self.root / names[-1]).write_bytes(png.encode(codes, quick=True))
+            self._record(names[-1], one, told)
+        return names[0]
 
-    def _place(self, folder: str, name: str, suffix: str) -> str:
+    def _by_tile(self, image: Image) -> list[tuple[int, Image]]:
+        empty = [(tile, image.on_empty_tile()) for tile in self.tiles[1:]]
+        return [(self.tiles[0], image), *empty]
+
+    def _place(self, folder: str, name: str, suffix: str, tile: int) -> str:
         (self.root / folder).mkdir(exist_ok=True)
-        return f"{folder}/{self.delivery.tiled(name, suffix)}"
+        return f"{folder}/{self.delivery.tiled(name, suffix, tile)}"
 
     def _record(self, file: str, image: Image, told: Mapping[str, Any]) -> None:
         with open(self.root / file, "rb") as stream:
@@ -154,17 +185,11 @@ def coded(image: Image, *, depth: int = 16) -> tuple[NDArray[Any], dict[str, Any
     top = 2**depth - 1
     values = np.nan_to_num(np.asarray(image.values, np.float64))
     shown = values if image.valid is None else values[image.valid]
+    low, high = coded_range(image)
     if image.space == SRGB:
-        low, high = 0.0, 1.0
         position = srgb_curve(np.clip(values, 0.0, 1.0))
         encoding = f"sRGB curve (IEC 61966-2-1): value = inverse curve of code / {top}"
     else:
-        low = float(shown.min(initial=np.inf)) if image.low is None else image.low
-        high = float(shown.max(initial=-np.inf)) if image.high is None else image.high
-        if not np.isfinite(low) or not np.isfinite(high):
-            low, high = 0.0, 1.0  # nothing is valid
-        if high <= low:
-            high = low + 1.0
         position = np.clip((values - low) / (high - low), 0.0, 1.0)
         encoding = f"value = low + (high - low) * code / {top}; import as raw, Non-Color"
     slack = 0.5 / top * (high - low)
@@ -177,6 +202,25 @@ def coded(image: Image, *, depth: int = 16) -> tuple[NDArray[Any], dict[str, Any
         "clipped_share": float(clipped.mean()) if clipped.size else 0.0,
     }
     return np.round(position * top).astype(dtype), told
+
+
+def coded_range(image: Image) -> tuple[float, float]:
+    """Return the values of an image's least and largest PNG code, see `coded`.
+
+    Examples
+    --------
+    >>> coded_range(Image(name="a", values=np.array([[1.0, 3.0]]), unit="mm", low=0.0))
+    (0.0, 3.0)
+    """
+    if image.space == SRGB:
+        return 0.0, 1.0
+    values = np.nan_to_num(np.asarray(image.values, np.float64))
+    shown = values if image.valid is None else values[image.valid]
+    low = float(shown.min(initial=np.inf)) if image.low is None else image.low
+    high = float(shown.max(initial=-np.inf)) if image.high is None else image.high
+    if not np.isfinite(low) or not np.isfinite(high):
+        low, high = 0.0, 1.0  # nothing is valid
+    return low, high if high > low else low + 1.0
 
 
 def srgb_curve(linear: Floats) -> NDArray[np.float64]:

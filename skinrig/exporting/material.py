@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from model import dipole, fresnel, skin_reflectance
 from model.skin import SkinAppearance
-from rigsim.mesh import Mesh
-from skinrig.exporting import subsurface_radius, surface_fit, tangents
+from skinrig.errors import UsageError
+from skinrig.exporting import subsurface_radius, surface_fit, tangents, udim
 from skinrig.exporting.images import CAMERA, SRGB, Image
-from skinrig.exporting.options import NORMAL_Y, Delivery
+from skinrig.exporting.options import FIRST_TILE, NORMAL_Y, Delivery
 from skinrig.exporting.sealing import ExportError
 from skinrig.exporting.tangents import FramedMesh
+from skinrig.exporting.udim import TiledMesh
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -69,6 +70,8 @@ class Material:
         What was not measured.
     source
         "measured" or "simulated".
+    tiles
+        UDIM tiles of the mesh; the maps are of the first.
     """
 
     mesh: FramedMesh
@@ -87,6 +90,7 @@ class Material:
     eta: float
     assumed: tuple[str, ...]
     source: str
+    tiles: tuple[int, ...] = (FIRST_TILE,)
 
     @staticmethod
     def of(appearance: SkinAppearance, mesh_file: Path | None = None) -> Material:
@@ -97,7 +101,8 @@ class Material:
         appearance
             With position, normals, r_d, lobes and mesh.
         mesh_file
-            Another mesh with the same texture coordinates; .npz, .obj, .ply, .gltf or .glb.
+            Another mesh with the same texture coordinates on tile 1001, perhaps with more on other
+            tiles; .npz, .obj, .ply, .gltf or .glb.
 
         Raises
         ------
@@ -109,10 +114,12 @@ class Material:
 
         model = skin_reflectance.assemble(appearance)
         own = own_mesh(appearance)
-        mesh = own if mesh_file is None else read_mesh(mesh_file)
-        surface = FittedSurface.of(model, mesh, rest=own)
+        mesh = TiledMesh.of(own) if mesh_file is None else udim.read(mesh_file)
+        surface = FittedSurface.of(model, mesh.first(), rest=own)
         framed = FramedMesh.of(mesh)
-        axes, covered = framed.texel_frames(surface.atlas.size)
+        # frames of the whole mesh: at a border of tiles a renderer has no others
+        on_maps = framed.only(mesh.tile == FIRST_TILE)
+        axes, covered = on_maps.texel_frames(surface.atlas.size)
         turned = tangents.to_tangent(surface.normals, axes, covered)
         inside = 1.0 - fresnel.diffuse_external(model.eta)
         r_d = np.nan_to_num(model.r_d)
@@ -137,6 +144,7 @@ class Material:
             eta=model.eta,
             assumed=model.assumed,
             source=appearance.source,
+            tiles=mesh.tiles,
         )
 
     @property
@@ -144,6 +152,25 @@ class Material:
         """Mean free path, (H, W, 3), mm; see :mod:`skinrig.exporting.subsurface_radius`."""
         found = subsurface_radius.radius_mm(self.translucency_mm, self.base_color, self.deficit)
         return found.astype(np.float32)
+
+    def told_tiles(self, delivery: Delivery) -> list[tuple[str, str]]:
+        """Return what is left out of tiles, and why.
+
+        Raises
+        ------
+        skinrig.errors.UsageError
+            For several tiles where files have no numbers.
+        """
+        if self.tiles[1:] and delivery.udim == "none":
+            numbers = ", ".join(map(str, self.tiles))
+            raise UsageError(
+                f"--udim: got none, but the mesh reaches over tiles {numbers}, expected dot or "
+                "underscore"
+            )
+        return [
+            (f"maps of tile {tile}", f"maps are of tile {FIRST_TILE}: medians and flat normals")
+            for tile in self.tiles[1:]
+        ]
 
     def usual_radius_mm(self) -> list[float]:
         """Return the median of `radius_mm` over the valid texels, red, green, blue."""
@@ -202,8 +229,9 @@ class Material:
             green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"
             what = f"tangent space of the mesh's vertex frames, {green}, x and y and z in -1 to 1"
             return Image(
-                name=name, values=flipped, unit="1", what=what, low=-1.0, high=1.0, valid=self.valid
-            )
+                name=name, values=flipped, unit="1", what=what, low=-1.0, high=1.0,
+                valid=self.valid, filler=(0.0, 0.0, 1.0),
+            )  # fmt: skip
         simple: dict[str, tuple[Floats, str, str, float, float]] = {
             "base_color": (self.base_color, "1", SRGB, 0.0, 1.0),
             "specular_roughness": (self.surface.roughness, "1", "data", 0.0, 1.0),
@@ -222,6 +250,7 @@ class Material:
         return Image(
             name=name, values=values, unit=unit, space=space, what=what, low=low, high=high,
             valid=None if name == "mask" else self.valid,
+            filler=(0.0,) if name == "mask" else None,
         )  # fmt: skip
 
     def error_images(self) -> list[Image]:
@@ -264,21 +293,3 @@ def deficit_of(r_d: NDArray[np.floating[Any]], eta: float) -> NDArray[np.float64
     nodes = np.linspace(0.001, 0.999, 999)
     root = np.sqrt(dipole.invert_to_deficit(nodes, eta))  # smooth at an albedo of 1, too
     return np.asarray(np.interp(r_d, nodes, root) ** 2, np.float64)
-
-
-def read_mesh(path: Path) -> Mesh:
-    """Read a mesh with texture coordinates, with its blend shapes where the format has them.
-
-    Raises
-    ------
-    rigsim.mesh.MeshError, skinrig.blend_shape_errors.BlendShapeError
-        The file is missing, damaged, or no mesh that maps can be laid on.
-    """
-    from rigsim.mesh import build_mesh
-    from skinrig import blend_shapes
-    from skinrig.rendering.geometry import read_mesh as without_shapes
-
-    if path.is_dir() or path.suffix.lower() in (".gltf", ".glb"):
-        read = blend_shapes.load(path)
-        return build_mesh(read.vertices_mm, read.faces, read.uv, shapes=dict(read.shapes))
-    return without_shapes(path)

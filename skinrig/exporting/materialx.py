@@ -13,7 +13,7 @@ from model.skin import SkinAppearance
 from skinrig.exporting import obj
 from skinrig.exporting.images import Image, ImageFolder
 from skinrig.exporting.material import COLOR_NOTE, NOTES, Material
-from skinrig.exporting.options import NORMAL_Y, UNITS_M, Delivery
+from skinrig.exporting.options import FIRST_TILE, NORMAL_Y, TILES, UNITS_M, Delivery
 from skinrig.exporting.provenance import ORIENTATION, provenance
 from skinrig.exporting.sealing import write_json
 
@@ -41,7 +41,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     Returns
     -------
     list of (str, str)
-        What was left out, and why: nothing.
+        What was left out, and why: maps of other tiles than the first.
 
     Raises
     ------
@@ -49,8 +49,9 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         See :meth:`skinrig.exporting.material.Material.of`.
     """
     material = Material.of(appearance, delivery.mesh)
+    left_out = material.told_tiles(delivery)
     unit = delivery.unit_or("m")
-    out = ImageFolder(folder, delivery)
+    out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = write_textures(material, out)
     if delivery.with_errors:
         for image in material.error_images():
@@ -65,7 +66,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             "files": dict(sorted(out.records.items())),
         },
     )
-    return []
+    return left_out
 
 
 def write_textures(material: Material, out: ImageFolder) -> float:
@@ -116,6 +117,7 @@ def facts(
         "scene_unit": unit,
         "mm_per_scene_unit": 1.0 / per_mm,
         "orientation": ORIENTATION,
+        "udim": {"tiles": list(material.tiles), "measured": [material.tiles[0]]},
         "frame": "+x right, +y up, +z towards the main camera",
         "base_color": f"{NOTES['base_color']}; {COLOR_NOTE}",
         "subsurface": {
@@ -211,7 +213,7 @@ def images_document(
 def _all_tiles(file: str, delivery: Delivery) -> str:
     """Return a file's name with the token of all tiles in place of the tile's number."""
     stem, dot, suffix = file.rpartition(".")
-    tile = {"none": "", "dot": ".1001", "underscore": "_1001"}[delivery.udim]
+    tile = "" if delivery.udim == "none" else f"{TILES[delivery.udim]}{FIRST_TILE}"
     return delivery.referred(stem.removesuffix(tile), suffix) if dot and tile else file
 
 

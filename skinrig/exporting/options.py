@@ -14,8 +14,10 @@ UNITS_M: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of a scene unit, m."""
 NORMAL_Y: Final[Mapping[str, float]] = {"gl": 1.0, "dx": -1.0}
 """Sign of a normal map's green: +Y up (OpenGL, glTF, Blender, Maya) or down (DirectX, Unreal)."""
-TILES: Final[Mapping[str, str]] = {"none": "", "dot": ".1001", "underscore": "_1001"}
-"""What stands between a texture's name and its suffix."""
+FIRST_TILE: Final = 1001
+"""UDIM tile of texture coordinates 0 to 1, which maps are of."""
+TILES: Final[Mapping[str, str]] = {"none": "", "dot": ".", "underscore": "_"}
+"""What stands between a texture's name and the number of its tile."""
 UDIM: Final[Mapping[str, str]] = {"none": "", "dot": ".<UDIM>", "underscore": "_<UDIM>"}
 """The same in a material file."""
 
@@ -33,7 +35,7 @@ class Delivery:
     normal_y
         Of `NORMAL_Y`.
     udim
-        Of `TILES`. Textures are those of tile 1001.
+        Of `TILES`. Maps are those of tile 1001; a mesh may reach over more.
     with_errors
         Whether standard errors and masks are written beside the values.
     only
@@ -73,15 +75,16 @@ class Delivery:
         """Return the scene unit, or a format's own where none is asked for."""
         return default if self.unit is None else self.unit
 
-    def tiled(self, name: str, suffix: str) -> str:
-        """Return a texture's file name.
+    def tiled(self, name: str, suffix: str, tile: int = FIRST_TILE) -> str:
+        """Return the file name of a texture's tile.
 
         Examples
         --------
         >>> Delivery(udim="underscore").tiled("normal", "png")
         'normal_1001.png'
         """
-        return f"{name}{TILES[self.udim]}.{suffix}"
+        number = "" if self.udim == "none" else str(tile)
+        return f"{name}{TILES[self.udim]}{number}.{suffix}"
 
     def referred(self, name: str, suffix: str) -> str:
         """Return a texture's name as a material file refers to all its tiles."""

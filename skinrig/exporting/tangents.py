@@ -12,12 +12,13 @@ Mikkelsen 2008, Simulation of Wrinkled Surfaces Revisited, section 2.3 and appen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigsim.mesh import Mesh
+from skinrig.exporting.udim import TiledMesh
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -54,7 +55,7 @@ class FramedMesh:
     source: NDArray[np.int64]
 
     @staticmethod
-    def of(mesh: Mesh) -> FramedMesh:
+    def of(mesh: Mesh | TiledMesh) -> FramedMesh:
         """Return a mesh with its tangents.
 
         Examples
@@ -92,6 +93,10 @@ class FramedMesh:
             mesh.vertices_mm[source], normals.astype(np.float32), mesh.uv[source],
             np.column_stack([tangent, signs]).astype(np.float32), faces.astype(np.int32), source,
         )  # fmt: skip
+
+    def only(self, faces: Bools) -> FramedMesh:
+        """Return the mesh with some of its faces, (F,), all vertices and their frames."""
+        return replace(self, faces=self.faces[faces])
 
     def texel_frames(self, size: int) -> tuple[Floats, Bools]:
         """Return the interpolated axes under each texel.

@@ -62,7 +62,8 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     material = Material.of(appearance, delivery.mesh)
     unit = delivery.unit_or("m")
     per_mm = materialx.MM_M / UNITS_M[unit]
-    out = ImageFolder(folder, delivery)
+    tiles = material.told_tiles(delivery)
+    out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = materialx.write_textures(material, out)
     out.png(material.image("specular_roughness", delivery), materialx.TEXTURES)
     if delivery.with_errors:
@@ -94,6 +95,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         },
     )
     left_out = [
+        *tiles,
         ("subsurface light and specular weight of UsdPreviewSurface",
          f"it has no place for them: the mtlx network holds both; {blender.FILE} sets them"),
     ]  # fmt: skip

@@ -189,3 +189,20 @@ def test_the_script_names_its_file_and_radii_without_blender():
     named = blender.Import("skin.usdc", 1.0, None, (("Roughness", "textures/r.exr", 0.5),))
     assert constants(named.script())["TEXTURES"] == {"Roughness": ("textures/r.exr", 0.5)}
     assert "wm.usd_import" in named.script()
+
+
+def test_blender_loads_a_texture_of_each_tile(simulated_face, patch, tmp_path):
+    pytest.importorskip("pxr")
+    mesh = patch.mesh()
+    count = len(mesh.vertices_mm)
+    np.savez(
+        tmp_path / "head.npz",
+        vertices_mm=np.concatenate([mesh.vertices_mm, mesh.vertices_mm * [1, 1, -1]]),
+        faces=np.concatenate([mesh.faces, mesh.faces[:, ::-1] + count]),
+        uv=np.concatenate([mesh.uv, mesh.uv + np.array([1.0, 0.0])]),
+    )
+    usd.write(simulated_face, tmp_path, Delivery(mesh=tmp_path / "head.npz", udim="dot"))
+    found, facts = read(tmp_path / blender.FILE, tmp_path / "read.npz", bake=0)
+    for name in ("base_color", "roughness", "normal", "specular", "radius"):
+        assert facts[f"{name}_tiles"] == [1001, 1002]
+    assert (found["uv"][..., 0].min(), found["uv"][..., 0].max()) == (0.0, 2.0)
