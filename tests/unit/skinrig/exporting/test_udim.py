@@ -60,7 +60,7 @@ def test_each_tile_has_its_textures_and_the_first_has_the_maps(simulated_face, h
     assert entry["valid_share"] == 0.0
     assert entry["what"].startswith("nothing was measured on this tile")
     text = (tmp_path / "skin.mtlx").read_text()
-    assert "base_color.<UDIM>.exr" in text
+    assert "base_color.&lt;UDIM&gt;.exr" in text
     assert "1001" not in text
 
 
