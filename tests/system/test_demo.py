@@ -64,7 +64,10 @@ def shown(out, capsys):
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_the_dome_alone_goes_from_targets_to_a_report(tmp_path, capsys, without_benchmarks):
+def test_the_dome_alone_goes_from_targets_to_a_report(
+    tmp_path, capsys, monkeypatch, without_benchmarks
+):
+    monkeypatch.setattr("skinrig.demo_rigs.DOME_WIDTH_PX", 200)
     out = tmp_path / "demo"
     assert main(["demo", "--rigs", "dome", "--out", str(out), "--json"]) == 0
     document, report = shown(out, capsys)
