@@ -112,9 +112,22 @@ def footprint(
     maps, masks : str
         Keys of `MAP_BYTES` and `MASK_BYTES`.
     zones : int
-        Four a mask texture.
+        At least 1; four a mask texture.
     mip_maps : bool
+
+    Raises
+    ------
+    WrinkleError
+        For an encoding that does not exist, or a size or number below 1.
     """
+    for name, encoding, known in (("maps", maps, MAP_BYTES), ("masks", masks, MASK_BYTES)):
+        if encoding not in known:
+            raise WrinkleError(f"{name}: got {encoding!r}, expected one of {', '.join(known)}")
+    if min(*wrinkle_shape, *mask_shape, zones) < 1:
+        raise WrinkleError(
+            f"wrinkle_shape, mask_shape, zones: got {wrinkle_shape}, {mask_shape}, {zones}, "
+            "expected at least 1 each"
+        )
     textures = -(-zones // 4)
     return Footprint(
         texture_bytes(wrinkle_shape, MAP_BYTES[maps], in_blocks=maps == "bc5"),
@@ -159,7 +172,15 @@ def stored_map(derivatives: Floating, encoding: MapEncoding) -> Floating:
 
 
 def stored_masks(masks: wrinkles.Masks, encoding: MaskEncoding) -> Floating:
-    """Return masks (Z, h, w), float32, as they come back from RGBA textures of [0, 1]."""
+    """Return masks (Z, h, w), float32, as they come back from RGBA textures.
+
+    "unit8" and "bc3" hold [0, 1]; the others what their numbers hold.
+
+    Raises
+    ------
+    WrinkleError
+        For an encoding that does not exist, and masks that it does not hold.
+    """
     if encoding not in MASK_BYTES:
         raise WrinkleError(f"masks: got {encoding!r}, expected one of {', '.join(MASK_BYTES)}")
     stack = wrinkles.mask_stack(masks)
@@ -167,6 +188,10 @@ def stored_masks(masks: wrinkles.Masks, encoding: MaskEncoding) -> Floating:
         raise WrinkleError(
             f"masks: got {stack.min():.3g}...{stack.max():.3g}, expected [0, 1] for {encoding}"
         )
+    if encoding in ("float16", "float32"):
+        limit = float(np.finfo(encoding).max)
+        if float(np.abs(stack).max()) > limit:
+            raise WrinkleError(f"masks: got values beyond {limit:g}, expected less for {encoding}")
     if encoding == "float16":
         stack = stack.astype(np.float16)
     elif encoding == "unit8":

@@ -382,18 +382,21 @@ def direction_dependence(
     table : KernelTable
         Of all directions together; covers the stretch ratios.
     stretch, alpha, sigma_um, angle_rad : array_like, shape (N,)
-        One entry a state: ratio, kernel, direction of the jaws.
+        One entry a state: ratio, kernel, direction of the jaws; finite.
 
     Raises
     ------
     KernelTableFitError
-        For fewer than two directions, or not more states than directions.
+        For fewer than two directions, not more states than directions, or what is not finite.
     """
     r, a, s, angle = (
         np.asarray(v, np.float64).reshape(-1) for v in (stretch, alpha, sigma_um, angle_rad)
     )
     if not r.size == a.size == s.size == angle.size:
         raise KernelTableFitError(f"angle_rad: got {angle.size} entries, expected {r.size}")
+    for name, values in (("stretch", r), ("alpha", a), ("sigma_um", s), ("angle_rad", angle)):
+        if not np.isfinite(values).all():
+            raise KernelTableFitError(f"{name}: got NaN or infinity, expected finite numbers")
     directions, group = np.unique(angle, return_inverse=True)
     k = directions.size
     if k < 2 or r.size <= k:
@@ -403,12 +406,14 @@ def direction_dependence(
     count = np.bincount(group, minlength=k)
     offsets, errors, chances = [], [], []
     for value, told in zip((a, s), kernel_parameters(r, table, extrapolate="refuse"), strict=True):
-        residual = value - told
+        # in a unit of their own, whose squares neither vanish nor overflow
+        unit = float(np.abs(value - told).max()) or 1.0
+        residual = (value - told) / unit
         mean = np.bincount(group, residual, k) / count
         within = float(np.sum((residual - mean[group]) ** 2)) / (r.size - k)
         between = float(np.sum(count * (mean - residual.mean()) ** 2)) / (k - 1)
-        offsets.append(tuple(mean.tolist()))
-        errors.append(tuple(np.sqrt(within / count).tolist()))
+        offsets.append(tuple((unit * mean).tolist()))
+        errors.append(tuple((unit * np.sqrt(within / count)).tolist()))
         ratio = between / within if within > 0 else (math.inf if between > 0 else 0.0)
         chances.append(float(fdtrc(k - 1, r.size - k, ratio)) if math.isfinite(ratio) else 0.0)
     return DirectionDependence(

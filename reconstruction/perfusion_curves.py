@@ -168,9 +168,12 @@ def usual_places(skin: ArrayLike) -> dict[str, tuple[float, float]]:
     Raises
     ------
     CurveError
-        When there is no skin.
+        When there is no skin, or no picture.
     """
-    rows, columns = np.nonzero(np.asarray(skin, bool))
+    shown = np.asarray(skin, bool)
+    if shown.ndim != 2:
+        raise CurveError(f"skin: got shape {shown.shape}, expected (H, W)")
+    rows, columns = np.nonzero(shown)
     if rows.size == 0:
         raise CurveError("skin: got none, expected a face")
     left, right = np.percentile(columns, (2, 98))

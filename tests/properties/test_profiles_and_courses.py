@@ -226,3 +226,83 @@ def test_the_plateau_is_one_of_the_ranks(errors, share):
 @given(values=st.lists(st.integers(), max_size=30), window=st.integers(1, 9))
 def test_tiles_come_back_in_their_order(values, window):
     assert list(tiles.map_tiles(lambda v: v + 1, values, window=window)) == [v + 1 for v in values]
+
+
+TURNS = np.arange(12) * (np.pi / 6)
+
+
+@FEW
+@given(seed=SEED, ratio=st.floats(1.0, 1.3), axis=st.floats(0.0, np.pi),
+       unit=st.sampled_from([1e-20, 1.0, 1e20]), lost=st.integers(0, 3))  # fmt: skip
+def test_the_axis_of_profiles_is_found_with_fibres_lost_and_in_any_unit(
+    seed, ratio, axis, unit, lost
+):
+    rng = np.random.default_rng(seed)
+    scattering = 1.5 * (1.0 - (ratio - 1.0) * np.cos(2 * (TURNS - axis)))
+    profiles = unit * photon_table.reflectance(RADIUS, 0.04, scattering[:, None])
+    profiles *= np.exp(0.05 * rng.standard_normal((12, 1)))  # how well the head couples
+    for _ in range(lost):
+        profiles[rng.integers(12), rng.integers(18)] = rng.choice([np.nan, np.inf, -np.inf])
+    kept = profiles.copy()
+    told = {"sigma_a_per_mm": 0.04, "sigma_s_prime_per_mm": 1.5}
+    found = anisotropy.estimate_from_profiles(TURNS, RADIUS, profiles, **told)
+    np.testing.assert_array_equal(profiles, kept)
+    assert found.valid
+    assert found.ratio >= 1.0
+    assert found.ratio == pytest.approx(1.0 + 1.1 * (ratio - 1.0), abs=0.05)
+    if ratio > 1.1:
+        off = abs((float(found.axis_rad) - axis + np.pi / 2) % np.pi - np.pi / 2)
+        assert off < 0.05
+        assert found.p_value < 1e-6
+    none = anisotropy.estimate_from_profiles(TURNS, RADIUS, np.zeros((12, 18)), **told)
+    assert not none.valid
+    assert none.ratio == 1.0
+    for name in ("sigma_a_per_mm", "sigma_s_prime_per_mm"):
+        for bad in (np.nan, 0.0, -1.0, np.inf):
+            unknown = anisotropy.estimate_from_profiles(
+                TURNS, RADIUS, profiles, **(told | {name: bad})
+            )
+            assert not unknown.valid
+    with pytest.raises(anisotropy.AnisotropyError, match="radius_mm"):
+        anisotropy.estimate_from_profiles(TURNS, -RADIUS, profiles, **told)
+    with pytest.raises(anisotropy.AnisotropyError, match="floor"):
+        anisotropy.estimate_from_profiles(TURNS, RADIUS, profiles, floor=np.nan, **told)
+
+
+@CHEAP
+@given(h=st.floats(0.0, 3.0), axis=st.floats(0.0, np.pi), level=st.floats(-0.5, 0.5),
+       drawn=SEED)  # fmt: skip
+def test_an_ellipse_fitted_to_its_own_values_is_itself(h, axis, level, drawn):
+    uv = h * np.array([[np.cos(2 * axis), np.sin(2 * axis)]])
+    shape, _ = diffusion_ellipse.relative_sigma_tr(TURNS, uv)
+    values = np.exp(0.5 * level) * shape.T
+    weight = np.random.default_rng(drawn).uniform(0.5, 2.0, (12, 1))
+    start = direction_harmonics.fit(TURNS, values, weight)
+    found, inverse, residual = diffusion_ellipse.fit(TURNS, values, weight, start)
+    assert start.told.all()
+    np.testing.assert_allclose(found[0, :3], [level, *uv[0]], atol=1e-5 * (1.0 + h))
+    assert residual[0] < 1e-9
+    assert np.isfinite(inverse).all()
+    assert np.linalg.eigvalsh(inverse[0])[0] >= -1e-9
+    # a series without a fit has zeros and no NaN
+    few = np.where(np.arange(12)[:, None] < 3, weight, 0.0)
+    nothing = direction_harmonics.fit(TURNS, values, few)
+    p, covariance, left = diffusion_ellipse.fit(TURNS, values, few, nothing)
+    assert not p.any()
+    assert not covariance.any()
+    assert left[0] == 0.0
+
+
+@CHEAP
+@given(seed=SEED, sides=st.tuples(st.integers(1, 40), st.integers(1, 40)))
+def test_usual_places_lie_on_the_face_s_own_rectangle(seed, sides):
+    rng = np.random.default_rng(seed)
+    skin = rng.uniform(size=sides) < 0.5
+    skin[rng.integers(sides[0]), rng.integers(sides[1])] = True
+    rows, columns = np.nonzero(skin)
+    for x, y in perfusion_curves.usual_places(skin).values():
+        assert columns.min() <= x <= columns.max()
+        assert rows.min() <= y <= rows.max()
+    for none in (np.zeros(sides, bool), np.ones(3, bool), np.ones((2, 2, 2), bool)):
+        with pytest.raises(perfusion_curves.CurveError, match="skin"):
+            perfusion_curves.usual_places(none)
