@@ -25,6 +25,7 @@ from skinrig.benchmarks import (
     interval_trials_flash,
     interval_trials_gradient,
     interval_trials_probe,
+    interval_trials_sequence,
 )
 from skinrig.benchmarks.interval_coverage import LEVELS, Covered, Trial, by_band
 
@@ -87,8 +88,19 @@ def _full() -> Mapping[str, Callable[[Path], Trials]]:
     faces = {FIRST_SEED + k: DOME[k] for k in range(len(DOME))}
     media = {FIRST_SEED + k: medium for k, medium in enumerate(MEDIA)}
     skin = {FIRST_SEED + k: SKIN[k] for k in range(len(SKIN))}
+    coarse = {FIRST_SEED + 16 + k: PRESETS[k] for k in range(len(PRESETS))}
+    moving = {FIRST_SEED + 24 + k: PRESETS[k + 1] for k in range(4)}
     return {
         "flash": lambda folder: interval_trials_flash.flash(folder, flash, width_px=768),
+        "coarse": lambda folder: interval_trials_flash.flash(
+            folder, coarse, width_px=384, moving=False, resolution=", half resolution"
+        ),
+        "event": lambda folder: interval_trials_sequence.sequences(
+            folder, moving, width_px=192, state="exercise"
+        ),
+        "prompts": lambda folder: interval_trials_sequence.sequences(
+            folder, moving, width_px=192, state="smile"
+        ),
         "gradient": lambda folder: interval_trials_gradient.gradient(folder, sites, width_px=128),
         "dome": lambda folder: interval_trials_dome.dome(folder, faces, width_px=320),
         "probe": lambda folder: interval_trials_probe.probe(
