@@ -153,7 +153,7 @@ def sections(found: Findings, checks: list[page.Check]) -> str:
     sessions = session.facts_of(found.sessions)
     body = _maps(found, appearances, checks)
     body += chromophore.identifiability(appearances.values())
-    body += population.section(appearances)
+    body += population.section(appearances, found.truths)
     body += _documents(found, checks)
     body += calibration.section(found.calibrations, appearances, sessions, checks)
     body += omissions.section(found.sessions)

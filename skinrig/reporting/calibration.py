@@ -58,10 +58,10 @@ FIGURES: Mapping[str, tuple[Figure, ...]] = {
     "white": (Figure("residual", "left by the smooth white reference", "%", factor=100.0),),
     "geometry": (Figure("reprojection_px", "reprojection", "px"),),
     "lights": (
-        Figure("intensity", "light", "of its unit", of=lambda v: float(np.mean(v)), worst=min),
+        Figure("intensity", "light", "arbitrary", of=lambda v: float(np.mean(v)), worst=min),
     ),
     "fibre": (
-        Figure("gain", "gain of a fibre", "of its unit", of=lambda v: float(np.mean(v)), worst=min),
+        Figure("gain", "gain of a fibre", "arbitrary", of=lambda v: float(np.mean(v)), worst=min),
         Figure("spot_edge_px", "edge of a fibre's spot", "px"),
     ),
 }
@@ -186,8 +186,8 @@ def _figures(folder: str, found: Calibration) -> list[tuple[object, ...]]:
             if figure.quantity in names
             and np.isfinite(np.asarray(names[figure.quantity].value, float)).all()
         }
-        if not told:
-            continue
+        if not told or (found.kind == "white" and not any(told.values())):
+            continue  # a white reference that nothing smoothed leaves nothing
         errors = [
             figure.factor * float(np.max(stderr))
             for names in found.values.values()

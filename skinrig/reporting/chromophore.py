@@ -17,6 +17,8 @@ NOISE_OF_IDENTIFIABILITY = 0.005
 """Relative noise of each channel that the identifiability plots are drawn for."""
 SMALL_PX = 200
 """Largest width of maps that stand alone."""
+ROUNDING = 1e-6
+"""Fractions below this are zero but for rounding."""
 
 
 def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
@@ -47,6 +49,8 @@ def _alone(key: str, skin_map: SkinMap) -> str:
     mask = _shown(skin_map, None)
     inside = skin_map.values[np.isfinite(skin_map.values) if mask is None else mask]
     low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
+    if max(abs(low), abs(high)) < ROUNDING:  # what rounding leaves is not to look like structure
+        low, high = 0.0, 1.0
     return map_pictures.scalar_picture(
         key, skin_map.values, low=low, high=high, valid=mask,
         unit=page.short_unit(skin_map.unit), width=SMALL_PX,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from collections.abc import Sequence
@@ -57,7 +58,24 @@ class Findings:
             "About "
             + (" and ".join([", ".join(told[:-1]), told[-1]]) if told[1:] else told[0])
             + "."
+            + self._of_whom()
         )
+
+    def _of_whom(self) -> str:
+        """Return whether people or a simulation were captured, as far as the folders say so."""
+        sources = []
+        for path in (*self.appearances.values(), *self.sessions):
+            for name in (store.DOCUMENT, "session.json"):
+                with contextlib.suppress(OSError, ValueError, AttributeError):
+                    sources.append(json.loads((path / name).read_bytes()).get("source"))
+        if not sources:
+            return ""
+        simulated = sources.count("simulated")
+        if simulated == len(sources):
+            return " All of it is simulated: no person was measured."
+        if simulated:
+            return f" {simulated} of the {len(sources)} sets of maps and sessions are simulated."
+        return " None of it is simulated."
 
     def truth_of(self, appearance: SkinAppearance) -> SkinAppearance | None:
         """Return the truth that an appearance names, where it was found."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from model import store
 from model.skin import SkinAppearance
 from model.translucency_population import (
     PopulationTable,
@@ -21,20 +23,28 @@ from skinrig.reporting import page
 
 PEOPLE = 87
 """As many as Weyrich et al. 2005 measured."""
+MEDIA = ("homogeneous:", "anisotropic:")
+"""How simulated subjects that are media are named."""
 
 
-def section(appearances: Mapping[str, SkinAppearance]) -> str:
+def section(
+    appearances: Mapping[str, SkinAppearance], truths: Mapping[str, Path] | None = None
+) -> str:
     """Return the tables of sigma_tr over people; empty where nobody's skin was probed.
 
     Parameters
     ----------
     appearances
-        By name; each that holds fits of a fibre probe counts as a person.
+        By name; each that holds fits of a fibre probe counts as a person, unless its truth says
+        that it is a medium.
+    truths
+        Folders of truths by name.
     """
     people = {
         name: fits
         for name, appearance in appearances.items()
         if (fits := document_of(appearance, SUBSURFACE_FILE)) is not None
+        and not _is_medium(appearance, truths or {})
     }
     if not people:
         return ""
@@ -59,12 +69,22 @@ def section(appearances: Mapping[str, SkinAppearance]) -> str:
     measured = [one for name, fits in people.items() for one in _measured(name, fits)]
     if measured:
         found = summarize(measured)
-        rows += _rows(f"measured here, {len(people)} sessions", found, published.sites)
+        many = "session" if len(people) == 1 else "sessions"
+        rows += _rows(f"measured here, {len(people)} {many}", found, published.sites)
     columns = [f"{site}, {word}" for site in published.sites for word in ("mean", "deviation")]
     head = ("who", "channel", *columns)
     return body + page.table(
         head, rows, caption="Mean and standard deviation over people, red, green and blue light"
     )
+
+
+def _is_medium(appearance: SkinAppearance, truths: Mapping[str, Path]) -> bool:
+    """Tell a simulated medium of given coefficients, which is nobody's skin."""
+    folder = truths.get(str(appearance.parameters.get("truth", "")))
+    if folder is None:
+        return False
+    subject = str(store.read_document(folder).parameters.get("subject", ""))
+    return subject.startswith(MEDIA)
 
 
 def _rows(who: str, found: PopulationTable, sites: tuple[str, ...]) -> list[tuple[object, ...]]:

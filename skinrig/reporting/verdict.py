@@ -112,7 +112,8 @@ def weaknesses(checks: Sequence[page.Check]) -> list[str]:
             out.append(f"intervals too large: {_covered(check)}")
     for check in checks:
         if check.masked > MUCH_MASKED:
-            out.append(f"masked: {check.name}, {100 * check.masked:.0f} % of pixels have no value")
+            of_what = check.name.rsplit(",", 1)[0]  # without what is measured, such as the median
+            out.append(f"masked: {of_what}: {100 * check.masked:.0f} % of pixels have no value")
     return out
 
 

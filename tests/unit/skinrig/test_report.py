@@ -5,9 +5,13 @@ import pytest
 
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
+from reconstruction.probe_stages import SUBSURFACE_FILE
 from skinrig import report
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
 from skinrig.benchmarks.document import to_document
+from skinrig.reporting import population
+from skinrig.reporting.chromophore import panels
+from skinrig.reporting.folders import discover
 
 
 @pytest.fixture
@@ -75,3 +79,39 @@ def test_an_empty_folder_is_refused_with_what_to_do(tmp_path):
         report.build([tmp_path])
     with pytest.raises(report.ReportError, match="does not exist"):
         report.build([tmp_path / "nothing"])
+
+
+def test_the_first_screen_says_that_nobody_was_measured(folder):
+    assert "All of it is simulated: no person was measured." in report.build([folder])
+    document = json.loads((folder / "appearance" / "appearance.json").read_text())
+    found = discover([folder])
+    assert found.words().endswith("All of it is simulated: no person was measured.")
+    document["source"] = "measured"
+    (folder / "appearance" / "appearance.json").write_text(json.dumps(document))
+    assert found.words().endswith("None of it is simulated.")
+
+
+def test_a_map_of_rounding_alone_does_not_look_like_structure(rng):
+    noise = 1e-11 * rng.random((24, 32))
+    told = panels(SkinAppearance({"gamut_distance": SkinMap(noise, "1")}, "simulated"), None)
+    assert "e-11" not in told
+    far = panels(SkinAppearance({"gamut_distance": SkinMap(noise * 1e9, "1")}, "simulated"), None)
+    assert "0.009" in far
+
+
+def test_a_medium_is_not_counted_as_a_person(tmp_path):
+    fits = {"sites": [{"site": "cheek", "sigma_tr_per_mm": value, "sigma_tr_stderr": 0.01}
+                      for value in (0.5, 0.7, 0.9)]}  # fmt: skip
+    files = {SUBSURFACE_FILE: json.dumps(fits).encode()}
+    truths, appearances = {}, {}
+    for subject in ("III", "homogeneous:0.08,1.2"):
+        name = f"truth-{len(truths)}"
+        truth = SkinAppearance({}, "simulated", parameters={"kind": "truth", "subject": subject})
+        truths[name] = store.write(tmp_path / name, truth)
+        appearances[subject] = SkinAppearance(
+            {}, "simulated", parameters={"truth": name}, files=files
+        )
+    assert "measured here, 1 session<" in population.section(appearances, truths)
+    assert "measured here, 2 sessions<" in population.section(appearances)  # no truth tells
+    del appearances["III"]
+    assert not population.section(appearances, truths)
