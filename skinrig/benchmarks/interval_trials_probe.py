@@ -20,8 +20,9 @@ from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.simulating.simulation import Simulated, simulate_session
 
-SIZE: Final = "full"
-"""With fewer photons the simulation's own noise, two percent, passes for errors of the probe."""
+PHOTONS: Final = "full"
+"""Of phantom and media, whose coefficients are known: with fewer the simulation's own noise,
+two percent, passes for errors of the probe. Skin's truth is of the very profile that is read."""
 DIRECTIONS: Final = 8
 """Of the head on tissue that scatters by direction."""
 COEFFICIENTS: Final[Mapping[str, str]] = {
@@ -51,7 +52,7 @@ def probe(
         Seed of each and "anisotropic:SIGMA_A,SIGMA_S_PRIME,STRENGTH,AXIS_DEG": axis and ratio.
     """
     phantom = folder / "session-phantom"
-    simulate_session("probe", phantom, target="phantom", seed=900, size=SIZE)
+    simulate_session("probe", phantom, target="phantom", seed=900, size=PHOTONS)
     calibrate("fibre", [phantom], folder / "calibration")
     for seed, medium in media.items():
         done = simulate_session(
@@ -60,7 +61,7 @@ def probe(
             subject=medium,
             sites=("cheek",),
             seed=seed,
-            size=SIZE,
+            size=PHOTONS,
         )
         found, truth = _maps(folder, done, "subsurface")
         name = f"{medium} {seed}"
@@ -69,9 +70,7 @@ def probe(
             yield of_coefficient(coefficient, found, truth, subject=name)
         forget(folder, done)
     for seed, preset in (skin or {}).items():
-        done = simulate_session(
-            "probe", folder / "session-subject", subject=preset, seed=seed, size=SIZE
-        )
+        done = simulate_session("probe", folder / "session-subject", subject=preset, seed=seed)
         found, truth = _maps(folder, done, "subsurface")
         band = melanin_band_of(preset)
         yield of_decay("sigma_tr of skin", found, truth, subject=f"{preset} {seed}", band=band)
@@ -80,7 +79,7 @@ def probe(
         angles = tuple(360.0 / DIRECTIONS * k for k in range(DIRECTIONS))
         done = simulate_session(
             "probe", folder / "session-subject", subject=medium, sites=("cheek",), seed=seed,
-            angles=angles, size=SIZE,
+            angles=angles,
         )  # fmt: skip
         found, truth = _maps(folder, done, "anisotropy")
         yield from of_directions(found, truth, float(medium.rpartition(",")[2]), f"{medium} {seed}")

@@ -1,0 +1,112 @@
+"""Trials of intervals from documents written out here: honest are kept, halved ones are not."""
+
+import json
+
+import numpy as np
+import pytest
+
+from model.skin import SkinAppearance
+from reconstruction.probe_stages import ANISOTROPY_FILE, SUBSURFACE_FILE
+from skinrig.benchmarks import interval_trials_probe as probe
+from skinrig.benchmarks.interval_coverage import pooled
+
+PLACE = {"site": "cheek", "repeat": 0, "angle_deg": 0.0}
+CHANNELS = ("red", "green", "blue")
+TRUE = 0.2
+
+
+def appearance(**given):
+    return SkinAppearance({}, "simulated", **given)
+
+
+def medium(rng, *, stated=1.0, told=True):
+    """Fits that are off by 5 % and say so, or `stated` times it; and their truth."""
+    fits = []
+    for channel in CHANNELS:
+        error = 0.05 * rng.standard_normal()
+        value, half = TRUE * np.exp(error), stated * 0.05
+        fits.append(
+            {
+                "channel": channel, "method": "photon_table", "valid": True,
+                "coefficients_identified": told, "sigma_tr_per_mm": value,
+                "sigma_tr_stderr": value * half,
+                "interval_per_mm": [value * np.exp(-half), value * np.exp(half)],
+                "sigma_a_per_mm": TRUE * (1 + error), "sigma_s_prime_per_mm": TRUE * (1 + error),
+                "sigma_a_stderr": TRUE * (1 + error) * half,
+                "sigma_s_prime_stderr": TRUE * (1 + error) * half,
+            }
+        )  # fmt: skip
+    document = {"measurements": [{**PLACE, "fits": fits}]}
+    values = [TRUE] * 3
+    truth = {
+        **PLACE, "kind": "homogeneous", "sigma_tr_per_mm": values, "sigma_a_per_mm": values,
+        "sigma_s_prime_per_mm": values,
+    }  # fmt: skip
+    return (
+        appearance(files={SUBSURFACE_FILE: json.dumps(document).encode()}),
+        appearance(parameters={"profiles": [truth]}),
+    )
+
+
+def decays(found, truth, subject):
+    return probe.of_decay("sigma_tr of media", found, truth, subject=subject, band="any")
+
+
+def absorptions(found, truth, subject):
+    return probe.of_coefficient("sigma_a", found, truth, subject=subject)
+
+
+@pytest.mark.parametrize("trial", [decays, absorptions])
+def test_intervals_of_a_medium_as_wide_as_its_errors_are_kept_and_halved_ones_missed(trial):
+    """80 media of 3 colors: 240 draws; the share is off by 0.08 with a chance of 1 % at most."""
+    rng = np.random.default_rng(8)
+    honest = [trial(*medium(rng), f"{k}") for k in range(80)]
+    assert pooled(honest, level=68).verdict == "kept"
+    assert honest[0].width == pytest.approx(5.0, rel=0.01)
+    halved = [trial(*medium(rng, stated=0.5), f"{k}") for k in range(80)]
+    assert pooled(halved, level=68).verdict == "missed"
+
+
+def test_coefficients_that_are_not_told_apart_are_not_judged():
+    found, truth = medium(np.random.default_rng(1), told=False)
+    assert absorptions(found, truth, "x").deviation.size == 0
+    assert decays(found, truth, "x").deviation.size == 3
+
+
+def directed(rng, *, axis_deg, stated):
+    rows = [
+        {
+            "channel": channel, "valid": True, "ratio": 1.2 + 0.01 * rng.standard_normal(),
+            "ratio_stderr": 0.01 * stated, "axis_stderr_deg": 2.0 * stated,
+            "axis_deg": (axis_deg + 2.0 * rng.standard_normal()) % 180.0,
+        }
+        for channel in CHANNELS
+    ]  # fmt: skip
+    angle = np.arange(8) * 45.0
+    # 1 / sigma_tr on an ellipse whose axes are as 1.2 to 1
+    turn = np.radians(angle - axis_deg)
+    decay = np.hypot(np.cos(turn) / 1.2, np.sin(turn))
+    profiles = [
+        {**PLACE, "angle_deg": float(a), "sigma_tr_per_mm": [float(d)] * 3}
+        for a, d in zip(angle, decay, strict=True)
+    ]
+    return (
+        appearance(files={ANISOTROPY_FILE: json.dumps({"sites": rows}).encode()}),
+        appearance(parameters={"profiles": profiles}),
+    )
+
+
+@pytest.mark.parametrize("axis_deg", [0.0, 60.0, 179.5])
+def test_axis_and_ratio_of_an_ellipse_are_judged_wherever_the_axis_lies(axis_deg):
+    rng = np.random.default_rng(3)
+    for stated, verdict in ((1.0, "kept"), (0.5, "missed")):
+        made = [
+            list(
+                probe.of_directions(
+                    *directed(rng, axis_deg=axis_deg, stated=stated), axis_deg, f"{k}"
+                )
+            )
+            for k in range(100)
+        ]
+        for trials in zip(*made, strict=True):
+            assert pooled(trials, level=68).verdict == verdict
