@@ -35,6 +35,13 @@ def view(
             "a simulation has its own."
         ),
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            help="CALIBRATION/ folder with the color of a dome's cameras; else the one its maps "
+            "were made with, or what its session says of the sensor."
+        ),
+    ] = None,
     port: Annotated[
         int | None,
         typer.Option(
@@ -73,6 +80,7 @@ def view(
         appearance or [],
         mesh=mesh,
         landmarks=landmarks,
+        calibration=calibration,
         preset=preset,
         seed=seed,
         size=size,
