@@ -15,6 +15,7 @@ from rigsim import lateral, shading
 from rigsim.atlas import spread
 from rigsim.bounce_color import BounceColor
 from rigsim.mesh import Float32Array
+from rigsim.relief_shadow import ReliefShadow
 from rigsim.render import Caster, visibility
 from rigsim.scenes.olat import Lamp
 from rigsim.scenes.skin_glow import HAIR_REFLECTANCE, PIGMENT_BLUR_MM, typical_kernels
@@ -49,6 +50,8 @@ class SkinBleeding:
         Whether that light is reflected wavelength by wavelength.
     enough
         Share of the first bounce below which further ones are left out.
+    relief
+        What of the texture's relief hides lights; None: nothing.
     """
 
     def __init__(
@@ -63,7 +66,9 @@ class SkinBleeding:
         bounce: SkinBounce | None,
         spectral: bool = True,
         enough: float = 1e-3,
+        relief: ReliefShadow | None = None,
     ) -> None:
+        self._relief = relief
         self._subject, self._surface, self._caster = subject, surface, caster
         self.subsurface = subsurface
         self._bounce = bounce
@@ -109,6 +114,10 @@ class SkinBleeding:
                 raise ValueError("glow: got neither subsurface nor bounce, expected one")
             return spread(surface.r_d * came, atlas.covered)
         entered = entering(self._caster, lamp, atlas.position_mm, surface.normal, atlas.normal)
+        if self._relief is not None:
+            entered *= self._relief.on_texture(
+                atlas.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm
+            )
         light = entered[..., None] if came is None else entered[..., None] + came
         light = np.where(covered, light, np.float32(0.0))
         spreading = np.ascontiguousarray(self._inside * light, np.float32)

@@ -34,11 +34,12 @@ from rigsim.dome_build import BuiltDome
 from rigsim.head_motion import HeadMotion
 from rigsim.led_light import lobe_exponent, white_intensity
 from rigsim.mesh import Float32Array
+from rigsim.relief_shadow import ReliefShadow
 from rigsim.render import Caster
 from rigsim.scene_needs import Noise, SceneNeeds
 from rigsim.scenes import dome_truth, dome_views, flash_needs, olat
 from rigsim.scenes.dome_needs import dome_needs, noise_of
-from rigsim.scenes.flash_needs import BOUNCES, LATERAL, LENS, SPECTRAL
+from rigsim.scenes.flash_needs import BOUNCES, LATERAL, LENS, SPECTRAL, WRINKLES
 from rigsim.scenes.olat import Hits, Lamp
 from rigsim.scenes.olat_vector import VectorLight
 from rigsim.sensor import Sensor, expose, sensor_of
@@ -124,6 +125,8 @@ class DomeScene:
         Whether light that went from skin to skin is reflected wavelength by wavelength.
     last_bounce
         Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
+    relief_shadows
+        Whether wrinkles of a face that has moved shade; ``None`` decides as above.
     on_s
         Longest on-time at full level of one light in the plan's exposures, s, by which sizes are
         told; ``None``: such that the brightest skin is at full scale.
@@ -152,6 +155,7 @@ class DomeScene:
         spectral: bool | None = None,
         last_bounce: float | None = None,
         optics: bool | None = None,
+        relief_shadows: bool | None = None,
         on_s: float | None = None,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
@@ -212,6 +216,7 @@ class DomeScene:
             interreflections=interreflections,
             spectral=spectral,
             optics=optics,
+            relief_shadows=relief_shadows,
             subpixels=subpixels,
         )
         """What is built, what is not, and why."""
@@ -220,6 +225,9 @@ class DomeScene:
         self._last_bounce = summed if last_bounce is None else last_bounce
         self.subsurface = self.needs.builds(LATERAL)
         self.optics = self.needs.builds(LENS)
+        self._relief: ReliefShadow | None = None
+        if isinstance(subject, Subject) and self.needs.builds(WRINKLES):
+            self._relief = ReliefShadow(subject)
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
@@ -483,14 +491,24 @@ class DomeScene:
         color = gain * self.intensity(light, view_name=view.name)
         glow = self._glow_of(view, light, t_s, hits)
         diffuse = not (self.subsurface and glow is not None)
+        relief = self._relief_of(hits, lamp)
         if hits.kind == olat.SKIN and caster.scene is not None:
             if (view.name, t_s) not in self._vector:
                 self._vector[view.name, t_s] = VectorLight(hits, caster)
-            image = self._vector[view.name, t_s].light_up(lamp, color, glow, diffuse=diffuse)
+            image = self._vector[view.name, t_s].light_up(
+                lamp, color, glow, diffuse=diffuse, relief=relief
+            )
         else:
             visible = olat.seen_from(hits, caster, lamp)
-            image = olat.light_up(hits, lamp, visible, color, glow, diffuse=diffuse)
+            image = olat.light_up(hits, lamp, visible, color, glow, diffuse=diffuse, relief=relief)
         return image
+
+    def _relief_of(self, hits: Hits, lamp: Lamp) -> Float32Array | None:
+        """Return which part of a light the texture's relief leaves to each row."""
+        if self._relief is None or hits.kind != olat.SKIN:
+            return None
+        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
+        return self._relief.seen(uv, hits.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm)
 
     def _glow_of(self, view: View, light: int, t_s: float, hits: Hits) -> Float32Array | None:
         """Return what leaves the interior of the rows besides their own diffuse term."""
@@ -510,6 +528,7 @@ class DomeScene:
                 bounce=self._bounce,
                 spectral=self.interreflections and self.needs.builds(SPECTRAL),
                 enough=self._last_bounce,
+                relief=self._relief,
             )
         key = (camera, light, t_s)
         if key not in self._glow:

@@ -24,6 +24,7 @@ from rigsim.scenes.flash_needs import (
     lens,
     polarization,
     textures,
+    wrinkles,
 )
 from rigsim.scenes.skin_glow import typical_kernels
 from rigsim.subject import Subject
@@ -44,6 +45,7 @@ def dome_needs(
     interreflections: bool | None,
     spectral: bool | None,
     optics: bool | None,
+    relief_shadows: bool | None,
     subpixels: int,
 ) -> SceneNeeds:
     """Decide what a scene in the dome builds.
@@ -63,7 +65,7 @@ def dome_needs(
         light, full scales, shape (3,); None: the brightest skin is taken as full.
     movement, motion
         Whether the face moves with its state, and how the head does.
-    subsurface, interreflections, spectral, optics
+    subsurface, interreflections, spectral, optics, relief_shadows
         What is asked for; None lets the sizes decide.
     subpixels
         Rays along each side of a pixel.
@@ -116,6 +118,7 @@ def dome_needs(
         ),
         further_bounces(bounces, share * float(brightest.max())),
         focus,
+        wrinkles(subject, noise, float(level.max()), relief_shadows),
     ]  # fmt: skip
     made += _movement(subject, movement, motion, view)
     made += absent(
@@ -135,7 +138,6 @@ def _movement(
         made.append(Effect(name, "absent", "at rest nothing moves", switch="movement"))
     else:
         made.append(Effect(name, "built", "the state moves the face", switch="movement"))
-        made += unmodeled([("shadows of wrinkles", "they tilt the surface only")])
     head = "movement of the head"
     if motion is None:
         return [*made, Effect(head, "absent", "motion=None: the head is held", switch="motion")]

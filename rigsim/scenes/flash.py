@@ -27,10 +27,11 @@ from rigsim.effect_sizes import exchange_share
 from rigsim.films import Films, films_of
 from rigsim.lateral import line_spread_mm
 from rigsim.mesh import Float32Array, Mesh
+from rigsim.relief_shadow import ReliefShadow
 from rigsim.render import Caster, camera_rays
 from rigsim.scene_needs import Noise, SceneNeeds
 from rigsim.scenes import flash_needs
-from rigsim.scenes.flash_needs import BOUNCES, LATERAL, LENS, SPECTRAL
+from rigsim.scenes.flash_needs import BOUNCES, LATERAL, LENS, SPECTRAL, WRINKLES
 from rigsim.scenes.picture import Look, Picture
 from rigsim.scenes.skin_glow import SkinGlow, SurfaceLight, light_skin, light_surface
 from rigsim.sensor import Sensor, expose, sensor_of
@@ -152,6 +153,8 @@ class FlashScene:
         Whether that light is reflected wavelength by wavelength.
     last_bounce
         Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
+    relief_shadows
+        Whether wrinkles of a face that has moved shade; ``None`` decides as above.
     power
         Highest power of a flash in the plan, above 0 to 1, by which sizes are told.
     optics
@@ -177,6 +180,7 @@ class FlashScene:
         spectral: bool | None = None,
         last_bounce: float | None = None,
         optics: bool | None = None,
+        relief_shadows: bool | None = None,
         power: float = 1.0,
         subpixels: int = 2,
         choice: VariantChoice | None = None,
@@ -222,6 +226,7 @@ class FlashScene:
             interreflections=interreflections,
             spectral=spectral,
             optics=optics,
+            relief_shadows=relief_shadows,
             subpixels=subpixels,
             share=self._stage.share(),
         )
@@ -451,11 +456,17 @@ class FlashScene:
         return self._glow[camera]
 
     def _surface_light(self, subject: Subject) -> SurfaceLight:
-        key = (self.rig.lights, tuple(self._weights.tolist()), self.films)
+        wrinkled = self.needs.builds(WRINKLES)
+        key = (self.rig.lights, tuple(self._weights.tolist()), self.films, wrinkled)
         known = self._stage.light
         if key not in known:
             known[key] = light_surface(
-                subject, self.rig.lights, self._weights, self.films, caster=self._caster
+                subject,
+                self.rig.lights,
+                self._weights,
+                self.films,
+                caster=self._caster,
+                relief=ReliefShadow(subject) if wrinkled else None,
             )
         return known[key]
 

@@ -29,6 +29,7 @@ LENS = "depth of field and lens blur"
 BANDS = "bands of the camera"
 RELIEF = "relief of the skin"
 PIGMENT = "pattern of pigment"
+WRINKLES = "shadows of wrinkles"
 
 EVERY = 16
 """Of the texels whose reflectance is looked at."""
@@ -58,6 +59,7 @@ def flash_needs(
     interreflections: bool | None,
     spectral: bool | None,
     optics: bool | None,
+    relief_shadows: bool | None,
     subpixels: int,
     share: float | None = None,
 ) -> SceneNeeds:
@@ -77,7 +79,7 @@ def flash_needs(
         What a white plate in the origin gives at the plan's highest power, full scales, shape (3,).
     movement
         Whether the face moves with its state.
-    lateral, interreflections, spectral, optics
+    lateral, interreflections, spectral, optics, relief_shadows
         What is asked for; None lets the sizes decide.
     subpixels
         Rays along each side of a pixel.
@@ -97,6 +99,7 @@ def flash_needs(
             made += unmodeled(FAR_LIGHT)
         else:
             made.append(Effect(LENS, "negligible", "all of the picture is alike", 0.0, "optics"))
+        made.append(Effect(WRINKLES, "absent", f"{subject.name} has none"))
         return SceneNeeds((*made, *absent(dark)))
     brightest = brightest_rgb(subject, state, view, illuminant)
     near = max(nearness(caster.mesh, light.position_mm) for light in rig.lights)
@@ -127,8 +130,31 @@ def flash_needs(
         ),
         further_bounces(bounces, share * float(brightest.max())),
         lens(view, illuminant, caster, noise, float(level.max()), subpixels, optics),
+        wrinkles(subject, noise, float(level.max()), relief_shadows),
     ]  # fmt: skip
     return SceneNeeds((*made, *_movement(subject, movement), *absent(dark), *_limits()))
+
+
+def wrinkles(subject: Subject, noise: Noise, level: float, asked: bool | None) -> Effect:
+    """Return whether the relief of a face that has moved hides lights from itself.
+
+    Pores of a face at rest tilt less than 4 degrees and are not built: under a light that grazes
+    the skin they would take up to a tenth of its cosine away, see docs/leaving-out.md.
+    """
+    if subject.pose is None:
+        return Effect(WRINKLES, "unmodeled", "pores of a face at rest tilt the surface only")
+    covered = subject.atlas.covered
+    across, along = (mm[covered] for mm in subject.atlas.texel_mm())
+    down, right = (
+        np.asarray(slope)[covered] for slope in np.gradient(subject.height_um.astype(np.float64))
+    )
+    steepest = 1e-3 * float(np.hypot(right / across, down / along).max(initial=0.0))
+    # a light as low as the relief is steep shines with that sine, and may be hidden
+    most = steepest / math.hypot(1.0, steepest) * level
+    return decide(
+        WRINKLES, most / float(noise.sigma(0.0)), asked, switch="relief_shadows",
+        because=f"wrinkles as steep as {math.degrees(math.atan(steepest)):.0f} degrees",
+    )  # fmt: skip
 
 
 FAR_LIGHT = [("glare and far rings of the lens", "light goes as far as the nearest rings")]
@@ -282,7 +308,6 @@ def _movement(subject: Subject, movement: bool) -> list[Effect]:
     out = [Effect(name, "built", "the state moves the face", switch="movement")]
     out += unmodeled(
         [
-            ("shadows of wrinkles", "they tilt the surface only"),
             ("parted lips and open eyes", "a mesh without an opening stretches instead"),
         ]
     )

@@ -371,6 +371,7 @@ def light_up(
     glow: Float32Array | None = None,
     *,
     diffuse: bool = True,
+    relief: Float32Array | None = None,
 ) -> Float32Array:
     """Shade rows by one light and sum them into pixels.
 
@@ -389,6 +390,8 @@ def light_up(
         intensity of 1 mm^2, shape (n, 3).
     diffuse
         False leaves out skin's own diffuse term, for a glow that holds it.
+    relief
+        Part of the light that the texture's relief leaves to each row, shape (n,); None: all.
 
     Returns
     -------
@@ -401,7 +404,8 @@ def light_up(
     axis = np.ascontiguousarray(lamp.axis, np.float64)
     _shade(
         hits.position_mm, hits.normal, hits.surface, hits.camera_mm, hits.kind, center, axis,
-        float(lamp.exponent), visible, extra, diffuse, rows,
+        float(lamp.exponent), visible, extra, diffuse,
+        np.ones(0, np.float32) if relief is None else relief, rows,
     )  # fmt: skip
     return sum_rows(hits, rows[0], rows[1], rows[2], color)
 
@@ -484,7 +488,8 @@ def _aim(  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, cache=True)
 def _shade(  # type: ignore[no-untyped-def]
-    position, normal, surface, camera, kind, center, axis, exponent, visible, glow, diffuse, out,
+    position, normal, surface, camera, kind, center, axis, exponent, visible, glow, diffuse,
+    relief, out,
 ):  # fmt: skip
     has_glow = glow.shape[0] > 0
     for i in prange(position.shape[0]):
@@ -519,6 +524,8 @@ def _shade(  # type: ignore[no-untyped-def]
         if off <= 0.0:
             continue
         strength *= off**exponent
+        if relief.shape[0] > 0:
+            strength *= relief[i]
         s0, s1, s2 = surface[i, 0] / FULL, surface[i, 1] / FULL, surface[i, 2] / FULL
         r0, r1, r2 = R_D_LIMIT * s0 * s0, R_D_LIMIT * s1 * s1, R_D_LIMIT * s2 * s2
         if kind == MATT:

@@ -68,12 +68,13 @@ class VectorLight:
         glow: Float32Array | None = None,
         *,
         diffuse: bool = True,
+        relief: Float32Array | None = None,
     ) -> Float32Array:
         """Trace shadow rays, shade and sum into pixels; see `rigsim.scenes.olat.light_up`.
 
         Parameters
         ----------
-        lamp, color, glow, diffuse
+        lamp, color, glow, diffuse, relief
             As there.
 
         Returns
@@ -114,6 +115,8 @@ class VectorLight:
         active &= ~self._scene.ray_test(ray, True, active)
         lobe = dr.power(dr.maximum(off, 1e-9), number(lamp.exponent))
         strength = dr.select(active, nl / squared * lobe, 0.0)
+        if relief is not None:
+            strength *= mi.Float(with_slack(relief))
         half = to_light + to_camera
         length = dr.norm(half)
         nh, lh = dr.minimum((nl + nv) / length, 1.0), 0.5 * length

@@ -15,6 +15,7 @@ from rigsim.atlas import Atlas
 from rigsim.films import Films, absorbing_axis
 from rigsim.lateral_kernels import GaussianSum
 from rigsim.mesh import Float32Array
+from rigsim.relief_shadow import ReliefShadow
 from rigsim.render import Caster, visibility
 from rigsim.skin_color import skin_color
 from rigsim.skin_layers import ETA
@@ -75,6 +76,7 @@ def light_surface(
     films: Films,
     *,
     caster: Caster,
+    relief: ReliefShadow | None = None,
 ) -> SurfaceLight:
     """Light the surface of a face.
 
@@ -90,6 +92,8 @@ def light_surface(
         The lights' films.
     caster
         The face's mesh.
+    relief
+        What of the texture's relief hides lights; None: nothing.
 
     Returns
     -------
@@ -113,6 +117,10 @@ def light_surface(
             radius_mm=light.radius_mm,
             samples=SHADOW_SAMPLES,
         )
+        if relief is not None:
+            visible[:, k] *= relief.on_texture(
+                atlas.position_mm, light.position_mm, radius_mm=light.radius_mm
+            ).reshape(-1)
         to_light, falloff = toward(light, position)
         cosine = np.maximum(np.einsum("ij,ij->i", normal, to_light), 0.0)
         falling = np.float32(weights[k]) * falloff * cosine * visible[:, k]

@@ -178,6 +178,30 @@ def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
     yield from _plainer("dome", preset, scene, look)
 
 
+def moved_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:
+    """Compare a face that has moved in the dome with and without shadows of its wrinkles."""
+    from capture.rig import load_rig
+    from rigsim.scene_needs import Noise
+    from rigsim.scenes.dome import DomeScene
+    from rigsim.subject import make_subject
+    from skinrig.simulating.dome import small_dome
+
+    rig = small_dome(load_rig("dome"), lights=lights, views=1, width_px=width_px)
+    face = make_subject(preset, seed=0, size=FACE_TEXELS)
+    plain: dict[str, Any] = {"state": "surprise", "interreflections": False, "subsurface": False}
+    scene = DomeScene(rig, face, **plain)
+    view = rig.views[0].name
+    brightest = scene.radiance(view).max(axis=(1, 2, 3), keepdims=True)
+
+    def render(**settings: Any) -> Pictures:
+        return Pictures(DomeScene(rig, face, **plain, **settings).radiance(view) / brightest)
+
+    yield from compare(
+        "dome", f"{preset}, surprise", scene, Noise.of(scene.sensor()), render,
+        {"relief_shadows": (True, False)},
+    )  # fmt: skip
+
+
 def _plainer(
     rig: str, preset: str, scene: Any, look: Callable[[Any], Pictures]
 ) -> Iterator[Omission]:

@@ -92,4 +92,5 @@ def _cases(toy: bool) -> Iterator[Omission]:
         yield from omission_cases.flash_face(preset, width_px=FLASH_PX)
     for preset in ("II", "darkest"):
         yield from omission_cases.dome_face(preset, width_px=DOME_PX, lights=DOME_LIGHTS)
+    yield from omission_cases.moved_face("II", width_px=DOME_PX, lights=DOME_LIGHTS)
     yield from omission_cases.gradient_skin("forehead", width_px=GRADIENT_PX)

@@ -1,0 +1,124 @@
+"""Shadows of wrinkles that only the texture knows, against a relief's own geometry."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from capture.rig import load_rig
+from rigsim.relief_shadow import DIRECTIONS, SOFT_RAD, ReliefShadow
+from rigsim.scenes.dome import DomeScene
+from rigsim.scenes.flash import FlashScene
+from rigsim.scenes.flash_needs import WRINKLES
+from rigsim.subject import make_subject
+from rigsim.variant import VariantChoice, choose_variant
+from skinrig.simulating.dome import small_dome
+
+EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
+MM = 0.5  # texel
+SIDE = 96
+
+
+@dataclasses.dataclass
+class Frame:
+    """A level texture, as much of an atlas as shadows need."""
+
+    dp_du_mm: np.ndarray
+    dp_dv_mm: np.ndarray
+    covered: np.ndarray
+    size: int = SIDE
+
+
+@dataclasses.dataclass
+class Plane:
+    atlas: Frame
+    height_um: np.ndarray
+
+
+def level(height_um: np.ndarray, *, across: float = 1.0) -> ReliefShadow:
+    du, dv = np.zeros((SIDE, SIDE, 3), np.float32), np.zeros((SIDE, SIDE, 3), np.float32)
+    du[..., 0], dv[..., 1] = across * MM * SIDE, MM * SIDE
+    frame = Frame(du, dv, np.ones((SIDE, SIDE), np.bool_))
+    return ReliefShadow(Plane(frame, height_um.astype(np.float32)))
+
+
+def seen_from(shadow: ReliefShadow, azimuth_deg: float, elevation_deg: float, across=1.0):
+    x, y = np.meshgrid((np.arange(SIDE) + 0.5) * MM, ((np.arange(SIDE) + 0.5) * MM)[::-1])
+    points = np.stack([across * x, y, np.zeros_like(x)], axis=-1).astype(np.float32)
+    a, e = np.radians([azimuth_deg, elevation_deg])
+    way = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
+    return shadow.on_texture(points, 1e6 * way)
+
+
+@pytest.mark.parametrize("across", [1.0, 2.0])
+@pytest.mark.parametrize(
+    ("azimuth_deg", "before"), [(0.0, "left"), (180.0, "right"), (90.0, "below")]
+)
+def test_a_wall_hides_a_light_as_far_as_its_height_over_the_tangent(azimuth_deg, before, across):
+    """A wall of 2 mm and a light 20 degrees up: 5.5 mm of shadow, on the side away from the light.
+
+    Tolerance: a texel, and the soft edge, 0.02 rad or 0.3 mm.
+    """
+    height = np.zeros((SIDE, SIDE))
+    if before == "below":
+        height[40:42] = 2000.0
+    else:
+        height[:, 40:42] = 2000.0
+    scale = across if before != "below" else 1.0
+    seen = seen_from(level(height, across=across), azimuth_deg, 20.0, across)
+    line = seen[:, 48] if before == "below" else seen[48]
+    told = 2.0 / math.tan(math.radians(20.0)) / (MM * scale)
+    hidden = {"left": line[:40], "right": line[42:], "below": line[42:]}[before]
+    assert (1.0 - hidden).sum() == pytest.approx(told, abs=1.2)
+    other = {"left": line[42:], "right": line[:40], "below": line[:40]}[before]
+    assert other.min() == 1.0
+
+
+def test_level_skin_and_lights_above_all_slopes_are_never_hidden():
+    ramp = np.abs(np.arange(SIDE) - 48.0)[None, :].repeat(SIDE, 0) * MM * 1e3 * 0.5
+    assert seen_from(level(np.zeros((SIDE, SIDE))), 33.0, 1.0).min() == 1.0
+    steep_deg = math.degrees(math.atan(0.5) + 1.1 * SOFT_RAD)
+    assert seen_from(level(ramp), 0.0, steep_deg).min() == 1.0
+    assert seen_from(level(ramp), 0.0, 10.0).min() == 0.0
+    assert DIRECTIONS % 4 == 0
+
+
+@pytest.fixture(scope="module")
+def face():
+    return make_subject("III", seed=0, size=192)
+
+
+def test_wrinkles_shade_a_face_that_has_moved_and_its_two_renderers_agree(face):
+    rig = small_dome(load_rig("dome"), lights=4, views=1, width_px=64)
+    view = rig.views[0].name
+    plain = {"state": "surprise", "interreflections": False, "subsurface": False}
+    lit = DomeScene(rig, face, relief_shadows=False, choice=EMBREE, **plain).radiance(view)
+    scene = DomeScene(rig, face, choice=EMBREE, **plain)
+    shaded = scene.radiance(view)
+    assert scene.needs[WRINKLES].verdict == "built"
+    assert (shaded <= lit + 1e-6 * lit.max()).all()
+    assert (lit - shaded).max() > 0.02 * lit.max()
+    compiled = DomeScene(rig, face, **plain)
+    if not choose_variant("rgb").is_vectorized:
+        pytest.skip("no LLVM for the compiled kernel")
+    other = compiled.radiance(view)
+    differ = np.abs(other - shaded) > 2e-3 * lit.max()
+    assert differ.mean() < 0.002  # rays that two tracers judge differently
+
+
+def test_a_face_at_rest_is_as_it_was_and_says_what_it_lacks(face):
+    rig = load_rig("flash").resized(64)
+    rest = FlashScene(rig, face, choice=EMBREE)
+    assert rest.needs[WRINKLES].verdict == "unmodeled"
+    moved, plain = (
+        FlashScene(rig, face, state="surprise", relief_shadows=on, choice=EMBREE, lateral=False,
+                   interreflections=False)
+        for on in (None, False)
+    )  # fmt: skip
+    assert moved.needs[WRINKLES].verdict == "built"
+    assert plain.needs[WRINKLES].verdict == "asked"
+    assert (moved.radiance() <= plain.radiance() + 1e-6).all()
+    assert (moved.radiance() < plain.radiance() - 1e-5).any()
