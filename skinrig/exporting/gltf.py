@@ -142,10 +142,11 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         },
     )
     left_out = [
+        *material.left_out_of_mesh(delivery),
         (
             "subsurface light",
             f"glTF has no place for it: see extras; {blender.FILE} sets it in Blender",
-        )
+        ),
     ]
     if not material.shapes:
         left_out.append(("morph targets", "the mesh has no blend shapes; name one with --mesh"))

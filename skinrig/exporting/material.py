@@ -153,8 +153,8 @@ class Material:
         found = subsurface_radius.radius_mm(self.translucency_mm, self.base_color, self.deficit)
         return found.astype(np.float32)
 
-    def told_tiles(self, delivery: Delivery) -> list[tuple[str, str]]:
-        """Return what is left out of tiles, and why.
+    def left_out_of_mesh(self, delivery: Delivery) -> list[tuple[str, str]]:
+        """Return what the mesh leaves out, and why: holes of a scan, maps of other tiles.
 
         Raises
         ------
@@ -167,7 +167,11 @@ class Material:
                 f"--udim: got none, but the mesh reaches over tiles {numbers}, expected dot or "
                 "underscore"
             )
-        return [
+        holes = self.mesh.holes()
+        told = [
+            (f"the surface at {holes} holes", "the scan has none there; --mesh takes a whole one")
+        ]
+        return (told if holes else []) + [
             (f"maps of tile {tile}", f"maps are of tile {FIRST_TILE}: medians and flat normals")
             for tile in self.tiles[1:]
         ]

@@ -49,7 +49,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
         See :meth:`skinrig.exporting.material.Material.of`.
     """
     material = Material.of(appearance, delivery.mesh)
-    left_out = material.told_tiles(delivery)
+    left_out = material.left_out_of_mesh(delivery)
     unit = delivery.unit_or("m")
     out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = write_textures(material, out)

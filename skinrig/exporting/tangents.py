@@ -98,6 +98,34 @@ class FramedMesh:
         """Return the mesh with some of its faces, (F,), all vertices and their frames."""
         return replace(self, faces=self.faces[faces])
 
+    def holes(self) -> int:
+        """Return how many rims connected surfaces have beside one each, seams of charts apart.
+
+        Examples
+        --------
+        >>> from rigsim.mesh import build_mesh
+        >>> square = [[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]]
+        >>> flat = build_mesh(square, [[0, 1, 2], [0, 2, 3]], [[0, 0], [1, 0], [1, 1], [0, 1]])
+        >>> FramedMesh.of(flat).holes()
+        0
+        """
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        _, welded = np.unique(self.vertices_mm, axis=0, return_inverse=True)
+        faces = welded.reshape(-1)[self.faces]
+        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        found, count = np.unique(edges, axis=0, return_counts=True)
+        rim = found[count == 1]
+        side = int(welded.max()) + 1
+
+        def parts(pairs: NDArray[np.intp]) -> int:
+            joined = coo_array((np.ones(len(pairs), np.int8), tuple(pairs.T)), (side, side))
+            labels = connected_components(joined, directed=False)[1]
+            return len(np.unique(labels[rim[:, 0]]))
+
+        return parts(rim) - parts(found)
+
     def texel_frames(self, size: int) -> tuple[Floats, Bools]:
         """Return the interpolated axes under each texel.
 

@@ -62,7 +62,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
     material = Material.of(appearance, delivery.mesh)
     unit = delivery.unit_or("m")
     per_mm = materialx.MM_M / UNITS_M[unit]
-    tiles = material.told_tiles(delivery)
+    tiles = material.left_out_of_mesh(delivery)
     out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = materialx.write_textures(material, out)
     out.png(material.image("specular_roughness", delivery), materialx.TEXTURES)

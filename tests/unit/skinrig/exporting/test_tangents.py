@@ -117,6 +117,20 @@ def test_relief_goes_on_where_it_was_not_measured_instead_of_lying_on_the_horizo
     assert old[20, 20, 2] < 0.5
 
 
+def test_holes_are_counted_without_seams_of_charts_and_the_outer_rim(patch):
+    mesh = patch.mesh()
+    middle = mesh.vertices_mm[mesh.faces].mean(axis=1)
+    near = [np.linalg.norm(middle[:, :2] - [x, y], axis=1) < 9.0 for x, y in ((0, 0), (25, 25))]
+    cut = build_mesh(mesh.vertices_mm, mesh.faces[~(near[0] | near[1])], mesh.uv)
+    assert FramedMesh.of(cut).holes() == 2
+    # each triangle a chart of its own
+    corners = mesh.vertices_mm[mesh.faces].reshape(-1, 3)
+    apart = build_mesh(
+        corners, np.arange(len(corners)).reshape(-1, 3), mesh.uv[mesh.faces].reshape(-1, 2)
+    )
+    assert FramedMesh.of(apart).holes() == 0
+
+
 def test_where_nothing_was_measured_the_surface_is_smooth():
     shown = filled(np.full((8, 8, 3), np.nan), np.zeros((8, 8), bool))
     np.testing.assert_array_equal(shown, np.broadcast_to([0, 0, 1], (8, 8, 3)))
