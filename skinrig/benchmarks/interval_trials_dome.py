@@ -138,12 +138,18 @@ def lobe_strength(
         return np.zeros(0), np.zeros(0)
     weights = [found.maps[name] for name in WEIGHTS]
     valid = valid_of(weights[0]).reshape(-1)[test.texels]
-    level = np.sum([w.values.reshape(-1)[test.texels] for w in weights], axis=0, dtype=np.float64)
-    spread = np.sum(
-        [np.zeros(level.shape) if w.stderr is None else w.stderr.reshape(-1)[test.texels]
-         for w in weights],
-        axis=0, dtype=np.float64,
-    )  # fmt: skip
+    shares, errors = (
+        np.stack(
+            [
+                np.zeros(valid.shape)
+                if part is None
+                else part.reshape(-1)[test.texels].astype(np.float64)
+                for part in parts
+            ]
+        )
+        for parts in ([w.values for w in weights], [w.stderr for w in weights])
+    )
+    level, spread = shares.sum(axis=0), errors.sum(axis=0)
     fitted, true = test.fitted.mean(axis=1), test.true.mean(axis=1)
     good = valid & (level > 0) & (fitted > 0) & (spread > 0)
     return true[good] / fitted[good] - 1.0, spread[good] / level[good]
