@@ -39,8 +39,6 @@ Mask = NDArray[np.bool_]
 
 CORRELATED_PX: Final = 3.0
 """Pixels whose noise goes together after demosaicing and interpolation."""
-STILL_PX: Final = 0.1
-"""A face whose median pixel moves less has not moved against the sensor's sites."""
 RADIUS_SHARE: Final = 1 / 32
 """Radius of the disc over the larger side of the map, where none is given."""
 
@@ -175,13 +173,12 @@ def fit(
     prior = shading_prior.of_faces()
     if not subject.has_white:
         prior = prior.broadened(EXPOSURE_SPREAD)
-    variance, covariance = _errors(averages, apart=_moved(aligned))
     shared = shared_melanin.weigh(
         np.stack([average[0] for average in averages]),
         table,
         prior=prior,
-        variance=variance,
-        model_error=covariance,
+        variance=np.stack([average[1] for average in averages]),
+        model_error=model_error.of_picture(*averages[0]),
         valid=np.stack([average[2] for average in averages]),
         shading_window_px=shared_melanin.SHADING_WINDOW_PX,
     )
@@ -328,36 +325,6 @@ def _average(
         ratio = np.mean(scatter[seen] / noise[seen]) if seen.any() else 1.0
         noise *= max(1.0, float(ratio))
     return rgb.astype(np.float32), noise.astype(np.float32), np.asarray(count > 0)
-
-
-def _moved(aligned: list[AlignedImage]) -> bool:
-    """Tell whether skin lies elsewhere on the sensor in any image than in the first."""
-    for one in aligned:
-        if one.alignment is None or not one.alignment.valid.any():
-            continue
-        rows, columns = np.indices(one.valid.shape)
-        place = one.alignment.source_px
-        shift = np.hypot(place[..., 0] - columns, place[..., 1] - rows)
-        if np.median(shift[one.alignment.valid]) >= STILL_PX:
-            return True
-    return False
-
-
-def _errors(
-    averages: list[tuple[NDArray[np.float32], NDArray[np.float32], Mask]], *, apart: bool
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Return the variance of each state's color, and the covariance of the error of all.
-
-    What is finer than a pixel errs alike in pictures of a face that holds still; where it has
-    moved (`apart`) each picture has met the sensor's sites anew, and it is noise of its own.
-    """
-    variances = []
-    for rgb, variance, valid in averages:
-        more: NDArray[np.floating] = variance
-        if apart:
-            more = variance + model_error.of_sampling(rgb, variance, valid) * np.square(rgb)
-        variances.append(more.astype(np.float32))
-    return np.stack(variances), model_error.of_picture(*averages[0], fine=not apart)
 
 
 def _blood(shared: SharedMelanin, k: int) -> SkinMap:

@@ -91,7 +91,6 @@ def of_picture(
     valid: NDArray[np.bool_],
     *,
     errors: ColorErrors | None = None,
-    fine: bool = True,
 ) -> Floats:
     """Return the covariance of each pixel's relative error beside noise, (H, W, 3, 3).
 
@@ -105,9 +104,6 @@ def of_picture(
         (H, W): pixels of skin; others count for nothing and get the transport term alone.
     errors
         The terms; None: those of the shipped data.
-    fine
-        Whether what is finer than a pixel counts; where it is counted by `of_sampling`, it does
-        not.
 
     Notes
     -----
@@ -122,29 +118,13 @@ def of_picture(
     """
     terms = color_errors() if errors is None else errors
     good = usable_pixels(rgb, valid)
-    structure = fine_structure(rgb, variance, good) if fine else np.zeros(good.shape)
+    structure = fine_structure(rgb, variance, good)
     color = np.where(good[..., None], rgb, 0.0).astype(np.float64)
     color -= color.mean(axis=-1, keepdims=True)
     color *= terms.bounced
     covariance: Floats = terms.transport + structure[..., None, None] * terms.fine
     covariance += color[..., :, None] * color[..., None, :]
     return covariance
-
-
-def of_sampling(
-    rgb: Image, variance: Image, valid: NDArray[np.bool_], *, errors: ColorErrors | None = None
-) -> Floats:
-    """Return the relative variance of each channel by what is finer than a pixel, (H, W, 3).
-
-    Of pictures whose skin has moved against the pixels: each meets the sites of the color filter
-    array anew, so that this part errs like noise. Parameters as of `of_picture`; as variances of
-    channels that err apart, it has the same sum in the plane without brightness.
-    """
-    terms = color_errors() if errors is None else errors
-    good = usable_pixels(rgb, valid)
-    structure = fine_structure(rgb, variance, good)
-    # of channels that err apart a third is brightness, which the covariance has not
-    return np.asarray(1.5 * structure[..., None] * np.diag(terms.fine))
 
 
 def usable_pixels(rgb: Image, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -101,16 +101,6 @@ def test_the_error_of_colors_has_no_brightness(table, rng):
     assert np.linalg.eigvalsh(found).min() > -1e-9 * size.max()
 
 
-def test_skin_that_moves_meets_the_sites_anew_with_as_much_variance(table, rng):
-    rgb = picture(table, shading=np.exp(0.03 * rng.standard_normal((SIZE, SIZE))))
-    channels = model_error.of_sampling(rgb, 0.0 * rgb, everywhere())
-    whole = model_error.of_picture(rgb, 0.0 * rgb, everywhere())
-    rest = model_error.of_picture(rgb, 0.0 * rgb, everywhere(), fine=False)
-    plane = np.eye(3) - 1.0 / 3.0
-    as_noise = np.einsum("ij,hwj,ji->hw", plane, channels, plane)
-    np.testing.assert_allclose(as_noise, np.trace(whole - rest, axis1=-2, axis2=-1), rtol=1e-4)
-
-
 def test_each_pixel_is_weighed_by_its_own_error(table):
     rgb = np.repeat(table.lookup([[0.01]], [[0.03]]), 2, axis=1)
     prior, variance = lognormal(0.7, 0.6), (1e-3 * rgb) ** 2
