@@ -317,7 +317,10 @@ def write_exr(path: str | Path, image: NDArray[np.float32]) -> None:
     channel = "Y" if image.ndim == 2 else "RGB"
     pixels = np.ascontiguousarray(image, np.float32)
     with OpenEXR.File(header, {channel: pixels}) as file:
-        file.write(str(path))
+        try:
+            file.write(str(path))
+        except RuntimeError as error:  # what the library makes of a full disk
+            raise StoreError(f"{path}: cannot be written ({error}); is the disk full?") from error
 
 
 def read_exr(path: str | Path) -> NDArray[np.float32]:

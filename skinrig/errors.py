@@ -71,9 +71,11 @@ def sentence(error: BaseException) -> str:
     """Return what to print for ``error``, without a traceback."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted; a capture or simulation goes on with --resume"
+    if isinstance(error, OSError) and error.strerror and error.errno in _ADVICE:
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror}; {_ADVICE[error.errno]}"
     if isinstance(error, OSError) and error.strerror and error.filename:
-        advice = _ADVICE.get(error.errno or 0, "")
-        return f"{error.filename}: {error.strerror}" + (f"; {advice}" if advice else "")
+        return f"{error.filename}: {error.strerror}"
     if isinstance(error, UnicodeDecodeError):
         return (
             f"a file that was to be UTF-8 text is not (byte {error.start} of it is "

@@ -143,3 +143,17 @@ def test_a_map_that_does_not_fit_itself_is_refused(change, message):
 def test_a_unit_that_contradicts_the_name_is_refused():
     with pytest.raises(ValueError, match=r"melanin: got unit '%'"):
         SkinAppearance({"melanin": SkinMap(np.zeros((1, 1)), "%")}, "measured")
+
+
+def test_a_map_that_the_disk_refuses_is_named(tmp_path):
+    pixels = np.zeros((4, 4), np.float32)
+    with pytest.raises(store.StoreError, match=r"nothing/a\.exr: cannot be written"):
+        store.write_exr(tmp_path / "nothing" / "a.exr", pixels)
+
+
+def test_a_folder_that_cannot_be_replaced_is_refused_beforehand(tmp_path):
+    store.require_free(tmp_path / "new" / "deep")
+    (tmp_path / "notes.txt").write_text("mine")
+    for taken in (tmp_path, tmp_path / "notes.txt", tmp_path / "notes.txt" / "below"):
+        with pytest.raises(store.StoreError, match="name another"):
+            store.require_free(taken)

@@ -56,3 +56,8 @@ def test_a_file_that_is_no_text_is_told_without_the_words_of_a_codec():
     assert errors.sentence(caught.value) == (
         "a file that was to be UTF-8 text is not (byte 2 of it is 0xff); is another file meant?"
     )
+
+
+def test_a_full_disk_that_names_no_file_is_told_without_a_number():
+    text = errors.sentence(OSError(28, "No space left on device"))
+    assert text.startswith("No space left on device; free space")
