@@ -1,6 +1,7 @@
 """Fixtures shared by all tests."""
 
 import os
+from collections import Counter
 from pathlib import Path
 
 # Tests run in as many processes as there are cores. Threads of one that wait by spinning take
@@ -37,20 +38,29 @@ LONGEST_FIRST = (
     "tests/unit/rigsim/test_tissue_mc_skin_table.py",
     "tests/unit/reconstruction/test_kernel_fit.py",
 )
-"""Files that take 20 s and more, the longest first. One process runs a file from end to end, so one
-of these taken up last would leave the other processes without work."""
+"""Files that take 20 s and more, the longest first; the rest go by how many tests they have. One
+process runs a file from end to end, so one of these taken up last would leave the others without
+work."""
 
 
 def pytest_addoption(parser):
     parser.addoption("--device-port", default=None, help="serial URL of a real box")
 
 
+@pytest.hookimpl(trylast=True)  # what is not asked for has been left out
 def pytest_collection_modifyitems(items):
     missing = [name for name in LONGEST_FIRST if not (ROOT / name).is_file()]
     if missing:
         raise pytest.UsageError(f"tests/conftest.py: LONGEST_FIRST: no file {', '.join(missing)}")
     rank = {ROOT / name: number for number, name in enumerate(LONGEST_FIRST)}
-    items.sort(key=lambda item: rank.get(item.path, len(rank)))
+    tests = Counter(item.path for item in items)
+    place = {path: number for number, path in enumerate(tests)}  # a file's tests stay together
+
+    def order(item):
+        path = item.path
+        return rank.get(path, len(rank)), -tests[path], place[path]
+
+    items.sort(key=order)
 
 
 @pytest.fixture
