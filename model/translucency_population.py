@@ -448,7 +448,7 @@ def _averaged(repeats: list[SiteMeasurement]) -> tuple[Floats, Floats, NDArray[n
         raise PopulationError(
             f"stderr_per_mm: got one of {repeats[0].subject!r} that is not finite and above 0"
         )
-    some = told.any(axis=0)
+    some = np.asarray(told.any(axis=0), np.bool_)
     # relative to the least error: squares of errors in a small unit vanish
     least = np.where(some, np.where(told, errors, np.inf).min(axis=0), 1.0)
     weights = np.where(told, (least / np.where(told, errors, 1.0)) ** 2, 0.0)

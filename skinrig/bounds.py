@@ -68,6 +68,7 @@ def relative_bounds(
     relative_variance: Floats,
     *,
     shading_spread: float,
+    model_scale: float = 1.0,
 ) -> tuple[Floats, Floats]:
     """Return the smallest relative standard errors of melanin and hemoglobin, each (n,).
 
@@ -81,12 +82,15 @@ def relative_bounds(
         (n, 3) noise variance of a pixel's channels over their squares.
     shading_spread
         Standard deviation of the log of the light that is known beforehand.
+    model_scale
+        Of the model error's variance.
     """
     color = table.lookup(c_m, c_hd)
     # by the logarithm of each fraction, so that errors come out relative
     gradient = table.jacobian(c_m, c_hd) / color[..., None]
     gradient = gradient * np.stack([c_m, c_hd], axis=-1)[:, None, :]
-    covariance = relative_variance[..., None] * np.eye(3) + model_error.load() + shading_spread**2
+    known = model_scale * model_error.load() + shading_spread**2
+    covariance = relative_variance[..., None] * np.eye(3) + known
     fisher = np.swapaxes(gradient, -1, -2) @ np.linalg.solve(covariance, gradient)
     aa, ab, bb = fisher[:, 0, 0], fisher[:, 0, 1], fisher[:, 1, 1]
     det = np.maximum(aa * bb - ab**2, 1e-12 * aa * bb)

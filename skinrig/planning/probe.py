@@ -90,7 +90,9 @@ class Prediction:
     """(S, 3) standard error: readings, misfit, certificate; of sites that are not measured what
     the others and people in general leave open."""
     bias: Floats
-    """(S, 3) by how much a fit without noise is off; 0 where not measured."""
+    """(S, 3) by how much a fit without noise is off on this skin; 0 where not measured. It is one
+    draw of the misfit that `sigma` states: counting both would count it twice, and judging plans by
+    it would choose those that suit this person by luck."""
     common: Floats
     """(S, 3) the certificate's part."""
     misfit: Floats
@@ -102,9 +104,8 @@ class Prediction:
 
     @property
     def total(self) -> Floats:
-        """Standard deviation of the error, the bias in it, of what is measured and valid."""
-        used = self.valid & self.measured[:, None]
-        return np.asarray(np.hypot(self.sigma, self.bias)[used])
+        """Standard deviation of the error of what is measured and valid."""
+        return np.asarray(self.sigma[self.valid & self.measured[:, None]])
 
     @property
     def median(self) -> float:
@@ -199,7 +200,7 @@ def predict(look: Sight, setting: Setting) -> Prediction:
         bias[k] = found[k] / look.truth[k] - 1.0
     rest = _between(look, found, sigma, valid & measured[:, None])
     sigma[~measured] = rest[~measured]
-    return Prediction(look.sites, sigma, bias, common, np.hypot(bias, still), valid, measured)
+    return Prediction(look.sites, sigma, bias, common, still, valid, measured)
 
 
 def _fits(look: Sight, setting: Setting, places: Sequence[int], *, noise: bool) -> Sequence[Any]:
@@ -508,7 +509,7 @@ def _choice(
             "further directions of the head", "sigma_tr is wanted, not how it changes with them"
         ))  # fmt: skip
     by_site = {
-        site: [round(100.0 * float(one), 3) for one in np.hypot(found.sigma, found.bias)[k]]
+        site: [round(100.0 * float(one), 3) for one in found.sigma[k]]
         for k, site in enumerate(look.sites)
     }
     return Choice(
