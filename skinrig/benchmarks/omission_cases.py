@@ -233,7 +233,7 @@ def _plainer(
         begin = time.process_time()
         lack = look(plain)
         spent = time.process_time() - begin
-        yield _changed(rig, preset, scene.needs[name], have, lack, noise, (with_s, spent))
+        yield changed(rig, preset, scene.needs[name], have, lack, noise, (with_s, spent))
     view = scene.rig.views[0]
     white = spectra.camera_white(view.spectral_sensitivity, scene.rig.lights[0].illuminant)
     gray = np.asarray(white / white.mean(), np.float32)
@@ -241,10 +241,10 @@ def _plainer(
     one = Pictures(have.light.mean(axis=-1, keepdims=True) * gray)
     spent = time.process_time() - begin
     # a band alone would be a third of the sums over colors, which are not timed apart
-    yield _changed(rig, preset, scene.needs[BANDS], have, one, noise, (spent, spent))
+    yield changed(rig, preset, scene.needs[BANDS], have, one, noise, (spent, spent))
 
 
-def _changed(
+def changed(
     rig: str,
     subject: str,
     effect: Any,
@@ -331,74 +331,3 @@ def flat_targets() -> Iterator[Omission]:
                 rig, name, effect.name, effect.verdict, effect.over_noise,
                 noise.share(lost), noise.share(ROUNDING), spent, told_s,
             )  # fmt: skip
-
-
-def gray_tissue() -> Iterator[Omission]:
-    """Take a gray medium as one color, and as 31 of which bands are made, of the same photons."""
-    from capture.rig import load_rig
-    from rigsim.probe_tissue import HomogeneousTissue
-    from rigsim.scene_needs import Noise
-    from rigsim.scenes.probe import ProbeScene
-    from rigsim.scenes.probe_needs import COLOR
-    from rigsim.suction import HeadState
-
-    rig = load_rig("probe")
-    gray = HomogeneousTissue(0.05, 1.5)
-    bands = tuple(float(nm) for nm in range(400, 701, 10))
-    colored = dataclasses.replace(
-        gray, sigma_a_per_mm=(0.05,) * len(bands), wavelength_nm=bands
-    )  # fmt: skip
-    head = HeadState("forehead", 0.0, True, 0.0, 5.0)
-    pictures, seconds = [], []
-    scene = ProbeScene(rig, gray)
-    for tissue in (colored, gray):
-        begin = time.process_time()
-        made = ProbeScene(rig, tissue)
-        profile = made.profile(head)
-        seconds.append(time.process_time() - begin)
-        if profile is None:
-            raise ValueError("gray tissue: the head touches nothing")
-        light = made.image(made.through_fibres(profile.reflectance_per_mm2))
-        pictures.append(Pictures(light))  # of stored photons: the same for both
-    brightest = np.float32(pictures[0].light.max())
-    noise = Noise.of(scene.sensor())
-    have, lack = (Pictures(part.light / brightest) for part in pictures)
-    effect = scene.needs[COLOR]
-    yield _changed(
-        "probe", "gray medium", effect, have, lack, noise, (seconds[0], seconds[1])
-    )  # fmt: skip
-    yield from _probe_build(scene, head, noise)
-
-
-def _probe_build(scene: Any, head: Any, noise: Any) -> Iterator[Omission]:
-    """Compare the probe as built with one without cross-talk, wings, or dark current."""
-    from rigsim.scenes.probe import LONGEST_S, ProbeScene
-    from rigsim.scenes.probe_needs import CROSSTALK, DARK, WINGS
-
-    profile = scene.profile(head)
-    build = scene.build
-
-    def picture(made: Any) -> tuple[Pictures, float]:
-        begin = time.process_time()
-        light = made.image(made.through_fibres(profile.reflectance_per_mm2))
-        return Pictures(light), time.process_time() - begin
-
-    have, with_s = picture(scene)
-    unit = np.float32(have.light.max())
-    plain = {
-        CROSSTALK: dataclasses.replace(build, crosstalk=np.eye(len(build.crosstalk))),
-        WINGS: dataclasses.replace(build, wings=0.0),
-    }
-    for name, without in plain.items():
-        lack, spent = picture(ProbeScene(scene.rig, scene.tissue, build=without))
-        yield _changed(
-            "probe", "gray medium", scene.needs[name], Pictures(have.light / unit),
-            Pictures(lack.light / unit), noise, (with_s, spent),
-        )  # fmt: skip
-    sensor = scene.sensor()
-    full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
-    hot = np.asarray(scene.hot_e_per_s * LONGEST_S / full_e, np.float32)
-    yield _changed(
-        "probe", "gray medium", scene.needs[DARK], Pictures(hot), Pictures(np.zeros_like(hot)),
-        noise, (0.0, 0.0),
-    )  # fmt: skip

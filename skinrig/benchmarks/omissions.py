@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from rigsim.scenes.flash_needs import LATERAL
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
-from skinrig.benchmarks import omission_cases
+from skinrig.benchmarks import omission_cases, omission_probe
 from skinrig.benchmarks.omission_cases import Omission
 
 BOUND = 0.1
@@ -84,7 +84,7 @@ def _other_shadows(one: Omission) -> bool:
 
 def _cases(toy: bool) -> Iterator[Omission]:
     yield from omission_cases.flat_targets()
-    yield from omission_cases.gray_tissue()
+    yield from omission_probe.gray_tissue()
     if toy:
         yield from omission_cases.flash_face("darkest", width_px=64, texels=64)
         return
