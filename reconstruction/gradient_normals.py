@@ -402,7 +402,11 @@ def _roughness(
             reflection, moments, table, _grid(table), _analyser(lights, table), eta,
             np.zeros((0, 3)), np.zeros((0, 2)),
         )  # fmt: skip
-        good = found[:, kernels.STATUS] == kernels.GOOD
+        # no vector is longer than its light; a lobe that falls between lights has no length at all
+        length = found[:, kernels.CONCENTRATION]
+        good = (found[:, kernels.STATUS] == kernels.GOOD) & (length >= 0.0) & (length <= 1.0)
+        if not good.any():
+            return float("nan"), np.zeros(0)
         light = found[good, kernels.ALBEDO]
         each = light * (
             found[good, kernels.CONCENTRATION_SEEN] - found[good, kernels.CONCENTRATION]
@@ -417,7 +421,7 @@ def _roughness(
     values = np.array([value for value, _ in steps])
     change = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
     if change.size == 0:
-        best = int(np.argmin(np.abs(values)))
+        best = int(np.nanargmin(np.abs(values)))
         _log.warning(
             "roughness: lobes are %s than any of roughness %g to %g; %g is taken",
             "narrower" if values[best] > 0.0 else "wider", ALPHAS[0], ALPHAS[-1], ALPHAS[best],
