@@ -314,9 +314,10 @@ def without_brightness(covariance: Floats) -> Floats:
     Parameters
     ----------
     covariance
-        (3, 3), of relative errors.
+        (..., 3, 3), of relative errors.
     """
-    return np.asarray(covariance + np.trace(covariance) / 3.0 + 1e-6)
+    common = np.trace(covariance, axis1=-2, axis2=-1) / 3.0 + 1e-6
+    return np.asarray(covariance + common[..., None, None])
 
 
 def _weights(relative_variance: Floats, covariance: Floats, *, free: bool) -> Floats:

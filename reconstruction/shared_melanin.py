@@ -128,8 +128,7 @@ def weigh(
         brighter or darker rather than of another color: that is the light's, not the noise's.
     model_error : array_like, optional
         Relative error of the table's colors, as of `reconstruction.chromophores.invert`; or a
-        covariance for each pixel, shape (..., 3, 3): melanin is weighed by each pixel's, blood
-        given melanin by their mean.
+        covariance for each pixel, shape (..., 3, 3).
     valid : array_like of bool, shape (S, ...), optional
         Where each state may be used; a state that is not leaves out.
     reference : int
@@ -183,9 +182,9 @@ def weigh(
     log_rgb = np.log(np.where(usable[..., None], colors, 1.0), dtype=np.float32)
     relative = np.where(usable[..., None], relative, 1.0).astype(np.float32)
 
-    by_pixel, whole = _model_errors(model_error, shape)
-    common = whole * (1.0 - own_share)
-    own = np.diag(own_share * np.diag(whole)) + FINEST**2 * np.eye(3)
+    each_error, usual = _model_errors(model_error, shape, usable)
+    common = each_error * (1.0 - own_share)
+    own = np.diag(own_share * usual) + FINEST**2 * np.eye(3)
     cells = np.ascontiguousarray(table.cells, np.float64)
     mean, mean_variance = _mean_color(log_rgb, relative, usable, table, cells, own)
     mean_rgb = np.exp(mean)
@@ -194,8 +193,8 @@ def weigh(
         table,
         prior=prior,
         variance=mean_variance * mean_rgb**2,
-        model_error=by_pixel * (1.0 - own_share)
-        + np.diag(np.diag(own)) / np.maximum(usable.sum(axis=0).max(), 1),
+        model_error=(common if len(common) > 1 else common[0])
+        + own / np.maximum(usable.sum(axis=0).max(), 1),
     )
     ends = np.array([table.c_m_max, table.c_hd_max])
     begin = _fractions(np.stack([found.melanin, found.hemoglobin], axis=-1), ends)
@@ -211,8 +210,8 @@ def weigh(
         of_states = np.empty((len(kernels.STATE_MAPS), states, pixels), np.float32)
         kernels.blood_of_states(
             log_rgb, relative, good, mean, log_change, stiffness, *fixed,
-            without_brightness(common), own, cells, float(ends[0]), float(ends[1]),
-            reference % states, of_pixels, of_states, _TASK_PIXELS,
+            np.ascontiguousarray(without_brightness(common)), own, cells,
+            float(ends[0]), float(ends[1]), reference % states, of_pixels, of_states, _TASK_PIXELS,
         )  # fmt: skip
         return of_pixels, of_states
 
@@ -242,20 +241,24 @@ def weigh(
 
 
 def _model_errors(
-    model_error: ArrayLike | None, shape: tuple[int, ...]
+    model_error: ArrayLike | None, shape: tuple[int, ...], usable: Mask
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the covariances that the mean color is weighed by, and the usual one, (3, 3)."""
+    """Return covariances of the pixels (n or 1, 3, 3), and the usual variances of channels (3,).
+
+    Usual is the median: where a picture is finer than its pixels, errors are many times as large.
+    """
     given = np.asarray(0.0 if model_error is None else model_error, np.float64)
     if given.ndim < 3:
-        usual = model_covariance(model_error, default_noise=False)
-        return usual, usual
+        one = model_covariance(model_error, default_noise=False)
+        return one[None], np.diag(one)
     if given.shape != (*shape, 3, 3):
         raise ChromophoreError(
             f"model_error: expected shape {(*shape, 3, 3)} for the pixels, got {given.shape}"
         )
     flat = given.reshape(-1, 3, 3)
-    usual = flat.mean(axis=0) if len(flat) else np.zeros((3, 3))
-    return flat, model_covariance(usual, default_noise=False)
+    seen = flat[usable.any(axis=0)]
+    usual = np.median(np.einsum("nii->ni", seen), axis=0) if len(seen) else np.zeros(3)
+    return flat, usual
 
 
 def _mean_color(

@@ -223,7 +223,7 @@ def mean_color(  # type: ignore[no-untyped-def]
         _given(float32, 2),  # one over its variance (s, n); 0 everywhere: free
         _given(float32, 2),  # melanin and where blood begins: fractions of the axes (n, 2)
         _given(float32, 1),  # standard error of melanin, as a fraction of its axis (n,)
-        _given(float64, 2),  # covariance of the model error common to the states (3, 3)
+        _given(float64, 3),  # covariance of the model error common to the states (n or 1, 3, 3)
         _given(float64, 2),  # covariance of the model error that is each state's own (3, 3)
         _given(float64, 5),  # cells of the color table
         float64,  # end of the axis of melanin as a volume fraction
@@ -241,7 +241,7 @@ def mean_color(  # type: ignore[no-untyped-def]
     error_model="numpy",
 )
 def blood_of_states(  # type: ignore[no-untyped-def]
-    log_rgb, variance, usable, mean, log_change, stiffness, begin, melanin_stderr, common, own,
+    log_rgb, variance, usable, mean, log_change, stiffness, begin, melanin_stderr, commons, own,
     cells, melanin_end, end, reference, pixel_maps, state_maps, block,
 ):  # fmt: skip
     """Fit the blood of every state under the shared melanin; shapes are in the signature.
@@ -270,6 +270,7 @@ def blood_of_states(  # type: ignore[no-untyped-def]
         two = np.empty(3)
         for n in range(task * block, min(pixels, (task + 1) * block)):
             a = float64(begin[n, 0])
+            common = commons[n if len(commons) > 1 else 0]
             pixel_maps[0, n] = np.nan
             total = 0.0
             for s in range(states):

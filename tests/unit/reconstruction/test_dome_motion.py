@@ -58,6 +58,7 @@ class Shots:
     """A session that holds tracking frames and nothing else."""
 
     id = "ball"
+    path = "session-ball"
 
     def __init__(self, drift_mm=0.0, turn_deg=0.0, *, levels=(1.0,), times_s=TIMES_S, lacks=None):
         self._frames = {}

@@ -131,6 +131,27 @@ def test_an_error_of_the_model_stays_in_melanin_and_leaves_changes(table, prior,
     assert np.mean(((found.melanin - MELANIN) / claimed) ** 2) > 2.0
 
 
+def test_pixels_of_large_errors_leave_the_others_as_they_are(table, prior, rng):
+    """Every map of each pixel is as with a model error of its own kind for all."""
+    rgb, variance = pictures(table, rng, noise=0.004, pixels=300)
+    fine, coarse = np.diag([2e-4, 1e-4, 3e-4]), np.diag([0.02, 0.01, 0.03])
+    rough = np.arange(300) % 3 == 0  # the median pixel is a fine one
+
+    def maps(error):
+        found = shared_melanin.weigh(
+            rgb, table, prior=prior, variance=variance, model_error=error, own_share=0.0
+        )
+        return np.stack([
+            found.melanin, found.stderr_melanin, found.noise_stderr_melanin,
+            *found.hemoglobin, *found.stderr_hemoglobin, *found.stderr_change,
+        ])  # fmt: skip
+
+    mixed = maps(np.where(rough[:, None, None], coarse, fine))
+    np.testing.assert_allclose(mixed[:, ~rough], maps(fine)[:, ~rough], rtol=2e-3)
+    np.testing.assert_allclose(mixed[:, rough], maps(coarse)[:, rough], rtol=2e-3)
+    assert np.median(maps(coarse)[2] / maps(fine)[2]) < 0.9  # else nothing was compared
+
+
 def test_one_state_alone_is_weighed_as_a_single_picture(table, prior, rng):
     rgb, variance = pictures(table, rng, noise=3e-3, pixels=200, blood=BLOOD[:1])
     covariance = model_error.load()
