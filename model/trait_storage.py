@@ -161,7 +161,9 @@ def from_bytes(content: bytes) -> TraitLibrary:
         document = json.loads(arrays["document"].tobytes())
         schema = document["schema"]
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise TraitFileError(f"got no trait spaces ({error})") from error
+        raise TraitFileError(
+            "got no trait spaces, expected a file that `skinrig fit traits` wrote"
+        ) from error
     if schema != SCHEMA:
         raise TraitFileError(
             f"schema: got {schema!r}, expected {SCHEMA!r}; another version wrote it"

@@ -111,8 +111,11 @@ class _Frames:
         self.rig = sessions[0].rig
         serials = {view.serial for session in sessions for view in session.rig.views}
         if len(serials) != 1:
+            named = sorted(serials)
+            some = ", ".join(named[:3]) + (", ..." if len(named) > 3 else "")
             raise CalibratingError(
-                f"cameras: got {', '.join(sorted(serials))}, expected one; calibrate each alone"
+                f"cameras: got {len(named)} ({some}), expected one: give sessions of one camera; "
+                "a dome needs `calibrate geometry` and `calibrate lights` only"
             )
         self.serial = serials.pop()
         self.source = sessions[0].source

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from skinrig.commands import completion
+from skinrig.errors import UsageError
 
 Rig = Annotated[
     str,
@@ -32,6 +33,16 @@ def _free(context: typer.Context, out: Path) -> Path:
 
 NewMaps = Annotated[Path, typer.Option("--out", callback=_free, help="Folder to write.")]
 """An APPEARANCE/ folder, new or to be replaced."""
+
+
+def file_to_write(context: typer.Context, out: Path | None) -> Path | None:
+    """Refuse a folder where a file is to be written, before the work."""
+    if out is not None and not context.resilient_parsing and out.is_dir():
+        raise UsageError(f"--out: {out} is a folder, expected a file to write")
+    return out
+
+
+Page = Annotated[Path, typer.Option("-o", "--out", callback=file_to_write, help="The page.")]
 Site = Annotated[
     str | None,
     typer.Option(help="Where the gradient rig's skin is from: forehead (default), cheek or chin."),

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from skinrig import errors
-from skinrig.commands.options import Json, Rig
+from skinrig.commands.options import Json, Rig, file_to_write
 from skinrig.console import Console
 
 
@@ -38,7 +38,10 @@ def plan(
     forecast: Annotated[
         Path | None, typer.Option(help="A plan, JSON: say what it will give instead.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="File for the plan, JSON.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", callback=file_to_write, help="File for the plan, JSON."),
+    ] = None,
     confirm: Annotated[
         Path | None,
         typer.Option(help="Folder: simulate the plan, reconstruct, and compare with the forecast."),
@@ -59,8 +62,6 @@ def plan(
     console = Console(json)
     if not 0 < valid_share <= 1:
         raise errors.UsageError(f"--valid-share: got {valid_share:g}, expected above 0, up to 1")
-    if out is not None and out.is_dir():
-        raise errors.UsageError(f"--out: {out} is a folder, expected a file, such as plan.json")
     choice = choose(
         rig, want, subject=subject, seed=seed, width_px=width, most_lights=most_lights,
         valid_share=valid_share, forecast=forecast,

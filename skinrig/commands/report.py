@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from skinrig.commands.options import Json
+from skinrig.commands.options import Json, Page
 from skinrig.console import Console
 
 
 def report(
     paths: Annotated[list[Path], typer.Argument(help="Folders that skinrig wrote.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The page.")] = Path("report.html"),
+    out: Page = Path("report.html"),
     compare: Annotated[
         bool | None,
         typer.Option(

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig.commands.options import Json
+from skinrig.commands.options import Json, Page
 from skinrig.console import Console
 from skinrig.errors import UsageError
 
@@ -20,7 +20,7 @@ def view(
             "simulated head."
         ),
     ] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="The page.")] = Path("page.html"),
+    out: Page = Path("page.html"),
     mesh: Annotated[
         Path | None,
         typer.Option(
@@ -45,8 +45,10 @@ def view(
     port: Annotated[
         int | None,
         typer.Option(
+            min=0,
+            max=65535,
             help="Serve the page and its large displacement on this port of this machine alone, 0: "
-            "any free one, in place of writing it."
+            "any free one, in place of writing it.",
         ),
     ] = None,
     displacement: Annotated[

@@ -70,7 +70,7 @@ def section(sessions: Sequence[Path]) -> str:
         effects = json.loads(text)
         rows = sorted((_row(effect) for effect in effects), key=lambda row: _place(row[1]))
         out = sum(not effect["verdict"] == "built" for effect in effects)
-        title = f"{', '.join(names)}: {len(effects) - out} effects built, {out} not"
+        title = f"{', '.join(names)}: of {len(effects)} effects {len(effects) - out} built"
         head = ("effect", "what became of it", "why", "change over noise")
         body += page.folded(title, page.table(head, rows, caption="Effects of light in the scene"))
     return body

@@ -236,6 +236,9 @@ def test_none_of_something_is_not_taken_for_the_default(option, tmp_path, capsys
         (["plan", "flash", "--valid-share", "7"], "--valid-share: got 7, expected above 0"),
         (["plan", "flash", "--valid-share", "nan"], "--valid-share: got nan"),
         (["plan", "flash", "--out", "FOLDER"], "is a folder, expected a file"),
+        (["view", "--out", "FOLDER"], "is a folder, expected a file"),
+        (["report", "FOLDER", "--out", "FOLDER"], "is a folder, expected a file"),
+        (["view", "--port", "99999999"], "equal to 65535"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -29,7 +29,7 @@ def test_what_is_left_out_comes_before_what_is_built(session):
     html = omissions.section([session("session-a", {"effects": EFFECTS})])
     places = [html.index(word) for word in ("bounces", "lens", "shadows")]
     assert places == sorted(places)
-    assert "1 effects built, 2 not" in html
+    assert "of 3 effects 1 built" in html
     assert "&lt;flat&gt;" in html
     assert "<flat>" not in html
 
