@@ -32,10 +32,12 @@ OFTEN = 1 / 3
 """Part of the frames from which on a track that moves on its own is not one of the skin."""
 PART_MM = 15.0
 PART_TIMES = 2.5
-"""Residual of the worst part of a face, over the capture's usual one, that is an expression."""
+"""Residual of the worst part of a face over the capture's usual one, and over what is usual beside
+the frame's own residuals: from either on it is an expression."""
 BLOCK_PX = 32
 """Side of the parts of an image whose tracks err alike."""
 _STEP_MM = 0.01
+_FINEST_PX = 1e-6
 _MAD = 1.1774100225154747  # median of the length of a unit normal vector in two dimensions
 
 
@@ -413,7 +415,10 @@ def _judged(found: Sequence[_Pose], points: Floats, times: Floats, reference: in
         [_worst_part(points[use], row[use]) for row, use in zip(left, known & steady, strict=True)]
     )
     usable = told & (share <= min(_middle(share[others]) + NONRIGID_SHARE, NONRIGID_AT_ALL))
-    usable &= worst <= max(PART_TIMES * _middle(worst[others]), OUTLIER_PX)
+    # residuals grow as the head turns in its light, and the worst part's with them
+    own = worst / np.maximum(scales, _FINEST_PX)
+    usual = np.minimum(_middle(worst[others]), _middle(own[others]) * scales)
+    usable &= worst <= np.fmax(PART_TIMES * usual, OUTLIER_PX)
     usable[reference] = True
     motion = np.array([f.motion for f in found])
     return HeadMotion(

@@ -126,6 +126,7 @@ def test_states_without_a_neutral_one_are_refused(captured, tmp_path):
 
     class Without:
         id = session.id
+        path = session.path
         rig = session.rig
 
         def frames(self, kind=None, **index):
