@@ -111,22 +111,30 @@ def pooled(trials: Sequence[Trial], *, level: int, confidence: float = 0.95) -> 
         bands.pop() if len(bands) == 1 else "all",
         level,
         float(shares.mean()),
-        _interval(shares, confidence),
+        _interval(shares, np.array([trial.deviation.size for trial in trials]), confidence),
         len(shares),
         float(np.median([trial.width for trial in trials])),
         trials[0].unit,
     )
 
 
-def _interval(shares: Floats, confidence: float) -> tuple[float, float]:
-    from scipy.stats import t
+def _interval(shares: Floats, truths: Floats, confidence: float) -> tuple[float, float]:
+    """Return the interval of the mean share, no narrower than if truths had nothing in common.
+
+    Subjects with a truth or two each may agree by chance: their scatter alone tells nothing then.
+    """
+    from scipy.stats import beta, t
 
     if shares.size < 2:
         return 0.0, 1.0
+    middle = float(shares.mean())
     reach = t.ppf(0.5 + confidence / 2.0, shares.size - 1)
     error = float(reach * shares.std(ddof=1) / math.sqrt(shares.size))
-    middle = float(shares.mean())
-    return max(middle - error, 0.0), min(middle + error, 1.0)
+    count, held = float(truths.sum()), float((shares * truths).sum())
+    tail = (1.0 - confidence) / 2.0  # Clopper and Pearson 1934, doi:10.1093/biomet/26.4.404
+    low = beta.ppf(tail, held, count - held + 1.0) if held > 0.5 else 0.0
+    high = beta.ppf(1.0 - tail, held + 1.0, count - held) if held < count - 0.5 else 1.0
+    return max(min(middle - error, float(low)), 0.0), min(max(middle + error, float(high)), 1.0)
 
 
 def by_band(trials: Sequence[Trial], *, level: int, confidence: float) -> list[Covered]:

@@ -69,3 +69,13 @@ def test_angles_of_two_gaussian_components_reach_their_95_percent(rng):
     # 4 sigma of the share
     assert np.mean(angle <= half_68) == pytest.approx(0.6827, abs=0.0042)
     assert np.mean(angle <= RAYLEIGH_95 * half_68) == pytest.approx(0.95, abs=0.002)
+
+
+def test_a_few_truths_that_all_lie_inside_leave_the_coverage_open():
+    """Two subjects with two truths each, all inside: that is no proof of 95 % or more."""
+    trials = [Trial("x", str(k), "any", np.array([0.1, 0.2]), 1.0, "s", 1.96) for k in range(2)]
+    row = pooled(trials, level=68, confidence=0.95)
+    assert row.verdict == "open"
+    assert row.interval == pytest.approx((0.025**0.25, 1.0))  # all of four: tail = low^4
+    many = [Trial("x", str(k), "any", np.full(500, 0.1), 1.0, "s", 1.96) for k in range(2)]
+    assert pooled(many, level=68, confidence=0.95).verdict == "missed"
