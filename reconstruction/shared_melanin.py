@@ -204,13 +204,15 @@ def weigh(
     fixed = (np.ascontiguousarray(begin, np.float32),
              np.where(np.isfinite(stderr), stderr, 0.0).astype(np.float32))  # fmt: skip
 
+    weighed_by = np.ascontiguousarray(without_brightness(common))
+
     def fit(log_change: Map, stiffness: Map) -> tuple[Map, Map]:
         pixels = mean.shape[0]
         of_pixels = np.empty((len(kernels.PIXEL_MAPS), pixels), np.float32)
         of_states = np.empty((len(kernels.STATE_MAPS), states, pixels), np.float32)
         kernels.blood_of_states(
             log_rgb, relative, good, mean, log_change, stiffness, *fixed,
-            np.ascontiguousarray(without_brightness(common)), own, cells,
+            weighed_by, own, cells,
             float(ends[0]), float(ends[1]), reference % states, of_pixels, of_states, _TASK_PIXELS,
         )  # fmt: skip
         return of_pixels, of_states

@@ -162,27 +162,21 @@ def compare(
     HeldOut or None
         None where one of the two lacks what it takes.
     """
-    basis = basis_of(appearance)
-    if basis is None or TEST_FILE not in truth.files or "r_d" not in appearance.maps:
+    held = _held_by(appearance, truth)
+    if held is None or not held[1].size:
         return None
-    with np.load(io.BytesIO(truth.files[TEST_FILE]), allow_pickle=False) as stored:
-        test = {name: stored[name] for name in stored.files}
-    at = _texels_for(test["texel"], appearance, truth)
-    found = at >= 0
-    if not found.any():
-        return None
-    light, view = (test[name][found].astype(np.float64) for name in ("light", "view"))
-    true_f = test["f_r"][found].astype(np.float64)
-    predicted = predict(appearance, basis, at[found], light, view)
-    usable = (true_f > 0).all(axis=-1) & np.isfinite(predicted).all(axis=-1)
+    basis, at, test = held
+    light, true_f = test["light"], test["f_r"]
+    predicted = predict(appearance, basis, at, light, test["view"])
+    usable = np.asarray((true_f > 0).all(axis=-1) & np.isfinite(predicted).all(axis=-1))
     error = np.abs(predicted - true_f) / np.where(true_f > 0, true_f, 1.0)
     by_point = np.array(
         [np.median(e[u]) if u.any() else math.nan for e, u in zip(error, usable, strict=True)]
     )
     _, interval = metrics.median_with_interval(by_point, rng=rng)
-    shiny = usable & (test["surface"][found] > 0.5 * true_f.mean(axis=-1))
+    shiny = usable & (test["surface"] > 0.5 * true_f.mean(axis=-1))
     return HeldOut(
-        points=int(found.sum()),
+        points=at.size,
         directions=light.shape[1],
         median=float(np.median(error[usable])),
         interval=interval,
@@ -223,24 +217,48 @@ def surface_test(appearance: SkinAppearance, truth: SkinAppearance) -> SurfaceTe
     SurfaceTest or None
         None where one of the two lacks what it takes.
     """
+    held = _held_by(appearance, truth)
+    if held is None:
+        return None
+    basis, at, test = held
+    lobes, cos_light, cos_view = _lobes(appearance, basis, at, test["light"], test["view"])
+    cosine = np.where((cos_light > 0) & (cos_view > 0), cos_light, 0.0)
+    return SurfaceTest(at, lobes * cosine, test["surface"] * cosine)
+
+
+def _held_by(
+    appearance: SkinAppearance, truth: SkinAppearance
+) -> tuple[BrdfBasis, NDArray[np.intp], dict[str, Double]] | None:
+    """Return basis, texels and the test at the points that the appearance holds; None: no test."""
     basis = basis_of(appearance)
     if basis is None or TEST_FILE not in truth.files or "r_d" not in appearance.maps:
         return None
     with np.load(io.BytesIO(truth.files[TEST_FILE]), allow_pickle=False) as stored:
-        test = {name: stored[name] for name in stored.files}
-    at = _texels_for(test["texel"], appearance, truth)
-    known = at >= 0
-    at = at[known]
-    light, view = (test[name][known].astype(np.float64) for name in ("light", "view"))
-    normals = normal_at(appearance, at)
-    cos_light = np.einsum("skc,sc->sk", light, normals)
-    cos_view = np.einsum("skc,sc->sk", view, normals)
+        at = _texels_for(stored["texel"], appearance, truth)
+        known = at >= 0
+        names = ("light", "view", "f_r", "surface")
+        test = {name: stored[name][known].astype(np.float64) for name in names}
+    return basis, at[known], test
+
+
+def _lobes(
+    appearance: SkinAppearance,
+    basis: BrdfBasis,
+    texels: NDArray[np.intp],
+    light: Double,
+    view: Double,
+) -> tuple[Double, Double, Double]:
+    """Return f_r of the lobes, 1/sr, and cosines of light and view, each (S, K)."""
+    normals = normal_at(appearance, texels)
     weights = np.stack(
-        [appearance.maps[name].values.reshape(-1)[at] for name in weight_names(basis.size)], axis=-1
+        [appearance.maps[name].values.reshape(-1)[texels] for name in weight_names(basis.size)],
+        axis=-1,
     ).astype(np.float64)
-    lobes = brdf_basis.evaluate(weights[:, None], basis, light, view, normals[:, None])
-    cosine = np.where((cos_light > 0) & (cos_view > 0), cos_light, 0.0)
-    return SurfaceTest(at, lobes * cosine, test["surface"][known] * cosine)
+    return (
+        brdf_basis.evaluate(weights[:, None], basis, light, view, normals[:, None]),
+        np.einsum("skc,sc->sk", light, normals),
+        np.einsum("skc,sc->sk", view, normals),
+    )
 
 
 def predict(
@@ -263,17 +281,9 @@ def predict(
     light, view
         Unit vectors away from the surface, rig frame, shape (S, K, 3).
     """
-
-    def flat(name: str) -> Double:
-        values = appearance.maps[name].values
-        return values.reshape(-1, *values.shape[2:])[texels].astype(np.float64)
-
-    normals = normal_at(appearance, texels)
-    cos_light = np.einsum("skc,sc->sk", light, normals)
-    cos_view = np.einsum("skc,sc->sk", view, normals)
-    weights = np.stack([flat(name) for name in weight_names(basis.size)], axis=-1)
-    lobes = brdf_basis.evaluate(weights[:, None], basis, light, view, normals[:, None])
-    inside = flat("r_d")[:, None] / np.pi * transmitted(cos_light, cos_view)[..., None]
+    lobes, cos_light, cos_view = _lobes(appearance, basis, texels, light, view)
+    r_d = appearance.maps["r_d"].values.reshape(-1, 3)[texels].astype(np.float64)
+    inside = r_d[:, None] / np.pi * transmitted(cos_light, cos_view)[..., None]
     above = (cos_light > 0) & (cos_view > 0)
     return np.where(above[..., None], inside + lobes[..., None], np.nan)
 
