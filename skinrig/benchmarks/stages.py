@@ -73,6 +73,10 @@ STAGES = {
 """Module and function of each; a module is imported, and its kernels compiled, when it is run."""
 
 
+INTERRUPTED = "the run ended before it was measured"
+"""Of a stage in a document that a run left which was interrupted."""
+
+
 class BenchError(ValueError):
     """A stage that cannot be measured."""
 
@@ -120,22 +124,20 @@ def run_stages(
     BenchError
         For an unknown stage.
     """
-    chosen = list(names) if names else bench_plan.in_order(STAGES)
+    chosen = list(dict.fromkeys(names)) if names else bench_plan.in_order(STAGES)
     for name in chosen:
         if name not in STAGES:
             raise BenchError(f"stage: got {name!r}, expected one of {', '.join(STAGES)}")
-    run = _Run(console, time.perf_counter() + budget_s, asked=bool(names))
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)  # a folder that cannot be is told before the work
+    run = _Run(console, time.perf_counter() + budget_s, asked=bool(names), toy=toy, out=out)
+    run.to_do = list(chosen)
     small = toy or not names
     for name in chosen:
         run.measure(name, "small" if small else "full")
     if small and not toy:
         run.enlarge()
     document = run.document()
-    document["toy"] = toy
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(plain(document), indent=1, sort_keys=True)
-        bench_table.write_whole(out / "bench.json", text + "\n")
     bench_table.show(document, console)
     return document
 
@@ -152,6 +154,11 @@ class _Run:
     """When the budget ends, by `time.perf_counter`."""
     asked: bool
     """Whether stages were asked for by name: then what they need must be there."""
+    toy: bool = False
+    out: Path | None = None
+    """Where the document is kept, stage by stage; None: nowhere."""
+    to_do: list[str] = field(default_factory=list)
+    """What is still to be measured for the first time."""
     done: dict[str, StageBenchmark] = field(default_factory=dict)
     size: dict[str, Size] = field(default_factory=dict)
     compile_s: dict[str, float] = field(default_factory=dict)
@@ -160,9 +167,22 @@ class _Run:
     def measure(self, name: str, size: Size) -> float:
         """Measure a stage, if there is time, and return the seconds that it took."""
         began = time.perf_counter()
+        self._measure(name, size, began)
+        if name in self.to_do:
+            self.to_do.remove(name)
+        self.keep()
+        return time.perf_counter() - began
+
+    def keep(self) -> None:
+        """Write what there is: a run that is interrupted leaves what it measured."""
+        if self.out is not None:
+            text = json.dumps(plain(self.document()), indent=1, sort_keys=True)
+            bench_table.write_whole(self.out / "bench.json", text + "\n")
+
+    def _measure(self, name: str, size: Size, began: float) -> None:
         if began > self.until_s:
             self.left_out.append((name, "the budget was used up"))
-            return 0.0
+            return
         self.console.progress(f"bench {name}, {size} size")
         try:
             made = _function(name)(toy=size == "small")
@@ -170,13 +190,12 @@ class _Run:
             if self.asked or exit_code(error) != EXTRA_MISSING:
                 raise
             self.left_out.append((name, sentence(error)))
-            return 0.0
+            return
         # the first time that its kernels are called; later ones find them compiled
         self.compile_s.setdefault(
             name, sum(max(p.timing.cold_s - p.timing.seconds, 0.0) for p in made.points)
         )
         self.done[name], self.size[name] = made, size
-        return time.perf_counter() - began
 
     def enlarge(self) -> None:
         """Measure again at full size what fits into the rest of the budget."""
@@ -190,7 +209,9 @@ class _Run:
     def document(self) -> dict[str, Any]:
         """Return the document of the run."""
         document = to_document(list(self.done.values()))
+        document["toy"] = self.toy
         document["left_out"] = [list(item) for item in self.left_out]
+        document["left_out"] += [[name, INTERRUPTED] for name in self.to_do]
         document["not_judged"] = [name for name, size in self.size.items() if size == "small"]
         for name, made in self.done.items():
             stage = document["stages"][made.name]

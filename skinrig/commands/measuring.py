@@ -14,13 +14,18 @@ from skinrig.commands.options import (
 )
 from skinrig.console import Console
 
+BUDGET_S = 600.0
+"""Seconds of a benchmark that names none."""
+
 
 def bench(
     stage: Annotated[
         list[str] | None,
         typer.Option(help="Stage; repeatable; default all.", autocompletion=completion.stages),
     ] = None,
-    budget: Annotated[float, typer.Option(help="Seconds to spend, about.")] = 600.0,
+    budget: Annotated[
+        float | None, typer.Option(help="Seconds to spend, about; default 600.", show_default=False)
+    ] = None,
     toy: Annotated[bool, typer.Option("--toy", help="Smallest sizes, no limits judged.")] = False,
     extremes: Annotated[
         bool, typer.Option("--extremes", help="Try stiff and extreme cases instead.")
@@ -43,6 +48,10 @@ def bench(
     Example: skinrig bench --extremes
     """
     console = Console(json)
+    if extremes and (toy or budget is not None):
+        what = "--toy" if toy else "--budget"
+        raise errors.UsageError(f"{what}: cases of --extremes have one size each; leave it out")
+    budget = BUDGET_S if budget is None else budget
     if not budget > 0:
         raise errors.UsageError(f"--budget: got {budget:g}, expected seconds above 0")
     if out is not None and out.exists() and not out.is_dir():

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from skinrig.benchmarks.table import write_whole
 from skinrig.console import Console, plain
 from skinrig.extremes.cases import PRECISIONS, SCHEMA, run_cases, to_document
 from skinrig.reporting import page
@@ -33,6 +34,8 @@ def run_extremes(
     ValueError
         For a stage without cases.
     """
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)  # a folder that cannot be is told before the work
     document = to_document(
         run_cases(stages, progress=lambda name: console.progress(f"extreme: {name}"))
     )
@@ -47,9 +50,8 @@ def run_extremes(
     failed = sum(not case["passed"] for case in document["cases"])
     console.say(f"{len(document['cases'])} extremes, {failed or 'none'} failed")
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         text = json.dumps(plain(document), indent=1, sort_keys=True)
-        (out / "extremes.json").write_text(text + "\n", encoding="utf-8")
+        write_whole(out / "extremes.json", text + "\n")
     return document
 
 

@@ -231,6 +231,8 @@ def test_none_of_something_is_not_taken_for_the_default(option, tmp_path, capsys
     ("order", "words"),
     [
         (["bench", "--budget", "-1"], "--budget: got -1, expected seconds above 0"),
+        (["bench", "--extremes", "--toy"], "--toy: cases of --extremes have one size each"),
+        (["bench", "--extremes", "--budget", "5"], "--budget: cases of --extremes have one size"),
         (["bench", "--budget", "nan"], "--budget: got nan, expected seconds above 0"),
         (["bench", "--out", "FILE"], "is a file, expected a folder"),
         (["plan", "flash", "--valid-share", "7"], "--valid-share: got 7, expected above 0"),

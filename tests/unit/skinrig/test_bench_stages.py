@@ -1,6 +1,7 @@
 """How a run spends its budget, on stages that take no time."""
 
 import csv
+import json
 from types import SimpleNamespace
 
 import pytest
@@ -99,6 +100,32 @@ def test_a_stage_whose_optional_part_is_missing_is_left_out_unless_asked_for(cal
     assert list(document["stages"]) == ["b", "c"]
     with pytest.raises(MissingExtra):
         run(600.0, ["a"])
+
+
+def test_a_run_that_is_interrupted_leaves_what_it_measured(calls, tmp_path, capsys):
+    calls[0]["b"] = stage("b", calls, error=KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        run(600.0, ["a", "b", "c"], out=tmp_path)
+    kept = json.loads((tmp_path / "bench.json").read_text())
+    assert list(kept["stages"]) == ["a"]
+    assert kept["left_out"] == [[name, bench_stages.INTERRUPTED] for name in ("b", "c")]
+    calls[0]["b"] = stage("b", calls)
+    run(600.0, ["a", "b", "c"], out=tmp_path)
+    whole = json.loads((tmp_path / "bench.json").read_text())
+    assert set(whole["stages"]) == set(NAMES)
+    assert whole["left_out"] == []
+
+
+def test_a_folder_that_cannot_be_made_is_told_before_anything_is_measured(calls, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file"):
+        run(600.0, ["a"], out=tmp_path / "file" / "bench")
+    assert calls[1:] == []
+
+
+def test_a_stage_that_is_named_twice_is_measured_once(calls, capsys):
+    run(600.0, ["a", "b", "a"])
+    assert calls[1:] == [("a", "full"), ("b", "full")]
 
 
 def test_a_table_of_all_points_and_a_plot_a_stage_are_written(calls, tmp_path, capsys):
