@@ -67,6 +67,9 @@ class CameraBody:
         Where it stands.
     view
         What it is.
+    first_shot
+        Number of its next shot, >= 0. It seeds the noise, so that no two shots may share one: a
+        camera that goes on where another world's ended goes on counting, too.
 
     Attributes
     ----------
@@ -74,7 +77,7 @@ class CameraBody:
         Triggers that came while it was not armed or busy.
     """
 
-    def __init__(self, world: World, view: View) -> None:
+    def __init__(self, world: World, view: View, *, first_shot: int = 0) -> None:
         self.world = world
         self.view = view
         self.exposure = Exposure(0.01, 100)
@@ -83,7 +86,7 @@ class CameraBody:
         self._armed = 0
         self._trigger = Trigger.SOFTWARE
         self._seq = 0
-        self._shots = 0
+        self._shots = first_shot
         self._busy_until = -math.inf
         self._waiting: deque[_Shot] = deque()
         self._previous: _Shot | None = None

@@ -15,7 +15,7 @@ import time
 import zlib
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar, cast
 
 import numpy as np
@@ -148,6 +148,9 @@ class World:
         What the cameras see; without one, frames hold black level and read noise.
     faults
         What goes wrong; by default nothing.
+    shots_made
+        How many shots cameras have made before, by view, in another world of the same seed: their
+        noise must not come again.
 
     Attributes
     ----------
@@ -177,6 +180,7 @@ class World:
         clock: Literal["virtual", "real"] = "virtual",
         scene: Scene | CaliperScene | ProbeScene | None = None,
         faults: Faults | None = None,
+        shots_made: Mapping[str, int] | None = None,
     ) -> None:
         if clock not in ("virtual", "real"):
             raise ValueError(f"clock: got {clock!r}, expected 'virtual' or 'real'")
@@ -212,6 +216,7 @@ class World:
         self._started = time.monotonic()
         self._now = 0.0
         self._name = ""
+        self._shots_made = dict(shots_made or {})
         self._cameras: dict[str, CameraBody] = {}
         self._dome: DomeUnit | None = None
         self._sphere: GradientSphereUnit | None = None
@@ -389,7 +394,10 @@ class World:
 
         with self.lock:
             if view_name not in self._cameras:
-                self._cameras[view_name] = CameraBody(self, self.rig.view(view_name))
+                first = self._shots_made.get(view_name, 0)
+                self._cameras[view_name] = CameraBody(
+                    self, self.rig.view(view_name), first_shot=first
+                )
             return self._cameras[view_name]
 
     def _trigger(self, now: float, mask: int = -1) -> None:

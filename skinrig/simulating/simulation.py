@@ -23,6 +23,7 @@ from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject
 from skinrig.sequences import SequenceOrder
+from skinrig.simulating.shot_numbers import shots_made
 
 RIGS = ("flash", "dome", "gradient", "probe")
 BOXES: Mapping[str, type[Box]] = {
@@ -396,7 +397,7 @@ def drive(
     """
     from rigsim.world import World
 
-    world = World(rig, seed=seed, clock="virtual", scene=scene)
+    world = World(rig, seed=seed, clock="virtual", scene=scene, shots_made=shots_made(session))
     name = world.register(session.id)
     boxes = {
         # a number of fixed length: with drawn ones the lines would take a little longer or shorter
