@@ -23,6 +23,9 @@ from skinrig.simulating.simulation import truth_folder
 MOST_AT_ONCE = 2
 """Rigs that run side by side: much of each is the work of one core, or waits for a compiler."""
 LONGEST_FIRST = ("gradient", "dome", "flash", "probe")
+SLEEPING_THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}
+"""Environment of rigs side by side, where the user has not set it. Threads that spin as they wait
+take the core of the other rig; libraries read it when they are loaded."""
 Shares = dict[str, float]
 
 
@@ -135,7 +138,8 @@ def _side_by_side(rigs: Sequence[str], order: _Order, at_once: int) -> _Parts:
     )
     first = sorted(rigs, key=lambda rig: LONGEST_FIRST.index(rig) if rig in LONGEST_FIRST else 0)
     try:
-        futures = {rig: pool.submit(_run_rig, rig, *order) for rig in first}
+        with _environment(SLEEPING_THREADS):  # processes start as their work is handed in
+            futures = {rig: pool.submit(_run_rig, rig, *order) for rig in first}
         wait(futures.values(), return_when=FIRST_EXCEPTION)
         failed = [f for f in futures.values() if f.done() and f.exception() is not None]
         if failed:
@@ -148,6 +152,18 @@ def _side_by_side(rigs: Sequence[str], order: _Order, at_once: int) -> _Parts:
         raise
     finally:
         pool.shutdown()
+
+
+@contextmanager
+def _environment(defaults: Mapping[str, str]) -> Iterator[None]:
+    """Set variables that are not set, for processes that start meanwhile."""
+    added = {name: value for name, value in defaults.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            os.environ.pop(name, None)
 
 
 def _die_when_interrupted() -> None:

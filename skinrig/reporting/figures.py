@@ -34,8 +34,11 @@ def canvas(width_in: float, height_in: float) -> tuple[Any, Any]:
 
 def finished(figure: Any, alt: str) -> str:
     """Return a figure as SVG text, with ``alt`` for those who do not see it."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    # savefig would draw twice, the first time for the layout, which the one drawing finds as well
+    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
     return svg.simplified(buffer.getvalue(), alt=alt)
 
 

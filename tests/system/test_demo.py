@@ -2,9 +2,11 @@
 
 import json
 import multiprocessing
+import os
 
 import pytest
 
+from skinrig import demo
 from skinrig.cli import main
 from skinrig.console import Console
 from skinrig.demo import RIGS, DemoError, run_demo
@@ -52,6 +54,21 @@ def test_an_error_in_one_of_two_rigs_side_by_side_is_that_rigs_own(tmp_path):
     with pytest.raises(SimulationError, match="width"):
         run_demo(tmp_path / "demo", ["flash", "dome"], console=Console(False), width_px=4, jobs=2)
     assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize(("own", "expected"), [(None, "1"), ("3", "3")])
+def test_threads_of_rigs_side_by_side_wait_asleep_but_as_the_user_has_set(
+    own, expected, monkeypatch
+):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    if own is not None:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", own)
+    monkeypatch.setattr(demo, "_run_rig", os.getenv)  # a process says what it was given
+    names = ["OMP_WAIT_POLICY", "OPENBLAS_NUM_THREADS"]
+    given = demo._side_by_side(names, ("not set",), 2)
+    assert given == {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": expected}
+    assert [os.environ.get(name) for name in names] == [None, own]
 
 
 def shown(out, capsys):
