@@ -4,7 +4,8 @@ Nagano et al. 2015 (doi 10.1145/2766894) take the stretch ratio from the caliper
 slips, so here it is the skin's own: an affine map between two pictures of its pigment, first by
 maximizing the enhanced correlation coefficient (Evangelidis and Psarakis 2008,
 doi 10.1109/TPAMI.2008.113) over a pyramid, then by least squares on many small windows that were
-followed separately, whose scatter gives the standard errors.
+followed separately, whose scatter, as alike as it is in neighbors, gives the standard errors
+(`reconstruction.affine_fit`).
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from reconstruction.affine_fit import fit_affine
 from reconstruction.registration import RegistrationError, evened, textured, track
 
 Floats = NDArray[np.float64]
@@ -272,7 +273,6 @@ def _by_windows(
     """Follow windows of the first picture into the second, warped back, and fit all of them."""
     shape = one.shape[0], one.shape[1]
     size = shape[1], shape[0]
-    # windows that do not overlap have errors of their own
     grid = np.stack(np.meshgrid(np.arange(0, shape[1], 3), np.arange(0, shape[0], 3)), axis=-1)
     candidates = grid.reshape(-1, 2).astype(np.float64)
     eroded = cv2.erode(mask.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8))
@@ -291,7 +291,7 @@ def _by_windows(
         tracks = track(one, back, start, window_px=WINDOW_PX, levels=2 if number == 0 else 0)
         inside = seen[start[:, 1].astype(int), start[:, 0].astype(int)] > 0
         good = tracks.valid & inside
-        fit = _fit(start[good], tracks.points_px[good], shape)
+        fit = _fit(start[good], tracks.points_px[good], shape, last=number == ROUNDS - 1)
         if fit is None:
             gradient, shift = _from_pixels(affine, shape)
             return Strain(
@@ -308,9 +308,9 @@ def _by_windows(
 
 
 def _fit(
-    start: Floats, found: Floats, shape: tuple[int, int]
+    start: Floats, found: Floats, shape: tuple[int, int], *, last: bool
 ) -> tuple[Floats, Floats, float, int] | None:
-    """Fit an affine map by least squares without outliers.
+    """Fit an affine map to what is no outlier: by least squares, or with its errors when `last`.
 
     Returns
     -------
@@ -336,31 +336,17 @@ def _fit(
         keep = now
     if keep.sum() < LEAST_WINDOWS:
         return None
+    design = np.column_stack([start[keep] - middle, np.ones(keep.sum())])
+    covariance = np.full((6, 6), np.inf)
+    if last:
+        solution, covariance = fit_affine(
+            start[keep] - middle, found[keep] - middle, window_px=WINDOW_PX
+        )
     linear, offset = solution[:2].T, solution[2]
-    rest = (found - middle - everywhere)[keep]
-    free = keep.sum() - 3
-    scatter = rest.T @ rest / free * _shared(start[keep], rest)
-    inverse = np.linalg.inv(design.T @ design)
-    covariance = np.zeros((6, 6))
-    for i in range(2):
-        for j in range(2):
-            covariance[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] = scatter[i, j] * inverse[:2, :2]
-            covariance[2 * i : 2 * i + 2, 4 + j] = scatter[i, j] * inverse[:2, 2]
-            covariance[4 + j, 2 * i : 2 * i + 2] = scatter[i, j] * inverse[:2, 2]
-            covariance[4 + i, 4 + j] = scatter[i, j] * inverse[2, 2]
+    rest = found[keep] - middle - design @ solution
     affine = np.column_stack([linear, middle + offset - linear @ middle])
     residual = float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
     return affine, covariance, residual, int(keep.sum())
-
-
-def _shared(places: Floats, rest: Floats) -> float:
-    """Return by how much the variance of a fit grows because neighbors share what they look at."""
-    pairs = cKDTree(places).query_pairs(1.5 * WINDOW_PX, output_type="ndarray")
-    if not len(pairs):
-        return 1.0
-    alike = float(np.mean(np.sum(rest[pairs[:, 0]] * rest[pairs[:, 1]], axis=1)))
-    alike /= max(float(np.mean(np.sum(rest**2, axis=1))), 1e-30)
-    return max(1.0, 1.0 + 2.0 * len(pairs) / len(places) * alike)
 
 
 def _carry(covariance: Floats, linear: Floats) -> Floats:

@@ -1,0 +1,111 @@
+"""An affine map through displaced windows whose deviations from it are alike in neighbors.
+
+Skin is stiffer here than there, so that its parts move less or more than the mean stretch says;
+what a window is off the affine map, the next one is off, too. Of such deviations a map of a small
+patch cannot be told from a larger stretch, and their scatter alone says too little of it: the fit
+has taken part of them. So they are taken for a random field of unknown strength and reach plus an
+error of each window's own, and the map's error is what such fields do to it (generalized least
+squares with the field's parameters integrated out; Handcock and Stein 1993,
+doi:10.1080/00401706.1993.10485354).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+Floats = NDArray[np.float64]
+
+REACHES = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
+"""Lengths over which deviations are alike, in windows. What is finer a window averages; what is
+longer moves a picture of a few windows as a whole and is no scatter in it. On simulated skin (seeds
+0 to 8) windows' displacements are alike over 0.8 to 1.2 windows of 150 um."""
+SHARES = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
+"""Of the deviations' variance, what neighbors have in common."""
+
+
+def fit_affine(places: Floats, found: Floats, *, window_px: float) -> tuple[Floats, Floats]:
+    """Fit an affine map to displaced points, with its covariance.
+
+    Parameters
+    ----------
+    places : ndarray, shape (N, 2)
+        Points of the first picture about its middle, px; at least 7, not on a line.
+    found : ndarray, shape (N, 2)
+        Where they are in the second, px.
+    window_px : float
+        Side of the windows that were followed: the unit of `REACHES`.
+
+    Returns
+    -------
+    map : ndarray of float64, shape (3, 2)
+        Linear part (transposed) over the shift: ``[x, y, 1] @ map`` is the place found.
+    covariance : ndarray of float64, shape (6, 6)
+        Of the linear part row by row, then of the shift of the middle, px.
+
+    Raises
+    ------
+    ValueError
+        For fewer points, or points on a line.
+
+    Examples
+    --------
+    >>> grid = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), -1).reshape(-1, 2)
+    >>> solution, _ = fit_affine(grid, grid * [1.1, 0.9] + 2.0, window_px=1.0)
+    >>> (solution.round(6) + 0.0).tolist()
+    [[1.1, 0.0], [0.0, 0.9], [2.0, 2.0]]
+    """
+    count = len(places)
+    design = np.column_stack([places, np.ones(count)])
+    if count < 7 or np.linalg.matrix_rank(design) < 3:
+        raise ValueError(f"places: got {count} points, expected at least 7, not all on one line")
+    apart = np.linalg.norm(places[:, None] - places[None], axis=-1) / window_px
+    free = count - 3
+    kept: list[tuple[float, Floats, Floats, Floats]] = []
+    for reach in REACHES:
+        alike = _correlation(apart / reach)
+        for share in SHARES:
+            if share == 0.0 and reach != REACHES[0]:
+                continue  # without a field its reach does not matter
+            kept.append(_given(design, found, share * alike + (1.0 - share) * np.eye(count)))
+    log = np.array([each[0] for each in kept])
+    # the case without a field stands for all reaches
+    log[0] += np.log(len(REACHES))
+    weight = np.exp(log - log.max())
+    weight /= weight.sum()
+    solution = np.einsum("k,kij->ij", weight, np.array([each[1] for each in kept]))
+    total = np.zeros((6, 6))
+    for share_of, (_, one, inverse, scatter) in zip(weight, kept, strict=True):
+        # mean of an inverse Wishart of two coordinates
+        total += share_of * np.kron(scatter / max(free - 3, 1), inverse)
+        way = (one - solution).T.ravel()
+        total += share_of * np.outer(way, way)
+    # coordinate by coordinate (x, y, 1 of the first, then of the second) to linear part and shift
+    order = [0, 1, 3, 4, 2, 5]
+    return solution, total[np.ix_(order, order)]
+
+
+def _correlation(distance: Floats) -> Floats:
+    """Return a Gaussian correlation: a window's displacement is a mean over smooth ones."""
+    return np.exp(-(distance**2))
+
+
+def _given(
+    design: Floats, found: Floats, correlation: Floats
+) -> tuple[float, Floats, Floats, Floats]:
+    """Return log evidence, map, inverse information, and sums of squares of one correlation."""
+    lower = np.linalg.cholesky(correlation + 1e-9 * np.eye(len(design)))
+    white = solve_triangular(
+        lower, np.column_stack([design, found]), lower=True, check_finite=False
+    )
+    a, b = white[:, :3], white[:, 3:]
+    information = a.T @ a
+    solution = np.linalg.solve(information, a.T @ b)
+    rest = b - a @ solution
+    scatter = rest.T @ rest + 1e-18 * np.eye(2)
+    free = len(design) - 3
+    log = -2.0 * float(np.log(np.diag(lower)).sum())
+    log -= float(np.linalg.slogdet(information)[1])
+    log -= 0.5 * free * float(np.linalg.slogdet(scatter)[1])
+    return log, solution, np.linalg.inv(information), scatter
