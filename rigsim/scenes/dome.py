@@ -17,10 +17,7 @@ responses that differ, dead LEDs and crossed wires.
 
 from __future__ import annotations
 
-import dataclasses
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,66 +26,26 @@ from capture.rig import Light, Rig, RigError, View
 from model import spectra
 from model.skin import SkinAppearance
 from rigsim import skin_conditions, surface_brdf
-from rigsim.atlas import sample, spread, unwrap
+from rigsim.atlas import sample, spread
 from rigsim.dome_build import BuiltDome
 from rigsim.head_motion import HeadMotion
-from rigsim.led_light import lobe_exponent, white_intensity
+from rigsim.led_light import white_intensity
 from rigsim.mesh import Float32Array
 from rigsim.relief_shadow import ReliefShadow
 from rigsim.render import Caster
 from rigsim.scene_needs import Noise, SceneNeeds
 from rigsim.scenes import dome_truth, dome_views, flash_needs, olat
+from rigsim.scenes.dome_exposures import Exposures, Pulse, SceneError
+from rigsim.scenes.dome_glow import DomeGlow
 from rigsim.scenes.dome_needs import dome_needs, noise_of
+from rigsim.scenes.dome_rows import DomeRows
 from rigsim.scenes.flash_needs import BOUNCES, LATERAL, LENS, SPECTRAL, WRINKLES
 from rigsim.scenes.olat import Hits, Lamp
-from rigsim.scenes.olat_vector import VectorLight
-from rigsim.sensor import Sensor, expose, sensor_of
-from rigsim.skin_bleeding import SkinBleeding
-from rigsim.skin_bounce import SkinBounce, bounce_on
+from rigsim.sensor import Sensor, sensor_of
 from rigsim.subject import Subject
 from rigsim.surface_brdf import SkinSurface, skin_surface
 from rigsim.targets import Target
 from rigsim.variant import VariantChoice
-
-Float16Array = NDArray[np.float16]
-
-POWER_DEVIATION: Final = 0.001
-"""Relative standard deviation of an LED's energy from pulse to pulse."""
-
-KEPT_FRAMES: Final = 16
-KEPT_BYTES: Final = 2**28
-"""Latest frames that are kept, the more of the two, so that a second exposure costs nothing."""
-
-KEPT_GLOW_BYTES: Final = 2**29
-"""Latest light from inside that is kept: it is the same for all cameras, which ask one after the
-other for many lights."""
-
-HALF_RANGE: Final = 1000.0
-"""Its greatest value where it is kept with 11 bits, which resolve 1e-10 of that."""
-
-
-class SceneError(ValueError):
-    """A scene is asked for something that it does not hold."""
-
-
-class Pulse(Protocol):
-    """A lit LED, as the world reports it, clipped to the exposure."""
-
-    @property
-    def led(self) -> int:
-        """Index of the light in the rig."""
-
-    @property
-    def level(self) -> float:
-        """Fraction of full power, 0 to 1."""
-
-    @property
-    def t_on_s(self) -> float:
-        """World time at which it went on, s."""
-
-    @property
-    def t_off_s(self) -> float:
-        """World time at which it went off, s."""
 
 
 class DomeScene:
@@ -195,14 +152,7 @@ class DomeScene:
         self._caster = Caster(subject.mesh, choice=choice)
         self._surfaces: dict[str, SkinSurface] = {}
         self._textures: dict[str, Float32Array] = {}
-        self._hits: OrderedDict[tuple[str, float], tuple[Hits, Caster]] = OrderedDict()
-        self._bounce: SkinBounce | None = None
-        self._bleeding: dict[str, SkinBleeding] = {}
-        self._glow: OrderedDict[tuple[str, int, float], tuple[np.float32, Float16Array]] = (
-            OrderedDict()
-        )
-        self._vector: dict[tuple[str, float], VectorLight] = {}
-        self._frames: OrderedDict[tuple[str, int, float], Float32Array] = OrderedDict()
+        self._exposures = Exposures(dome, seed=seed)
         self.needs: SceneNeeds = dome_needs(
             rig,
             subject,
@@ -221,13 +171,33 @@ class DomeScene:
         )
         """What is built, what is not, and why."""
         self.interreflections = self.needs.builds(BOUNCES)
-        summed = flash_needs.last_bounce(self.needs[BOUNCES].over_noise or 0.0)
-        self._last_bounce = summed if last_bounce is None else last_bounce
         self.subsurface = self.needs.builds(LATERAL)
         self.optics = self.needs.builds(LENS)
         self._relief: ReliefShadow | None = None
         if isinstance(subject, Subject) and self.needs.builds(WRINKLES):
             self._relief = ReliefShadow(subject)
+        summed = flash_needs.last_bounce(self.needs[BOUNCES].over_noise or 0.0)
+        self._glow: DomeGlow | None = None
+        if isinstance(subject, Subject) and (self.subsurface or self.interreflections):
+            self._glow = DomeGlow(
+                subject,
+                self._caster,
+                illuminant=self._illuminant,
+                subsurface=self.subsurface,
+                interreflections=self.interreflections,
+                spectral=self.interreflections and self.needs.builds(SPECTRAL),
+                enough=summed if last_bounce is None else last_bounce,
+                relief=self._relief,
+            )
+        self._rows = DomeRows(
+            dome,
+            subject,
+            self._caster,
+            motion=motion,
+            illuminant=self._illuminant,
+            optics=self.optics,
+            subpixels=subpixels,
+        )
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
@@ -289,10 +259,10 @@ class DomeScene:
         view = self._view(view_name)
         chosen = range(len(self.rig.lights)) if lights is None else lights
         if len(chosen) == 1:  # the usual stream, one light after the other, is not copied
-            return self._render(view, chosen[0], self._instant(t_s))[None]
+            return self._render(view, chosen[0], self._rows.instant(t_s))[None]
         out = np.empty((len(chosen), view.height_px, view.width_px, 3), np.float32)
         for k, light in enumerate(chosen):
-            out[k] = self._render(view, light, self._instant(t_s))
+            out[k] = self._render(view, light, self._rows.instant(t_s))
         return out
 
     def exposure(
@@ -317,23 +287,10 @@ class DomeScene:
             Raw DN, shape (H, W).
         """
         view = self._view(view_name)
-        rng = np.random.default_rng([self.seed, seed])
-        light = np.zeros((view.height_px, view.width_px, 3), np.float32)
-        for pulse in pops:
-            if not 0.0 <= pulse.level <= 1.0:
-                raise SceneError(f"level of LED {pulse.led}: got {pulse.level}, expected 0 to 1")
-            if not pulse.t_off_s >= pulse.t_on_s:
-                raise SceneError(
-                    f"pulse of LED {pulse.led}: got {pulse.t_on_s} to {pulse.t_off_s} s, "
-                    "expected an end after its beginning"
-                )
-            on_s = pulse.level * (pulse.t_off_s - pulse.t_on_s)
-            energy = on_s * (1.0 + POWER_DEVIATION * rng.standard_normal())
-            if energy > 0.0:
-                middle = 0.5 * (pulse.t_on_s + pulse.t_off_s)
-                led = self.dome.answering(pulse.led)
-                light += np.float32(energy) * self._frame(view, led, middle)
-        return expose(light, sensor=self._sensors[view.name], rng=rng, exposure_s=exposure_s)
+        return self._exposures.expose(
+            view, self._sensors[view.name], self._render, pops=pops, exposure_s=exposure_s,
+            seed=seed, instant=self._rows.instant,
+        )  # fmt: skip
 
     # truth ------------------------------------------------------------------------------------
 
@@ -364,7 +321,7 @@ class DomeScene:
             A target stands there; only faces have these maps.
         """
         self._face()
-        hits, _ = self._seen(self._view(view_name), 0.0)
+        hits, _ = self._rows.seen(self._view(view_name), 0.0, self._texture)
         return dome_truth.maps_of(hits)
 
     def truth_appearance(self, view_name: str | None = None) -> SkinAppearance:
@@ -462,46 +419,26 @@ class DomeScene:
             self._textures[camera] = spread(layers, atlas.covered)
         return self._textures[camera]
 
-    def _frame(self, view: View, light: int, t_s: float) -> Float32Array:
-        key = (view.name, light, self._instant(t_s))
-        if key not in self._frames:
-            # a capture comes back to each light in its next pass
-            most = max(KEPT_FRAMES, KEPT_BYTES // (12 * view.width_px * view.height_px))
-            while len(self._frames) >= most:
-                self._frames.popitem(last=False)
-            self._frames[key] = self._render(view, light, key[2])
-        self._frames.move_to_end(key)
-        return self._frames[key]
-
-    def _instant(self, t_s: float) -> float:
-        """Return the time that decides how the scene stands, s."""
-        if self.motion is None or not isinstance(self.subject, Subject):
-            return 0.0
-        return round(t_s, 4)
-
     def _render(self, view: View, light: int, t_s: float) -> Float32Array:
         if not 0 <= light < len(self.rig.lights):
             raise SceneError(f"light: got {light}, expected 0 to {len(self.rig.lights) - 1}")
         shape = (view.height_px, view.width_px, 3)
         if isinstance(self.subject, Target) and self.subject.kind == "cap":
             return np.zeros(shape, np.float32)
-        hits, caster = self._seen(view, t_s)
-        lamp = self._lamp(light, t_s)
+        hits, caster = self._rows.seen(view, t_s, self._texture)
+        lamp = self._rows.lamp(light, t_s)
         gain = np.float32(self.dome.gain.get(view.name, 1.0))
         color = gain * self.intensity(light, view_name=view.name)
-        glow = self._glow_of(view, light, t_s, hits)
+        glow = None
+        if self._glow is not None and hits.kind == olat.SKIN:
+            glow = self._glow.on_rows(hits, lamp, view, self.surface, light=light, t_s=t_s)
         diffuse = not (self.subsurface and glow is not None)
         relief = self._relief_of(hits, lamp)
         if hits.kind == olat.SKIN and caster.scene is not None:
-            if (view.name, t_s) not in self._vector:
-                self._vector[view.name, t_s] = VectorLight(hits, caster)
-            image = self._vector[view.name, t_s].light_up(
-                lamp, color, glow, diffuse=diffuse, relief=relief
-            )
-        else:
-            visible = olat.seen_from(hits, caster, lamp)
-            image = olat.light_up(hits, lamp, visible, color, glow, diffuse=diffuse, relief=relief)
-        return image
+            rows = self._rows.vector_light(view, t_s, hits, caster)
+            return rows.light_up(lamp, color, glow, diffuse=diffuse, relief=relief)
+        visible = olat.seen_from(hits, caster, lamp)
+        return olat.light_up(hits, lamp, visible, color, glow, diffuse=diffuse, relief=relief)
 
     def _relief_of(self, hits: Hits, lamp: Lamp) -> Float32Array | None:
         """Return which part of a light the texture's relief leaves to each row."""
@@ -510,99 +447,7 @@ class DomeScene:
         uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
         return self._relief.seen(uv, hits.position_mm, lamp.position_mm, radius_mm=lamp.radius_mm)
 
-    def _glow_of(self, view: View, light: int, t_s: float, hits: Hits) -> Float32Array | None:
-        """Return what leaves the interior of the rows besides their own diffuse term."""
-        if not (self.subsurface or self.interreflections) or hits.kind != olat.SKIN:
-            return None
-        camera = view.spectral_sensitivity
-        if camera not in self._bleeding:
-            if self.interreflections and self._bounce is None:
-                self._bounce = bounce_on(self._caster)
-            self._bleeding[camera] = SkinBleeding(
-                self._face(),
-                self.surface(view),
-                self._caster,
-                camera=camera,
-                light=self._illuminant,
-                subsurface=self.subsurface,
-                bounce=self._bounce,
-                spectral=self.interreflections and self.needs.builds(SPECTRAL),
-                enough=self._last_bounce,
-                relief=self._relief,
-            )
-        key = (camera, light, t_s)
-        if key not in self._glow:
-            glow = self._bleeding[camera].glow(self._lamp(light, t_s))
-            most = max(1, KEPT_GLOW_BYTES // (2 * glow.size))
-            while len(self._glow) >= most:
-                self._glow.popitem(last=False)
-            unit = np.float32(max(float(glow.max()), 1e-30) / HALF_RANGE)
-            self._glow[key] = unit, np.asarray(glow / unit, np.float16)
-        self._glow.move_to_end(key)
-        unit, kept = self._glow[key]
-        uv = np.asarray(hits.uv, np.float32) / np.float32(olat.FULL)
-        return unit * sample(kept.astype(np.float32), uv, np.ones(len(uv), np.bool_))
-
-    def _pose(self, t_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        if self.motion is None or not isinstance(self.subject, Subject):
-            return np.eye(3), np.zeros(3)
-        return self.motion.pose(t_s)
-
-    def _lamp(self, light: int, t_s: float) -> Lamp:
-        """Return a light in the frame of the mesh."""
-        rotation, shift = self._pose(t_s)
-        led = self.rig.lights[light]
-        return Lamp(
-            position_mm=(np.asarray(led.position_mm) - shift) @ rotation,
-            axis=self.dome.axis[light] @ rotation,
-            exponent=lobe_exponent(led),
-            radius_mm=led.radius_mm,
-        )
-
-    def _seen(self, view: View, t_s: float) -> tuple[Hits, Caster]:
-        key = (view.name, t_s)
-        if key not in self._hits:
-            # Still heads need every camera's rows again for every light; moving ones never do.
-            most = len(self.rig.views) if self._instant(1.0) == 0.0 else 2
-            while len(self._hits) >= most:
-                old, _ = self._hits.popitem(last=False)
-                self._vector.pop(old, None)
-            self._hits[key] = self._look(view, t_s)
-        self._hits.move_to_end(key)
-        return self._hits[key]
-
-    def _look(self, view: View, t_s: float) -> tuple[Hits, Caster]:
-        rotation, shift = self._pose(t_s)
-        moved = dataclasses.replace(
-            view,
-            position_mm=_vector((np.asarray(view.position_mm) - shift) @ rotation),
-            target_mm=_vector((np.asarray(view.target_mm) - shift) @ rotation),
-            up=_vector(np.asarray(view.up) @ rotation),
-        )
-        how = dome_views.Looking(
-            self.subpixels, self.dome.distortion.get(view.name), self._illuminant, self.optics
-        )
-        if isinstance(self.subject, Target):
-            if self.subject.kind == "source":
-                raise SceneError(f"target {self.subject.name!r}: shines itself, no dome holds it")
-            return dome_views.at_target(self._caster, moved, self.subject, how), self._caster
-        caster = self._caster
-        amount = 0.0 if self.motion is None else self.motion.twitch(t_s)
-        texture = self._texture(view)
-        if amount > 0.0 and self.motion is not None:
-            mesh, atlas = self.motion.twitched(self.subject.mesh, amount), self.subject.atlas
-            caster = Caster(mesh, choice=self._caster.choice)
-            # The relief turns with the surface below it.
-            turned = spread(unwrap(mesh, atlas.size).normal - atlas.normal, atlas.covered)
-            texture = np.concatenate([texture[..., :-3], texture[..., -3:] + turned], axis=-1)
-        return dome_views.at_skin(caster, moved, texture, how), caster
-
 
 def _toward_origin(light: Light) -> NDArray[np.float64]:
     place = np.asarray(light.position_mm, np.float64)
     return np.asarray(-place / np.linalg.norm(place))
-
-
-def _vector(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in values)
-    return x, y, z

@@ -19,7 +19,7 @@ from rigsim.dome_build import BuiltDome, build, image_of, pixel_corner_rays
 from rigsim.led_light import lobe_exponent, white_intensity
 from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
 from rigsim.scenes import mirror_ball, printed_plate
-from rigsim.scenes.dome import Pulse
+from rigsim.scenes.dome_exposures import Pulse
 from rigsim.scenes.printed_plate import CELL_MM, Plate
 from rigsim.sensor import expose, sensor_of
 
