@@ -15,7 +15,7 @@ from capture.plan.rows import lights_of
 from capture.rig import Rig, load_rig
 from model import store
 from model.skin import SkinAppearance
-from skinrig.evaluating.reflection import TEST_FILE, make_test
+from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
 from skinrig.light_safety import light_figures, light_lines
 from skinrig.simulating.simulation import (
     Order,

@@ -7,6 +7,7 @@ from model import brdf_tables, fresnel
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.dome_stages import BASIS_FILE, RANK, WEIGHTS, _basis_bytes
 from skinrig.evaluating import reflection as evaluation
+from skinrig.evaluating import reflection_truth
 
 SIDE = 40
 R_D = np.array([0.5, 0.35, 0.25])
@@ -38,8 +39,8 @@ def maps():
 @pytest.fixture
 def truth(rng):
     bare = SkinAppearance(maps(), "simulated")
-    test = evaluation.make_test(Matt(), bare, rng=rng, sites={"middle": (20.0, 20.0, 0.0)})
-    return SkinAppearance(maps(), "simulated", files={evaluation.TEST_FILE: test})
+    test = reflection_truth.make_test(Matt(), bare, rng=rng, sites={"middle": (20.0, 20.0, 0.0)})
+    return SkinAppearance(maps(), "simulated", files={reflection_truth.TEST_FILE: test})
 
 
 def estimate(scale=1.0, **changes):
@@ -78,7 +79,7 @@ def test_spheres_show_truth_and_estimate_alike(truth):
     assert name == "middle"
     np.testing.assert_allclose(drawn, image, atol=1e-6)
     # the light comes from the upper right
-    half = evaluation.SPHERE_PX // 2
+    half = reflection_truth.SPHERE_PX // 2
     assert image[:half, half:].sum() > 3 * image[half:, :half].sum()
 
 
@@ -87,7 +88,7 @@ def test_a_spot_that_looks_aside_makes_the_same_sphere():
         def reflect(light, camera):
             return np.repeat((np.maximum(light @ normal, 0) ** 3)[:, None], 3, axis=1)
 
-        return evaluation.sphere(reflect, normal)[0]
+        return reflection_truth.sphere(reflect, normal)[0]
 
     aside = np.array([0.6, 0.0, 0.8])
     np.testing.assert_allclose(facing(aside), facing(np.array([0.0, 0.0, 1.0])), atol=1e-12)

@@ -1,6 +1,8 @@
 """Domes that are simulated small, and their targets through the real drivers."""
 
 import itertools
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -27,6 +29,17 @@ def test_what_is_kept_of_a_dome_is_spread_evenly():
     assert gap_deg.min() > 25.0
     first = np.degrees(np.arccos(np.sort((way[:24] @ way[:24].T)[0])[-2]))
     assert first < 20.0  # the first 24 as they come lie together: the test can fail
+
+
+def test_simulating_a_dome_loads_nothing_that_only_evaluates():
+    code = (
+        "import sys, skinrig.simulating.dome\n"
+        "assert 'sklearn' not in sys.modules, 'sklearn'\n"
+        "import skinrig.evaluating.reflection\n"
+        "assert 'sklearn' in sys.modules, 'what evaluates loads it: this test can fail'"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
 
 
 def test_a_small_dome_keeps_its_names_and_fields_of_view():

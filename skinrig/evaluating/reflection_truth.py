@@ -1,0 +1,169 @@
+"""True reflection, asked of a simulated face in directions that no light had, and on spheres."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.skin import SkinAppearance
+
+TEST_FILE: Final = "reflection_test.npz"
+LEAST_COSINE: Final = 0.3
+"""Directions nearer to the horizon are not asked for: 73 degrees."""
+SPHERE_PX: Final = 96
+
+Double = NDArray[np.float64]
+
+
+class TrueReflection(Protocol):
+    """What a simulated face tells of its reflection."""
+
+    def brdf(
+        self, uv: ArrayLike, to_light: ArrayLike, to_camera: ArrayLike
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return f_r, shape (n, 3), and its surface part, shape (n,), 1/sr."""
+
+
+def make_test(
+    scene: TrueReflection,
+    truth: SkinAppearance,
+    *,
+    rng: np.random.Generator,
+    sites: Mapping[str, Sequence[float]] | None = None,
+    points: int = 600,
+    directions: int = 24,
+) -> bytes:
+    """Draw points and directions, and ask the simulated face how it reflects there.
+
+    Parameters
+    ----------
+    scene
+        The simulated face.
+    truth
+        Its maps: "position" and "normals".
+    rng
+        Draws texels and directions, evenly over the half sphere down to `LEAST_COSINE`.
+    sites
+        Places on the face, mm, whose reflection is drawn on spheres.
+    points, directions
+        How many.
+
+    Returns
+    -------
+    bytes
+        An .npz with texel (S,), light and view (S, K, 3), f_r (S, K, 3) and surface (S, K); of
+        the sites "site" (names), "site_texel" and "sphere" (n, SPHERE_PX, SPHERE_PX, 3).
+    """
+    place = truth.maps["position"]
+    size = place.values.shape[0]
+    valid = np.ones(place.values.shape[:2], bool) if place.valid is None else place.valid
+    chosen = rng.permutation(np.flatnonzero(valid))[:points]
+    all_normals = truth.maps["normals"].values.reshape(-1, 3).astype(np.float64)
+
+    def uv_of(texel: NDArray[np.integer]) -> Double:
+        rows, columns = np.divmod(texel, size)
+        return np.stack([(columns + 0.5) / size, 1.0 - (rows + 0.5) / size], axis=-1)
+
+    uv, normals = uv_of(chosen), all_normals[chosen]
+    light = _around(normals, directions, rng)
+    view = _around(normals, directions, rng)
+    flat = np.repeat(uv, directions, axis=0)
+    total, surface = scene.brdf(flat, light.reshape(-1, 3), view.reshape(-1, 3))
+    spheres, at = [], []
+    for place_mm in (sites or {}).values():
+        apart = np.linalg.norm(place.values.reshape(-1, 3) - np.asarray(place_mm), axis=-1)
+        texel = int(np.argmin(np.where(valid.reshape(-1), apart, np.inf)))
+        spot = uv_of(np.array([texel]))
+
+        def reflect(to_light: Double, to_camera: Double, spot: Double = spot) -> Double:
+            return np.asarray(scene.brdf(spot.repeat(len(to_light), 0), to_light, to_camera)[0])
+
+        spheres.append(sphere(reflect, all_normals[texel])[0])
+        at.append(texel)
+    stream = io.BytesIO()
+    np.savez_compressed(
+        stream,
+        texel=chosen,
+        light=light.astype(np.float32),
+        view=view.astype(np.float32),
+        f_r=np.asarray(total).reshape(len(chosen), directions, 3),
+        surface=np.asarray(surface).reshape(len(chosen), directions),
+        site=np.array(list(sites or {})),
+        site_texel=np.array(at, np.int64),
+        sphere=np.array(spheres, np.float32),
+    )
+    return stream.getvalue()
+
+
+def sphere(
+    reflect: Callable[[Double, Double], Double],
+    normal: Double,
+    *,
+    light_dir: tuple[float, float, float] = (0.5, 0.5, 0.70710678),
+) -> tuple[Double, NDArray[np.bool_]]:
+    """Draw the reflection of one spot on a sphere seen from +z, far away.
+
+    Parameters
+    ----------
+    reflect
+        f_r of the spot, (N, 3), by unit vectors to light and camera, (N, 3) each.
+    normal
+        Of the spot, in the frame of those vectors.
+    light_dir
+        Unit vector to the sphere's light; +x right, +y up.
+
+    Returns
+    -------
+    image : ndarray, shape (SPHERE_PX, SPHERE_PX, 3)
+        f_r times the cosine of the light, 1/sr.
+    inside : ndarray of bool
+    """
+    at = (np.arange(SPHERE_PX) + 0.5) / SPHERE_PX * 2.0 - 1.0
+    x, y = np.meshgrid(at, -at)
+    inside = x**2 + y**2 < 1.0
+    outward = np.stack([x, y, np.sqrt(np.where(inside, 1.0 - x**2 - y**2, 0.0))], -1)[inside]
+    shade = np.maximum(outward @ np.asarray(light_dir), 0.0)
+    to_light = _turned(np.asarray(light_dir), outward, normal)
+    to_camera = _turned(np.array([0.0, 0.0, 1.0]), outward, normal)
+    image = np.zeros((SPHERE_PX, SPHERE_PX, 3))
+    lit = shade > 0
+    image[np.flatnonzero(inside.reshape(-1))[lit] // SPHERE_PX,
+          np.flatnonzero(inside.reshape(-1))[lit] % SPHERE_PX] = (
+        np.nan_to_num(reflect(to_light[lit], to_camera[lit])) * shade[lit, None]
+    )  # fmt: skip
+    return image, inside
+
+
+def _turned(direction: Double, outward: Double, normal: Double) -> Double:
+    """Return a direction seen from points of a sphere as seen from a spot: outward to normal.
+
+    The turn is the shortest one, Rodrigues' formula for two unit vectors.
+    """
+    cosine = outward @ normal
+    axis = np.cross(outward, normal)
+    across = np.cross(axis, direction)
+    along = axis * (axis @ direction)[:, None]
+    return np.asarray(
+        cosine[:, None] * direction + across + along / (1.0 + np.maximum(cosine, -0.999))[:, None]
+    )
+
+
+def _around(normals: Double, count: int, rng: np.random.Generator) -> Double:
+    """Draw directions around normals, even in solid angle down to `LEAST_COSINE`, (S, K, 3)."""
+    shape = (len(normals), count)
+    z = rng.uniform(LEAST_COSINE, 1.0, shape)
+    turn = rng.uniform(0.0, 2.0 * np.pi, shape)
+    helper = np.where(np.abs(normals[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    side = np.cross(normals, helper)
+    side /= np.linalg.norm(side, axis=-1, keepdims=True)
+    other = np.cross(normals, side)
+    r = np.sqrt(1.0 - z**2)
+    return np.asarray(
+        z[..., None] * normals[:, None]
+        + (r * np.cos(turn))[..., None] * side[:, None]
+        + (r * np.sin(turn))[..., None] * other[:, None]
+    )
