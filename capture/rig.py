@@ -609,12 +609,19 @@ def load_rig(name_or_path: str | Path) -> Rig:
     return rig_from_json(read_toml(path, error=RigError), where=str(path))
 
 
+MOST_LISTED = 40
+"""Names of lights or views that a message lists; of more it tells the first ones and the last."""
+
+
 def _named(rows: tuple[Any, ...], name: str, what: str) -> Any:
     for row in rows:
         if row.name == name:
             return row
     known = [row.name for row in rows]
-    fault = Fault("name", repr(name), f"one of {', '.join(known)}", near_miss(name, known))
+    listed = ", ".join(known)
+    if len(known) > MOST_LISTED:
+        listed = f"{', '.join(known[:2])} … {known[-1]}, {len(known)} in all"
+    fault = Fault("name", repr(name), f"one of {listed}", near_miss(name, known))
     raise RigError(what, faults=[fault])
 
 

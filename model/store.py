@@ -323,6 +323,10 @@ def write_exr(path: str | Path, image: NDArray[np.float32]) -> None:
             raise StoreError(f"{path}: cannot be written ({error}); is the disk full?") from error
 
 
+EXR_MAGIC = b"v/1\x01"
+"""First bytes of an OpenEXR file (technical introduction to OpenEXR, file layout)."""
+
+
 def read_exr(path: str | Path) -> NDArray[np.float32]:
     """Read an EXR file with channel Y or RGB as float32 (H, W) or (H, W, 3).
 
@@ -333,6 +337,14 @@ def read_exr(path: str | Path) -> NDArray[np.float32]:
     """
     import OpenEXR
 
+    # the library says less of these, and prints a line of its own
+    try:
+        with Path(path).open("rb") as stream:
+            magic = stream.read(len(EXR_MAGIC))
+    except OSError as error:
+        raise StoreError(f"{path}: {error.strerror}, expected an OpenEXR image") from error
+    if magic != EXR_MAGIC:
+        raise StoreError(f"{path}: begins with {magic!r}, expected an OpenEXR image")
     try:
         with OpenEXR.File(str(path)) as file:
             channels = file.channels()

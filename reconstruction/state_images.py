@@ -137,6 +137,11 @@ def read(
     has_white = True
     pairs = [_pairs(session, path) for path, session in zip(sessions, opened, strict=True)]
     named = [state for group in pairs for state, _, _ in group]
+    if NEUTRAL not in named:  # told before minutes are spent on images
+        raise EvidenceError(
+            f"sessions: show {', '.join(sorted(set(named)))}, expected a state {NEUTRAL!r} that "
+            "the others are laid over"
+        )
     maps = REPEATED if len(set(named)) < len(named) else ONCE
     for number, (path, session) in enumerate(zip(sessions, opened, strict=True)):
         began_s = (session.manifest.created_at - start).total_seconds()
@@ -157,11 +162,6 @@ def read(
             spectra = evidence.noted["color_table"]
             table.add((str(spectra["camera"]), str(spectra["illuminant"])))
             has_white = has_white and "calibration white" in evidence.hashes
-    if not any(image.state == NEUTRAL for image in images):
-        states = ", ".join(sorted({image.state for image in images}))
-        raise EvidenceError(
-            f"sessions: show {states}, expected a state {NEUTRAL!r} that the others are laid over"
-        )
     if len(table) > 1:
         raise EvidenceError(f"sessions: of {len(table)} cameras or lights, expected one of each")
     shapes = {image.maps["diffuse"].values.shape for image in images}

@@ -42,7 +42,7 @@ def require_addresses(
     *,
     needed: Sequence[str] | None = None,
 ) -> None:
-    """Raise, naming all that is missing, unless each box and each camera has an address.
+    """Raise, naming all that is missing, unless each box and camera has an address of a known kind.
 
     Parameters
     ----------
@@ -56,6 +56,8 @@ def require_addresses(
     ------
     UsageError
     """
+    from capture.devices.camera import CameraUrlError, check_address
+
     missing = [f"--port {name}=URL" for name in needed or rig.boxes if name not in boxes]
     missing += [f"--camera {v.name}=URL" for v in rig.views if v.name not in cameras]
     if missing:
@@ -63,6 +65,11 @@ def require_addresses(
             f"the rig {rig.name!r} needs {' '.join(missing)}; --dry-run needs none, and "
             "skinrig serve prints those of a simulation"
         )
+    for view in rig.views:  # before any box is opened, and its light switched
+        try:
+            check_address(cameras[view.name])
+        except CameraUrlError as error:
+            raise UsageError(f"--camera {view.name}: {error}") from error
 
 
 def patiently(

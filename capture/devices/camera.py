@@ -184,6 +184,27 @@ class Camera(Protocol):
         """Let go of the camera."""
 
 
+def check_address(url: str) -> None:
+    """Raise unless the address names a kind of camera that is installed; opens nothing.
+
+    Raises
+    ------
+    CameraUrlError
+    """
+    _entry(url)
+
+
+def _entry(url: str) -> importlib.metadata.EntryPoint:
+    kind, colon, _ = url.partition(":")
+    found = {entry.name: entry for entry in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+    if not colon or kind not in found:
+        raise CameraUrlError(
+            f"camera address: got {url!r}, expected KIND:REST with KIND one of "
+            f"{', '.join(sorted(found))}; for example hotfolder:incoming"
+        )
+    return found[kind]
+
+
 def open_camera(url: str) -> Camera:
     """Open a camera by its address.
 
@@ -200,14 +221,8 @@ def open_camera(url: str) -> Camera:
     CameraError
         When the camera does not answer.
     """
-    kind, colon, rest = url.partition(":")
-    found = {entry.name: entry for entry in importlib.metadata.entry_points(group=ENTRY_POINTS)}
-    if not colon or kind not in found:
-        raise CameraUrlError(
-            f"camera address: got {url!r}, expected KIND:REST with KIND one of "
-            f"{', '.join(sorted(found))}; for example hotfolder:incoming"
-        )
-    camera: Camera = found[kind].load()(rest.removeprefix("//"))
+    rest = url.partition(":")[2]
+    camera: Camera = _entry(url).load()(rest.removeprefix("//"))
     return camera
 
 

@@ -33,6 +33,11 @@ Image = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
 PARTS: Final = ("albedo", "surface")
+MOST_AMOUNT: Final = 10.0
+"""Of a trait. The strongest of the package's change R_d by a factor of 1.3 (tan) to 1.9 (powder) an
+amount: at 10 they reach the least or greatest factor of an edit, and more says nothing more."""
+UNREACHED: Final = 0.5
+"""Share of the distance to the wanted histograms that is left, from which on it is told."""
 STALE: Final = {"lobe_residual": "is of the lobes before the edit"}
 """Maps that an edit of the lobes leaves without meaning."""
 
@@ -82,15 +87,21 @@ class Order:
         if not self.traits and not self.spots:
             raise EditError("edit: got neither traits nor spots, expected some")
         for name, amount in self.traits.items():
-            if not np.isfinite(amount):
-                raise EditError(f"trait {name}: got {amount}, expected a finite amount")
+            if not abs(amount) <= MOST_AMOUNT:
+                raise EditError(
+                    f"trait {name}: got {amount:g}, expected -{MOST_AMOUNT:g} to {MOST_AMOUNT:g}; "
+                    "faces with a trait and without it differ by 1, and beyond there are no faces "
+                    "that it was learned from"
+                )
         for part in self.parts or ():
             if part not in PARTS:
                 raise EditError(f"parts: got {part!r}, expected of {', '.join(PARTS)}")
-        if self.iterations < 0 or self.seed < 0:
+        if self.iterations < 1:
             raise EditError(
-                f"iterations, seed: got {self.iterations}, {self.seed}, expected at least 0"
+                f"iterations: got {self.iterations}, expected at least 1: none changes nothing"
             )
+        if self.seed < 0:
+            raise EditError(f"seed: got {self.seed}, expected at least 0")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -331,6 +342,11 @@ def _edit_albedo(
     again, _ = back.apply(values, mask)
     work.maps["r_d"] = editing_spots.with_values(source, values)
     good = face_textures.valid_of(source) & (values != source.values).any(axis=-1)
+    if found.after > UNREACHED * found.before and any(abs(a) > 1 for a in amounts.values()):
+        work.warnings.append(
+            f"albedo: matching came {100 * (1 - found.after / found.before):.0f} % of the way to "
+            "the histograms asked for; smaller amounts can be reached"
+        )
     work.record["albedo"] = {
         "traits": dict(amounts),
         "vectors": space.kind,

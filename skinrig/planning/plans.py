@@ -305,12 +305,29 @@ def lines(choice: Choice) -> list[str]:
         )
     out += [f"why: {reason}" for reason in choice.reasons]
     for name, value in choice.knobs.items():
-        shown = f"{len(value)}: {', '.join(map(str, value))}" if isinstance(value, list) else value
-        out.append(f"{name}: {shown}")
+        shown = f"{len(value)}: {', '.join(map(str, value))}" if isinstance(value, list) else ""
+        out.append(f"{name.replace('_', ' ')}: {shown or _told(value)}")
     out.append(
         f"capture: {choice.seconds:.1f} s, {choice.full_seconds - choice.seconds:.1f} s less than "
         "the whole rig's plan"
     )
     out += [f"left out: {what} ({why})" for what, why in choice.left_out]
-    out += [f"light: {name} {value}" for name, value in choice.light.items()]
+    out += [f"light: {name.replace('_', ' ')} {_told(v)}" for name, v in choice.light.items()]
     return out
+
+
+def _told(value: Any) -> str:
+    """Return a figure as people read it: four digits, names with their values.
+
+    Examples
+    --------
+    >>> _told(0.05926277112717791), _told({"melanin": 1.0, "r_d": 0.98765}), _told(True)
+    ('0.05926', 'melanin 1, r_d 0.9877', 'yes')
+    """
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_told(item)}" for key, item in value.items())
+    return str(value)

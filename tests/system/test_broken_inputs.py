@@ -151,6 +151,16 @@ def test_reconstruct_refuses_or_is_not_touched_by_the_damage(session, damage, ca
     assert not (tmp_path / "maps").exists()
 
 
+def test_a_session_without_a_neutral_state_is_refused_before_its_images_are_made(tmp_path, capsys):
+    made = simulate_session("flash", tmp_path / "session-white", target="white", width_px=64)
+    out = tmp_path / "moving"
+    assert main(["fit", "facial-color", str(made.session), "--out", str(out)]) == 3
+    err = capsys.readouterr().err
+    assert "sessions: show white, expected a state 'neutral'" in err
+    assert "repeat" not in err
+    assert not out.exists()
+
+
 def test_a_sound_session_passes(session, capsys):
     assert main(["verify", str(session)]) == 0
 

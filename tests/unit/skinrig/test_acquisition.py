@@ -69,6 +69,15 @@ def test_all_missing_addresses_are_one_line_and_a_usage_error(tmp_path, capsys):
     assert not (tmp_path / "s").exists()
 
 
+def test_an_unknown_kind_of_camera_is_told_before_a_port_is_opened(tmp_path, capsys):
+    argv = ["capture", "flash", "--out", str(tmp_path / "s")]
+    argv += ["--port", "flash=/dev/no-such-port", "--camera", "cam=blah:1"]
+    assert main(argv) == 2
+    err = capsys.readouterr().err
+    assert "--camera cam: camera address: got 'blah:1', expected KIND:REST" in err
+    assert "no-such-port" not in err
+
+
 @pytest.mark.parametrize("there_before", [True, False])
 def test_a_capture_that_fails_before_its_first_frame_leaves_no_session(
     tmp_path, sim, capsys, there_before

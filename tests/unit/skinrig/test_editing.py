@@ -218,6 +218,10 @@ def test_the_same_seed_makes_the_same_face(source, library):
         (["--spots", "moles=-2"], 3, "at least -1"),
         (["--trait", "tan=1", "--mask", "none.png"], 3, "none.png"),
         (["--trait", "tan=1", "--landmarks", "none.csv"], 3, "none.csv"),
+        (["--trait", "tan=1000"], 3, "trait tan: got 1000, expected -10 to 10"),
+        (["--trait", "tan=nan"], 3, "trait tan: got nan, expected -10 to 10"),
+        (["--trait", "tan=1", "--iterations", "0"], 3, "iterations: got 0, expected at least 1"),
+        (["--trait", "tan=1", "--seed", "-1"], 3, "seed: got -1, expected at least 0"),
     ],
 )
 def test_a_wrong_edit_is_one_clear_error_and_writes_nothing(argv, code, says, lab, capsys):

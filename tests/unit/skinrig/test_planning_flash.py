@@ -1,6 +1,7 @@
 """The flash rig's choice of frames, light and darks, on a small simulated face."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,8 @@ def test_the_plan_leaves_out_what_the_errors_wanted_do_not_need(small, tmp_path,
     assert document["knobs"]["power"] < 1.0
     assert document["saved_seconds"] > 20.0
     assert all(one["median"] <= one["wanted"] for one in document["forecasts"])
+    told = plans.lines(plans.choose("flash", want))  # figures as people read them
+    assert not any(re.search(r"\d\.\d{5}|[{}_]", line) for line in told), told
     # half the light would not have been enough
     look = flash.sight(None, "III")
     power = document["knobs"]["power"] / 2
