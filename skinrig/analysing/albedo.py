@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import os
@@ -20,7 +21,7 @@ from model import texture_histograms
 from model.texture_histograms import GroupHistograms
 from model.texture_space import TextureSpace
 from reconstruction import common_regions
-from skinrig import face_textures
+from skinrig import consent, face_textures
 from skinrig.fitting import traits
 from skinrig.fitting.traits import AlbedoSample, TraitFitError
 from skinrig.traits import albedo_vectors
@@ -51,6 +52,10 @@ class AlbedoAnalysis:
         Of the faces.
     left_out
         What was not done, and why.
+    source
+        "measured" where any of the faces was, else "simulated".
+    consent
+        What the subjects of measured faces agreed to, see `skinrig.consent.carried`.
     """
 
     histograms: Mapping[str, GroupHistograms]
@@ -58,10 +63,14 @@ class AlbedoAnalysis:
     scores: Mapping[str, Floats]
     names: tuple[str, ...]
     left_out: tuple[tuple[str, str], ...]
+    source: str = "simulated"
+    consent: tuple[Mapping[str, Any], ...] = ()
 
     def document(self) -> dict[str, Any]:
         """Return all of it but the histograms as JSON values."""
         return {
+            "source": self.source,
+            "consent": [dict(one) for one in self.consent],
             "faces": list(self.names),
             "groups": {
                 name: int(n)
@@ -129,7 +138,13 @@ def analyse_measured(
         tell(face.name)
         samples.append(traits.albedo_sample(face, frame))
     regions = {name: common_regions.region(name, frame) for name in ("face", "beard", "no-beard")}
-    return _write(out, analyse(samples, names, groups, regions, vectors))
+    seen = [face.appearance for face in faces]
+    found = dataclasses.replace(
+        analyse(samples, names, groups, regions, vectors),
+        source="measured" if any(one.source == "measured" for one in seen) else "simulated",
+        consent=tuple(consent.carried(*seen)),
+    )
+    return _write(out, found)
 
 
 def analyse_simulated(

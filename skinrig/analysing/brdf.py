@@ -20,6 +20,7 @@ from model.brdf_tables import BrdfBasis
 from model.skin import SkinMap
 from reconstruction import brdf_space
 from reconstruction.brdf_space import SpaceCurve
+from skinrig import consent
 from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf_space_datasets import Dataset
 from skinrig.errors import UsageError
@@ -190,7 +191,7 @@ def analyse_simulated(
         analyse(data, basis, by_label=data.name == "dataset B", method=method, rng=rng)
         for data in sets
     )
-    _write(out, found, basis, spheres=found[1], method=method)
+    _write(out, found, basis, spheres=found[1], method=method, source="simulated")
     return found
 
 
@@ -259,7 +260,12 @@ def analyse_measured(
     )  # fmt: skip
     for data in sets[len(lobes) :]:
         done += (analyse(data, materials, by_label=True, groups=groups, method=method, rng=rng),)
-    _write(out, done, materials, spheres=done[-1], method=method)
+    told = [store.read_document(folder) for folder in folders]
+    _write(
+        out, done, materials, spheres=done[-1], method=method,
+        source="measured" if any(one.source == "measured" for one in told) else "simulated",
+        agreed=consent.carried(*told),
+    )  # fmt: skip
     return done
 
 
@@ -309,11 +315,20 @@ def _measured(
 
 
 def _write(
-    out: Path, found: Sequence[Analysis], basis: BrdfBasis, *, spheres: Analysis, method: str
+    out: Path,
+    found: Sequence[Analysis],
+    basis: BrdfBasis,
+    *,
+    spheres: Analysis,
+    method: str,
+    source: str,
+    agreed: Sequence[Mapping[str, Any]] = (),
 ) -> None:
     out.mkdir(parents=True, exist_ok=True)
     document = {
         "schema": SCHEMA,
+        "source": source,
+        consent.KEY: [dict(one) for one in agreed],
         "method": method,
         "rule": "plateau: the first rank whose error exceeds the least one by no more than 5 % of "
         "the fall from the first rank to the least; normalized: errors over that of the first rank",

@@ -110,13 +110,17 @@ def _data_set(one: Mapping[str, Any]) -> str:
     ranks: Sequence[float] = one.get("ranks", ())
     if not ranks:
         return ""
-    head = [name for name in ("error", "normalized", "held_out") if name in one]
+    head = [name for name in ("error", "normalized", "held_out_error") if name in one]
     rows = [
         (rank, *(float("nan") if one[key][k] is None else one[key][k] for key in head))
         for k, rank in enumerate(ranks)
     ]
     name = one.get("name", "")
-    return page.table(("lobes", *head), rows, caption=f"Errors by number of lobes: {name}")
+    return page.table(
+        ("lobes", *(n.replace("_", " ") for n in head)),
+        rows,
+        caption=f"Errors by number of lobes: {name}",
+    )
 
 
 def _pictures(folder: Path) -> str:

@@ -22,6 +22,7 @@ def test_groups_differ_in_their_histograms_as_they_were_made(lab, capsys):
     argv = ["analyse", "albedo", *map(str, paths), "--labels", str(labels), "--out", str(out)]
     assert main([*argv, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
+    assert (told["source"], told["consent"]) == ("simulated", [])
     assert told["groups"] == {"all": 4, "tan": 2, "no tan": 2, "oily": 2, "no oily": 2}
     ratio = np.log(np.array(told["mean_r_d"]["face"]["tan"]) / told["mean_r_d"]["face"]["no tan"])
     np.testing.assert_allclose(ratio, -0.365 * np.array([1.0, 1.1, 1.2]), atol=0.06)

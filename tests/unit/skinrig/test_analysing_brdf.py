@@ -143,8 +143,12 @@ def appearance(basis, rank, rng, *, names=None):
 
 def test_measured_faces_are_analysed_by_label(tmp_path, basis, capsys):
     rng = np.random.default_rng(7)
+    agreed = {"pseudonym": "P7", "consent_scope": ["research"], "consent_expires": "2031-01-31"}
     for name in ("a", "b", "c"):
-        store.write(tmp_path / f"appearance-{name}", appearance(basis, 3, rng))
+        face = appearance(basis, 3, rng)
+        if name == "b":
+            face = dataclasses.replace(face, source="measured", parameters={"consent": [agreed]})
+        store.write(tmp_path / f"appearance-{name}", face)
     table = tmp_path / "labels.csv"
     table.write_text("name,lotion,age\na,1,30\nb,1,40\nc,0,50\n", encoding="utf-8")
     folders = [str(tmp_path / f"appearance-{n}") for n in "abc"]
@@ -162,6 +166,12 @@ def test_measured_faces_are_analysed_by_label(tmp_path, basis, capsys):
     assert told["datasets"][3]["held_out"] == "people"
     for name in ("figure-14.png", "figure-15.png", "curves.csv", "analysis.json"):
         assert (tmp_path / "out" / name).stat().st_size > 0
+    kept = json.loads((tmp_path / "out" / "analysis.json").read_text(encoding="utf-8"))
+    assert (kept["source"], kept["consent"]) == ("measured", [agreed])
+    assert main(["report", str(tmp_path / "out"), "--out", str(tmp_path / "report.html")]) == 0
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert ">P7</th>" in page
+    assert "research, until 2031-01-31" in page
 
 
 def test_faces_without_usable_lobes_are_named(tmp_path, basis, capsys):
