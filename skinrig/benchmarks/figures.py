@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from skinrig.reporting import figures
+from skinrig.reporting import figures, point_names
 
 
 def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
@@ -25,8 +25,8 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     -------
     str
         An image with a name, as SVG. The Pareto front of each condition is joined, in a color of
-        its own, and its points are labelled with their effort; others are hollow. Knees have a
-        ring, and the Cramer-Rao bound a dash where it is known.
+        its own, and its points are labelled with their effort where there is room for it; others
+        are hollow. Knees have a ring, and the Cramer-Rao bound a dash where it is known.
     """
     figure, axes = figures.canvas(5.2, 3.4)
     points, fronts = document["points"], document["fronts"]
@@ -41,7 +41,8 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
         low, high = np.where(exact, error, low), np.where(exact, error, high)
     bars = np.maximum(np.stack([error - low, high - error]), 0.0)
     bars[0] = np.minimum(bars[0], 0.999 * error)  # a log axis has no room for zero
-    middle = np.log([seconds.min(), seconds.max()]).mean()
+    labels: list[tuple[str, float, float]] = []
+    joined = [best for front in fronts if len(best := np.array(front["points"], int)) > 1]
     named = len(fronts) <= MOST_NAMED
     for number, front in enumerate(fronts):
         color = figures.COLORS[number % len(figures.COLORS)]
@@ -68,13 +69,7 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
             label = _words(effort)
             label += "  (knee)" if index == bend else ""
             label += "  (error 0)" if exact[index] else ""
-            # names of points on the right run to the left, into the plot
-            right = np.log(seconds[index]) > middle
-            words = axes.annotate(
-                label, (seconds[index], error[index]), xytext=(-5 if right else 5, 5),
-                textcoords="offset points", ha="right" if right else "left", fontsize=6,
-            )  # fmt: skip
-            words.set_in_layout(False)  # a long label must not squeeze the axes away
+            labels.append((label, float(seconds[index]), float(error[index])))
     bounds = np.array([p.get("cramer_rao_bound") or np.nan for p in points], float)
     if np.isfinite(bounds).any():
         known = np.isfinite(bounds)
@@ -91,8 +86,18 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     axes.set_ylabel("\n".join(textwrap.wrap(document["error_name"], 36)))
     small = document.get("size") == "small"
     axes.set_title(f"{stage}, small size" if small else stage, fontsize=10)
+    legend = None
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=6, frameon=False)
+        legend = axes.legend(fontsize=6, frameon=False)
+    point_names.name_points(
+        figure, axes, labels, points=list(zip(seconds.tolist(), error.tolist(), strict=True)),
+        lines=[
+            *(np.column_stack([seconds[best], error[best]]) for best in joined),
+            *np.stack([np.stack([seconds, error - bars[0]], 1),
+                       np.stack([seconds, error + bars[1]], 1)], 1),
+        ],
+        legend=legend,
+    )  # fmt: skip
     told = "; ".join(
         f"{_words(front['condition']) or 'front'}: {len(front['points'])} settings"
         + (

@@ -64,7 +64,7 @@ class MapError:
     @property
     def band_name(self) -> str:
         """The band as text."""
-        return "all" if self.band is None else f"C_m {self.band[0]:g}–{self.band[1]:g}"
+        return "all" if self.band is None else f"melanin {self.band[0]:g}–{self.band[1]:g}"
 
 
 MEDIAN_LIMIT = 0.15

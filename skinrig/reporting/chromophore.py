@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Literal
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.flash_stages import NOISE_STDERR
 from skinrig.evaluating import flash
-from skinrig.reporting import figures, map_pictures, page
+from skinrig.reporting import figures, map_names, map_pictures, page
 
 NOISE_OF_IDENTIFIABILITY = 0.005
 """Relative noise of each channel that the identifiability plots are drawn for."""
@@ -32,7 +32,7 @@ def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
             alone += _alone(key, skin_map)
             continue
         body += map_pictures.map_panel(
-            key,
+            map_names.heading(key),
             page.short_unit(skin_map.unit),
             estimate=skin_map.values,
             standard_error=skin_map.stderr,
@@ -52,7 +52,7 @@ def _alone(key: str, skin_map: SkinMap) -> str:
     if max(abs(low), abs(high)) < ROUNDING:  # what rounding leaves is not to look like structure
         low, high = 0.0, 1.0
     return map_pictures.scalar_picture(
-        key, skin_map.values, low=low, high=high, valid=mask,
+        map_names.heading(key), skin_map.values, low=low, high=high, valid=mask,
         unit=page.short_unit(skin_map.unit), width=SMALL_PX,
     )  # fmt: skip
 
@@ -107,7 +107,8 @@ def errors(
         caption="Relative errors against what the subject is made of (sharp) and against what "
         "light that spreads in skin leaves visible of it (blurred); C_m: melanin fraction",
     )  # fmt: skip
-    return body + _bars([row for row in blurred if row.band is not None])
+    limits = {row.name: 100 * flash.limit(row) for row in blurred if row.band is None}
+    return body + _bars([row for row in blurred if row.band is not None], limits)
 
 
 def _worst(banded: Iterable[flash.MapError]) -> tuple[str, float]:
@@ -121,7 +122,7 @@ def _worst(banded: Iterable[flash.MapError]) -> tuple[str, float]:
     return text, low
 
 
-def _bars(banded: list[flash.MapError]) -> str:
+def _bars(banded: list[flash.MapError], limits: Mapping[str, float]) -> str:
     labels = list(dict.fromkeys(row.band_name for row in banded))
     if not labels:
         return ""
@@ -131,8 +132,8 @@ def _bars(banded: list[flash.MapError]) -> str:
         for key in dict.fromkeys(row.name for row in banded)
     }
     plot = figures.bars(
-        "median error by melanin band", labels, series, unit="%",
-        limit=100 * flash.MEDIAN_LIMIT,
+        "median error by melanin band; dashed: limit of all bands together", labels, series,
+        unit="%", limits=limits,
     )  # fmt: skip
     return f'<div class="plots">{plot}</div>'
 

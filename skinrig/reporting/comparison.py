@@ -19,6 +19,7 @@ from skinrig.reporting import (
 )
 from skinrig.reporting import comparison_conditions as conditions
 from skinrig.reporting.map_comparison import MapDifference
+from skinrig.reporting.map_names import heading, melanin_band, words
 from skinrig.reporting.run_comparison import Pair, Run, alone
 
 WIDTH_PX = 200
@@ -79,7 +80,7 @@ def lead(a: Run, b: Run, found: Sequence[Pair]) -> str:
 def _in_words(one: MapDifference) -> str:
     by = page.number(one.median if one.unit == "°" else one.bias)
     return (
-        f"{one.name} by {by} {one.unit}".rstrip()
+        f"{words(one.name)} by {by} {one.unit}".rstrip()
         + f" in the median, {100 * one.beyond[-1]:.3g} % of pixels"
     )
 
@@ -136,7 +137,7 @@ def _difference_row(one: MapDifference) -> tuple[object, ...]:
     if one.beyond:
         verdict = "disagree" if one.disagree else "equal" if one.high == 0.0 else "agree"
     return (
-        one.name, verdict, *shares[::-1], one.median_a, one.median_b, one.bias, one.median,
+        words(one.name), verdict, *shares[::-1], one.median_a, one.median_b, one.bias, one.median,
         one.high, one.combined, one.unit, one.pixels, one.only_a, one.only_b,
     )  # fmt: skip
 
@@ -147,10 +148,10 @@ def _pictures(a: Run, b: Run, pair: Pair) -> str:
     order = sorted((one for one in told if one.high > 0.0), key=_farthest_first)
     body = ""
     for one in order[:MOST_SHOWN]:
-        body += f"<h3>{page.escape(one.name)}</h3><div class='maps'>"
+        body += f"<h3>{page.escape(heading(one.name))}</h3><div class='maps'>"
         body += "".join(_four(a, b, pair, one)) + "</div>"
     if len(order) > MOST_SHOWN:
-        names = ", ".join(one.name for one in order[MOST_SHOWN:])
+        names = "; ".join(words(one.name) for one in order[MOST_SHOWN:])
         body += page.note(f"Not drawn, since they disagree less: {names}.")
     return body
 
@@ -224,7 +225,7 @@ def _by_band(pair: Pair) -> str:
                 continue
             sigmas = np.abs(one.sigmas[inside])
             rows.append(
-                (one.name, f"C_m {low:g}–{high:g}", one.unit, int(inside.sum()),
+                (words(one.name), melanin_band(low, high), one.unit, int(inside.sum()),
                  float(np.median(one.difference[inside])),
                  float(np.median(np.abs(one.difference[inside]))),
                  float(np.median(sigmas)), 100 * float(np.mean(sigmas > 3.0)))

@@ -14,6 +14,7 @@ from skinrig.applying.expression import colors, hemoglobin_rig
 from skinrig.evaluating import facial_color as evaluation
 from skinrig.evaluating.flash import BANDS
 from skinrig.reporting import figures, map_pictures, page
+from skinrig.reporting.map_names import melanin_band
 
 SHOWN = 4
 """States drawn; the tables list all."""
@@ -235,7 +236,7 @@ def errors_by_band(
             relative = (found - real) / real
             held = np.abs(found - real) <= blend.stderr[inside]
             rows.append(
-                (state, f"C_m {low:g}–{high:g}", int(inside.sum()),
+                (state, melanin_band(low, high), int(inside.sum()),
                  100 * float(np.median(np.abs(relative))), 100 * float(np.median(relative)),
                  100 * float(np.mean(held)))
             )  # fmt: skip

@@ -68,9 +68,12 @@ def bars(
     series: Mapping[str, NDArray[np.floating] | Sequence[float]],
     *,
     unit: str,
-    limit: float | None = None,
+    limits: Mapping[str, float] | None = None,
 ) -> str:
-    """Draw groups of bars, one group a label, one bar a series; NaN leaves a gap."""
+    """Draw groups of bars, one group a label, one bar a series; NaN leaves a gap.
+
+    A series in ``limits`` has its limit drawn as a dashed line of its color.
+    """
     figure, axes = canvas(6.2, 3.0)
     position = np.arange(len(labels))
     width = 0.8 / max(len(series), 1)
@@ -82,8 +85,8 @@ def bars(
             label=name,
             color=COLORS[number % len(COLORS)],
         )
-    if limit is not None:
-        axes.axhline(limit, color="0.5", ls="--", lw=1)
+        if limits and name in limits:
+            axes.axhline(limits[name], color=COLORS[number % len(COLORS)], ls="--", lw=1)
     axes.set_xticks(position, labels, fontsize=8)
     axes.set_ylabel(unit)
     axes.set_title(title, fontsize=10)
@@ -97,7 +100,7 @@ def bars(
         )
         for name, values in series.items()
     )
-    held = "" if limit is None else f"; limit {limit:g}"
+    held = "".join(f"; limit of {name} {limit:.3g}" for name, limit in (limits or {}).items())
     return finished(figure, f"{title}, {unit}: {told}{held}")
 
 

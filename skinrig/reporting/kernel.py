@@ -10,6 +10,7 @@ from model.skin import SkinAppearance
 from reconstruction.gradient_stages import KERNEL_FILE
 from skinrig.evaluating import microrelief as evaluation
 from skinrig.reporting import figures, page
+from skinrig.reporting.map_names import state_words
 
 
 def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> str:
@@ -36,10 +37,10 @@ def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> 
                        worst["distance"] / worst["distance_before"], evaluation.DISTANCE_LIMIT,
                        "<=", "", worst=state_words(worst["name"]))
         )  # fmt: skip
-    untold = [fit["name"] for fit in fits if fit["valid"] and not _told(fit)]
+    untold = [state_words(fit["name"]) for fit in fits if fit["valid"] and not _told(fit)]
     note = (
         page.note(
-            f"The patch is too small for {', '.join(untold)}: two histograms of one skin of this "
+            f"The patch is too small for {'; '.join(untold)}: two histograms of one skin of this "
             "size differ by more than half of what the strain changes, so that the distance left "
             "by the kernel is not judged."
         )
@@ -51,8 +52,8 @@ def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> 
          "nearly as good", "fitted"),
         [
             (
-                fit["name"], fit["stretch_s"], _value(fit["alpha"]), _value(fit["sigma_um"]),
-                _value(fit["distance_before"]), _value(fit["distance"]),
+                state_words(fit["name"]), fit["stretch_s"], _value(fit["alpha"]),
+                _value(fit["sigma_um"]), _value(fit["distance_before"]), _value(fit["distance"]),
                 _value(fit.get("noise_floor")), fit.get("near_best_count", 0),
                 "yes" if fit["valid"] else "no",
             )
@@ -118,19 +119,6 @@ def _direction(found: Mapping[str, Any] | None) -> str:
 def _told(fit: Mapping[str, Any]) -> bool:
     """Return whether a strain changes the histogram by more than twice what chance does."""
     return _value(fit["distance_before"]) > 2.0 * _value(fit["noise_floor"])
-
-
-def state_words(state: str) -> str:
-    """Return a state's name in words.
-
-    Examples
-    --------
-    >>> state_words("a045_m2"), state_words("a000_n0")
-    ('45°, compressed 2', '0°, neutral')
-    """
-    angle, step = state.split("_")
-    kinds = {"n": "neutral", "m": f"compressed {step[1:]}", "p": f"stretched {step[1:]}"}
-    return f"{int(angle[1:])}°, {kinds[step[0]]}"
 
 
 def _value(value: object) -> float:

@@ -12,7 +12,7 @@ from model.skin import SkinAppearance, SkinMap
 from reconstruction.gradient_stages import HISTOGRAM_FILE, STRAIN_FILE
 from skinrig.evaluating import microrelief as evaluation
 from skinrig.reporting import figures, kernel, map_pictures, page
-from skinrig.reporting.kernel import state_words
+from skinrig.reporting.map_names import state_words
 
 WIDTH_PX = 200
 SHOWN = 7
@@ -145,7 +145,7 @@ def _relief_errors(
     for row in neutral:
         checks.append(
             page.Check(f"{name}: specular normals at the lens's resolution, mean error",
-                       row.mean_deg, evaluation.NORMAL_LIMIT_DEG, "<=", "°", row.state,
+                       row.mean_deg, evaluation.NORMAL_LIMIT_DEG, "<=", "°", state_words(row.state),
                        masked=row.masked, coverage=row.coverage, worst=where,
                        worst_got=worst_got)
         )  # fmt: skip
@@ -163,7 +163,7 @@ def _relief_errors(
          "relief rms um", "of relief %"),
         [
             (
-                row.state, row.pixels, 100 * row.masked, row.mean_deg, row.median_deg,
+                state_words(row.state), row.pixels, 100 * row.masked, row.mean_deg, row.median_deg,
                 f"{row.interval_deg[0]:.3g} – {row.interval_deg[1]:.3g}", row.unblurred_deg,
                 row.stderr_deg, 100 * row.coverage, row.height_um, row.relief_um,
                 100 * row.height_relative,
@@ -202,7 +202,7 @@ def _strain(
         )  # fmt: skip
     rows = [
         (
-            state["name"], _value(state["reading_mm"]), _value(state["force_n"]),
+            state_words(state["name"]), _value(state["reading_mm"]), _value(state["force_n"]),
             _value(state["reading_ratio"]), _value(state["stretch_s"]),
             round(_value(state["stretch_s_stderr"]), 6),
             true[state["name"]].truth if state["name"] in true else math.nan,
@@ -239,10 +239,10 @@ def _histograms(appearance: SkinAppearance) -> str:
             state_words(state["name"]), shown, low=0.0, high=top, scale="magma", width=WIDTH_PX,
             of="histogram of normals",
         )  # fmt: skip
-    aliased = [state["name"] for state in states if state["aliased"]]
+    aliased = [state_words(state["name"]) for state in states if state["aliased"]]
     note = (
         page.note(
-            f"Too few samples a bucket in {', '.join(aliased)}: distances between these "
+            f"Too few samples a bucket in {'; '.join(aliased)}: distances between these "
             "histograms show chance."
         )
         if aliased

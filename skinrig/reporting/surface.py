@@ -10,11 +10,14 @@ from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as evaluation
 from skinrig.front_view import WIDTH_PX, FrontView
 from skinrig.reporting import map_pictures, page
+from skinrig.reporting.map_names import heading, words
 from skinrig.reporting.surface_bands import Banded, errors_by_band
 
 SMALL_PX = 110
 """Of earlier normals, lobes, samples and residuals: every second pixel of the others."""
 GRAY = 0.5
+RELATIVE = ("r_d",)
+"""Maps whose standard errors are shown in percent of the estimate."""
 FIRST = ("r_d", "normals_refined", "normals", "half_vector_normals")
 
 
@@ -77,7 +80,9 @@ def section(
             figures.append(_spread(key, skin_map, rows, columns, view, good, width=width))
         if key in FIRST:
             size = "maps" if key in large else "maps small"
-            body += f"<h3>{page.escape(key)}</h3><div class='{size}'>{''.join(figures)}</div>"
+            body += (
+                f"<h3>{page.escape(heading(key))}</h3><div class='{size}'>{''.join(figures)}</div>"
+            )
         else:
             minor += "".join(figures)
     if minor:
@@ -111,7 +116,7 @@ def _shown(
 
 def _title(title: str, key: str) -> str:
     """Return what stands below a picture: of maps that share a heading, which one it is."""
-    return title if key in FIRST else f"{key}, {title}"
+    return title if key in FIRST else f"{words(key)}, {title}"
 
 
 def _error(
@@ -152,9 +157,13 @@ def _spread(
     if skin_map.stderr is None:
         return ""
     stderr = skin_map.stderr[rows, columns].astype(np.float64)
+    unit = page.short_unit(skin_map.unit)
+    if key in RELATIVE:  # as errors are told, beside which it stands
+        size = np.abs(skin_map.values[rows, columns].astype(np.float64))
+        good = good & (size > 0.0).reshape(len(good), -1).all(axis=-1)
+        stderr, unit = 100.0 * stderr / np.where(size > 0.0, size, 1.0), "%"
     if stderr.ndim == 2:
         stderr = stderr.mean(axis=-1)
-    unit = page.short_unit(skin_map.unit)
     if key in evaluation.NORMAL_MAPS:
         stderr, unit = np.degrees(stderr), "°"
     image, valid = view.picture(stderr, valid=good)
@@ -183,7 +192,7 @@ def _errors(
         where, worst_got = _worst(row.name, banded)
         checks.append(
             page.Check(
-                f"{name}: {row.name}, {what}", got, bound, "<=", unit,
+                f"{name}: {words(row.name)}, {what}", got, bound, "<=", unit,
                 masked=row.masked, coverage=row.coverage.share, worst=where, worst_got=worst_got,
             )
         )  # fmt: skip
@@ -200,16 +209,17 @@ def _errors(
          "bias", "68 % coverage %", "median standard error"),
         [
             (
-                row.name, "°" if row.unit == "deg" else row.unit, row.points, 100 * row.masked,
-                row.mean, row.median, f"{row.interval[0]:.3g} – {row.interval[1]:.3g}", row.high,
-                row.bias, 100 * row.coverage.share, row.median_stderr,
+                words(row.name), "°" if row.unit == "deg" else row.unit, row.points,
+                100 * row.masked, row.mean, row.median,
+                f"{row.interval[0]:.3g} – {row.interval[1]:.3g}", row.high, row.bias,
+                100 * row.coverage.share, row.median_stderr,
             )
             for row in found
         ],
         caption="Texel by texel against the nearest true point; angles in degrees",
     ) + page.table(
         ("map", "unit", "skin", "points", "masked %", "median |error|", "95th %"),
-        banded,
+        [(words(row[0]), *row[1:]) for row in banded],
         caption="By skin color: the individual typology angle of the true reflectance "
         "(Chardon et al. 1991)",
     )  # fmt: skip

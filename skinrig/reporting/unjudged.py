@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from model.skin import SkinAppearance, SkinMap
 from skinrig.evaluating import flash
 from skinrig.reporting import page
+from skinrig.reporting.map_names import melanin_band, words
 
 RESIDUALS = ("residual", "misfit", "gamut_distance")
 """Words in the names of maps that tell how badly a model fits."""
@@ -41,13 +42,14 @@ def weaknesses(name: str, appearance: SkinAppearance) -> list[str]:
         if row is None:
             continue
         share = float(str(row[2]))
+        of = f"{name}: {words(key)}, median standard error"
         missing = f", {100 - share:.0f} % of pixels without a value" if share < 99.5 else ""
         if row[1] == "°":
             angle = float(str(row[4]))
-            text = f"{name}: {key}, median standard error {page.number(angle)}°"
+            text = f"{of} {page.number(angle)}°"
             angles.append((angle, text + missing))
         elif np.isfinite(percent := float(str(row[5]))):
-            text = f"{name}: {key}, median standard error {page.number(percent)} % of its value"
+            text = f"{of} {page.number(percent)} % of its value"
             told.append((percent, text + missing))
     first = sorted(told, reverse=True)[:MOST_NAMED] + sorted(angles, reverse=True)[:1]
     return [text for _, text in first]
@@ -106,12 +108,12 @@ def _spread(name: str, one: SkinMap) -> tuple[object, ...] | None:
     share = 100.0 * float(good.mean())
     if "normals" in name:
         degrees = np.degrees(stderr)
-        return (name, "°", share, "", float(np.median(degrees)), "",
+        return (words(name), "°", share, "", float(np.median(degrees)), "",
                 float(np.percentile(degrees, 95)))  # fmt: skip
     size = np.abs(values[good])
     relative = stderr[size > 0] / size[size > 0]
     return (
-        name, page.short_unit(one.unit), share, float(np.median(values[good])),
+        words(name), page.short_unit(one.unit), share, float(np.median(values[good])),
         float(np.median(stderr)),
         100.0 * float(np.median(relative)) if relative.size else float("nan"),
         float(np.percentile(stderr, 95)),
@@ -123,7 +125,7 @@ def _residual(name: str, one: SkinMap) -> tuple[object, ...] | None:
     if not good.any():
         return None
     low, middle, high = np.percentile(np.abs(values[good]), [50, 68.27, 95])
-    return (name, page.short_unit(one.unit), float(low), float(middle), float(high))
+    return (words(name), page.short_unit(one.unit), float(low), float(middle), float(high))
 
 
 def _by_band(appearance: SkinAppearance) -> str:
@@ -144,7 +146,7 @@ def _by_band(appearance: SkinAppearance) -> str:
                 continue
             relative = 100.0 * one.stderr[chosen] / np.abs(values[chosen])
             rows.append(
-                (name, f"C_m {low:g}–{high:g}", int(np.count_nonzero(chosen)),
+                (words(name), melanin_band(low, high), int(np.count_nonzero(chosen)),
                  float(np.median(relative)), float(np.percentile(relative, 95)))
             )  # fmt: skip
     if not rows:

@@ -244,6 +244,6 @@ def test_meshes_of_other_places_are_not_subtracted(tmp_path, rng):
 
 def test_errors_against_the_truth_come_with_their_band(folders):
     rows = truth_errors.of(store.read(folders["b"]), store.read(folders["truth"]))
-    assert {row.skin for row in rows} == {"all", "C_m 0.05–0.1"}
+    assert {row.skin for row in rows} == {"all", "melanin 0.05–0.1"}
     assert all(row.error == pytest.approx(30.0, abs=0.3) for row in rows)
     assert map_comparison.MOST_BEYOND > BY_CHANCE[-1]

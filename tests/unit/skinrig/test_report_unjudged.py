@@ -17,8 +17,8 @@ def maps(**extra):
 
 def test_standard_errors_are_told_by_band_of_what_was_found():
     body = unjudged.section(maps())
-    assert '<td class="k">C_m 0–0.02</td><td class="n">300</td><td class="n">5</td>' in body
-    assert '<td class="k">C_m 0.1–0.2</td><td class="n">300</td><td class="n">20</td>' in body
+    assert '<td class="k">melanin 0–0.02</td><td class="n">300</td><td class="n">5</td>' in body
+    assert '<td class="k">melanin 0.1–0.2</td><td class="n">300</td><td class="n">20</td>' in body
 
 
 def test_coverage_is_not_claimed_and_residuals_are_told():

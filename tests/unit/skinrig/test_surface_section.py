@@ -64,12 +64,14 @@ def test_the_section_checks_normals_and_albedo_and_shows_the_baseline_unchecked(
     )
     assert [check.name for check in checks] == [
         "head: normals, mean error",
-        "head: r_d red, median error",
-        "head: r_d green, median error",
-        "head: r_d blue, median error",
+        "head: diffuse reflectance R_d, red, median error",
+        "head: diffuse reflectance R_d, green, median error",
+        "head: diffuse reflectance R_d, blue, median error",
     ]
     assert [check.passed for check in checks] == [True, False, False, False]
-    assert "half_vector_normals" in body
+    assert "normals by half vectors (half_vector_normals)" in body
+    # 0.01 of 1.05 x 0.4, in the unit of the errors beside it
+    assert "r_d, standard error: median 2.381 %" in body
     assert body.count("<img") > 8
 
 

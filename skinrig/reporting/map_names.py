@@ -1,0 +1,84 @@
+"""What maps, states of skin and bands are called where people read of them."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+WORDS: Final = {
+    "r_d": "diffuse reflectance R_d",
+    "normals_refined": "normals without gloss",
+    "half_vector_normals": "normals by half vectors",
+    "lobe_residual": "residual of the lobes",
+    "samples": "samples of a point",
+    "gamut_distance": "distance from colors of skin",
+    "tsumura_melanin": "melanin by independent components",
+    "tsumura_hemoglobin": "hemoglobin by independent components",
+    "specular_picture": "picture of gloss",
+}
+"""Names in files to words; what is not here is a word already."""
+_STATE: Final = re.compile(r"(?P<map>[a-z_]+)_(?P<state>a\d+_[nmp]\d+)")
+_NUMBERED: Final = {"basis_weight_": "share of lobe "}
+_OF: Final = {
+    "change_": "change of hemoglobin, ", "hemoglobin_": "hemoglobin, ",
+    "microrelief_": "microrelief, ",
+}  # fmt: skip
+
+
+def words(name: str) -> str:
+    """Return a map's name, with or without a channel, as people read it.
+
+    Examples
+    --------
+    >>> words("r_d"), words("r_d red"), words("basis_weight_2"), words("melanin")
+    ('diffuse reflectance R_d', 'diffuse reflectance R_d, red', 'share of lobe 2', 'melanin')
+    >>> words("diffuse_normals_a045_m2"), words("hemoglobin_anger")
+    ('diffuse normals, 45°, compressed 2', 'hemoglobin, anger')
+    """
+    key, _, channel = name.partition(" ")
+    if channel:
+        return f"{words(key)}, {channel}"
+    if key in WORDS:
+        return WORDS[key]
+    if found := _STATE.fullmatch(key):
+        return f"{found['map'].replace('_', ' ')}, {state_words(found['state'])}"
+    for head, told in (_NUMBERED | _OF).items():
+        if key.startswith(head):
+            return told + key.removeprefix(head).replace("_", " ")
+    return key.replace("_", " ")
+
+
+def heading(name: str) -> str:
+    """Return a map's name in words, with the name of its file where that is another.
+
+    Examples
+    --------
+    >>> heading("r_d"), heading("melanin")
+    ('diffuse reflectance R_d (r_d)', 'melanin')
+    """
+    told = words(name)
+    return told if told == name else f"{told} ({name})"
+
+
+def state_words(state: str) -> str:
+    """Return a state's name in words.
+
+    Examples
+    --------
+    >>> state_words("a045_m2"), state_words("a000_n0")
+    ('45°, compressed 2', '0°, neutral')
+    """
+    angle, step = state.split("_")
+    kinds = {"n": "neutral", "m": f"compressed {step[1:]}", "p": f"stretched {step[1:]}"}
+    return f"{int(angle[1:])}°, {kinds[step[0]]}"
+
+
+def melanin_band(low: float, high: float) -> str:
+    """Return a band of the melanin fraction C_m, the volume fraction of the epidermis.
+
+    Examples
+    --------
+    >>> melanin_band(0.05, 0.1)
+    'melanin 0.05–0.1'
+    """
+    return f"melanin {low:g}–{high:g}"

@@ -1,0 +1,102 @@
+"""Names of a plot's points, each where nothing else stands."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_PLACES = tuple(
+    (dx, dy, across, up)
+    for far in (5, 12, 20)
+    for dx, dy, across, up in (
+        (5, far, "left", "bottom"), (-5, far, "right", "bottom"), (5, -far, "left", "top"),
+        (-5, -far, "right", "top"), (0, far, "center", "bottom"), (0, -far, "center", "top"),
+    )
+)  # fmt: skip
+"""Where a name is tried: offsets from its point, points, and which of its corners lies there."""
+
+
+def name_points(
+    figure: Any,
+    axes: Any,
+    labels: Sequence[tuple[str, float, float]],
+    *,
+    points: Sequence[tuple[float, float]],
+    lines: Sequence[NDArray[np.floating]] = (),
+    legend: Any = None,
+) -> None:
+    """Write names beside points, each where nothing else stands; where there is no room, not.
+
+    Parameters
+    ----------
+    figure, axes
+        Finished but for the names: limits and scales are final.
+    labels
+        Name, x and y of each point that has one, the most important first.
+    points
+        x and y of all points that names must leave free.
+    lines
+        (N, 2) each, x and y: they are crossed only where there is no other room.
+    legend
+        Of the axes, left free too.
+
+    Notes
+    -----
+    Of equal names the first stands for all that have no room. A name that is wider than the axes
+    is not written: tables and alt texts hold them all.
+    """
+    from matplotlib.transforms import Bbox
+
+    figure.draw_without_rendering()  # what the constrained layout makes of the axes
+    inside = axes.get_window_extent()
+    dot = figure.dpi / 72.0
+    taken = [
+        Bbox.from_bounds(x - 3 * dot, y - 3 * dot, 6 * dot, 6 * dot)
+        for x, y in axes.transData.transform(np.asarray(points, float).reshape(-1, 2))
+    ]
+    if legend is not None:
+        taken.append(legend.get_window_extent())
+    crossed = np.concatenate(
+        [_along(axes.transData.transform(line)) for line in lines] or [np.zeros((0, 2))]
+    )
+    for label, x, y in labels:
+        if not label:
+            continue
+        words = axes.annotate(label, (x, y), xytext=(0, 0), textcoords="offset points", fontsize=6)
+        words.set_in_layout(False)  # a long name must not squeeze the axes away
+        found = None
+        for place in _PLACES:
+            box = _moved(words, place)
+            within = inside.containsx(box.x0) and inside.containsx(box.x1)
+            within = within and inside.containsy(box.y0) and inside.containsy(box.y1)
+            if not within or any(box.overlaps(other) for other in taken):
+                continue
+            over = np.all((crossed > box.min) & (crossed < box.max), axis=1).any()
+            if found is None or not over:
+                found = place
+            if not over:
+                break
+        if found is None:
+            words.remove()
+        else:
+            taken.append(_moved(words, found))
+
+
+def _moved(words: Any, place: tuple[int, int, str, str]) -> Any:
+    """Put a name at a place of `_PLACES`, and return the box that it then fills, pixels."""
+    dx, dy, across, up = place
+    words.set_position((dx, dy))
+    words.set_ha(across)
+    words.set_va(up)
+    return words.get_window_extent()
+
+
+def _along(line: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return points along a line of (N, 2) pixels, closer than a name is high."""
+    parts = np.linspace(0.0, 1.0, 200)[:, None]
+    pairs = itertools.pairwise(line)
+    return np.concatenate([start + parts * (end - start) for start, end in pairs])
