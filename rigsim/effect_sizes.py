@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigsim.mesh import Mesh
 from rigsim.render import Caster
+from rigsim.scene_needs import Noise
 
 EXCHANGE_PATCHES = 32
 """Texels along one side of the coarse texture on which exchange between skin is estimated."""
@@ -59,6 +60,33 @@ def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> NDAr
     density = np.exp(-0.5 * q * q) / math.sqrt(2.0 * math.pi)
     mean = tail + (1.0 / math.sqrt(2.0 * math.pi) - density) / q
     return np.asarray(weight @ mean, np.float64)
+
+
+def spread_over_noise(lost: ArrayLike, level: ArrayLike, noise: Noise) -> NDArray[np.float64]:
+    """Return how much spreading across a shadow's edge changes a pixel, over its noise.
+
+    Parameters
+    ----------
+    lost
+        What a lit pixel loses across the edge, of its light, see `edge_loss`, shape (C,).
+    level
+        The brightest pixel's signal, full scales, shape (C,); it may be over-full.
+    noise
+        Of the sensor.
+
+    Returns
+    -------
+    ndarray
+        Shape (C,). The pixel beyond the edge gains as much as the lit one loses, and where nothing
+        else shines on it, all that it has is this gain: its noise is the least.
+
+    Examples
+    --------
+    >>> spread_over_noise([0.1], [0.5], Noise(1e-4, 0.0)).round(3).tolist()
+    [22.361]
+    """
+    gained = np.minimum(np.asarray(lost, np.float64) * np.asarray(level, np.float64), 1.0)
+    return np.asarray(gained / noise.sigma(gained), np.float64)
 
 
 def exchange_share(caster: Caster) -> float:
@@ -122,16 +150,37 @@ def steepest_slope(slope_x: NDArray[np.floating], slope_y: NDArray[np.floating])
     return float(np.hypot(slope_x, slope_y).max(initial=0.0))
 
 
-def nearness(mesh: Mesh, place_mm: ArrayLike) -> float:
-    """Return how much brighter a light shines on a mesh than in the origin at most, >= 1.
+def most_irradiance(mesh: Mesh, places_mm: ArrayLike, weights_mm2: ArrayLike) -> float:
+    """Return a bound on the light that lights together send to any point of a mesh.
 
     Parameters
     ----------
     mesh
-        The mesh, around the origin.
-    place_mm
-        The light, shape (3,).
+        The mesh.
+    places_mm
+        The lights, shape (L, 3).
+    weights_mm2
+        Energy of each over what a plate in the origin gets in all that faces the camera, mm^2,
+        shape (L,): a surface that faces light k from a distance d gets ``weight / d^2`` of that.
+
+    Returns
+    -------
+    float
+        Over the plate's light: of all lights as if each point faced each of them from as near as
+        any point is. Lights that graze the plate shine many times brighter on what faces them.
+
+    Examples
+    --------
+    >>> from rigsim.mesh import build_mesh
+    >>> plate = build_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], [[0, 0], [1, 0], [0, 1]])
+    >>> round(most_irradiance(plate, [[0, 0, 100]], [100.0**2]), 3)
+    1.0
     """
-    place = np.asarray(place_mm, np.float64)
-    nearest = np.linalg.norm(place - np.asarray(mesh.vertices_mm, np.float64), axis=1).min()
-    return max(float(place @ place) / max(float(nearest) ** 2, 1e-12), 1.0)
+    points = np.asarray(mesh.vertices_mm, np.float64)
+    total = 0.0
+    for place, weight in zip(
+        np.asarray(places_mm, np.float64), np.asarray(weights_mm2, np.float64), strict=True
+    ):
+        squared = float(np.min(np.sum((place - points) ** 2, axis=1)))
+        total += float(weight) / max(squared, 1e-12)
+    return total

@@ -197,6 +197,35 @@ class SceneNeeds:
         return [effect.document() for effect in self.effects]
 
 
+def strictest(each: Sequence[SceneNeeds]) -> SceneNeeds:
+    """Return what a scene must hold that several cameras look at: what any of them needs.
+
+    Parameters
+    ----------
+    each
+        One a camera, at least one.
+
+    Examples
+    --------
+    >>> coarse, fine = (
+    ...     SceneNeeds((decide("blur", size, None, switch="optics", because="a lens"),))
+    ...     for size in (0.01, 5.0)
+    ... )
+    >>> strictest([coarse, fine])["blur"].over_noise
+    5.0
+    """
+    found: dict[str, Effect] = {}
+    for effect in (effect for needs in each for effect in needs):
+        other = found.get(effect.name)
+        if other is None or _need(effect) > _need(other):
+            found[effect.name] = effect
+    return SceneNeeds(tuple(found.values()))
+
+
+def _need(effect: Effect) -> tuple[bool, float]:
+    return effect.built, effect.over_noise or 0.0
+
+
 def decide(
     name: str, over_noise: float, asked: bool | None, *, switch: str, because: str
 ) -> Effect:

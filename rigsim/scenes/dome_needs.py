@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.rig import Rig, View
+from capture.rig import Rig, Vector, View
 from model import spectra
-from rigsim.effect_sizes import bounced, edge_loss, exchange_share, nearness
+from rigsim.effect_sizes import (
+    bounced,
+    edge_loss,
+    exchange_share,
+    most_irradiance,
+    spread_over_noise,
+)
 from rigsim.head_motion import HeadMotion
 from rigsim.render import Caster
 from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
@@ -89,13 +97,14 @@ def dome_needs(
         white = spectra.camera_white(view.spectral_sensitivity, illuminant)
         level = white * brightest / (white * brightest).max()
     else:
-        near = max(nearness(caster.mesh, light.position_mm) for light in rig.lights)
-        level = np.minimum(1.0, near * white_rgb * brightest)
+        near = max(_nearness(caster, light.position_mm) for light in rig.lights)
+        level = near * white_rgb * brightest
     pixel_mm = view.distance_mm / view.focal_px
     kernels = typical_kernels(subject, state, view.spectral_sensitivity, illuminant)
     lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
     share = exchange_share(caster)
     more = level * [bounced(share, float(reflectance)) for reflectance in brightest]
+    more = np.minimum(more, 1.0)
     unseen = more / noise.sigma(more)  # where nothing else shines
     bounces = decide(
         BOUNCES, float(unseen.max()), interreflections, switch="interreflections",
@@ -106,7 +115,7 @@ def dome_needs(
         *textures(subject, view, illuminant),
         Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0)),
         decide(
-            LATERAL, float((lost * level / noise.sigma(level)).max()), subsurface,
+            LATERAL, float(spread_over_noise(lost, level, noise).max()), subsurface,
             switch="subsurface",
             because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
         ),
@@ -118,7 +127,7 @@ def dome_needs(
         ),
         further_bounces(bounces, share * float(brightest.max())),
         focus,
-        wrinkles(subject, noise, float(level.max()), relief_shadows),
+        wrinkles(subject, noise, 1.0, relief_shadows),
     ]  # fmt: skip
     made += _movement(subject, movement, motion, view)
     made += absent(
@@ -151,6 +160,12 @@ def _movement(
         *made,
         *unmodeled([("the twitch in light from inside", "it stays that of the still mouth"), blur]),
     ]
+
+
+def _nearness(caster: Caster, place_mm: Vector) -> float:
+    """Return how much brighter a light shines on a mesh than in the origin at most, >= 1."""
+    squared = math.hypot(*place_mm) ** 2
+    return max(most_irradiance(caster.mesh, [place_mm], [squared]), 1.0)
 
 
 def _limits(made: list[Effect]) -> list[Effect]:

@@ -29,7 +29,7 @@ from rigsim.lateral import line_spread_mm
 from rigsim.mesh import Float32Array, Mesh
 from rigsim.relief_shadow import ReliefShadow
 from rigsim.render import Caster, camera_rays
-from rigsim.scene_needs import Noise, SceneNeeds
+from rigsim.scene_needs import Noise, SceneNeeds, strictest
 from rigsim.scenes import flash_needs
 from rigsim.scenes.flash_needs import BOUNCES, LATERAL, LENS, SPECTRAL, WRINKLES
 from rigsim.scenes.picture import Look, Picture
@@ -214,21 +214,28 @@ class FlashScene:
         self._glow: dict[str, SkinGlow] = {}
         self._pictures: dict[str, Picture] = {}
         self._blurs: dict[str, Mapping[str, Float32Array]] = {}
-        self.needs: SceneNeeds = flash_needs.flash_needs(
-            rig,
-            subject,
-            state,
-            caster=self._caster,
-            noise=Noise.of(self._sensors[rig.views[0].name]),
-            white_rgb=np.asarray(self.white_rgb(), np.float64) * power,
-            movement=movement,
-            lateral=lateral,
-            interreflections=interreflections,
-            spectral=spectral,
-            optics=optics,
-            relief_shadows=relief_shadows,
-            subpixels=subpixels,
-            share=self._stage.share(),
+        self.needs: SceneNeeds = strictest(
+            [
+                flash_needs.flash_needs(
+                    rig,
+                    subject,
+                    state,
+                    view=view,
+                    caster=self._caster,
+                    noise=Noise.of(self._sensors[view.name]),
+                    white_rgb=np.asarray(self.white_rgb(view.name), np.float64) * power,
+                    weights_mm2=self._weights,
+                    movement=movement,
+                    lateral=lateral,
+                    interreflections=interreflections,
+                    spectral=spectral,
+                    optics=optics,
+                    relief_shadows=relief_shadows,
+                    subpixels=subpixels,
+                    share=self._stage.share(),
+                )
+                for view in rig.views
+            ]
         )
         """What is built, what is not, and why."""
         self.lateral = self.needs.builds(LATERAL)

@@ -9,12 +9,20 @@ from numpy.typing import NDArray
 
 from capture.rig import Rig, View
 from model import spectra
+from rigsim import shading
 from rigsim.depth_of_field import facing_depths, lens_spread
-from rigsim.effect_sizes import bounced, edge_loss, exchange_share, nearness
+from rigsim.effect_sizes import (
+    bounced,
+    edge_loss,
+    exchange_share,
+    most_irradiance,
+    spread_over_noise,
+)
 from rigsim.render import Caster
 from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
 from rigsim.scenes.skin_glow import typical_kernels
 from rigsim.skin_color import skin_color
+from rigsim.skin_layers import ETA
 from rigsim.skin_table import SkinTable
 from rigsim.subject import Subject
 from rigsim.targets import Target
@@ -51,9 +59,11 @@ def flash_needs(
     subject: Subject | Target,
     state: str,
     *,
+    view: View,
     caster: Caster,
     noise: Noise,
     white_rgb: NDArray[np.floating],
+    weights_mm2: NDArray[np.floating],
     movement: bool,
     lateral: bool | None,
     interreflections: bool | None,
@@ -68,15 +78,19 @@ def flash_needs(
     Parameters
     ----------
     rig
-        The rig; of several cameras the first decides.
+        The rig.
     subject, state
         Who stands there, in which state.
+    view
+        Which of its cameras looks; of several see `rigsim.scene_needs.strictest`.
     caster
         The mesh.
     noise
         Of the sensor.
     white_rgb
         What a white plate in the origin gives at the plan's highest power, full scales, shape (3,).
+    weights_mm2
+        Each light's energy over the sum that such a plate gets, mm^2, shape (L,).
     movement
         Whether the face moves with its state.
     lateral, interreflections, spectral, optics, relief_shadows
@@ -86,7 +100,6 @@ def flash_needs(
     share
         `exchange_share` of the mesh, where it is known already.
     """
-    view = rig.views[0]
     made = [polarization(rig, view), bands(view)]
     dark = [("ambient light", "the room is dark and the flash is short")]
     illuminant = rig.lights[0].illuminant
@@ -102,13 +115,17 @@ def flash_needs(
         made.append(Effect(WRINKLES, "absent", f"{subject.name} has none"))
         return SceneNeeds((*made, *absent(dark)))
     brightest = brightest_rgb(subject, state, view, illuminant)
-    near = max(nearness(caster.mesh, light.position_mm) for light in rig.lights)
-    level = np.minimum(1.0, near * white_rgb * brightest)
+    places = [light.position_mm for light in rig.lights]
+    most = most_irradiance(caster.mesh, places, weights_mm2)
+    # not cut at full scale: light of pixels that are full goes on to others all the same
+    level = most * white_rgb * brightest
+    peak = float((level + white_rgb * highlight(rig, view, subject, caster, weights_mm2)).max())
     pixel_mm = view.distance_mm / view.focal_px
     kernels = typical_kernels(subject, state, view.spectral_sensitivity, illuminant)
     lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
     share = exchange_share(caster) if share is None else share
     more = level * [bounced(share, float(reflectance)) for reflectance in brightest]
+    more = np.minimum(more, 1.0)
     unseen = more / noise.sigma(more)  # where nothing else shines
     bounces = decide(
         BOUNCES, float(unseen.max()), interreflections, switch="interreflections",
@@ -117,9 +134,9 @@ def flash_needs(
     off = unseen * color_error(subject, state, view, illuminant) if bounces.built else np.zeros(1)
     made += [
         *textures(subject, view, illuminant),
-        Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0, float(level.max()))),
+        Effect(SHADOWS, "built", "a face shades itself", noise.share(1.0, min(peak, 1.0))),
         decide(
-            LATERAL, float((lost * level / noise.sigma(level)).max()), lateral, switch="lateral",
+            LATERAL, float(spread_over_noise(lost, level, noise).max()), lateral, switch="lateral",
             because=f"pixels of {pixel_mm:.2f} mm lose {100 * lost.max():.1f} % at a shadow's edge",
         ),
         bounces,
@@ -129,8 +146,8 @@ def flash_needs(
             if bounces.built else "there is no such light",
         ),
         further_bounces(bounces, share * float(brightest.max())),
-        lens(view, illuminant, caster, noise, float(level.max()), subpixels, optics),
-        wrinkles(subject, noise, float(level.max()), relief_shadows),
+        lens(view, illuminant, caster, noise, peak, subpixels, optics),
+        wrinkles(subject, noise, peak, relief_shadows),
     ]  # fmt: skip
     return SceneNeeds((*made, *_movement(subject, movement), *absent(dark), *_limits()))
 
@@ -150,11 +167,54 @@ def wrinkles(subject: Subject, noise: Noise, level: float, asked: bool | None) -
     )
     steepest = 1e-3 * float(np.hypot(right / across, down / along).max(initial=0.0))
     # a light as low as the relief is steep shines with that sine, and may be hidden
-    most = steepest / math.hypot(1.0, steepest) * level
+    most = min(1.0, steepest / math.hypot(1.0, steepest) * level)
     return decide(
         WRINKLES, most / float(noise.sigma(0.0)), asked, switch="relief_shadows",
         because=f"wrinkles as steep as {math.degrees(math.atan(steepest)):.0f} degrees",
     )  # fmt: skip
+
+
+def highlight(
+    rig: Rig,
+    view: View,
+    subject: Subject,
+    caster: Caster,
+    weights_mm2: NDArray[np.floating],
+) -> float:
+    """Return a bound on what a face's surface reflects, over the light of a white plate.
+
+    Parameters
+    ----------
+    rig, view
+        Lights, and the camera that looks.
+    subject
+        Whose roughness.
+    caster
+        The face's mesh.
+    weights_mm2
+        As of `flash_needs`.
+
+    Notes
+    -----
+    Of the facets' ``F D G(l) G(v) / (4 n.v)`` with GGX's ``D <= 1 / (pi a^2)``, ``G(l) <= 1`` and
+    ``G(v) / n.v <= 2 / a``: pi times it is at most ``F / (2 a^3)``. F is that of light polarized
+    across the plane of incidence, at half the largest angle between light and camera; an analyser
+    passes all of such light, and half of a plate's.
+    """
+    rough = max(float(subject.roughness[subject.atlas.covered].min()), shading.ALPHA_RANGE[0])
+    points = np.asarray(caster.mesh.vertices_mm, np.float64)
+    to_camera = np.asarray(view.position_mm) - points
+    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+    total = 0.0
+    for light, weight in zip(rig.lights, weights_mm2, strict=True):
+        way = np.asarray(light.position_mm) - points
+        to_light = way / np.linalg.norm(way, axis=1, keepdims=True)
+        between = float(np.einsum("ij,ij->i", to_light, to_camera).min())
+        cosine = math.sqrt(max(0.5 * (1.0 + between), 0.0))  # of half the angle
+        inside = math.sqrt(ETA**2 - 1.0 + cosine**2)
+        across = ((cosine - inside) / (cosine + inside)) ** 2
+        total += 2.0 * across * most_irradiance(caster.mesh, [light.position_mm], [float(weight)])
+    return total / (2.0 * rough**3)
 
 
 FAR_LIGHT = [("glare and far rings of the lens", "light goes as far as the nearest rings")]
@@ -180,7 +240,7 @@ def lens(
     noise
         Of the sensor.
     level
-        The brightest pixel, full scales.
+        The brightest pixel, full scales; it may be over-full.
     subpixels
         Rays along each side of a pixel.
     asked
@@ -190,7 +250,7 @@ def lens(
     spread = lens_spread(view, illuminant, subpixels=subpixels, depths_mm=depths)
     spilled = spread.spilled(depths)
     far = max(abs(depth) for depth in depths)
-    gained = min(1.0, level) * spilled  # by a black pixel amid bright ones, where noise is least
+    gained = min(1.0, level * spilled)  # by a black pixel amid bright ones, where noise is least
     return decide(
         LENS, gained / float(noise.sigma(gained)), asked, switch="optics",
         because=f"at f/{view.f_number:g}, up to {far:.0f} mm off focus, "

@@ -150,6 +150,60 @@ def test_what_is_asked_for_is_done_and_said(flash, faces):
     assert "spectral=True asks for it" in forced.needs[flash_needs.SPECTRAL].reason
 
 
+def grazing(rig, angle_deg=88.0):
+    """Return the rig with one of its lights alone, far off the camera's axis."""
+    light = rig.lights[0]
+    far, angle = math.hypot(*light.position_mm), math.radians(angle_deg)
+    place = (far * math.sin(angle), 0.0, far * math.cos(angle))
+    return dataclasses.replace(rig, lights=(dataclasses.replace(light, position_mm=place),))
+
+
+@pytest.mark.parametrize("power", [1.0, 0.02])
+def test_sizes_are_bounds_where_a_light_grazes_a_plate_that_faces_the_camera(flash, faces, power):
+    """What faces the light is 29 times as bright as the plate, and beyond full scale."""
+    rig, face = grazing(flash), faces["darkest"]
+    scene = FlashScene(rig, face, power=power)
+    noise = Noise.of(scene.sensor())
+
+    def light(**settings):
+        made = FlashScene(rig, face, power=power, **settings)
+        return power * np.stack([made.radiance(name) for name in ("parallel", "crossed")])
+
+    told = {effect.switch: effect.over_noise for effect in scene.needs}
+    for switch in ("lateral", "interreflections", "spectral", "optics"):
+        have, lack = light(**{switch: True}), light(**{switch: False})
+        # what is full shows no change, but what it sends to others does
+        change = np.abs(np.minimum(have, 1.0) - np.minimum(lack, 1.0)) / noise.sigma(have)
+        assert change.max() <= told[switch]
+    assert told["interreflections"] < 40.0 * max(told["spectral"], 0.02)
+
+
+def test_a_highlight_is_brighter_than_dark_skin_and_the_lens_is_judged_by_it(flash, faces):
+    """A bound on highlights: above what is found anywhere, though a few times at most."""
+    for rig in (flash, grazing(flash, 60.0)):
+        scene = FlashScene(rig, faces["darkest"], lateral=False, optics=False)
+        shown = scene.radiance("parallel") - scene.radiance("crossed")
+        bound = flash_needs.highlight(
+            rig, rig.views[0], scene.subject, scene._caster, scene._weights
+        )
+        peak = float((bound * scene.white_rgb()).max())
+        assert shown.max() < peak
+
+
+def test_of_two_cameras_the_one_that_tells_more_decides(flash, faces):
+    view = flash.views[0]
+    dull = dataclasses.replace(view, read_noise_e=2e4)
+    keen = dataclasses.replace(view, name="keen", serial="SR-0002")
+    alone, both, swapped = (
+        FlashScene(dataclasses.replace(flash, views=views), faces["darkest"]).needs
+        for views in ((dull,), (dull, keen), (keen, dull))
+    )
+    assert alone[flash_needs.BOUNCES].verdict == "negligible"
+    for needs in (both, swapped):
+        assert needs.builds(flash_needs.BOUNCES)
+        assert needs[flash_needs.LATERAL].over_noise > alone[flash_needs.LATERAL].over_noise
+
+
 def test_flat_targets_need_neither_shadows_nor_bounces(flash):
     dome = load_rig("dome").resized(64).subset(views=["C02"])
     for scene in (FlashScene(flash, make_target("chart")), DomeScene(dome, make_target("white"))):
