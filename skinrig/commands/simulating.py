@@ -110,8 +110,10 @@ def simulate(
     leave_out: Annotated[
         str | None,
         typer.Option(
-            help="What a dome's scene does not build although it changes pixels: subsurface, "
-            "interreflections, joined by commas."
+            help="What a scene of skin does not build although it changes pixels, joined by "
+            "commas. Flash rig: lateral, interreflections, spectral, optics, relief_shadows; dome: "
+            "subsurface for lateral, and the same; gradient rig: shadows, lateral, "
+            "interreflections, optics."
         ),
     ] = None,
     condition: Annotated[

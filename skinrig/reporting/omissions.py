@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from skinrig.reporting import page
+from skinrig.simulating.leaving_out import may_be_left_out
 
 ORDER = ("asked", "negligible", "unmodeled", "absent", "built")
 """In which verdicts are listed, see `rigsim.scene_needs.MEANING`."""
@@ -61,9 +62,10 @@ def section(sessions: Sequence[Path]) -> str:
         return ""
     body = (
         "<h2>What simulated scenes leave out</h2><p class=note>A scene builds what changes a pixel "
-        "by a tenth of its noise or more. The last column is the largest change that its rule "
-        "tells, over the noise; <code>skinrig bench --stage omissions</code> renders scenes with "
-        "and without. What is not modeled may change pixels: real photographs hold it and "
+        "by a tenth of its noise or more. The number is the largest change that its rule tells, "
+        "over the noise; <code>skinrig bench --stage omissions</code> renders scenes with "
+        "and without. <code>skinrig simulate --leave-out</code> leaves out all the same what has "
+        "a name beside. What is not modeled may change pixels: real photographs hold it and "
         "simulated ones do not.</p>"
     )
     for text, names in alike.items():
@@ -71,16 +73,17 @@ def section(sessions: Sequence[Path]) -> str:
         rows = sorted((_row(effect) for effect in effects), key=lambda row: _place(row[1]))
         out = sum(not effect["verdict"] == "built" for effect in effects)
         title = f"{', '.join(names)}: of {len(effects)} effects {len(effects) - out} built"
-        head = ("effect", "what became of it", "why", "change over noise")
+        head = ("effect", "what became of it", "why", "change over noise", "--leave-out")
         body += page.folded(title, page.table(head, rows, caption="Effects of light in the scene"))
     return body
 
 
-def _row(effect: Mapping[str, Any]) -> tuple[str, str, str, str]:
-    over = effect.get("over_noise")
+def _row(effect: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
+    over, switch = effect.get("over_noise"), str(effect.get("switch", ""))
     return (
         str(effect["name"]), WORDS.get(str(effect["verdict"]), str(effect["verdict"])),
         str(effect["reason"]), "" if over is None else f"{over:.3g}",
+        switch if may_be_left_out(switch) else "",
     )  # fmt: skip
 
 

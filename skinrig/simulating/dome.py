@@ -328,26 +328,25 @@ def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
     else:
         person = make_subject(order.subject, seed=order.seed, size=TEXELS, mesh=order.mesh)
     motion = head_motion(order.seed) if order.move else None
-    light = _light_of_skin(order)
     return DomeScene(
         rig, person, dome=built, motion=motion, state=order.states[0], movement=order.movement,
-        seed=order.seed, subsurface=light["subsurface"], interreflections=light["interreflections"],
-        conditions=conditions, on_s=longest_on_s(plan),
+        seed=order.seed, conditions=conditions, on_s=longest_on_s(plan), **_light_of_skin(order),
     )  # fmt: skip
 
 
 def _light_of_skin(order: Order) -> dict[str, bool | None]:
-    """Return which light from inside and from other skin is built; None: what changes pixels."""
+    """Return what of a face is built though it shows in no pixel, and what is not though it does.
+
+    What changes pixels is built where nothing is asked for.
+    """
     asked: dict[str, bool | None] = {
         "subsurface": order.subsurface or None, "interreflections": order.interreflections or None
     }  # fmt: skip
-    for name in order.leave_out:
-        if name not in asked:
-            raise SimulationError(f"leave_out: got {name!r}, expected one of {', '.join(asked)}")
-        if asked[name]:
+    without = order.without("dome")
+    for name in without:
+        if asked.get(name):
             raise SimulationError(f"leave_out: {name} was asked for, too")
-        asked[name] = False
-    return asked
+    return {**asked, **without}
 
 
 def _attach_scan(session: Any, scene: Any, order: Order) -> dict[str, Any]:

@@ -53,6 +53,7 @@ def simulate_flash(order: Order) -> Simulated:
         "mesh": str(order.mesh or ""), "states": list(states), "repeats": order.repeats,
         "movement": order.movement,
         **({} if order.plan is None else {"plan": order.plan.to_json()}),
+        **({"leave_out": list(order.leave_out)} if order.leave_out else {}),
     }  # fmt: skip
     # what cannot be built must fail before a folder is made
     plan = order.plan or _plan(rig, target, states, order.repeats)
@@ -100,9 +101,12 @@ def _scenes(rig: Rig, order: Order, plan: Plan) -> dict[str, Any]:
         return {state: FlashScene(rig, targets.make_target(order.target), seed=seed, power=power)}
     person = make_subject(order.subject, seed=seed, mesh=order.mesh)
     return {
-        state: FlashScene(rig, person, state=state, movement=order.movement, seed=seed, power=power)
+        state: FlashScene(
+            rig, person, state=state, movement=order.movement, seed=seed, power=power,
+            **order.without("flash"),
+        )
         for state in order.states
-    }
+    }  # fmt: skip
 
 
 def to_superpixels(values: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> NDArray[Any]:

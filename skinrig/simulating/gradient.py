@@ -67,10 +67,12 @@ def simulate_gradient(order: Order) -> Simulated:
         "angles": ",".join(f"{angle:g}" for angle in order.angles or ANGLES_DEG[order.size] or ()),
         "steps": "" if order.steps is None else f"{order.steps[0]}..{order.steps[1]}",
         **({} if order.plan is None else {"plan": order.plan.to_json()}),
+        **({"leave_out": list(order.leave_out)} if order.leave_out else {}),
     }  # fmt: skip
     scene = make_scene(
-        rig, order.target, site=order.site, preset=order.subject, seed=order.seed, plan=plan
-    )
+        rig, order.target, site=order.site, preset=order.subject, seed=order.seed, plan=plan,
+        without=order.without("gradient"),
+    )  # fmt: skip
     session = open_session(order, plan, rig, asked, scene)
     try:
         log = GripLog(scene, truth_folder(order.out), resume=order.resume, session=session)
@@ -117,6 +119,7 @@ def make_scene(
     preset: str = "III",
     seed: int = 0,
     plan: Plan | None = None,
+    without: Mapping[str, bool] | None = None,
 ) -> Any:
     """Return what stands in the sphere, with LEDs as they were built.
 
@@ -130,6 +133,8 @@ def make_scene(
         Of the skin; the seed also of the sphere and of the patch's motion.
     plan : Plan, optional
         By whose angles the skin must be large enough; any angle by default.
+    without
+        What of the skin is not built, see `skinrig.simulating.leaving_out`.
     """
     from rigsim.microrelief import make_micro_skin
     from rigsim.patch_motion import PatchMotion
@@ -148,7 +153,9 @@ def make_scene(
     )  # fmt: skip
     skin = make_micro_skin(site or SITE, seed=seed, size_mm=size_mm, preset=preset)
     on_s = None if plan is None else longest_on_s(plan)
-    return GradientScene(rig, skin, sphere=sphere, motion=PatchMotion(seed), seed=seed, on_s=on_s)
+    return GradientScene(
+        rig, skin, sphere=sphere, motion=PatchMotion(seed), seed=seed, on_s=on_s, **(without or {})
+    )
 
 
 class GripLog:

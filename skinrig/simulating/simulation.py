@@ -23,6 +23,7 @@ from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject
 from skinrig.sequences import SequenceOrder
+from skinrig.simulating.leaving_out import left_out_of
 from skinrig.simulating.shot_numbers import shots_made
 
 RIGS = ("flash", "dome", "gradient", "probe")
@@ -146,6 +147,24 @@ class Order:
             if getattr(self, name) != value:
                 raise SimulationError(f"{name}: the {rig} rig knows nothing of it; leave it out")
 
+    def without(self, rig: str) -> dict[str, bool]:
+        """Return arguments of a scene of skin that leave out what is to be left out.
+
+        Raises
+        ------
+        SimulationError
+            Where the rig's scenes cannot, or a target or a sequence is ordered.
+        """
+        if not self.leave_out:
+            return {}
+        if self.target is not None or self.sequence is not None:
+            what = "a sequence" if self.target is None else "a target"
+            raise SimulationError(f"leave_out: is of skin at rest or in a state, not of {what}")
+        try:
+            return left_out_of(rig, self.leave_out)
+        except ValueError as exc:
+            raise SimulationError(str(exc)) from exc
+
     def check_plan(self, rig: str) -> None:
         """Raise where a plan was handed over that is another rig's, or a target's or sequence's."""
         if self.plan is None:
@@ -263,7 +282,8 @@ def simulate_session(
         What is captured of the subject instead of the rig's own plan; of the dome its lights and
         cameras are those of targets, too.
     leave_out
-        "subsurface", "interreflections": what the dome does not build although it changes pixels.
+        What is not built of skin although it changes pixels, by the switches of
+        `skinrig.simulating.leaving_out`.
 
     Raises
     ------
@@ -286,10 +306,9 @@ def simulate_session(
         plan=plan, leave_out=tuple(leave_out),
     )  # fmt: skip
     if rig_name != "dome":
-        order.refuse(
-            rig_name, subsurface=False, interreflections=False, conditions={}, leave_out=()
-        )
+        order.refuse(rig_name, subsurface=False, interreflections=False, conditions={})
         order.check_plan(rig_name)
+    order.without(rig_name)
     if sequence is not None and rig_name != "flash":
         raise SimulationError(f"sequence: the {rig_name} rig knows nothing of it; leave it out")
     if sequence is None and relaxation_s is not None:

@@ -1,0 +1,67 @@
+"""What a simulated scene is asked not to build, by the names that its list of effects shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Final
+
+SWITCHES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "flash": ("lateral", "interreflections", "spectral", "optics", "relief_shadows"),
+        "dome": ("subsurface", "interreflections", "spectral", "optics", "relief_shadows"),
+        "gradient": ("shadows", "lateral", "interreflections", "optics"),
+        "probe": (),
+    }
+)
+"""By rig: what can be left out, by the ``switch`` of its effect, see `rigsim.scene_needs`."""
+
+SAME: Final = frozenset({"lateral", "subsurface"})
+"""Names of light spreading sideways in skin: each rig's own, and the other's."""
+
+
+def left_out_of(rig: str, names: Sequence[str]) -> dict[str, bool]:
+    """Return arguments for a rig's scene that leave effects out.
+
+    Parameters
+    ----------
+    rig
+        Name of the rig.
+    names
+        Switches of effects.
+
+    Returns
+    -------
+    dict
+        Arguments of the scene, each False.
+
+    Raises
+    ------
+    ValueError
+        Where a name is none that the rig's scenes can leave out.
+
+    Examples
+    --------
+    >>> left_out_of("flash", ["optics", "subsurface"])
+    {'optics': False, 'lateral': False}
+    """
+    known = SWITCHES[rig]
+    out: dict[str, bool] = {}
+    for name in names:
+        own = next((k for k in known if k == name or {k, name} <= SAME), None)
+        if own is None:
+            expected = f"one of {', '.join(known)}" if known else "none: its scenes build all"
+            raise ValueError(f"leave_out: got {name!r}, expected of the {rig} rig {expected}")
+        out[own] = False
+    return out
+
+
+def may_be_left_out(switch: str) -> bool:
+    """Return whether some rig's scenes can leave the effect of a switch out.
+
+    Examples
+    --------
+    >>> may_be_left_out("optics"), may_be_left_out("last_bounce")
+    (True, False)
+    """
+    return any(switch in known for known in SWITCHES.values())

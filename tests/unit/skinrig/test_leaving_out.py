@@ -1,0 +1,47 @@
+"""What a simulation is asked not to build goes by the names in its list of effects."""
+
+import inspect
+
+import pytest
+
+from capture.plan import flash_plan
+from capture.rig import load_rig
+from capture.session import Session
+from rigsim.scenes.dome import DomeScene
+from rigsim.scenes.flash import FlashScene
+from rigsim.scenes.gradient import GradientScene
+from skinrig.simulating.leaving_out import SWITCHES
+from skinrig.simulating.simulation import SimulationError, simulate_session
+
+
+@pytest.mark.parametrize(
+    ("rig", "scene"), [("flash", FlashScene), ("dome", DomeScene), ("gradient", GradientScene)]
+)
+def test_every_name_is_an_argument_of_the_rig_s_scene(rig, scene):
+    assert set(SWITCHES[rig]) <= set(inspect.signature(scene).parameters)
+
+
+def test_effects_left_out_of_the_flash_rig_are_told_under_their_names(tmp_path):
+    rig = load_rig("flash").resized(48)
+    asked = {"width_px": 48, "plan": flash_plan(rig), "leave_out": ("subsurface", "optics")}
+    made = simulate_session("flash", tmp_path / "s", **asked)
+    verdicts = {effect["switch"]: effect["verdict"] for effect in made.effects}
+    assert verdicts["lateral"] == verdicts["optics"] == "asked"
+    assert verdicts["interreflections"] == "built"
+    noted = Session.open(tmp_path / "s").manifest.extra["simulation"]
+    assert noted["leave_out"] == ["subsurface", "optics"]
+
+
+@pytest.mark.parametrize(
+    ("rig", "more", "match"),
+    [("flash", {"leave_out": ("shadow",)}, "'shadow', expected of the flash rig one of lat"),
+     ("gradient", {"leave_out": ("spectral",)}, "one of shadows, lateral, interreflections,"),
+     ("probe", {"leave_out": ("optics",)}, "none: its scenes build all"),
+     ("dome", {"leave_out": ("lateral",), "subsurface": True}, "subsurface was asked for, too"),
+     ("flash", {"leave_out": ("optics",), "target": "white"}, "not of a target"),
+     ("dome", {"leave_out": ("optics",), "target": "white"}, "not of a target")],
+)  # fmt: skip
+def test_what_cannot_be_left_out_is_refused_before_a_folder_is_made(tmp_path, rig, more, match):
+    with pytest.raises(SimulationError, match=match):
+        simulate_session(rig, tmp_path / "s", **more)
+    assert not (tmp_path / "s").exists()
