@@ -68,6 +68,12 @@ def reflectance(
         Shape (n,): fraction of the incident power that leaves through the top, without the
         reflection of the beam at the first surface.
 
+    Raises
+    ------
+    ValueError
+        For coefficients or thicknesses that are negative or NaN, or of different shapes; for `eta`
+        outside 1 to 100, an `anisotropy` outside [0, 1), an odd number of directions.
+
     Notes
     -----
     The radiance is resolved by Gauss points below the critical angle and Radau points above it.
@@ -89,8 +95,22 @@ def reflectance(
     0.2599
     """
     rule = quadrature(float(eta), int(directions))
+    shapes = [np.shape(x) for x in (sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm)]
+    if len(set(shapes)) > 1 or len(shapes[0]) != 2:
+        raise ValueError(
+            "sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm: got shapes "
+            f"{', '.join(map(str, shapes))}, expected one (n, layers)"
+        )
+    for name, values, most in (
+        ("sigma_a_per_mm", sigma_a_per_mm, False), ("thickness_mm", thickness_mm, True),
+        ("sigma_s_prime_per_mm", sigma_s_prime_per_mm, False),
+    ):  # fmt: skip
+        if not np.all((values >= 0.0) & ((values < np.inf) | most)):
+            raise ValueError(f"{name}: got negative values or NaN, expected at least 0")
     layers = sigma_a_per_mm.shape[1]
     g = np.broadcast_to(np.asarray(anisotropy, dtype=np.float64), (layers,))
+    if not np.all((g >= 0.0) & (g < 1.0)):
+        raise ValueError(f"anisotropy: got {anisotropy}, expected in [0, 1)")
     stack = np.stack([sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm], axis=-1)
     stack = stack.reshape(stack.shape[0], 3 * layers)
     below: FloatArray | None = None  # reflection matrices of what lies below, one a unique row
@@ -117,8 +137,11 @@ def quadrature(eta: float, directions: int) -> Quadrature:
     """Return the directions for an index of refraction: half of them beyond the critical angle."""
     if directions < 4 or directions % 2:
         raise ValueError(f"directions: expected an even number of at least 4, got {directions}")
-    if not 1.0 <= eta < np.inf:
-        raise ValueError(f"eta: expected a relative refractive index of at least 1, got {eta}")
+    if not 1.0 <= eta <= fresnel.LARGEST_INDEX:
+        raise ValueError(
+            f"eta: expected a relative refractive index of at least 1, up to "
+            f"{fresnel.LARGEST_INDEX:g}, got {eta}"
+        )
     mu_c = np.sqrt(1.0 - 1.0 / eta**2)
     if mu_c < 1e-3:  # matched: a single range
         mu, weight = _radau(directions)

@@ -15,6 +15,8 @@ ETA_SKIN = 1.4
 Jimenez 2010 gives none (Donner 2008 has 1.4); Weyrich 2005 writes "about 1.3".
 """
 
+LARGEST_INDEX = 100.0
+"""Largest relative index of averages over directions: beyond it 1 - F_dr vanishes in rounding."""
 _POINTS = 96  # the external average is smooth: 96 Gauss points are exact to rounding
 
 
@@ -32,17 +34,22 @@ def reflectance(cos_incident: ArrayLike, eta: float) -> FloatArray:
     Returns
     -------
     ndarray
-        Reflectance in [0, 1], shaped like `cos_incident`.
+        Reflectance in [0, 1], shaped like `cos_incident`; NaN where the cosine is.
+
+    Raises
+    ------
+    ValueError
+        For an `eta` that is not finite and above 0.
 
     Examples
     --------
     >>> round(float(reflectance(1.0, 1.5)), 6)
     0.04
     """
-    if not eta > 0.0:
-        raise ValueError(f"eta: expected a positive relative refractive index, got {eta}")
+    _require_index(eta)
     mu_i = np.asarray(cos_incident, dtype=np.float64)
-    sin2_t = (1.0 - mu_i**2) / eta**2
+    with np.errstate(over="ignore"):  # beyond any number it is beyond the critical angle, too
+        sin2_t = (1.0 - mu_i**2) / eta / eta  # the square of a huge index overflows
     mu_t = np.sqrt(np.maximum(0.0, 1.0 - sin2_t))
     # At grazing incidence on a matched surface both terms are 0/0; nothing is reflected there.
     sum_s = mu_i + eta * mu_t
@@ -55,13 +62,14 @@ def reflectance(cos_incident: ArrayLike, eta: float) -> FloatArray:
 
 
 def normal_reflectance(eta: float) -> float:
-    """Return the reflectance at normal incidence, ((eta - 1)/(eta + 1))^2.
+    """Return the reflectance at normal incidence, ((eta - 1)/(eta + 1))^2; eta as above.
 
     Examples
     --------
     >>> round(normal_reflectance(1.4), 6)
     0.027778
     """
+    _require_index(eta)
     return float(((eta - 1.0) / (eta + 1.0)) ** 2)
 
 
@@ -91,7 +99,7 @@ def diffuse_internal(eta: float) -> float:
     >>> round(diffuse_internal(1.4), 6)
     0.528985
     """
-    return 1.0 - (1.0 - diffuse_external(eta)) / eta**2
+    return 1.0 - (1.0 - diffuse_external(eta)) / eta / eta
 
 
 @lru_cache(maxsize=64)
@@ -142,9 +150,17 @@ def boundary_factor(eta: float) -> float:
     return (1.0 + f_dr) / (1.0 - f_dr)
 
 
+def _require_index(eta: float) -> None:
+    if not 0.0 < eta < np.inf:
+        raise ValueError(f"eta: expected a positive, finite relative refractive index, got {eta}")
+
+
 def _denser(eta: float) -> float:
-    if not 1.0 <= eta < np.inf:
-        raise ValueError(f"eta: expected a relative refractive index of at least 1, got {eta}")
+    if not 1.0 <= eta <= LARGEST_INDEX:
+        raise ValueError(
+            f"eta: expected a relative refractive index of at least 1, up to {LARGEST_INDEX:g}, "
+            f"got {eta}"
+        )
     return float(eta)
 
 

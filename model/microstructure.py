@@ -57,6 +57,10 @@ ALPHA_LIMITS = (-2.0, 1.0)
 TABLE_SCHEMA = "skinrig.kernel-table/1"
 
 
+WIDEST_PX = 1e6
+"""Widest Gaussian, px: wider than any map, and its weights still fit into memory."""
+
+
 class KernelTableError(ValueError):
     """A table of kernels that contradicts itself, or a stretch that it does not reach."""
 
@@ -70,7 +74,7 @@ def gaussian_weights(sigma_px: float) -> Floats:
     Parameters
     ----------
     sigma_px : float
-        Standard deviation, px, > 0.
+        Standard deviation, px, above 0, up to `WIDEST_PX`.
 
     Returns
     -------
@@ -84,8 +88,8 @@ def gaussian_weights(sigma_px: float) -> Floats:
     >>> gaussian_weights(0.1).tolist()
     [1.0]
     """
-    if not (math.isfinite(sigma_px) and sigma_px > 0):
-        raise ValueError(f"sigma_px: got {sigma_px}, expected a finite number above 0")
+    if not 0 < sigma_px <= WIDEST_PX:
+        raise ValueError(f"sigma_px: got {sigma_px}, expected above 0, up to {WIDEST_PX:g}")
     k = np.arange(int(TRUNCATE * sigma_px + 0.5) + 1)
     w = np.exp(-0.5 * (k / sigma_px) ** 2)
     return w / (w[0] + 2.0 * w[1:].sum())

@@ -100,7 +100,16 @@ def asymptotic_decay(absorption_ratio: float, g: float) -> float:
     >>> k = asymptotic_decay(1.0, 0.0)  # isotropic: (c/2 k) ln((1 + k)/(1 - k)) = 1, c = 1/2
     >>> round(float(0.25 / (k / 2) * np.log((1 + k / 2) / (1 - k / 2))), 9)
     1.0
+
+    Raises
+    ------
+    ValueError
+        For a ratio outside 1e-100 to 1e100, or a g outside [0, 1).
     """
+    if not 1e-100 <= absorption_ratio <= 1e100:
+        raise ValueError(f"absorption_ratio: got {absorption_ratio}, expected 1e-100 to 1e100")
+    if not 0.0 <= g < 1.0:
+        raise ValueError(f"g: got {g}, expected in [0, 1)")
     order = np.arange(_MOMENTS)
     removed = absorption_ratio + (1.0 - g**order) / (1.0 - g)
     ell = order[1:]

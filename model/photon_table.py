@@ -38,6 +38,8 @@ __all__ = [
 
 NUMERICAL_APERTURE = 0.22
 """Of the source and of the detectors in the collection "fibre", in air."""
+LARGEST = 1e50
+"""Largest length, mm, and coefficient, 1/mm: their squares and cubes are still finite numbers."""
 MAX_ABSORPTION_RATIO = 10.0
 """Largest sigma_a/sigma_s' in the domain."""
 MIN_REDUCED_RADIUS, MAX_REDUCED_RADIUS = 0.02, 50.0
@@ -62,11 +64,11 @@ def reflectance(
     Parameters
     ----------
     radius_mm
-        Distance from the beam, or between the centres of the fibres, mm, at least 0; more than 0
+        Distance from the beam, or between the centres of the fibres, mm, 0 to 1e50; at least 1e-50
         when both cores are points. Broadcast with the coefficients; fastest with the radii on the
         last axis and coefficients of length 1 there.
     sigma_a_per_mm, sigma_s_prime_per_mm
-        Absorption and reduced scattering, 1/mm, at least 0.
+        Absorption, any finite number from 0 on, and reduced scattering, 0 to 1e50; 1/mm.
     eta
         Refractive index of the medium over that of its surroundings, 1 to 1.6.
     g
@@ -89,7 +91,8 @@ def reflectance(
     TableDomainError
         For an eta, g or collection that the table does not hold.
     ValueError
-        For negative or non-finite arguments, or a radius of 0 between points (R is infinite there).
+        For arguments that are negative, not finite or too large, or a radius below 1e-50 between
+        points (R is infinite at 0).
 
     Examples
     --------
@@ -135,6 +138,12 @@ def derivatives(
     radius = _not_negative("radius_mm", radius_mm)
     sigma_a = _not_negative("sigma_a_per_mm", sigma_a_per_mm)
     sigma_s = _not_negative("sigma_s_prime_per_mm", sigma_s_prime_per_mm)
+    cores = (_not_negative("core_mm", core_mm), _not_negative("source_core_mm", source_core_mm))
+    if not any(cores) and np.any(radius < 1.0 / LARGEST):
+        raise ValueError(
+            f"radius_mm: got {radius.min():g} between points, where R is infinite; "
+            f"expected {1.0 / LARGEST:g} and more"
+        )
     shape = np.broadcast_shapes(radius.shape, sigma_a.shape, sigma_s.shape)
     columns = shape[-1] if shape else 1
     one_radius_list = radius.ndim <= 1 or all(n == 1 for n in radius.shape[:-1])
@@ -281,6 +290,10 @@ def domain(
 
 def _not_negative(name: str, value: ArrayLike) -> FloatArray:
     array = np.asarray(value, dtype=np.float64)
-    if not np.all((array >= 0.0) & (array < np.inf)):
-        raise ValueError(f"{name}: got negative or non-finite values, expected at least 0")
+    # only the ratio of absorption to scattering counts, and what is black beyond its range is 0
+    most = np.finfo(np.float64).max if name == "sigma_a_per_mm" else LARGEST
+    outside = ~((array >= 0.0) & (array <= most))
+    if np.any(outside):
+        got = float(array[outside].flat[0])
+        raise ValueError(f"{name}: got {got:g}, expected at least 0, up to {most:.3g}")
     return array

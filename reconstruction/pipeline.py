@@ -277,7 +277,12 @@ class _Kept:
 def _previous(out: Path) -> SkinAppearance | None:
     if not (out / store.DOCUMENT).is_file():
         return None
-    return store.read(out)
+    try:
+        return store.read(out)
+    except store.StoreError as error:
+        raise EvidenceError(
+            f"{error}; nothing was written: remove {out}, or name another, to make all anew"
+        ) from error
 
 
 def _contents(appearance: SkinAppearance) -> dict[str, SkinMap | bytes]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from reconstruction import stage_record, stages
+from reconstruction.evidence import EvidenceError
 from reconstruction.stages import Stage
 
 
@@ -115,3 +116,13 @@ def test_asking_for_nothing_new_reads_no_frame_and_touches_no_file(tmp_path, mon
     assert more["tsumura"] == "run"
     assert standing() != before
     assert "melanin" in store.read(out).maps
+
+    # a folder that lost a map, or holds another than was written, is neither used nor replaced
+    (out / "melanin.exr").write_bytes(b"x" + (out / "melanin.exr").read_bytes()[1:])
+    damaged = standing()
+    with pytest.raises(EvidenceError, match=r"melanin\.exr: was changed .*remove .*make all anew"):
+        pipeline.reconstruct(session, want=["melanin"], out=out)
+    assert standing() == damaged
+    (out / "melanin.exr").unlink()
+    with pytest.raises(EvidenceError, match=r"melanin\.exr: is missing.*remove"):
+        pipeline.reconstruct(session, want=["melanin"], out=out)
