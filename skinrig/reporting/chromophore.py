@@ -105,7 +105,7 @@ def errors(
             for row in rows
         ],
         caption="Relative errors against what the subject is made of (sharp) and against what "
-        "light that spreads in skin leaves visible of it (blurred); C_m: melanin fraction",
+        "light that spreads in skin leaves visible of it (blurred); bands: melanin fraction C_m",
     )  # fmt: skip
     limits = {row.name: 100 * flash.limit(row) for row in blurred if row.band is None}
     return body + _bars([row for row in blurred if row.band is not None], limits)
