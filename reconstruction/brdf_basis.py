@@ -26,8 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
-from model import fresnel
 from model.brdf_tables import BrdfBasis
+from reconstruction import boundary_kernels
 from reconstruction.nnls_kernels import fit_points
 
 FloatArray = NDArray[np.float64]
@@ -161,9 +161,7 @@ def surface_samples(
         )
     cos_l = np.einsum("pmc,pc->pm", light, n)
     cos_v = np.einsum("pmc,pc->pm", view, n)
-    through = np.ones((points, samples))
-    for cosine in (cos_l, cos_v):
-        through *= 1.0 - fresnel.reflectance(np.nan_to_num(np.clip(cosine, 0.0, 1.0)), eta)
+    through = boundary_kernels.transmitted(np.nan_to_num(cos_l), np.nan_to_num(cos_v), eta)
     surface = f - (through[..., None] * albedo[:, None] / np.pi)
     usable = np.all(np.isfinite(surface), axis=-1) & (cos_l >= LEAST_COSINE)
     usable &= cos_v >= LEAST_COSINE

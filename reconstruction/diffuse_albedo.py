@@ -18,7 +18,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model import dipole, fresnel
+from model import dipole
+from reconstruction import boundary_kernels
 from reconstruction.diffuse_albedo_kernels import LEAST_COSINE, fit_envelope
 
 FloatArray = NDArray[np.float64]
@@ -221,9 +222,7 @@ def _ratios(
     """Return pi f / (F_t F_t), infinite where unusable, and the cosines of light and view."""
     cosines = [np.einsum("pmc,pc->pm", v, n, dtype=np.float64) for v in (light, view)]
     above = (cosines[0] >= LEAST_COSINE) & (cosines[1] >= LEAST_COSINE)
-    through = np.ones(above.shape)
-    for cosine in cosines:
-        through *= 1.0 - fresnel.reflectance(np.where(above, np.minimum(cosine, 1.0), 1.0), eta)
+    through = boundary_kernels.transmitted(*(np.where(above, c, 1.0) for c in cosines), eta)
     good = usable & above[..., None]
     ratio = np.pi * np.where(good, f, 0.0) / through[..., None]
     return np.where(good, ratio, np.inf), cosines[0], cosines[1]

@@ -2,7 +2,8 @@
 
 Each image is read once. What it shows of the points that its camera sees is one row of that
 camera's table, on disk where a folder is given; a chunk of points reads its columns of all rows.
-Memory holds one image, one row and one chunk, however many points there are.
+Memory holds one image, one row and one chunk, however many points there are. Without a folder the
+tables are in memory, and so are the chunks of a small surface, which every estimate asks for.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numba import njit, prange
@@ -28,6 +29,11 @@ from reconstruction.lumitexels import (
     visibility,
 )
 from reconstruction.ray_casting import RayCaster
+
+SAMPLE_BYTES: Final = 57
+"""Of one sample of `Lumitexels`."""
+KEPT_BYTES: Final = 2**28
+"""Up to this size chunks are kept for the next estimate, unless the tables are on disk."""
 
 
 class LumitexelStore:
@@ -87,6 +93,8 @@ class LumitexelStore:
         self._lit = np.packbits(seen.light, axis=0, bitorder="little")  # (L / 8, P)
         self._rows = [np.flatnonzero(row).astype(np.int32) for row in seen.view]
         self._scale = np.zeros((len(cameras), self.light_count, 2), np.float32)
+        self._kept_bytes = KEPT_BYTES if folder is None else 0
+        self._kept: dict[tuple[int, int], Lumitexels] = {}
         self._tables = [
             _table(folder, view, (self.light_count, 2, len(rows), 3), np.dtype(dtype))
             for view, rows in enumerate(self._rows)
@@ -131,6 +139,7 @@ class LumitexelStore:
             )
         if good is not None and good.shape != signal.shape[:2]:
             raise ValueError(f"good: got shape {good.shape}, expected {signal.shape[:2]}")
+        self._kept.clear()
         points = self.surface.points_mm[self._rows[view]]
         pose = self._pose(view, light)
         if pose is not None:
@@ -163,7 +172,17 @@ class LumitexelStore:
             yield slice(start, stop), self.chunk(start, stop)
 
     def chunk(self, start: int, stop: int) -> Lumitexels:
-        """Return the lumitexels of the points from `start` to before `stop`."""
+        """Return the lumitexels of the points from `start` to before `stop`, not to be changed."""
+        part = (start, stop)
+        if part in self._kept:
+            return self._kept[part]
+        found = self._chunk(start, stop)
+        samples = sum(kept.valid.size for kept in (found, *self._kept.values()))
+        if SAMPLE_BYTES * samples <= self._kept_bytes:
+            self._kept[part] = found
+        return found
+
+    def _chunk(self, start: int, stop: int) -> Lumitexels:
         count, views, lights = stop - start, len(self._cameras), self.light_count
         points = self.surface.points_mm[start:stop].astype(np.float64)
         normals = self.surface.normals[start:stop]

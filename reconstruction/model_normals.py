@@ -15,9 +15,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from model import fresnel
 from model.brdf_tables import BrdfBasis
-from reconstruction import mixture_kernels
+from reconstruction import boundary_kernels, mixture_kernels
 from reconstruction.lumitexels import Lumitexels
 
 Floats = NDArray[np.float64]
@@ -185,13 +184,7 @@ class _Fit:
         lobes = mixture_kernels.evaluate(
             self.basis.table, self.weights, s.light_dir, s.view_dir, normals
         )
-        through = np.prod(
-            [
-                1.0 - fresnel.reflectance(np.clip(cosine, 0.0, 1.0), fresnel.ETA_SKIN)
-                for cosine in (cos_light, cos_view)
-            ],
-            axis=0,
-        )
+        through = boundary_kernels.transmitted(cos_light, cos_view)
         # the cosine that made f from the radiance is the scan's
         ratio = np.clip(cos_light, 0.0, None) / s.cos_light
         value = (self.r_d[:, None] * through / np.pi + lobes) * ratio

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from model import fresnel
 from model.brdf_tables import BrdfBasis
 from reconstruction import (
+    boundary_kernels,
     brdf_basis,
     diffuse_albedo,
     half_vector_normals,
@@ -75,9 +76,7 @@ def chunk_points(store: LumitexelStore) -> int:
 
 def transmitted(cos_light: NDArray[np.floating], cos_view: NDArray[np.floating]) -> Double:
     """Return F_t(light) F_t(view), the share that the skin's boundary lets in and out again."""
-    inside = 1.0 - fresnel.reflectance(np.clip(cos_light, 0.0, 1.0), fresnel.ETA_SKIN)
-    outside = 1.0 - fresnel.reflectance(np.clip(cos_view, 0.0, 1.0), fresnel.ETA_SKIN)
-    return np.asarray(inside * outside)
+    return boundary_kernels.transmitted(np.asarray(cos_light), np.asarray(cos_view))
 
 
 def seen_enough(samples: Lumitexels) -> NDArray[np.bool_]:

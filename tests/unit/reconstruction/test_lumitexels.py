@@ -315,6 +315,35 @@ def test_a_store_on_disk_gives_the_same_samples_chunk_by_chunk(tmp_path):
     assert covered == len(where)
 
 
+def test_samples_asked_for_again_are_kept_until_an_image_comes_in(tmp_path, monkeypatch):
+    where = surface(5)
+    words = {"cameras": CAMERAS, "lights": LIGHTS, "caster": CASTER}
+
+    def filled(folder=None):
+        store = LumitexelStore(where, folder=folder, **words)
+        for view in range(2):
+            for light in range(4):
+                store.add(view, light, *image(view, light))
+        return store
+
+    store = filled()
+    first = [part for _, part in store.chunks(77)]
+    assert all(a is b for a, (_, b) in zip(first, store.chunks(77), strict=True))
+    signal, *rest = image(1, 2)
+    store.add(1, 2, 2.0 * signal, *rest)
+    changed = store.chunk(0, 77)
+    there = first[0].valid & (first[0].view == 1) & (first[0].light == 2)
+    assert there.any()
+    np.testing.assert_allclose(changed.f[there], 2.0 * first[0].f[there], rtol=2e-3)
+    # what is too large to keep, or on disk, is put together anew, and the same
+    on_disk = filled(tmp_path)
+    assert on_disk.chunk(0, 77) is not on_disk.chunk(0, 77)
+    monkeypatch.setattr("reconstruction.lumitexel_store.KEPT_BYTES", 0)
+    large = filled()
+    assert large.chunk(0, 77) is not large.chunk(0, 77)
+    np.testing.assert_array_equal(large.chunk(0, 77).f, first[0].f)
+
+
 def test_memory_does_not_grow_with_the_tables(tmp_path):
     """Four times the points: memory grows by less than a quarter of what the tables on disk do."""
     points = trimesh.creation.icosphere(subdivisions=6, radius=RADIUS).vertices

@@ -1,0 +1,86 @@
+"""What the skin's boundary lets in and out again, for each sample of a surface, compiled.
+
+`model.fresnel.reflectance` is the plain twin, equal to the last bit; it needs a dozen passes over
+arrays of millions of samples where one is enough.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from model.fresnel import ETA_SKIN
+
+Double = NDArray[np.float64]
+
+
+def transmitted(
+    cos_light: NDArray[np.floating[Any]],
+    cos_view: NDArray[np.floating[Any]],
+    eta: float = ETA_SKIN,
+) -> Double:
+    """Return F_t(light) F_t(view) of a smooth boundary.
+
+    Parameters
+    ----------
+    cos_light, cos_view
+        Cosines of light and view, of the same shape; those outside 0 to 1 count as the nearer end.
+    eta
+        Refractive index behind the surface over that before it, finite and above 0.
+
+    Returns
+    -------
+    ndarray of float64
+        Of that shape, in [0, 1]; NaN where a cosine is.
+
+    Raises
+    ------
+    ValueError
+        For cosines of different shapes, or an index that is none.
+
+    Examples
+    --------
+    >>> transmitted(np.array([1.0, 0.0]), np.array([1.0, 1.0])).round(4).tolist()
+    [0.9452, 0.0]
+    """
+    if np.shape(cos_light) != np.shape(cos_view):
+        raise ValueError(
+            f"cos_light, cos_view: got shapes {np.shape(cos_light)} and {np.shape(cos_view)}, "
+            "expected the same"
+        )
+    if not (math.isfinite(eta) and eta > 0.0):
+        raise ValueError(f"eta: got {eta}, expected a finite number above 0")
+    out = np.empty(np.shape(cos_light), np.float64)
+    _transmitted(
+        np.ascontiguousarray(cos_light).reshape(-1),
+        np.ascontiguousarray(cos_view).reshape(-1),
+        float(eta),
+        out.reshape(-1),
+    )
+    return out
+
+
+@njit(inline="always")
+def _reflectance(cosine, eta):  # type: ignore[no-untyped-def]
+    # comparisons that NaN fails leave it as it is
+    mu_i = 0.0 if cosine < 0.0 else (1.0 if cosine > 1.0 else cosine)
+    sin2_t = (1.0 - mu_i * mu_i) / eta / eta
+    if sin2_t >= 1.0:
+        return 1.0 if eta != 1.0 else 0.0
+    mu_t = math.sqrt(1.0 - sin2_t)
+    sum_s = mu_i + eta * mu_t
+    sum_p = eta * mu_i + mu_t
+    r_s = (mu_i - eta * mu_t) / (sum_s if sum_s > 0.0 else 1.0)
+    r_p = (eta * mu_i - mu_t) / (sum_p if sum_p > 0.0 else 1.0)
+    return 0.5 * (r_s * r_s + r_p * r_p)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _transmitted(cos_light, cos_view, eta, out):  # type: ignore[no-untyped-def]
+    for k in range(out.size):
+        inside = 1.0 - _reflectance(np.float64(cos_light[k]), eta)
+        out[k] = inside * (1.0 - _reflectance(np.float64(cos_view[k]), eta))
