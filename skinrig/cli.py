@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -120,24 +121,31 @@ def main(argv: list[str] | None = None) -> int:
     if os.environ.get("SKINRIG_TRACEBACK"):
         app(args=argv, standalone_mode=False)
         return errors.DONE
+    given = sys.argv[1:] if argv is None else argv
     try:
         result = app(args=argv, standalone_mode=False)
     except (typer.Exit, SystemExit) as stop:
         code = getattr(stop, "exit_code", None)
         return int(code if code is not None else getattr(stop, "code", 0) or 0)
-    except typer.Abort:
-        print(f"skinrig: {errors.sentence(KeyboardInterrupt())}", file=sys.stderr)
-        return errors.INTERRUPTED
-    except KeyboardInterrupt as stop:
-        print(f"skinrig: {errors.sentence(stop)}", file=sys.stderr)
-        return errors.INTERRUPTED
+    except (typer.Abort, KeyboardInterrupt):
+        return _failed(KeyboardInterrupt(), errors.INTERRUPTED, given)
     except Exception as error:
         if hasattr(error, "exit_code") and hasattr(error, "show"):  # a usage error of Typer's
             error.show()
-            return errors.USAGE
-        print(f"skinrig: {errors.sentence(error)}", file=sys.stderr)
-        return errors.exit_code(error)
+            return _failed(error, errors.USAGE, given, say=False)
+        return _failed(error, errors.exit_code(error), given)
     return int(result or 0)
+
+
+def _failed(error: BaseException, code: int, given: Sequence[str], *, say: bool = True) -> int:
+    """Tell people, and programs that asked for JSON, why a command ended; return its code."""
+    format_message = getattr(error, "format_message", None)
+    told = errors.sentence(error) if say or format_message is None else str(format_message())
+    if say:
+        print(f"skinrig: {told}", file=sys.stderr)
+    # none of a command's own came before: it is the last that a command prints
+    Console("--json" in given).document("skinrig.error/1", {"error": told, "exit_code": code})
+    return code
 
 
 def run() -> None:

@@ -105,6 +105,28 @@ def test_a_dry_run_prints_the_plan_and_opens_nothing(capsys):
     assert document["steps"] > 1
 
 
+@pytest.mark.parametrize(
+    ("argv", "code", "says"),
+    [
+        (["verify", "nothing"], 3, "is not a session"),
+        (["capture", "flash", "--out", "x"], 2, "--port flash=URL"),
+        (["plan", "flash", "--width", "many"], 2, "--width"),
+        (["capture", "flash", "--out", "x", "--port", "flash=/dev/no-such-port", "--camera",
+          "cam=hotfolder:none"], 4, "no-such-port"),
+    ],
+)  # fmt: skip
+def test_with_json_an_error_too_is_one_document(argv, code, says, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main([*argv, "--json"]) == code
+    out, err = capsys.readouterr()
+    document = json.loads(out)
+    assert says in document.pop("error")
+    assert document == {"schema": "skinrig.error/1", "exit_code": code}
+    assert says in err
+    assert main(argv) == code
+    assert "skinrig.error" not in capsys.readouterr().out
+
+
 def test_no_argument_shows_where_to_begin(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main([]) == 0
