@@ -341,18 +341,23 @@ class World:
     def deadline(self) -> float:
         """Return when something will next happen, in s; inf for never."""
         with self.lock:
-            return min(
-                (link.deadline(self._now) for link in self._links.values()), default=math.inf
-            )
+            due = math.inf
+            for link in self._links.values():
+                due = min(due, link.deadline(self._now))
+            return due
 
-    def advance(self, now: float) -> None:
-        """Let time pass up to `now`, in s; everything due before happens at its own time."""
+    def advance(self, now: float) -> float:
+        """Let time pass up to `now`, in s; everything due before happens at its own time.
+
+        Return when something will next happen, in s, as far as is known now; inf for never.
+        """
         with self.lock:
             while (due := self.deadline()) <= now:
                 self._now = max(self._now, due)
                 for link in self._links.values():
                     link.advance(self._now)
             self._now = max(self._now, now)
+            return due
 
     def wait(self, until: float) -> None:
         """Let the world's time come to `until`, in s: at once, or by waiting."""

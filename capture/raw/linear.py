@@ -239,13 +239,13 @@ def _to_middle(
     """
     near, far = np.float32(0.75**power), np.float32(0.25**power)
     for axis, forward in enumerate(ahead):
-        lines = np.moveaxis(plane, axis, 0)
+        lines = plane.T if axis else plane
         shifted = lines.copy()
         if forward:
             shifted[:-1] = near * lines[:-1] + far * lines[1:]
         else:
             shifted[1:] = near * lines[1:] + far * lines[:-1]
-        plane = np.moveaxis(shifted, 0, axis)
+        plane = shifted.T if axis else shifted
     return plane
 
 

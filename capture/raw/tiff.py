@@ -11,6 +11,7 @@ import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 
 from capture.documents import Fault
 from capture.raw.frame import RawError
@@ -168,6 +169,7 @@ class Directory:
         return RawError(what, where=self._where, faults=[Fault(path, got, expected)], advice=advice)
 
 
+@lru_cache(maxsize=4096)  # a session's frames say the same numbers
 def _fraction(value: float, top: int) -> tuple[int, int]:
     """Return the nearest numerator and denominator that both stay within ``top``."""
     exact = Fraction(value)

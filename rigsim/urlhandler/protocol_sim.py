@@ -143,14 +143,13 @@ class Serial(SerialBase):
         until = math.inf if self._timeout is None else world.now + self._timeout
         while True:
             with world.lock:
-                world.advance(world.now)
+                due = world.advance(world.now)
                 try:
                     link.check(world.now)
                 except Unplugged as exc:
                     what = "device reports readiness to read but returned no data"
                     raise SerialException(f"{what} (device disconnected?)") from exc
                 data += link.take(size - len(data))
-                due = world.deadline()
             if len(data) >= size or world.now >= until:
                 return data
             if world.virtual and math.isinf(min(due, until)):
