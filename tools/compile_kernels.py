@@ -1,7 +1,9 @@
 """Compile the kernels that the demo calls, into numba's cache beside the modules, in processes.
 
 ``tools/compiled_kernels.csv`` names them with their types; without this they are compiled when
-they are first called. A line that does not fit the code any more is left out and costs nothing.
+they are first called. Kernels whose types stand in their source are compiled as their module is
+imported; those that a cached function makes for a type of numbers stand under its name. A line that
+does not fit the code any more is left out and costs nothing.
 
 Usage: python tools/compile_kernels.py [--processes N]
        python tools/compile_kernels.py --record   (runs the demo, 3 minutes, and lists its kernels)
@@ -13,6 +15,7 @@ import argparse
 import csv
 import importlib
 import os
+import re
 import sys
 import tempfile
 import time
@@ -21,12 +24,13 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numba import types
 from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
 
 LIST = Path(__file__).with_name("compiled_kernels.csv")
-PACKAGES = ("capture", "model", "reconstruction", "rigsim")
+PACKAGES = ("capture", "model", "reconstruction", "rigsim", "skinrig")
 _NAMES = {name: getattr(types, name) for name in dir(types)} | {"bool": types.boolean}
 
 
@@ -44,13 +48,32 @@ def _compile(module: str, name: str, signature: str) -> bool:
         given = eval(signature, {"__builtins__": {}}, _NAMES)
     except (ImportError, AttributeError, NameError, SyntaxError, TypeError):
         return False
-    if not isinstance(kernel, Dispatcher):
-        return False
     try:
-        kernel.compile(given)
+        if _is_maker(kernel):
+            kernel(np.dtype(str(given)).type)
+        elif not isinstance(kernel, Dispatcher):
+            return False
+        elif given not in kernel.signatures:  # else the import has compiled it
+            kernel.compile(given)
     except (NumbaError, TypeError, RuntimeError):  # the last of kernels with types of their own
         return False
     return True
+
+
+def _is_maker(found: Any) -> bool:
+    """Tell whether a name of a module is a cached function, which makes kernels."""
+    return hasattr(found, "cache_info")
+
+
+def _named(function: Any, given: Any) -> tuple[str, str]:
+    """Return name and types under which `_compile` finds the kernel of a function."""
+    name, scope = function.__name__, vars(importlib.import_module(function.__module__))
+    kernels = [n for n, v in scope.items() if getattr(v, "py_func", None) is function]
+    maker = name.lstrip("_")
+    if not kernels and _is_maker(scope.get(maker)):
+        real = re.search(r"float\d+", str(given))
+        return maker, real.group() if real else str(given)
+    return (name if name in kernels or not kernels else kernels[0]), str(given)
 
 
 def listed() -> list[list[tuple[str, str, str]]]:
@@ -83,7 +106,7 @@ def record() -> None:
     class Recorder(event.Listener):  # type: ignore[misc]
         def __init__(self) -> None:
             self.began: list[float] = []
-            self.rows: list[dict[str, Any]] = []
+            self.found: list[tuple[Any, float, Any]] = []
 
         def on_start(self, _: Any) -> None:
             self.began.append(time.thread_time())
@@ -93,15 +116,17 @@ def record() -> None:
             function = getattr(event.data["dispatcher"], "py_func", None)
             module = getattr(function, "__module__", "") or ""
             if not self.began and module.split(".")[0] in PACKAGES:
-                self.rows.append(
-                    {"module": module, "function": getattr(function, "__name__", ""),
-                     "seconds": f"{seconds:.1f}", "types": str(event.data["args"])}
-                )  # fmt: skip
+                self.found.append((function, seconds, event.data["args"]))
 
     recorder = Recorder()
     with event.install_listener("numba:compile", recorder), tempfile.TemporaryDirectory() as out:
         run_demo(Path(out) / "demo", list(RIGS), console=Console(False), jobs=1)
-    write(recorder.rows)
+    rows = []
+    for function, seconds, given in recorder.found:  # all modules are whole by now
+        name, kinds = _named(function, given)
+        rows.append({"module": function.__module__, "function": name,
+                     "seconds": f"{seconds:.1f}", "types": kinds})  # fmt: skip
+    write(rows)
 
 
 def write(rows: list[dict[str, Any]]) -> None:

@@ -26,7 +26,9 @@ def test_most_listed_kernels_are_in_the_code_with_as_many_arguments(tool):
         tree = ast.parse(path.read_text("utf-8")) if path.is_file() else ast.Module([], [])
         found = [d for d in tree.body if isinstance(d, ast.FunctionDef) and d.name == name]
         given = eval(signature, {"__builtins__": {}}, tool._NAMES)
-        fit += any(len(d.args.args) == len(given) for d in found)
+        # a function that makes kernels stands with a type of numbers, a kernel with its arguments'
+        count = len(given) if isinstance(given, tuple) else 1
+        fit += any(len(d.args.args) == count for d in found)
     assert len(rows) > 50
     assert fit >= 0.9 * len(rows)
 
@@ -40,13 +42,35 @@ def test_a_kernel_that_does_not_fit_is_counted_and_left_to_its_first_call(tool):
         ("rigsim.atlas", "sample", good),  # no kernel
         ("rigsim.head", "_distance", text),
         ("model.photon_kernels", "evaluate", good),  # has types of its own, and takes no other
+        ("reconstruction.photometric_kernels", "fit_points", "unicode_type"),  # makes no such one
         ("rigsim.head", "_distance", "(Array(float64"),
         ("rigsim.head", "_distance", "__import__('os')"),
     ]:
         assert tool.compile_module([row]) == 1
 
 
-def test_a_listed_kernel_compiles_for_its_types(tool):
-    rows = [r for rows in tool.listed() for r in rows if r[:2] == ("rigsim.atlas", "_rasterize")]
+@pytest.mark.parametrize(
+    ("module", "function"),
+    [
+        ("rigsim.atlas", "_rasterize"),
+        ("model.photon_kernels", "evaluate"),  # compiled as it is imported
+        ("reconstruction.photometric_kernels", "fit_points"),  # made by a cached function
+    ],
+)
+def test_a_listed_kernel_compiles_for_its_types(module, function, tool):
+    rows = [row for rows in tool.listed() for row in rows if row[:2] == (module, function)]
     assert rows
     assert tool.compile_module(rows) == 0
+
+
+def test_kernels_are_listed_under_the_name_that_compiles_them(tool):
+    """A kernel's function may stand under another name, or be compiled by a function's call."""
+    from reconstruction import photometric_kernels
+    from rigsim import atlas, skin_table
+
+    kinds = (tool._NAMES["float32"], tool._NAMES["int64"])
+    assert tool._named(atlas._rasterize.py_func, kinds) == ("_rasterize", "(float32, int64)")
+    assert tool._named(skin_table._interpolate, kinds)[0].startswith("_interpolate_f")
+    named = tool._named(photometric_kernels._fit_points, kinds)
+    assert named == ("fit_points", "float32")
+    assert tool.compile_module([(photometric_kernels.__name__, *named)]) == 0
