@@ -93,7 +93,8 @@ class SourceTree:
         _expect("source_area_mm2", area, (len(place),))
         if np.any(area < 0.0):
             raise GatherError("source_area_mm2: got negative values, expected at least 0")
-        size, some = len(place), np.flatnonzero(area > 0.0)
+        # an area that float32 does not hold sends nothing
+        size, some = len(place), np.flatnonzero(area.astype(np.float32) > 0.0)
         place, area = place[some], area[some]
         center = place.mean(axis=0) if len(some) else np.zeros(3)
         near = (place - center).astype(np.float32)

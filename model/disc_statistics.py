@@ -71,7 +71,8 @@ def half_widths(radius_px: float, rows: int, columns: int) -> NDArray[np.int64]:
         raise DiscStatisticsError(
             f"radius_px: got {radius_px}, expected a finite number of pixels, 0 or more"
         )
-    square = math.floor(float(radius_px) ** 2)
+    # a disc that holds the whole map grows no more; the square of a huge radius overflows
+    square = math.floor(min(float(radius_px), math.hypot(rows, columns) + 1.0) ** 2)
     return np.array(
         [
             min(math.isqrt(square - dy * dy), columns)
@@ -127,7 +128,8 @@ def measure(
     rows, columns = h.shape
     half = half_widths(radius_px, rows - 1, columns - 1)
     high = half_widths(radius_px, columns - 1, rows - 1)
-    inner = min(math.isqrt(math.floor(radius_px**2 / 2.0)), int(high[0]), int(half[0]))
+    reach = min(float(radius_px), math.hypot(rows, columns))
+    inner = min(math.isqrt(math.floor(reach**2 / 2.0)), int(high[0]), int(half[0]))
     mean, deviation = np.empty(h.shape), np.empty(h.shape)
     count = np.empty(h.shape, np.int32)
     mask = np.zeros((1, 1), np.uint8) if valid is None else np.ascontiguousarray(valid)

@@ -35,6 +35,11 @@ def reflectance(
         Shape (...): fraction of the incident power that leaves through the top, without the
         reflection of the beam at the first surface.
 
+    Raises
+    ------
+    ValueError
+        For coefficients or thicknesses that are negative or NaN, or an `eta` outside 1 to 100.
+
     Notes
     -----
     The fluence phi solves D phi'' = sigma_a phi - sigma_s' exp(-tau), D = 1/(3 (sigma_a +
@@ -56,6 +61,12 @@ def reflectance(
     >>> round(float(reflectance(*layer, eta=1.3)), 2)
     0.22
     """
+    for name, values, endless in (
+        ("sigma_a_per_mm", sigma_a_per_mm, False), ("thickness_mm", thickness_mm, True),
+        ("sigma_s_prime_per_mm", sigma_s_prime_per_mm, False),
+    ):  # fmt: skip
+        if not np.all((values >= 0.0) & ((values < np.inf) | endless)):
+            raise ValueError(f"{name}: got negative values or NaN, expected at least 0")
     sigma_t = np.maximum(sigma_a_per_mm + sigma_s_prime_per_mm, _FAINT_PER_MM)
     diffusion = 1.0 / (3.0 * sigma_t)
     kappa = np.sqrt(sigma_a_per_mm / diffusion)

@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 
+LONGEST_NM = 1e6
+"""Longest wavelength that is one of light, nm."""
+
 WAVELENGTH_NM: FloatArray = np.arange(400.0, 701.0, 10.0)
 """Default sampling of the visible spectrum in nm: 400 to 700 in steps of 10, 31 samples."""
 WAVELENGTH_NM.setflags(write=False)
@@ -99,7 +102,7 @@ def eumelanin_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray
     >>> round(float(eumelanin_absorption(500.0)), 2)
     67.92
     """
-    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    wavelength = _wavelengths(wavelength_nm)
     return np.asarray(EUMELANIN_FACTOR_PER_MM * wavelength**EUMELANIN_EXPONENT)
 
 
@@ -115,7 +118,7 @@ def pheomelanin_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArr
     >>> round(float(pheomelanin_absorption(500.0)), 2)
     43.88
     """
-    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    wavelength = _wavelengths(wavelength_nm)
     return np.asarray(PHEOMELANIN_FACTOR_PER_MM * wavelength**PHEOMELANIN_EXPONENT)
 
 
@@ -131,7 +134,7 @@ def baseline_absorption(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
     >>> round(float(baseline_absorption(500.0)), 4)
     0.0702
     """
-    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    wavelength = _wavelengths(wavelength_nm)
     decay = np.exp(-(wavelength - BASELINE_ORIGIN_NM) / BASELINE_SCALE_NM)
     return np.asarray(BASELINE_OFFSET_PER_MM + BASELINE_FACTOR_PER_MM * decay)
 
@@ -146,7 +149,7 @@ def reduced_scattering(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArray:
     >>> round(float(reduced_scattering(500.0)), 3)
     7.276
     """
-    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    wavelength = _wavelengths(wavelength_nm)
     mie = MIE_FACTOR_PER_MM * wavelength**MIE_EXPONENT
     rayleigh = RAYLEIGH_FACTOR_PER_MM * wavelength**RAYLEIGH_EXPONENT
     return np.asarray(mie + rayleigh)
@@ -231,7 +234,7 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> FloatArra
     >>> illuminant("D65", [560.0, 600.0]).round(1).tolist()
     [100.0, 90.0]
     """
-    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    wavelength = _wavelengths(wavelength_nm)
     if name in _DAYLIGHT_NOMINAL_K:
         return _daylight(_DAYLIGHT_NOMINAL_K[name], wavelength)
     if name == "A":
@@ -347,7 +350,7 @@ def _table(file_name: str) -> tuple[FloatArray, FloatArray]:
 def _sampled(file_name: str, wavelength_nm: ArrayLike, *, outside: float | None) -> FloatArray:
     """Interpolate a table linearly; `outside` is the value beyond it, None forbids going there."""
     nodes, values = _table(file_name)
-    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    wavelength = _wavelengths(wavelength_nm)
     if outside is None and not np.all((wavelength >= nodes[0]) & (wavelength <= nodes[-1])):
         raise ValueError(
             f"wavelength_nm: the table {file_name} spans {nodes[0]:.0f} to {nodes[-1]:.0f} nm, "
@@ -375,6 +378,16 @@ def _band_weights(camera: str, light_name: str, grid: tuple[float, ...]) -> Floa
     return np.asarray(weights / weights.sum(axis=0))
 
 
+def _wavelengths(wavelength_nm: ArrayLike) -> FloatArray:
+    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    if not np.all((wavelength > 0.0) & (wavelength <= LONGEST_NM)):
+        raise ValueError(
+            f"wavelength_nm: got a smallest of {np.min(wavelength):g} and a largest of "
+            f"{np.max(wavelength):g}, expected above 0, up to {LONGEST_NM:g} nm"
+        )
+    return wavelength
+
+
 def _increasing(wavelength_nm: ArrayLike) -> tuple[float, ...]:
     grid = np.asarray(wavelength_nm, dtype=np.float64)
     if grid.ndim != 1 or grid.size < 2 or not np.all(np.diff(grid) > 0):
@@ -382,7 +395,7 @@ def _increasing(wavelength_nm: ArrayLike) -> tuple[float, ...]:
             "wavelength_nm: expected at least two increasing wavelengths on one axis, "
             f"got shape {grid.shape}"
         )
-    return tuple(grid.tolist())
+    return tuple(_wavelengths(grid).tolist())
 
 
 def _daylight(nominal_k: float, wavelength: FloatArray) -> FloatArray:

@@ -30,7 +30,16 @@ def fill_smoothly(image: Array, valid: Mask) -> Array:
     -------
     ndarray, shape (H, W, C)
         Valid texels as they were.
+
+    Raises
+    ------
+    ValueError
+        Where no texel is valid, or one that is valid is not finite.
     """
+    if not valid.any():
+        raise ValueError(f"valid: got no texel of {valid.shape}, expected one at least")
+    if not np.isfinite(image[valid]).all():
+        raise ValueError("image: got NaN or infinity at a valid texel, expected finite values")
     if valid.all():
         return image
     known = np.where(valid[..., None], image, 0)

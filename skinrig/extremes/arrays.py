@@ -8,6 +8,8 @@ from collections.abc import Callable
 import numpy as np
 
 from skinrig.extremes.cases import (
+    INTEGERS,
+    RENDERER,
     Case,
     Real,
     Unexpected,
@@ -236,13 +238,16 @@ CASES = (
     Case("single pixels", "pictures", "1 x 1", "differences of neighbors that do not exist",
          "values of that pixel", _single_pixels),
     Case("8K pictures", "hdr", "7680 x 4320, two exposures", "indices and memory",
-         "the values of a small picture", _eight_thousand),
+         "the values of a small picture", _eight_thousand,
+         one_precision=INTEGERS),
     Case("brackets that miss the range", "hdr", "darker than all noise, brighter than the shortest",
-         "0/0 of weights", "darkness within its error; saturated pixels masked", _missed_range),
+         "0/0 of weights", "darkness within its error; saturated pixels masked", _missed_range,
+         one_precision=INTEGERS),
     Case("conditions 1 to 1e12", "non-negative mixtures", "six materials ever more alike",
          "a Gram matrix squares the condition", "samples again within 1e-6, shares bounded",
          _conditions),
     Case("light that no lamp gives", "renderer", "negative, NaN, infinite",
          "the renderer draws it without a word", "RenderError naming the light",
-         _light_in_renderer),
+         _light_in_renderer,
+         one_precision=RENDERER),
 )  # fmt: skip

@@ -42,6 +42,9 @@ class Case:
     """The behavior that holds."""
     run: Callable[[Real], str]
     """Tries it with inputs of a precision; returns what happened, or raises `Unexpected`."""
+    one_precision: str = ""
+    """Why its inputs have no precision to choose, so that one run stands for both; empty: they
+    have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +73,7 @@ def all_cases() -> tuple[Case, ...]:
     """Return every case, in the order of the light: transport, pictures, surface, motion."""
     from skinrig.extremes import (
         arrays,
+        domains,
         interior,
         motion,
         photons,
@@ -82,15 +86,18 @@ def all_cases() -> tuple[Case, ...]:
 
     groups = (
         transport, photons, rendering, pictures, extremes_surface,
-        reflectance, interior, motion, arrays,
+        reflectance, interior, motion, arrays, domains,
     )  # fmt: skip
     return tuple(case for group in groups for case in group.CASES)
 
 
 def try_case(case: Case) -> Result:
     """Run a case in every precision; whatever it raises becomes its outcome."""
-    outcomes = {}
+    outcomes: dict[str, Outcome] = {}
     for name, real in PRECISIONS.items():
+        if case.one_precision and outcomes:
+            outcomes[name] = next(iter(outcomes.values()))
+            continue
         start = time.perf_counter()
         try:
             with np.errstate(all="ignore"):
@@ -145,6 +152,7 @@ def to_document(results: Iterable[Result]) -> dict[str, Any]:
             "danger": result.case.danger,
             "expected": result.case.expected,
             "passed": result.passed,
+            "one_precision": result.case.one_precision or None,
             **{
                 name: {"got": one.got, "passed": one.passed, "seconds": one.seconds}
                 for name, one in result.outcomes.items()
@@ -154,6 +162,10 @@ def to_document(results: Iterable[Result]) -> dict[str, Any]:
     ]
     return {"schema": SCHEMA, "cases": rows, "passed": all(row["passed"] for row in rows)}
 
+
+INTEGERS = "pictures of a sensor are integers"
+RENDERER = "rays are cast in the renderer's own single precision"
+"""Of cases whose inputs have one precision."""
 
 # what cases say of their results
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.rig import load_rig
-from skinrig.extremes.cases import Case, Real, Unexpected, as_real, near, refused, within
+from skinrig.extremes.cases import RENDERER, Case, Real, Unexpected, as_real, near, refused, within
 
 if TYPE_CHECKING:
     from rigsim.sensor import Sensor
@@ -81,14 +81,20 @@ def _light_on_skin(_: Real) -> str:
     return within(lit, 1.0, 1.0, what="share lit by a light at 1 mm")
 
 
+def _light_near_far_skin(_: Real) -> str:
+    # where the renderer's own offsets, which grow with the distance, are as long as the ray
+    lit = _seen(_sheet(lambda x, y: 0.0 * x, (0.0, 0.0, 1000.0)), (0.3, 0.3, 1000.1))
+    return within(lit, 1.0, 1.0, what="share lit by a light at 0.1 mm")
+
+
 def _light_behind(_: Real) -> str:
     return within(_seen(_sheet(lambda x, y: 0.0 * x), (0.0, 0.0, -300.0)), 0.0, 0.0, what="share")
 
 
-def _zero_triangles(_: Real) -> str:
+def _zero_triangles(real: Real) -> str:
     from rigsim.mesh import build_mesh, vertex_normals
 
-    points = np.array([[0, 0, 0], [40, 0, 0], [0, 40, 0], [80, 0, 0], [40, 40, 9]], np.float64)
+    points = as_real([[0, 0, 0], [40, 0, 0], [0, 40, 0], [80, 0, 0], [40, 40, 9]], real)
     faces = np.array([[0, 1, 2], [0, 1, 3], [1, 4, 2]])  # the second has no area
     normals = vertex_normals(points, faces)
     near(np.linalg.norm(normals, axis=-1)[[0, 1, 2]], np.ones(3), absolute=1e-5)
@@ -96,10 +102,10 @@ def _zero_triangles(_: Real) -> str:
     return "corners of those with area: lit " + within(lit[:3], 1.0, 1.0, what="share")
 
 
-def _wrong_unit(_: Real) -> str:
+def _wrong_unit(real: Real) -> str:
     from rigsim.mesh import MeshError, build_mesh
 
-    points = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+    points = as_real([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], real)
     return refused(
         lambda: build_mesh(points, np.array([[0, 1, 2]]), np.zeros((3, 2))),
         MeshError, "millimetres",
@@ -218,15 +224,23 @@ def _negative_environment(_: Real) -> str:
 CASES = (
     Case("shadow far from the origin", "ray casting", "300 mm off",
          "offsets of rays grow with the distance from the origin", "the same shadow",
-         _shadow_off_origin),
+         _shadow_off_origin,
+         one_precision=RENDERER),
     Case("shadow of furrows far from the origin", "ray casting", "60 um deep, 1000 mm off",
-         "offsets of rays wider than the relief", "the same shadows", _fine_shadow_off_origin),
+         "offsets of rays wider than the relief", "the same shadows", _fine_shadow_off_origin,
+         one_precision=RENDERER),
     Case("light along a plane", "ray casting", "0.1 degrees above it",
-         "a flat sheet shadows itself", "all lit", _no_self_shadow),
+         "a flat sheet shadows itself", "all lit", _no_self_shadow,
+         one_precision=RENDERER),
     Case("light on the skin", "ray casting", "1 mm away", "rays shorter than their offset",
-         "all lit", _light_on_skin),
+         "all lit", _light_on_skin,
+         one_precision=RENDERER),
+    Case("light on skin far from the origin", "ray casting", "0.1 mm away, 1000 mm off",
+         "offsets as long as the ray", "all lit", _light_near_far_skin,
+         one_precision=RENDERER),
     Case("light behind the skin", "ray casting", "a closed horizon", "light leaks through",
-         "nothing lit", _light_behind),
+         "nothing lit", _light_behind,
+         one_precision=RENDERER),
     Case("triangles without area", "mesh", "three points in a line", "normal 0/0",
          "unit normals, and rays that hit the others", _zero_triangles),
     Case("mesh in metres", "mesh", "an extent of 0.1", "offsets larger than the face",
@@ -245,5 +259,6 @@ CASES = (
          "white", _very_bright),
     Case("negative environment", "renderer", "radiance -1",
          "the renderer makes a negative picture without a word", "RenderError",
-         _negative_environment),
+         _negative_environment,
+         one_precision=RENDERER),
 )  # fmt: skip

@@ -16,6 +16,7 @@ from model import (
     layered_diffusion,
     photon_medium,
     photon_table,
+    spectra,
     tissue_optics,
 )
 
@@ -236,6 +237,34 @@ def test_layers_of_numbers_that_no_medium_has_are_an_error(bad, place):
     assume(place != 2 or bad != np.inf)
     with pytest.raises(ValueError, match=("sigma_a", "sigma_s", "thickness")[place]):
         adding_doubling.reflectance(*values)
+    with pytest.raises(ValueError, match=("sigma_a", "sigma_s", "thickness")[place]):
+        layered_diffusion.reflectance(*values)
+
+
+@CHEAP
+@given(bad=st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -500.0, 1e308]))
+@pytest.mark.parametrize(
+    "of",
+    [spectra.eumelanin_absorption, spectra.pheomelanin_absorption, spectra.baseline_absorption,
+     spectra.reduced_scattering, spectra.color_matching_functions,
+     lambda nm: spectra.illuminant("D65", nm),
+     lambda nm: spectra.camera_sensitivity("Nikon 5100 (NPL)", nm)],
+)  # fmt: skip
+def test_a_wavelength_that_no_light_has_is_an_error(of, bad):
+    with pytest.raises(ValueError, match="wavelength_nm"):
+        of(np.array([500.0, bad]))
+
+
+@FEW
+@given(tiny=st.sampled_from([5e-324, 1e-300, 1e-46]))
+def test_areas_too_small_for_a_number_send_no_light(tiny):
+    place = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    light, at = np.ones((3, 3)), np.array([[0.5, 0.5, 0.0]])
+    told = dipole_gather.exitance(place, np.array([1.0, tiny, 1.0]), light, at, 0.5, 1.0)
+    bare = dipole_gather.exitance(place, np.array([1.0, 0.0, 1.0]), light, at, 0.5, 1.0)
+    np.testing.assert_allclose(told, bare, rtol=1e-6)
+    none = dipole_gather.exitance(place, np.full(3, tiny), light, at, 0.5, 1.0)
+    assert np.isfinite(none).all()
 
 
 @CHEAP

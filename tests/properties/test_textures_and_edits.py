@@ -488,3 +488,23 @@ def test_a_leveled_patch_knows_no_constant_and_fills_its_holes(seed, level):
     whole = synthesis_sources.filled(first, valid)
     assert np.isfinite(whole).all()
     assert whole.max() <= first[valid].max() + 1e-6
+
+
+@CHEAP
+@given(bad=st.sampled_from([np.nan, np.inf, -np.inf, None]), size=st.integers(1, 9))
+def test_a_texture_without_anything_to_fill_from_is_an_error(bad, size):
+    image = np.full((size, 5, 3), 0.5)
+    valid = np.zeros((size, 5), bool)
+    if bad is not None:
+        valid[0, 0], image[0, 0] = True, bad
+    with pytest.raises(
+        ValueError, match="valid: got no texel" if bad is None else "image: got NaN"
+    ):
+        texture_masks.fill_smoothly(image, valid)
+
+
+@CHEAP
+@given(radius=st.floats(12.0, 1.79e308))
+def test_a_disc_of_any_radius_beyond_the_map_holds_all_of_it(radius):
+    found = disc_statistics.measure(np.arange(48.0).reshape(6, 8), radius)
+    np.testing.assert_allclose(found.mean, 23.5, rtol=1e-9)

@@ -1,0 +1,131 @@
+"""Extremes of what functions state of their arguments: ends of domains, and beyond them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from skinrig.extremes.cases import Case, Real, Unexpected, as_real, clean, masked, near, refused
+from skinrig.extremes.cases import within as within_bounds
+
+NO_MEDIUM = (np.nan, np.inf, -1.0)
+
+
+def _far_lights(real: Real) -> str:
+    from reconstruction import photometric_stereo as stereo
+
+    turn = np.arange(8) * (np.pi / 4)
+    way = np.stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), np.full(8, np.sqrt(0.75))], -1)
+    normal = np.array([0.1, -0.2, np.sqrt(0.95)])
+    lit = as_real((way @ normal)[:, None, None], real)
+    infinite = stereo.estimate_normals(lit, way)
+    far = stereo.estimate_normals(
+        1e-12 * lit, way, light_positions_mm=1e6 * way, points_mm=np.zeros((1, 1, 3))
+    )
+    masked(infinite.valid & far.valid, share=(1.0, 1.0))
+    near(far.normals, infinite.normals, absolute=1e-5)
+    refused(
+        lambda: stereo.estimate_normals(
+            lit, way, light_positions_mm=np.inf * np.sign(way), points_mm=np.zeros((1, 1, 3))
+        ),
+        stereo.PhotometricStereoError, "light_positions_mm",
+    )  # fmt: skip
+    return "at 1 km as without a distance; at infinity refused"
+
+
+def _one_turned_triangle(real: Real) -> str:
+    from model import microstructure
+
+    u, v = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9))
+    flat = np.stack([40 * u.ravel(), 40 * v.ravel(), 0 * u.ravel()], -1)
+    cell = np.arange(81).reshape(9, 9)
+    a, b, c, d = (
+        cell[:-1, :-1].ravel(), cell[:-1, 1:].ravel(), cell[1:, 1:].ravel(), cell[1:, :-1].ravel()
+    )  # fmt: skip
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+    faces[20] = faces[20][::-1]
+    found = microstructure.strain(
+        as_real(flat, real), as_real(flat * [1.1, 1.0, 1.0], real), faces,
+        as_real(np.stack([u.ravel(), v.ravel()], -1), real),
+    )  # fmt: skip
+    masked(found.valid, share=(1.0, 1.0))
+    return near(found.r_s, np.full(81, 1.1), relative=1e-5)
+
+
+def _profile_beyond_numbers(real: Real) -> str:
+    from model import photon_table
+
+    ends = as_real([1e-18, 1e18] if real is np.float32 else [1e-50, 1e50], real)
+    slopes = photon_table.derivatives(ends, real(0.02), real(1.0))
+    clean(np.stack(slopes), np.ones((3, 2), bool), what="profile and slopes")
+    near(slopes.reflectance_per_mm2[1], 0.0, absolute=1e-30)
+    for place, name in enumerate(("radius_mm", "sigma_a_per_mm", "sigma_s_prime_per_mm")):
+        for bad in NO_MEDIUM:
+            values = [real(1.0), real(0.1), real(1.0)]
+            values[place] = real(bad)
+            refused(lambda v=values: photon_table.reflectance(*v), ValueError, name)  # type: ignore[misc]
+    refused(lambda: photon_table.reflectance(1e301, 0.1, 1.0), ValueError, "radius_mm")
+    return "finite from end to end; no medium is refused by name"
+
+
+def _layers_of_no_medium(real: Real) -> str:
+    from model import adding_doubling, layered_diffusion
+
+    told = 0
+    for solver in (adding_doubling, layered_diffusion):
+        for place, name in enumerate(("sigma_a_per_mm", "sigma_s_prime_per_mm", "thickness_mm")):
+            for bad in (np.nan, -1.0):
+                values = [as_real([[0.1, 0.1]], real), as_real([[1.0, 1.0]], real),
+                          as_real([[0.2, np.inf]], real)]  # fmt: skip
+                values[place][0, 0] = bad
+                refused(lambda v=values, s=solver: s.reflectance(*v), ValueError, name)  # type: ignore[misc]
+                told += 1
+    return f"ValueError naming it, {told} times"
+
+
+def _nothing_to_continue(real: Real) -> str:
+    from model import texture_masks
+
+    image = as_real(np.full((7, 5, 3), 0.4), real)
+    refused(lambda: texture_masks.fill_smoothly(image, np.zeros((7, 5), bool)), ValueError, "valid")
+    one = np.zeros((7, 5), bool)
+    one[3, 2] = True
+    image[~one] = np.nan
+    return near(texture_masks.fill_smoothly(image, one), np.full((7, 5, 3), 0.4), relative=1e-6)
+
+
+def _index_of_nothing(real: Real) -> str:
+    from model import fresnel
+
+    averages = (fresnel.normal_reflectance, fresnel.boundary_factor, fresnel.diffuse_internal)
+    for average in averages:
+        for bad in (np.nan, np.inf, 0.0, -1.0):
+            refused(lambda a=average, b=bad: a(float(real(b))), ValueError, "eta")  # type: ignore[misc]
+    most = float(np.finfo(real).max)
+    for eta, cosine in ((most, 0.5), (1.0 / most, 0.5), (most, 0.0)):
+        if not 0.0 <= float(fresnel.reflectance(real(cosine), eta)) <= 1.0:
+            raise Unexpected(f"eta {eta:g}: expected a reflectance from 0 to 1")
+    matched = [float(fresnel.reflectance(real(c), 1.0)) for c in (0.0, 1e-3, 1.0)]
+    return within_bounds(matched, 0.0, 1e-12, what="matched: reflectance")
+
+
+CASES = (
+    Case("light at infinity", "photometric stereo", "no distance, 1 km, and infinity as a place",
+         "infinity over infinity in the falloff", "the same normals; PhotometricStereoError",
+         _far_lights),
+    Case("one triangle turned over", "strain", "one of 128 wound the other way",
+         "its stretch changes sign among its neighbors'", "the stretch of all, 1.1",
+         _one_turned_triangle),
+    Case("photon table beyond numbers", "photon table",
+         "r of 1e-50 and 1e50 mm (float32: 1e-18 and 1e18); NaN, infinity, negative",
+         "squares over- and underflow", "finite, none far away; ValueError naming the argument",
+         _profile_beyond_numbers),
+    Case("layers of no medium", "layers", "NaN and negative coefficients and thicknesses",
+         "NaN through every layer without a mask", "ValueError naming the argument",
+         _layers_of_no_medium),
+    Case("texture with nothing valid", "texture fill", "an empty mask; NaN around one texel",
+         "levels halved for ever", "ValueError naming valid; the one color everywhere",
+         _nothing_to_continue),
+    Case("index of nothing", "fresnel", "eta NaN, 0, negative, infinite, and the largest number",
+         "its square overflows, 0/0 where media match", "ValueError naming eta; from 0 to 1",
+         _index_of_nothing),
+)  # fmt: skip
