@@ -28,14 +28,17 @@ This and the one above bring intervals to their nominal coverage on simulated fa
 seen at 2.1 mm a pixel; see docs/decisions."""
 UNRESOLVED_R_D_PX: Final = 1.55
 """Standard error of the albedo over what it changes by in a pixel: misplaced samples, and albedo
-that is too fine for the pixels and the more of it, the more there is that is just not.
+that is too fine for the pixels and the more of it, the more there is that is just not."""
+SHARED_DETAIL: Final = 0.8
+"""Share of the face's typical mean square change in that of a point, the rest is its neighbors'.
 
-Of simulated faces of seeds 0, 1, 1, 2 and 5 and types III, V, II, I and IV, at 2.1 (and the last
-at 3.3) mm a pixel, 68 % of the truths lie within 1.36 to 1.68 of it at each point and channel; a
-map, which lies between the points too, has 6 % more."""
-UNRESOLVED_R_D_PER_MM: Final = 0.017
-"""The same for a forecast, where there is no image: relative, of medium skin, by the size of a
-pixel. Of light skin it was 0.011, of dark skin 0.02."""
+A few edges tell little of how much is finer than they are: where neighbors happen to look alike,
+the albedo within a pixel goes on changing as elsewhere on the face."""
+SHARED_R_D: Final = 0.007
+"""Relative error of the albedo that all points of a face share, of calibration and of relief within
+pixels. Faces of seeds 1 to 3 lay 0.4 to 0.6 % below the truth blurred as by their pixels.
+
+This and the two above were set on these faces (types V, I and II, 2.1 mm a pixel)."""
 R_D_BY_NORMAL: Final = 0.5
 """Relative error of the albedo by that of the normal, 1/rad: lights all around leave so much."""
 RINGS: Final = 2
@@ -153,12 +156,17 @@ def of_albedo(
     Notes
     -----
     A pixel averages what is finer. The albedo of skin goes on to finer scales as it comes down to
-    the pixel's, so what is lost is in proportion to what still shows between neighbors.
+    the pixel's, so what is lost is in proportion to what still shows between neighbors: between a
+    point's own by a part, and by `SHARED_DETAIL` between those of the whole face (their median).
     """
     change = change_per_mm(
         r_d.values, surface.points_mm, surface.faces, r_d.valid,
         pixel_mm=pixel_mm, noise=r_d.stderr, rings=RINGS,
     )  # fmt: skip
+    known = change[r_d.valid]
+    typical = np.median(known, axis=0) if len(known) else np.zeros(change.shape[1])
+    change = np.hypot(np.sqrt(1.0 - SHARED_DETAIL) * change, np.sqrt(SHARED_DETAIL) * typical)
     stderr = np.hypot(r_d.stderr, UNRESOLVED_R_D_PX * pixel_mm * change)
-    stderr = np.hypot(stderr, R_D_BY_NORMAL * normals.stderr[:, :1] * np.abs(r_d.values))
+    relative = np.hypot(SHARED_R_D, R_D_BY_NORMAL * normals.stderr[:, :1])
+    stderr = np.hypot(stderr, relative * np.abs(r_d.values))
     return PointValues(r_d.values, np.where(r_d.valid[:, None], stderr, 0.0), r_d.valid)

@@ -29,10 +29,10 @@ from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as surface_evaluation
 from skinrig.simulating.simulation import simulate_session
 
-FACTORS_95: Final[Mapping[str, float]] = {"normals": 2.1, "R_d": 2.3, "surface": 2.5}
-"""Half width of a 95 % interval over that of the 68 % one, to 0.1, set on five faces of seeds 0 to
-5 and types I to V that are not judged: tails are heavier than a Gaussian's where one point in
-twenty is not like the others."""
+FACTORS_95: Final[Mapping[str, float]] = {"normals": 2.1, "R_d": 2.2, "surface": 2.5}
+"""Half width of a 95 % interval over that of the 68 % one, to 0.1, set on faces of seeds 0 to 5 and
+types I to V that are not judged (R_d: of seeds 1 to 3, types V, I and II): tails are heavier than a
+Gaussian's where one point in twenty is not like the others."""
 NORMALS: Final[Mapping[str, str]] = {
     "normals": "normals of the dome", "normals_refined": "refined normals of the dome"
 }  # fmt: skip

@@ -140,6 +140,31 @@ def test_errors_of_albedo_are_as_large_as_its_own_detail_makes_them(roughness):
     assert np.mean(halved) < 0.55
 
 
+def test_where_neighbors_happen_to_look_alike_the_albedo_is_known_no_better():
+    """Even skin-like detail: 68 % intervals hold in each third of points by their stated error.
+
+    A point's own neighbors alone would be believed too much: below half in the lowest third.
+    """
+    rng = np.random.default_rng(12)
+    surface = sheet(flat, side=20)
+    inside, alone = [], []
+    for _ in range(12):
+        seen, true = seen_and_true(rng, 0.1)
+        values = np.tile(seen[:, None], (1, 3))
+        point = PointValues(values, np.full(values.shape, 1e-5), np.ones(len(seen), bool))
+        found = surface_errors.of_albedo(point, plain(surface), surface, 2.0).stderr[:, 0]
+        own = 2.0 * surface_errors.UNRESOLVED_R_D_PX * surface_errors.change_per_mm(
+            values, surface.points_mm, surface.faces, point.valid, pixel_mm=2.0, rings=2
+        )[:, 0]  # fmt: skip
+        order = np.array_split(np.argsort(own), 3)
+        hit, hit_alone = np.abs(seen - true) <= found, np.abs(seen - true) <= own
+        inside.append([hit[part].mean() for part in order])
+        alone.append([hit_alone[part].mean() for part in order])
+    thirds, alone_thirds = np.mean(inside, axis=0), np.mean(alone, axis=0)
+    assert thirds.min() > 0.60
+    assert np.ptp(thirds) < 0.5 * np.ptp(alone_thirds)
+
+
 def test_noise_is_no_detail_of_the_albedo():
     rng = np.random.default_rng(5)
     surface = sheet(flat)
@@ -156,14 +181,15 @@ def test_noise_is_no_detail_of_the_albedo():
     assert np.median(untold.stderr) > 0.015
 
 
-def test_even_albedo_keeps_the_error_of_its_noise():
+def test_even_albedo_keeps_the_error_of_its_noise_and_of_its_scale():
     surface = sheet(ball(60.0))
     count = len(surface.points_mm)
     even = PointValues(np.full((count, 3), 0.3), np.full((count, 3), 0.002), np.ones(count, bool))
     found = surface_errors.of_albedo(even, plain(surface), surface, 2.0)
-    np.testing.assert_allclose(found.stderr, 0.002, rtol=1e-6)
+    scale = 0.3 * surface_errors.SHARED_R_D
+    np.testing.assert_allclose(found.stderr, np.hypot(0.002, scale), rtol=1e-6)
     # normals off by 0.02 rad take 1 % of the albedo along
     tilted = surface_errors.of_albedo(even, plain(surface, 0.02), surface, 2.0)
-    np.testing.assert_allclose(tilted.stderr, np.hypot(0.002, 0.3 * 0.01), rtol=1e-6)
+    np.testing.assert_allclose(tilted.stderr, np.hypot(np.hypot(0.002, scale), 0.003), rtol=1e-6)
     none = dataclasses.replace(even, valid=np.zeros(count, bool))
     assert not surface_errors.of_albedo(none, plain(surface), surface, 2.0).stderr.any()

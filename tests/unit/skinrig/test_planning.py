@@ -1,5 +1,6 @@
 """What is wanted of a plan, and the dome's own choice."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -7,8 +8,9 @@ import pytest
 
 from capture.plan import Plan
 from capture.rig import load_rig
+from reconstruction import light_selection
 from skinrig.cli import main
-from skinrig.planning import dome_sight, plans
+from skinrig.planning import dome, dome_sight, plans
 
 
 @pytest.mark.parametrize(
@@ -56,6 +58,30 @@ def test_darker_skin_and_fewer_cameras_tell_less(rig, look):
     every = look.information(range(16)).weight.sum()
     assert dark.information(range(16)).weight.sum() < every
     assert look.information(range(4)).weight.sum() < every
+
+
+def test_albedo_is_forecast_by_the_subjects_own_detail_and_gloss(rig, look):
+    """Coarser pixels and darker skin, where the same gloss is more, leave more error."""
+    every = range(len(rig.views)), range(len(rig.lights))
+
+    def forecast(sight):
+        told = light_selection.predict(sight.information(every[0]), every[1], least=10)
+        return dome._r_d_error(told, sight)
+
+    assert look.unresolved.shape == look.r_d.shape == (300, 3)
+    assert 0.015 < forecast(look) < 0.03
+    assert forecast(dome_sight.sight(rig, "VI", points=300)) > 1.1 * forecast(look)
+    fine = dome_sight.sight(rig.resized(1300), "III", points=300)
+    assert np.abs(fine.unresolved).mean() < 0.6 * np.abs(look.unresolved).mean()
+    assert forecast(fine) < 0.75 * forecast(look)
+    even = dataclasses.replace(look, unresolved=0.0 * look.unresolved)
+    assert forecast(even) < 0.6 * forecast(look)
+
+
+def test_the_median_of_errors_about_offsets_is_that_of_draws(rng):
+    offset, sigma = rng.normal(0.0, 0.02, (400, 3)), rng.uniform(0.005, 0.03, (400, 3))
+    drawn = np.abs(offset + sigma * rng.standard_normal((500, 400, 3)))
+    assert dome._median_magnitude(offset, sigma) == pytest.approx(np.median(drawn), rel=0.01)
 
 
 def test_a_plan_keeps_what_it_promises_and_says_what_it_leaves_out(tmp_path, capsys, monkeypatch):
