@@ -222,7 +222,8 @@ def _ratios(
     """Return pi f / (F_t F_t), infinite where unusable, and the cosines of light and view."""
     cosines = [np.einsum("pmc,pc->pm", v, n, dtype=np.float64) for v in (light, view)]
     above = (cosines[0] >= LEAST_COSINE) & (cosines[1] >= LEAST_COSINE)
-    through = boundary_kernels.transmitted(*(np.where(above, c, 1.0) for c in cosines), eta)
+    cos_light, cos_view = (np.where(above, cosine, 1.0) for cosine in cosines)
+    through = boundary_kernels.transmitted(cos_light, cos_view, eta)
     good = usable & above[..., None]
     ratio = np.pi * np.where(good, f, 0.0) / through[..., None]
     return np.where(good, ratio, np.inf), cosines[0], cosines[1]
