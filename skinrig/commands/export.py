@@ -99,6 +99,15 @@ def export(
     known = (*appearances.FORMATS, *brdfs.SUFFIX, *sessions.FORMATS, light_lists.NAME, stokes.NAME)
     if to not in known:
         raise UsageError(f"--to: got {to!r}, expected one of {', '.join(known)}")
+    of_maps = (*appearances.FORMATS, *brdfs.SUFFIX)
+    of_sessions = tuple(name for name in known if name not in of_maps)
+    for file, kind, fitting in (
+        ("session.json", "a session", of_sessions), ("appearance.json", "maps", of_maps),
+    ):  # fmt: skip
+        if (source / file).is_file() and to not in fitting:
+            raise UsageError(
+                f"--to: got {to!r}, but {source} holds {kind}; expected one of {', '.join(fitting)}"
+            )
     names = () if only is None else tuple(name.strip() for name in only.split(","))
     if to in brdfs.SUFFIX:
         place = brdfs.place_of(at, radius_mm=radius, diffuse=not without_diffuse)

@@ -86,7 +86,7 @@ def test_one_json_document_says_what_was_written_and_left_out(dome, tmp_path, ca
         (["--to", "maps", "--use", "research", "--only", "melanin"], 3, "got melanin"),
         (["--to", "spectral", "--use", "research"], 3, "as of the flash rig"),
         (["--to", "metahuman", "--use", "research"], 3, "skinrig fit wrinkles"),
-        (["--to", "lp", "--use", "research"], 3, "session"),
+        (["--to", "lp"], 2, "dome holds maps; expected one of maps, mtlx"),
     ],
 )
 def test_what_cannot_be_exported_says_why_and_leaves_nothing(
@@ -98,6 +98,17 @@ def test_what_cannot_be_exported_says_why_and_leaves_nothing(
     assert says in said.err
     assert "Traceback" not in said.err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dome"]
+
+
+def test_maps_are_not_asked_of_a_session(tmp_path, capsys):
+    (tmp_path / "session").mkdir()
+    (tmp_path / "session" / "session.json").write_text("{}", encoding="utf-8")
+    argv = ["export", tmp_path / "session", "--to", "gltf", "--out", tmp_path / "out"]
+    code, said = run(capsys, *argv)
+    assert code == 2
+    assert (
+        "session holds a session; expected one of mhl, frames, event-model, lp, stokes" in said.err
+    )
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path, capsys):
