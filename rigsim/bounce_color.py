@@ -10,12 +10,17 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from capture.rig import View
 from model import spectra
 from rigsim.mesh import Float32Array
 from rigsim.skin_bounce import ENOUGH, SkinBounce
 from rigsim.skin_table import SkinTable
 from rigsim.subject import Subject
+
+STEPS: Final = (5, 3, 2)
+"""Every how many of the table's wavelengths may be summed at, the most first: the ends stay."""
 
 LEAST: Final = 1e-6
 """Reflectance and cover below which a patch has no color."""
@@ -38,6 +43,8 @@ class BounceColor:
         Names known to `model.spectra`.
     spectral
         Whether wavelengths are told apart; without, each channel is taken as one.
+    step
+        Every how many of the table's wavelengths are summed at, 1 or one of `STEPS`.
     enough
         Share of the first bounce below which further ones are left out.
     """
@@ -53,6 +60,7 @@ class BounceColor:
         camera: str,
         light: str,
         spectral: bool = True,
+        step: int = 1,
         enough: float = ENOUGH,
     ) -> None:
         self._bounce, self._enough = bounce, enough
@@ -66,8 +74,8 @@ class BounceColor:
         self._weights: Float32Array | None = None
         if spectral:
             table = SkinTable.load()
-            weights = spectra.band_weights(camera, light, table.wavelength_nm)
-            skin = table.spectra(coarse[:, 1], coarse[:, 2])
+            weights = spectra.band_weights(camera, light, table.wavelength_nm[::step])
+            skin = table.spectra(coarse[:, 1], coarse[:, 2])[:, ::step]
             # what covers the skin (hair, makeup) is gray beside it
             cover = coarse[:, 3:6].mean(axis=1, keepdims=True)
             self._spectrum = np.asarray(skin * cover, np.float32)
@@ -106,3 +114,54 @@ class BounceColor:
         u, v = np.meshgrid(middle, middle[::-1])
         uv = np.ascontiguousarray(np.stack([u, v], axis=-1))
         return sample(filled, uv, np.ones((size, size), np.bool_))
+
+
+def color_error(subject: Subject, state: str, view: View, illuminant: str) -> NDArray[np.float64]:
+    """Return by how much each channel's mean of R^2 is off the square of its mean, shape (3,).
+
+    Of typical skin.
+    """
+    table = SkinTable.load()
+    weights = spectra.band_weights(view.spectral_sensitivity, illuminant, table.wavelength_nm)
+    covered = subject.atlas.covered
+    blood = subject.hemoglobin(state)
+    skin = table.spectra(np.median(subject.melanin[covered]), np.median(blood[covered]))
+    return np.asarray(np.abs((skin**2 @ weights) / (skin @ weights) ** 2 - 1.0), np.float64)
+
+
+def step_error(
+    subject: Subject, state: str, camera: str, light: str, step: int
+) -> NDArray[np.float64]:
+    """Return by how much each channel of light from skin to skin is off at fewer wavelengths.
+
+    Parameters
+    ----------
+    subject, state
+        Whose skin, in which state.
+    camera, light
+        Names known to `model.spectra`.
+    step
+        Every how many of the table's wavelengths are summed at.
+
+    Returns
+    -------
+    ndarray
+        Relative, shape (3,): the most for light that goes between any two of the face's extremes
+        and middles of melanin and blood, by its mean of products over its mean.
+    """
+    table = SkinTable.load()
+    covered = subject.atlas.covered
+    ends = [
+        [part.min(), np.median(part), part.max()]
+        for part in (subject.melanin[covered], subject.hemoglobin(state)[covered])
+    ]
+    melanin, blood = (axis.ravel() for axis in np.meshgrid(*ends))
+    skin = table.spectra(melanin, blood)
+
+    def bounced(every: int) -> NDArray[np.float64]:
+        weights = spectra.band_weights(camera, light, table.wavelength_nm[::every])
+        some = skin[:, ::every]
+        twice = np.einsum("al,bl,lc->abc", some, some, weights)
+        return np.asarray(twice / (some @ weights)[None], np.float64)
+
+    return np.asarray(np.abs(bounced(step) / bounced(1) - 1.0).max(axis=(0, 1)), np.float64)

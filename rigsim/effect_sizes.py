@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from rigsim.mesh import Mesh
 from rigsim.render import Caster
 from rigsim.scene_needs import Noise
+from rigsim.skin_layers import ETA
 
 EXCHANGE_PATCHES = 32
 """Texels along one side of the coarse texture on which exchange between skin is estimated."""
@@ -184,3 +185,51 @@ def most_irradiance(mesh: Mesh, places_mm: ArrayLike, weights_mm2: ArrayLike) ->
         squared = float(np.min(np.sum((place - points) ** 2, axis=1)))
         total += float(weight) / max(squared, 1e-12)
     return total
+
+
+def highlight(
+    mesh: Mesh, places_mm: ArrayLike, weights_mm2: ArrayLike, camera_mm: ArrayLike, alpha: float
+) -> float:
+    """Return a bound on what a surface's facets reflect, over the light of a white plate.
+
+    Parameters
+    ----------
+    mesh
+        The surface.
+    places_mm, weights_mm2
+        Lights, as of `most_irradiance`.
+    camera_mm
+        The camera, shape (3,).
+    alpha
+        The least GGX roughness, 0 to 1.
+
+    Notes
+    -----
+    Of the facets' ``F D G(l) G(v) / (4 n.v)`` with GGX's ``D <= 1 / (pi a^2)``, ``G(l) <= 1`` and
+    ``G(v) / n.v <= 2 / a``: pi times it is at most ``F / (2 a^3)``. F is that of light polarized
+    across the plane of incidence, at half the largest angle between light and camera; an analyser
+    passes all of such light, and half of a plate's.
+
+    Examples
+    --------
+    >>> from rigsim.mesh import build_mesh
+    >>> plate = build_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], [[0, 0], [1, 0], [0, 1]])
+    >>> bound = highlight(plate, [[0, 0, 1e4]], [1e8], [0, 0, 1e4], 0.5)
+    >>> round(bound / (2.0 * (0.4 / 2.4) ** 2 / (2.0 * 0.5**3)), 3)
+    1.0
+    """
+    points = np.asarray(mesh.vertices_mm, np.float64)
+    to_camera = np.asarray(camera_mm, np.float64) - points
+    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+    total = 0.0
+    for place, weight in zip(
+        np.asarray(places_mm, np.float64), np.asarray(weights_mm2, np.float64), strict=True
+    ):
+        to_light = place - points
+        to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
+        between = float(np.einsum("ij,ij->i", to_light, to_camera).min())
+        cosine = math.sqrt(max(0.5 * (1.0 + between), 0.0))  # of half the angle
+        inside = math.sqrt(ETA**2 - 1.0 + cosine**2)
+        across = ((cosine - inside) / (cosine + inside)) ** 2
+        total += 2.0 * across * most_irradiance(mesh, [place], [weight])
+    return total / (2.0 * alpha**3)

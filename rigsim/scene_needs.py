@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.plan import Plan
+from capture.plan.rows import lights_of
 from rigsim.sensor import Sensor
 
 Verdict: TypeAlias = Literal["built", "negligible", "absent", "asked", "unmodeled"]
@@ -273,7 +274,8 @@ def longest_on_s(plan: Plan) -> float | None:
     Parameters
     ----------
     plan
-        Of LEDs; an on-time counts by its level, 0 to 1.
+        Of LEDs; an on-time counts by its level, 0 to 1, and of LEDs that a step names by how many
+        they are: together they give more light than one.
 
     Examples
     --------
@@ -283,7 +285,9 @@ def longest_on_s(plan: Plan) -> float | None:
     0.018
     """
     lit = [
-        float(step.settings["level"]) * float(step.settings["exposure_s"])
+        max(len(lights_of(step)), 1)
+        * float(step.settings["level"])
+        * float(step.settings["exposure_s"])
         for step in plan.steps
         if "level" in step.settings and "exposure_s" in step.settings
     ]

@@ -151,6 +151,8 @@ class FlashScene:
         Whether light goes from skin to skin.
     spectral
         Whether that light is reflected wavelength by wavelength.
+    spectral_step
+        At every how many of the table's wavelengths; ``None``: as `needs` says.
     last_bounce
         Share of the first bounce below which further ones are left out; ``None``: as `needs` says.
     relief_shadows
@@ -178,6 +180,7 @@ class FlashScene:
         lateral: bool | None = None,
         interreflections: bool | None = None,
         spectral: bool | None = None,
+        spectral_step: int | None = None,
         last_bounce: float | None = None,
         optics: bool | None = None,
         relief_shadows: bool | None = None,
@@ -243,6 +246,7 @@ class FlashScene:
         self.optics = self.needs.builds(LENS)
         summed = flash_needs.last_bounce(self.needs[BOUNCES].over_noise or 0.0)
         self._last_bounce = summed if last_bounce is None else last_bounce
+        self._step = spectral_step
 
     @property
     def left_out(self) -> list[tuple[str, str]]:
@@ -458,9 +462,16 @@ class FlashScene:
                 lateral_transport=self.lateral,
                 bounce=self._stage.exchange() if self.interreflections else None,
                 spectral=self.interreflections and self.needs.builds(SPECTRAL),
+                step=self._spectral_step(self.subject, view),
                 enough=self._last_bounce,
             )
         return self._glow[camera]
+
+    def _spectral_step(self, subject: Subject, view: View) -> int:
+        if self._step is not None:
+            return self._step
+        bounces = self.needs[BOUNCES]
+        return flash_needs.spectral_step(subject, self.state, view, self._illuminant, bounces)[0]
 
     def _surface_light(self, subject: Subject) -> SurfaceLight:
         wrinkled = self.needs.builds(WRINKLES)

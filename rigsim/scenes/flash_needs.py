@@ -8,28 +8,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.rig import Rig, View
-from model import spectra
 from rigsim import shading
+from rigsim.bounce_color import STEPS, color_error, step_error
 from rigsim.depth_of_field import facing_depths, lens_spread
 from rigsim.effect_sizes import (
     bounced,
     edge_loss,
     exchange_share,
+    highlight,
     most_irradiance,
     spread_over_noise,
 )
 from rigsim.render import Caster
-from rigsim.scene_needs import Effect, Noise, SceneNeeds, absent, decide, unmodeled
+from rigsim.scene_needs import ENOUGH, Effect, Noise, SceneNeeds, absent, decide, unmodeled
 from rigsim.scenes.skin_glow import typical_kernels
 from rigsim.skin_color import skin_color
-from rigsim.skin_layers import ETA
-from rigsim.skin_table import SkinTable
 from rigsim.subject import Subject
 from rigsim.targets import Target
 
 LATERAL = "light spreading sideways in skin"
 BOUNCES = "light from skin to skin"
 SPECTRAL = "color of light from skin to skin, wavelength by wavelength"
+FINER = "wavelengths between those at which light from skin to skin is summed"
 FURTHER = "bounces after the last that is summed"
 POLARIZATION = "polarization"
 SHADOWS = "shadows"
@@ -119,7 +119,9 @@ def flash_needs(
     most = most_irradiance(caster.mesh, places, weights_mm2)
     # not cut at full scale: light of pixels that are full goes on to others all the same
     level = most * white_rgb * brightest
-    peak = float((level + white_rgb * highlight(rig, view, subject, caster, weights_mm2)).max())
+    rough = max(float(subject.roughness[subject.atlas.covered].min()), shading.ALPHA_RANGE[0])
+    shine = highlight(caster.mesh, places, weights_mm2, view.position_mm, rough)
+    peak = float((level + white_rgb * shine).max())
     pixel_mm = view.distance_mm / view.focal_px
     kernels = typical_kernels(subject, state, view.spectral_sensitivity, illuminant)
     lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
@@ -145,6 +147,8 @@ def flash_needs(
             because="a channel's mean of squares is not the square of its mean"
             if bounces.built else "there is no such light",
         ),
+        _finer(bounces, bool(off.max() >= ENOUGH) if spectral is None else spectral,
+               spectral_step(subject, state, view, illuminant, bounces)),
         further_bounces(bounces, share * float(brightest.max())),
         lens(view, illuminant, caster, noise, peak, subpixels, optics),
         wrinkles(subject, noise, peak, relief_shadows),
@@ -172,49 +176,6 @@ def wrinkles(subject: Subject, noise: Noise, level: float, asked: bool | None) -
         WRINKLES, most / float(noise.sigma(0.0)), asked, switch="relief_shadows",
         because=f"wrinkles as steep as {math.degrees(math.atan(steepest)):.0f} degrees",
     )  # fmt: skip
-
-
-def highlight(
-    rig: Rig,
-    view: View,
-    subject: Subject,
-    caster: Caster,
-    weights_mm2: NDArray[np.floating],
-) -> float:
-    """Return a bound on what a face's surface reflects, over the light of a white plate.
-
-    Parameters
-    ----------
-    rig, view
-        Lights, and the camera that looks.
-    subject
-        Whose roughness.
-    caster
-        The face's mesh.
-    weights_mm2
-        As of `flash_needs`.
-
-    Notes
-    -----
-    Of the facets' ``F D G(l) G(v) / (4 n.v)`` with GGX's ``D <= 1 / (pi a^2)``, ``G(l) <= 1`` and
-    ``G(v) / n.v <= 2 / a``: pi times it is at most ``F / (2 a^3)``. F is that of light polarized
-    across the plane of incidence, at half the largest angle between light and camera; an analyser
-    passes all of such light, and half of a plate's.
-    """
-    rough = max(float(subject.roughness[subject.atlas.covered].min()), shading.ALPHA_RANGE[0])
-    points = np.asarray(caster.mesh.vertices_mm, np.float64)
-    to_camera = np.asarray(view.position_mm) - points
-    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-    total = 0.0
-    for light, weight in zip(rig.lights, weights_mm2, strict=True):
-        way = np.asarray(light.position_mm) - points
-        to_light = way / np.linalg.norm(way, axis=1, keepdims=True)
-        between = float(np.einsum("ij,ij->i", to_light, to_camera).min())
-        cosine = math.sqrt(max(0.5 * (1.0 + between), 0.0))  # of half the angle
-        inside = math.sqrt(ETA**2 - 1.0 + cosine**2)
-        across = ((cosine - inside) / (cosine + inside)) ** 2
-        total += 2.0 * across * most_irradiance(caster.mesh, [light.position_mm], [float(weight)])
-    return total / (2.0 * rough**3)
 
 
 FAR_LIGHT = [("glare and far rings of the lens", "light goes as far as the nearest rings")]
@@ -323,6 +284,37 @@ def last_bounce(over_noise: float) -> float:
     return min(LAST_BOUNCE, REST / max(over_noise, 1e-9))
 
 
+def spectral_step(
+    subject: Subject, state: str, view: View, illuminant: str, bounces: Effect
+) -> tuple[int, float]:
+    """Return at which of the table's wavelengths light from skin to skin is summed: every n-th.
+
+    Returns
+    -------
+    step, over_noise
+        The largest that changes no pixel, and how much it changes one at most over its noise; 1
+        and what the least larger one would change, where each does.
+    """
+    size = float(bounces.over_noise or 0.0)
+    told = math.inf
+    for step in STEPS:
+        error = step_error(subject, state, view.spectral_sensitivity, illuminant, step)
+        told = size * float(error.max())
+        if told < ENOUGH:
+            return step, told
+    return 1, told
+
+
+def _finer(bounces: Effect, spectral: bool, found: tuple[int, float]) -> Effect:
+    """Return whether all of the table's wavelengths are needed for light from skin to skin."""
+    step, over_noise = found
+    if not (bounces.built and spectral):
+        why = "there is no such light" if not bounces.built else "channels are taken whole"
+        return Effect(FINER, "negligible", why, 0.0, "spectral_step")
+    nm = f"each {10 * step} nm are enough" if step > 1 else "each 20 nm would not be enough"
+    return decide(FINER, over_noise, None, switch="spectral_step", because=nm)
+
+
 def further_bounces(bounces: Effect, once: float) -> Effect:
     """Return what is left of light from skin to skin; ``once`` is the share that bounces on."""
     if not bounces.built:
@@ -344,19 +336,6 @@ def _of_target(target: Target, caster: Caster) -> list[Effect]:
         decide(BOUNCES, size, None, switch="interreflections", because=because),
         Effect(LATERAL, "absent", f"{target.name} is opaque"),
     ]
-
-
-def color_error(subject: Subject, state: str, view: View, illuminant: str) -> NDArray[np.float64]:
-    """Return by how much each channel's mean of R^2 is off the square of its mean, shape (3,).
-
-    Of typical skin.
-    """
-    table = SkinTable.load()
-    weights = spectra.band_weights(view.spectral_sensitivity, illuminant, table.wavelength_nm)
-    covered = subject.atlas.covered
-    blood = subject.hemoglobin(state)
-    skin = table.spectra(np.median(subject.melanin[covered]), np.median(blood[covered]))
-    return np.asarray(np.abs((skin**2 @ weights) / (skin @ weights) ** 2 - 1.0), np.float64)
 
 
 def _movement(subject: Subject, movement: bool) -> list[Effect]:

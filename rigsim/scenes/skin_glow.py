@@ -152,6 +152,7 @@ def light_skin(
     lateral_transport: bool,
     bounce: SkinBounce | None = None,
     spectral: bool = True,
+    step: int = 1,
     enough: float = 1e-3,
 ) -> SkinGlow:
     """Let the light on a face into its skin and out again.
@@ -170,6 +171,8 @@ def light_skin(
         How light goes from skin to skin; None leaves that out.
     spectral
         Whether that light is reflected wavelength by wavelength.
+    step
+        Every how many of the table's wavelengths, see `rigsim.bounce_color`.
     enough
         Share of the first bounce below which further ones are left out.
 
@@ -190,7 +193,7 @@ def light_skin(
         outside = scale * ((1.0 - hair) * reflectance + covering)
         color = BounceColor(
             bounce, subject, state, outside, reflectance,
-            camera=camera, light=illuminant, spectral=spectral, enough=enough,
+            camera=camera, light=illuminant, spectral=spectral, step=step, enough=enough,
         )  # fmt: skip
         covered = subject.atlas.covered
         sums = bounce.coarsen(np.dstack([surface.entered, covered]).astype(np.float32))

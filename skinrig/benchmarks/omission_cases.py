@@ -93,7 +93,7 @@ def compare(
         have, with_s = _timed(render, {effect.switch: on}, times)
         lack, without_s = _timed(render, {effect.switch: off}, times)
         sigma = noise.sigma(have.light)
-        change = np.abs(have.light.astype(np.float64) - lack.light) / sigma
+        change = np.abs(_shown(have) - _shown(lack)) / sigma
         place = np.unravel_index(int(np.argmax(change)), change.shape)
         rounded = ROUNDING * float(np.max(have.light / sigma))
         error = rounded
@@ -106,6 +106,11 @@ def compare(
         )  # fmt: skip
 
 
+def _shown(pictures: Pictures) -> NDArray[np.float64]:
+    """Return what a sensor tells of light, which ends at full scale."""
+    return np.minimum(pictures.light.astype(np.float64), 1.0)
+
+
 def _timed(render: Render, settings: Mapping[str, Any], times: int) -> tuple[Pictures, float]:
     least = math.inf
     for _ in range(times):
@@ -115,14 +120,31 @@ def _timed(render: Render, settings: Mapping[str, Any], times: int) -> tuple[Pic
     return made, least
 
 
-def flash_face(preset: str, *, width_px: int, texels: int = FACE_TEXELS) -> Iterator[Omission]:
-    """Compare pictures of a face before the flash rig, parallel and crossed, at full power."""
+def flash_face(
+    preset: str, *, width_px: int, texels: int = FACE_TEXELS, light_deg: float | None = None
+) -> Iterator[Omission]:
+    """Compare pictures of a face before the flash rig, parallel and crossed, at full power.
+
+    Parameters
+    ----------
+    preset
+        Of the face.
+    width_px, texels
+        Columns of the camera, and texels along one side of the face's texture.
+    light_deg
+        One of the lights alone, so far off the camera's axis to the right, degrees; None: all
+        lights where they stand.
+    """
     from capture.rig import load_rig
     from rigsim.scene_needs import Noise
     from rigsim.scenes.flash import FlashScene
+    from rigsim.scenes.flash_needs import FINER
     from rigsim.subject import make_subject
 
     rig = load_rig("flash").resized(width_px)
+    name = preset
+    if light_deg is not None:
+        rig, name = _lit_from(rig, light_deg), f"{preset}, one light at {light_deg:g} degrees"
     face = make_subject(preset, seed=0, size=texels)
     scene = FlashScene(rig, face)
 
@@ -131,19 +153,31 @@ def flash_face(preset: str, *, width_px: int, texels: int = FACE_TEXELS) -> Iter
         return Pictures(np.stack([made.radiance(name) for name in ("parallel", "crossed")]))
 
     scene.radiance()  # compiles, and traces what all scenes of this face share
+    coarser = 2 if scene.needs.builds(FINER) else None
     yield from compare(
-        "flash", preset, scene, Noise.of(scene.sensor()), render,
+        "flash", name, scene, Noise.of(scene.sensor()), render,
         {
             "lateral": (True, False), "interreflections": (True, False),
-            "spectral": (True, False), "last_bounce": (1e-7, None), "optics": (True, False),
+            "spectral": (True, False), "spectral_step": (1, coarser), "last_bounce": (1e-7, None),
+            "optics": (True, False),
         },
     )  # fmt: skip
+    if light_deg is not None:
+        return
 
     def look(subject: Any) -> Pictures:
         made = FlashScene(rig, subject)
         return Pictures(np.stack([made.radiance(name) for name in ("parallel", "crossed")]))
 
     yield from _plainer("flash", preset, scene, look)
+
+
+def _lit_from(rig: Any, angle_deg: float) -> Any:
+    """Return a rig with the first of its lights alone, at an angle off +z towards +x."""
+    light = rig.lights[0]
+    far, angle = math.hypot(*light.position_mm), math.radians(angle_deg)
+    place = (far * math.sin(angle), 0.0, far * math.cos(angle))
+    return dataclasses.replace(rig, lights=(dataclasses.replace(light, position_mm=place),))
 
 
 def dome_face(preset: str, *, width_px: int, lights: int) -> Iterator[Omission]:

@@ -15,6 +15,9 @@ rule that was loosened shows here."""
 
 NO_MEMORY = "scenes share what they trace: a picture's memory is not its own"
 FLASH_PX = 192
+GRAZED_PX = 96
+GRAZING_DEG = 88.0
+"""A plate that faces the camera gets 1/29 of what faces the light."""
 DOME_PX = 100
 GRADIENT_PX = 128
 DOME_LIGHTS = 3
@@ -91,6 +94,7 @@ def _cases(toy: bool) -> Iterator[Omission]:
         return
     for preset in ("II", "VI", "darkest"):
         yield from omission_cases.flash_face(preset, width_px=FLASH_PX)
+    yield from omission_cases.flash_face("darkest", width_px=GRAZED_PX, light_deg=GRAZING_DEG)
     for preset in ("II", "darkest"):
         yield from omission_cases.dome_face(preset, width_px=DOME_PX, lights=DOME_LIGHTS)
     yield from omission_cases.moved_face("II", width_px=DOME_PX, lights=DOME_LIGHTS)

@@ -8,6 +8,7 @@ import pytest
 
 from capture.rig import load_rig
 from rigsim import effect_sizes
+from rigsim.bounce_color import STEPS, step_error
 from rigsim.furrow_light import hidden_share
 from rigsim.lateral import spread_light
 from rigsim.mesh import build_mesh
@@ -183,11 +184,35 @@ def test_a_highlight_is_brighter_than_dark_skin_and_the_lens_is_judged_by_it(fla
     for rig in (flash, grazing(flash, 60.0)):
         scene = FlashScene(rig, faces["darkest"], lateral=False, optics=False)
         shown = scene.radiance("parallel") - scene.radiance("crossed")
-        bound = flash_needs.highlight(
-            rig, rig.views[0], scene.subject, scene._caster, scene._weights
+        rough = float(scene.subject.roughness[scene.subject.atlas.covered].min())
+        places = [light.position_mm for light in rig.lights]
+        bound = effect_sizes.highlight(
+            scene.subject.mesh, places, scene._weights, rig.views[0].position_mm, rough
         )
         peak = float((bound * scene.white_rgb()).max())
         assert shown.max() < peak
+
+
+def test_fewer_wavelengths_change_no_pixel_by_more_than_is_told(flash, faces):
+    """Of light from skin to skin, whose share is told as a bound, between any two of its skins."""
+    face = faces["II"]
+    scene = FlashScene(flash, face)
+    noise, view = Noise.of(scene.sensor()), flash.views[0]
+    effect = scene.needs[flash_needs.FINER]
+    assert effect.verdict == "built"
+    assert "each 20 nm would not be enough" in effect.reason
+    fine = scene.radiance()
+    sensor = dataclasses.replace(scene.sensor(), read_noise_e=2e3)
+    coarse = FlashScene(flash, face, sensor=sensor).needs[flash_needs.FINER]
+    assert coarse.verdict == "negligible"
+    bounces = scene.needs[flash_needs.BOUNCES].over_noise
+    changes = []
+    for step in STEPS:
+        error = step_error(face, "neutral", view.spectral_sensitivity, "D55", step)
+        lack = FlashScene(flash, face, spectral_step=step).radiance()
+        changes.append(float((np.abs(lack - fine) / noise.sigma(fine)).max()))
+        assert 0.0 < changes[-1] <= bounces * error.max()
+    assert changes[0] > 3.0 * changes[-1]  # 50 nm miss what 20 nm see
 
 
 def test_of_two_cameras_the_one_that_tells_more_decides(flash, faces):
