@@ -168,15 +168,20 @@ def reconstruct(
     opened = Session.open(session)
     recipe = recipe_of(opened)
     store.require_free(out)
-    if hold_out is not None or rank is not None:
-        if recipe.maps_of_rank is None:
-            raise EvidenceError(
-                f"hold-out, rank: {opened.path} is no session of the dome; leave them out"
-            )
-        if rank is not None and rank < 1:
-            raise EvidenceError(f"rank: got {rank}, expected 1 or more")
-        if rank is not None:
-            recipe = replace(recipe, maps=recipe.maps_of_rank(rank))
+    of_domes = {"hold-out": hold_out, "rank": rank, "scan": scan, "basis": basis}
+    given = [name for name, value in of_domes.items() if value is not None]
+    if given and recipe.maps_of_rank is None:
+        raise EvidenceError(
+            f"{', '.join(given)}: {opened.path} is no session of the dome; leave out what only it "
+            "takes"
+        )
+    for name, file in (("scan", scan), ("landmarks", landmarks)):
+        if file is not None and not Path(file).is_file():
+            raise EvidenceError(f"{name}: {file} is no file")
+    if rank is not None and rank < 1:
+        raise EvidenceError(f"rank: got {rank}, expected 1 or more")
+    if rank is not None and recipe.maps_of_rank is not None:
+        recipe = replace(recipe, maps=recipe.maps_of_rank(rank))
     known = ", ".join(recipe.maps)
     if not want:
         raise EvidenceError(f"want: got nothing, expected names out of {known}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,10 @@ def fit_facial_color(
     FacialColorFitError, EvidenceError, LandmarkError, DynamicAppearanceError
         Naming what is missing or does not fit.
     """
+    if radius_px is not None and not 0.0 < radius_px < math.inf:
+        raise FacialColorInputError(f"radius: got {radius_px:g} px, expected more than 0")
+    if stored_size is not None and stored_size < 1:
+        raise FacialColorInputError(f"stored size: got {stored_size} cells, expected 1 or more")
     dynamic_appearance.check_target(out)
     subject = state_images.read(sessions, calibration=calibration, progress=progress)
     marks, marked_by, unmarked = _landmarks(subject, sessions, landmarks)

@@ -151,6 +151,29 @@ def test_reconstruct_refuses_or_is_not_touched_by_the_damage(session, damage, ca
     assert not (tmp_path / "maps").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["fit", "facial-color", "SESSION", "--radius", "-3"], "radius: got -3 px, expected more"),
+        (["fit", "facial-color", "SESSION", "--radius", "nan"], "radius: got nan px"),
+        (["fit", "facial-color", "SESSION", "--stored-size", "0"], "stored size: got 0 cells"),
+        (["reconstruct", "SESSION", "--want", "melanin", "--scan", "x.ply"], "scan: "),
+        (["reconstruct", "SESSION", "--want", "melanin", "--rank", "3"], "is no session of the"),
+        (["reconstruct", "SESSION", "--want", "melanin", "--landmarks", "x.csv"],
+         "landmarks: x.csv is no file"),
+    ],
+)  # fmt: skip
+def test_what_an_option_cannot_mean_is_refused_before_images_are_made(
+    words, says, sound, tmp_path, capsys
+):
+    argv = [str(sound) if word == "SESSION" else word for word in words]
+    assert main([*argv, "--out", str(tmp_path / "out")]) == 3
+    err = capsys.readouterr().err
+    assert says in err
+    assert len(err.splitlines()) == 1  # no line of progress before
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_session_without_a_neutral_state_is_refused_before_its_images_are_made(tmp_path, capsys):
     made = simulate_session("flash", tmp_path / "session-white", target="white", width_px=64)
     out = tmp_path / "moving"
