@@ -172,10 +172,10 @@ def analyse_simulated(
 
     tell = progress or (lambda text: None)
     everybody = table_1(seed=seed)
+    if not 2 <= people <= len(everybody):
+        raise TraitFitError(f"people: got {people}, expected 2 to {len(everybody)}")
     chosen = np.random.default_rng([seed, 1]).permutation(len(everybody))[:people]
     some = [everybody[k] for k in sorted(chosen)]
-    if len(some) < 2:
-        raise TraitFitError(f"people: got {people}, expected 2 or more")
     faces = CommonFaces.of(some, size=size, common=128)
     samples = []
     for k, person in enumerate(some):

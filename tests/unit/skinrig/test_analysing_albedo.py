@@ -40,6 +40,14 @@ def test_groups_differ_in_their_histograms_as_they_were_made(lab, capsys):
     assert (out / "figure-16.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.parametrize("people", ["1", "88"])
+def test_more_people_than_there_are_are_refused(people, tmp_path, capsys):
+    argv = ["analyse", "albedo", "--people", people, "--out", str(tmp_path / "out")]
+    assert main(argv) == 3
+    assert f"people: got {people}, expected 2 to 87" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_labels_without_faces_are_refused(lab, capsys):
     folder, _, labels = lab
     argv = ["analyse", "albedo", "--labels", str(labels), "--out", str(folder / "none")]
