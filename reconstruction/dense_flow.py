@@ -36,6 +36,8 @@ NEIGHBORS_PX = 8.0
 """Gaussian window over which gaps are averaged, and unknown flow is filled."""
 BEND_PX = 3.0
 """Gaussian window that derivatives of the displacement are taken at, px."""
+_CUBIC = -0.75
+"""Slope of OpenCV's cubic kernel at a pixel's distance."""
 ERROR_FACTORS = (1.2, 0.3, 1.1, 12.0, 0.04)
 """Squared error along an axis, by parts: the variance by noise, the squares of gap and last step
 (px^2), of the Laplacian (1/px^2 times px^4) and of the gradient of the displacement (times px^2).
@@ -143,6 +145,25 @@ def bilinear(image: Any, at_px: Float32s, *, interpolation: int = cv2.INTER_LINE
     return cv2.remap(
         image, flat[..., 0], flat[..., 1], interpolation, borderMode=cv2.BORDER_REPLICATE
     )
+
+
+def noise_left(at_px: Float32s) -> Float32s:
+    """Return the variance that cubic interpolation leaves of noise of single pixels, (H, W).
+
+    Parameters
+    ----------
+    at_px
+        (H, W, 2): column and row, px. On pixels themselves all of it is left, 1; in the middle
+        between four the sum of the squared weights, 0.51.
+    """
+    left = np.ones(at_px.shape[:2], np.float32)
+    for axis in (0, 1):
+        along = at_px[..., axis] - np.floor(at_px[..., axis])
+        t = np.stack([along + 1.0, along, 1.0 - along, 2.0 - along])
+        near = ((_CUBIC + 2.0) * t - (_CUBIC + 3.0)) * t * t + 1.0
+        far = ((t - 5.0) * t + 8.0) * t * _CUBIC - 4.0 * _CUBIC
+        left *= np.square(np.where(t <= 1.0, near, far)).sum(axis=0)
+    return left
 
 
 def _follow(one: Bytes, two: Bytes) -> Float32s:

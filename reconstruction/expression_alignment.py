@@ -191,8 +191,9 @@ class Alignment:
             Of the moving picture.
         place
             Whether the error of the place is added to the map's own. Colors for
-            `reconstruction.shared_melanin` go without: a misplaced pixel is mostly brighter or
-            darker, and brightness is left open there.
+            `reconstruction.shared_melanin` go without: `reconstruction.misplacement` tells it with
+            how the channels go together. What interpolation averages of the noise is taken off
+            then.
         """
         values, seen = self.warp(skin_map.values, skin_map.valid)
         stderr = None
@@ -200,7 +201,9 @@ class Alignment:
             stderr = self.warp_stderr(skin_map.values, skin_map.stderr, skin_map.valid)
         elif skin_map.stderr is not None:
             variance, _ = self.warp(np.square(skin_map.stderr), skin_map.valid)
-            stderr = np.sqrt(np.maximum(variance, 0.0))
+            left = dense_flow.noise_left(self.source_px)
+            left = left[..., None] if values.ndim == 3 else left
+            stderr = np.sqrt(np.maximum(variance, 0.0) * left).astype(np.float32)
         return SkinMap(values, skin_map.unit, stderr, seen, skin_map.description)
 
     def _checked(self, values: ArrayLike, valid: ArrayLike | None) -> tuple[Float32s, Bools]:

@@ -23,6 +23,7 @@ from model.skin import UNITS, SkinMap
 from model.tissue_optics import ANISOTROPY_SKIN
 from reconstruction import (
     expression_alignment,
+    misplacement,
     model_error,
     repeatability,
     shading_prior,
@@ -36,6 +37,7 @@ from reconstruction.shared_melanin import SharedMelanin
 from reconstruction.state_images import NEUTRAL, Landmarks, StateImage, Subject
 
 Mask = NDArray[np.bool_]
+Floats = NDArray[np.float64]
 
 CORRELATED_PX: Final = 3.0
 """Pixels whose noise goes together after demosaicing and interpolation."""
@@ -168,7 +170,8 @@ def fit(
         reasons = "; ".join(f"{what}: {why}" for what, why in left_out)
         raise FacialColorFitError(f"sessions: no state could be laid over the neutral: {reasons}")
     tell("one melanin for all states")
-    averages = [_average([one for one in aligned if one.image.state == state]) for state in kept]
+    of_states = [[one for one in aligned if one.image.state == state] for state in kept]
+    averages = [_average(images) for images in of_states]
     table = color_table.build(subject.camera, subject.illuminant, anisotropy=ANISOTROPY_SKIN)
     prior = shading_prior.of_faces()
     if not subject.has_white:
@@ -178,7 +181,8 @@ def fit(
         table,
         prior=prior,
         variance=np.stack([average[1] for average in averages]),
-        model_error=model_error.of_picture(*averages[0]),
+        model_error=_model_error(averages),
+        own_error=np.stack([_own_error(images) for images in of_states]),
         valid=np.stack([average[2] for average in averages]),
         shading_window_px=shared_melanin.SHADING_WINDOW_PX,
     )
@@ -325,6 +329,32 @@ def _average(
         ratio = np.mean(scatter[seen] / noise[seen]) if seen.any() else 1.0
         noise *= max(1.0, float(ratio))
     return rgb.astype(np.float32), noise.astype(np.float32), np.asarray(count > 0)
+
+
+def _model_error(averages: list[tuple[NDArray[np.float32], NDArray[np.float32], Mask]]) -> Floats:
+    """Return each pixel's model error: the mean of what those states tell that show it."""
+    total = np.zeros((*averages[0][2].shape, 3, 3))
+    count = np.zeros(averages[0][2].shape)
+    for rgb, variance, valid in averages:
+        good = model_error.usable_pixels(rgb, valid)
+        total += np.where(good[..., None, None], model_error.of_picture(rgb, variance, valid), 0.0)
+        count += good
+    mean = total / np.maximum(count, 1.0)[..., None, None]
+    return np.where((count > 0)[..., None, None], mean, model_error.color_errors().transport)
+
+
+def _own_error(images: list[AlignedImage]) -> Floats:
+    """Return what a state's mean color errs by as its images were laid over another.
+
+    Repeats move alike and err alike: their mean errs as one of them.
+    """
+    total = np.zeros((*images[0].valid.shape, 3, 3))
+    count = np.zeros(images[0].valid.shape)
+    for one in images:
+        count += one.valid
+        if one.alignment is not None:
+            total += misplacement.own_error(one.rgb, one.variance, one.valid, one.alignment)
+    return np.asarray(total / np.maximum(count, 1.0)[..., None, None])
 
 
 def _blood(shared: SharedMelanin, k: int) -> SkinMap:

@@ -21,15 +21,13 @@ Jimenez et al. 2010, doi:10.1145/1866158.1866167, section 3.1
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter
 
 from model.color_table import ColorTable
-from reconstruction import chromophore_posterior
+from reconstruction import chromophore_posterior, light_change
 from reconstruction.chromophore_posterior import FINEST
 from reconstruction.chromophore_start import LOWEST
 from reconstruction.chromophores import (
@@ -50,13 +48,6 @@ pictures of the same unmoved face in neutral, smile, fear and exercise, seeds 0 
 SHADING_WINDOW_PX = 3.0
 """Window for the light's changes on moving faces: wider ones blur the shadows that move with them,
 narrower ones average less."""
-LEAST_CHANGE = 0.002
-"""Least relative change of light from state to state that is allowed for in each pixel: what a
-flash's energy differs by from pop to pop."""
-CLEARLY = 3.0
-"""Standard errors from which on a pixel's light is said not to follow its neighbors'."""
-FREE_CHANGE = 1.0
-"""Most that matters: with more, the brightness tells nothing."""
 MISFIT = 4.0
 """Standard errors from which on a state's color does not belong to the pixel's melanin."""
 _TASK_PIXELS = 2048
@@ -112,6 +103,7 @@ def weigh(
     reference: int = 0,
     shading_window_px: float | None = None,
     own_share: float = OWN_SHARE,
+    own_error: ArrayLike | None = None,
 ) -> SharedMelanin:
     """Estimate one melanin and the blood of every state, pixel by pixel.
 
@@ -140,6 +132,9 @@ def weigh(
         in each pixel and state.
     own_share : float
         Part of the model error's variance that is each state's own, 0...1.
+    own_error : array_like, shape (S, ..., 3, 3), optional
+        Covariance of what each state's relative color errs by beside all that, such as where it
+        was misplaced (`reconstruction.misplacement`). None: nothing.
 
     Returns
     -------
@@ -184,17 +179,16 @@ def weigh(
 
     each_error, usual = _model_errors(model_error, shape, usable)
     common = each_error * (1.0 - own_share)
-    own = np.diag(own_share * usual) + FINEST**2 * np.eye(3)
+    owns = _own_errors(own_error, own_share * usual + FINEST**2, (states, *shape), usable)
     cells = np.ascontiguousarray(table.cells, np.float64)
-    mean, mean_variance = _mean_color(log_rgb, relative, usable, table, cells, own)
+    mean, mean_variance = _mean_color(log_rgb, relative, usable, table, cells, owns)
     mean_rgb = np.exp(mean)
     found = chromophore_posterior.weigh(
         mean_rgb,
         table,
         prior=prior,
         variance=mean_variance * mean_rgb**2,
-        model_error=(common if len(common) > 1 else common[0])
-        + own / np.maximum(usable.sum(axis=0).max(), 1),
+        model_error=_with_mean_of(owns, relative, usable, common),
     )
     ends = np.array([table.c_m_max, table.c_hd_max])
     begin = _fractions(np.stack([found.melanin, found.hemoglobin], axis=-1), ends)
@@ -212,7 +206,7 @@ def weigh(
         of_states = np.empty((len(kernels.STATE_MAPS), states, pixels), np.float32)
         kernels.blood_of_states(
             log_rgb, relative, good, mean, log_change, stiffness, *fixed,
-            weighed_by, own, cells,
+            weighed_by, owns, cells,
             float(ends[0]), float(ends[1]), reference % states, of_pixels, of_states, _TASK_PIXELS,
         )  # fmt: skip
         return of_pixels, of_states
@@ -220,8 +214,8 @@ def weigh(
     free = np.zeros(good.shape, np.float32)
     pixel_maps, state_maps = fit(free, free)
     if shading_window_px is not None and states > 1:
-        log_change, stiffness = _smooth_change(
-            state_maps, good & (state_maps[5] < MISFIT), shape, shading_window_px
+        log_change, stiffness = light_change.smooth(
+            state_maps[6], state_maps[7], good & (state_maps[5] < MISFIT), shape, shading_window_px
         )
         pixel_maps, state_maps = fit(log_change, np.where(good, stiffness, 0.0).astype(np.float32))
     named = {
@@ -263,13 +257,56 @@ def _model_errors(
     return flat, usual
 
 
+_UPPER = np.triu_indices(3)
+
+
+def _own_errors(
+    own_error: ArrayLike | None,
+    least: NDArray[np.float64],
+    shape: tuple[int, ...],
+    usable: Mask,
+) -> NDArray[np.float64]:
+    """Return upper triangles of the states' own covariances, (S, n or 1, 6)."""
+    diagonal = np.diag(least)[_UPPER]
+    if own_error is None:
+        return np.ascontiguousarray(np.broadcast_to(diagonal, (shape[0], 1, 6)))
+    given = np.asarray(own_error, np.float64)
+    if given.shape != (*shape, 3, 3):
+        raise ChromophoreError(
+            f"own_error: expected shape {(*shape, 3, 3)} for states and pixels, got {given.shape}"
+        )
+    flat = given.reshape(shape[0], -1, 3, 3)[..., _UPPER[0], _UPPER[1]]
+    if not (np.isfinite(flat[usable]).all() and (flat[usable][:, [0, 3, 5]] >= 0.0).all()):
+        raise ChromophoreError("own_error: expected finite covariances without negative variances")
+    return np.ascontiguousarray(np.where(usable[..., None], flat, 0.0) + diagonal)
+
+
+def _with_mean_of(
+    owns: NDArray[np.float64], relative: Map, usable: Mask, common: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return what the mean color of the states errs by beside noise, (3, 3) or (n, 3, 3)."""
+    if owns.shape[1] == 1:
+        own = np.zeros((3, 3))
+        own[_UPPER] = owns[0, 0]
+        most = max(int(usable.sum(axis=0).max(initial=0)), 1)
+        return np.asarray((common if len(common) > 1 else common[0]) + own / most)
+    # each state's part in the mean, as `shared_melanin_kernels.mean_color` takes it
+    share = usable / (relative.sum(axis=-1) + owns[..., [0, 3, 5]].sum(axis=-1))
+    share /= np.maximum(share.sum(axis=0), 1e-300)
+    mean = (np.square(share)[..., None] * owns).sum(axis=0)
+    whole = np.empty((len(mean), 3, 3))
+    whole[(slice(None), *_UPPER)] = mean
+    whole[(slice(None), *_UPPER[::-1])] = mean
+    return np.asarray(whole + common)
+
+
 def _mean_color(
     log_rgb: Map,
     relative: Map,
     usable: Mask,
     table: ColorTable,
     cells: NDArray[np.float64],
-    own: NDArray[np.float64],
+    owns: NDArray[np.float64],
 ) -> tuple[Map, Map]:
     """Return the states' mean log color, as of skin with their mean blood, and its variance."""
     from reconstruction import shared_melanin_kernels as kernels  # compiled when imported
@@ -285,53 +322,10 @@ def _mean_color(
     begin = _fractions(np.stack([first.melanin, first.hemoglobin], axis=-1), ends)
     mean, variance = np.empty_like(plain, np.float32), np.empty_like(plain, np.float32)
     kernels.mean_color(
-        log_rgb, relative, np.ascontiguousarray(usable), begin.astype(np.float32), own, cells,
+        log_rgb, relative, np.ascontiguousarray(usable), begin.astype(np.float32), owns, cells,
         mean, variance, _TASK_PIXELS,
     )  # fmt: skip
     return mean, variance
-
-
-def _smooth_change(
-    state_maps: Map, good: Mask, shape: tuple[int, ...], window_px: float
-) -> tuple[Map, Map]:
-    """Return how the light of each state differs, smoothed, and one over the variance of the rest.
-
-    Log shading and its variance by the states' colors alone are the maps 6 and 7.
-    """
-    known = good & np.isfinite(state_maps[7]) & (state_maps[7] > 0.0)
-    light = np.where(known, state_maps[6], 0.0).astype(np.float64)
-    variance = np.where(known, state_maps[7], 1.0).astype(np.float64)
-    share = np.where(known, 1.0 / variance, 0.0)
-    share /= np.maximum(share.sum(axis=0), 1e-300)
-    change = light - (share * light).sum(axis=0)
-    scatter = (1.0 - 2.0 * share) * variance + (share**2 * variance).sum(axis=0)
-    # a pixel seen in one state alone tells nothing of changes
-    weight = np.where(known & (share < 1.0 - 1e-9), 1.0 / np.maximum(scatter, 1e-12), 0.0)
-
-    def around(values: NDArray[np.float64], reach_px: float) -> NDArray[np.float64]:
-        stack = values.reshape(-1, *shape)
-        return np.stack([gaussian_filter(v, reach_px, mode="constant") for v in stack]).reshape(
-            values.shape
-        )
-
-    total = np.maximum(around(weight, window_px), 1e-9)
-    smooth = around(weight * change, window_px) / total
-    smooth_variance = around(weight, window_px / math.sqrt(2.0)) / (
-        4.0 * math.pi * window_px**2 * total**2
-    )
-    rest = weight * (np.square(change - smooth) - scatter)
-    wide = 3.0 * window_px
-    squares = np.maximum(around(weight**2, wide), 1e-9)
-    excess = around(weight * rest, wide) / squares
-    # by chance alone it is 0 within this
-    chance = np.sqrt(2.0 * around(weight**2, wide / math.sqrt(2.0)) / (4.0 * math.pi)) / (
-        wide * squares
-    )
-    # a wrinkle's shadow is narrower than that: a pixel that is clearly off is off by so much
-    apart = np.square(change - smooth)
-    alone = np.where(apart > CLEARLY**2 * scatter, apart, 0.0)
-    loose = np.maximum(np.maximum(excess, alone), 0.0) + chance + smooth_variance + LEAST_CHANGE**2
-    return smooth.astype(np.float32), (1.0 / np.minimum(loose, FREE_CHANGE**2)).astype(np.float32)
 
 
 def _fractions(values: Map, ends: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -54,15 +54,15 @@ def _color(cells, a, b, out):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=_FAST)
-def _weights(noise, model, stiffness, w):  # type: ignore[no-untyped-def]
-    """Write the inverse of noise + model + brightness / stiffness, (3, 3), to `w`.
+def _weights(each, model, stiffness, w):  # type: ignore[no-untyped-def]
+    """Write the inverse of each + model + brightness / stiffness, (3, 3), to `w`.
 
-    `noise` is the diagonal of relative variances; 1 / stiffness is the variance of an error common
-    to the channels. At 0 the brightness is free, and `w` of rank 2. Returns how the channels tell
-    the brightness.
+    `each` and `model` are covariances of log color; 1 / stiffness is the variance of an error
+    common to the channels. At 0 the brightness is free, and `w` of rank 2. Returns how the channels
+    tell the brightness.
     """
-    a00, a11, a22 = noise[0] + model[0, 0], noise[1] + model[1, 1], noise[2] + model[2, 2]
-    a01, a02, a12 = model[0, 1], model[0, 2], model[1, 2]
+    a00, a11, a22 = each[0, 0] + model[0, 0], each[1, 1] + model[1, 1], each[2, 2] + model[2, 2]
+    a01, a02, a12 = each[0, 1] + model[0, 1], each[0, 2] + model[0, 2], each[1, 2] + model[1, 2]
     c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
     scale = 1.0 / (a00 * c00 + a01 * c01 + a02 * c02)
     w[0, 0], w[0, 1], w[0, 2] = c00 * scale, c01 * scale, c02 * scale
@@ -92,14 +92,28 @@ def _times(w, g):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=_FAST)
-def _form(diagonal, common, p, q):  # type: ignore[no-untyped-def]
-    """Return p' (diagonal + common brightness) q."""
+def _form(each, common, p, q):  # type: ignore[no-untyped-def]
+    """Return p' (each + common brightness) q; `each` is symmetric, (3, 3)."""
     return (
-        diagonal[0] * p[0] * q[0]
-        + diagonal[1] * p[1] * q[1]
-        + diagonal[2] * p[2] * q[2]
+        each[0, 0] * p[0] * q[0]
+        + each[1, 1] * p[1] * q[1]
+        + each[2, 2] * p[2] * q[2]
+        + each[0, 1] * (p[0] * q[1] + p[1] * q[0])
+        + each[0, 2] * (p[0] * q[2] + p[2] * q[0])
+        + each[1, 2] * (p[1] * q[2] + p[2] * q[1])
         + common * (p[0] + p[1] + p[2]) * (q[0] + q[1] + q[2])
     )
+
+
+@njit(fastmath=_FAST)
+def _own_error(variance, own, each):  # type: ignore[no-untyped-def]
+    """Write a state's own covariance to `each`, (3, 3): noise and the triangle of its own error."""
+    each[0, 0] = variance[0] + own[0]
+    each[1, 1] = variance[1] + own[3]
+    each[2, 2] = variance[2] + own[5]
+    each[0, 1] = each[1, 0] = own[1]
+    each[0, 2] = each[2, 0] = own[2]
+    each[1, 2] = each[2, 1] = own[4]
 
 
 @njit(fastmath=_FAST)
@@ -152,7 +166,7 @@ def _given(dtype: types.Type, axes: int) -> types.Array:
         _given(float32, 3),  # relative variance (s, n, 3)
         _given(boolean, 2),  # usable (s, n)
         _given(float32, 2),  # where to begin: fractions of the axes (n, 2)
-        _given(float64, 2),  # covariance of the model error that is each state's own (3, 3)
+        _given(float64, 3),  # upper triangle of each state's own covariance (s, n or 1, 6)
         _given(float64, 5),  # cells of the color table
         float32[:, ::1],  # mean log color as of skin with the mean blood (n, 3)
         float32[:, ::1],  # its relative variance, noise alone (n, 3)
@@ -166,7 +180,7 @@ def _given(dtype: types.Type, axes: int) -> types.Array:
     error_model="numpy",
 )
 def mean_color(  # type: ignore[no-untyped-def]
-    log_rgb, variance, usable, begin, own, cells, mean, mean_variance, block
+    log_rgb, variance, usable, begin, owns, cells, mean, mean_variance, block
 ):
     """Average the states' colors as if all had the mean blood; shapes are in the signature."""
     states, pixels = usable.shape
@@ -174,7 +188,8 @@ def mean_color(  # type: ignore[no-untyped-def]
         w = np.empty((3, 3))
         color = np.empty((3, 3))
         level = np.empty((3, 3))
-        noise = np.empty(3)
+        each = np.empty((3, 3))
+        nothing = np.zeros((3, 3))
         here = np.empty(3)
         blood = np.empty(states)
         share = np.empty(states)
@@ -187,13 +202,11 @@ def mean_color(  # type: ignore[no-untyped-def]
                 if not usable[s, n]:
                     continue
                 for c in range(3):
-                    noise[c] = variance[s, n, c]
                     here[c] = log_rgb[s, n, c]
-                _weights(noise, own, 0.0, w)
+                _own_error(variance[s, n], owns[s, n if owns.shape[1] > 1 else 0], each)
+                _weights(each, nothing, 0.0, w)
                 blood[s] = _blood(cells, w, here, a, b, color)
-                share[s] = 1.0 / (
-                    noise[0] + noise[1] + noise[2] + own[0, 0] + own[1, 1] + own[2, 2]
-                )
+                share[s] = 1.0 / (each[0, 0] + each[1, 1] + each[2, 2])
                 total += share[s]
                 middle += share[s] * blood[s]
             for c in range(3):
@@ -224,7 +237,7 @@ def mean_color(  # type: ignore[no-untyped-def]
         _given(float32, 2),  # melanin and where blood begins: fractions of the axes (n, 2)
         _given(float32, 1),  # standard error of melanin, as a fraction of its axis (n,)
         _given(float64, 3),  # covariance of the model error common to the states (n or 1, 3, 3)
-        _given(float64, 2),  # covariance of the model error that is each state's own (3, 3)
+        _given(float64, 3),  # upper triangle of each state's own covariance (s, n or 1, 6)
         _given(float64, 5),  # cells of the color table
         float64,  # end of the axis of melanin as a volume fraction
         float64,  # end of the axis of blood as a volume fraction
@@ -241,7 +254,7 @@ def mean_color(  # type: ignore[no-untyped-def]
     error_model="numpy",
 )
 def blood_of_states(  # type: ignore[no-untyped-def]
-    log_rgb, variance, usable, mean, log_change, stiffness, begin, melanin_stderr, commons, own,
+    log_rgb, variance, usable, mean, log_change, stiffness, begin, melanin_stderr, commons, owns,
     cells, melanin_end, end, reference, pixel_maps, state_maps, block,
 ):  # fmt: skip
     """Fit the blood of every state under the shared melanin; shapes are in the signature.
@@ -254,10 +267,11 @@ def blood_of_states(  # type: ignore[no-untyped-def]
     for task in prange((pixels + block - 1) // block):
         w = np.empty((3, 3))
         color = np.empty((3, 3))
-        noise = np.empty(3)
+        noise = np.empty((3, 3))
+        nothing = np.zeros((3, 3))
         here = np.empty(3)
         rest = np.empty(3)
-        each = np.empty((states, 3))  # E_s: variance of a state's channels, without brightness
+        each = np.empty((states, 3, 3))  # E_s: own covariance of a state, without brightness
         level = np.empty(states)  # variance of its brightness
         share = np.empty(states)  # part in the mean
         own_row = np.empty((states, 3))  # blood's answer to the state's own color
@@ -279,23 +293,21 @@ def blood_of_states(  # type: ignore[no-untyped-def]
                 share[s] = 0.0
                 if not (usable[s, n] and a == a):
                     continue
-                summed = 0.0
-                for c in range(3):
-                    each[s, c] = variance[s, n, c] + own[c, c]
-                    summed += each[s, c]
+                _own_error(variance[s, n], owns[s, n if owns.shape[1] > 1 else 0], each[s])
                 level[s] = 1.0 / stiffness[s, n] if stiffness[s, n] > 0.0 else 0.0
-                share[s] = 1.0 / summed
+                share[s] = 1.0 / (each[s, 0, 0] + each[s, 1, 1] + each[s, 2, 2])
                 total += share[s]
             if total == 0.0:
                 continue
-            noise[:] = 0.0
+            noise[:, :] = 0.0
             noise_level = 0.0
             usual_change = 0.0
             for s in range(states):
                 share[s] /= total
                 if share[s] > 0.0:
                     for c in range(3):
-                        noise[c] += share[s] * share[s] * each[s, c]
+                        for k in range(3):
+                            noise[c, k] += share[s] * share[s] * each[s, c, k]
                     noise_level += share[s] * share[s] * level[s]
                     usual_change += share[s] * log_change[s, n]
             # the mean color: its blood and brightness under the melanin, and how they err
@@ -332,9 +344,8 @@ def blood_of_states(  # type: ignore[no-untyped-def]
                     continue
                 moved = brightness + log_change[s, n] - usual_change
                 for c in range(3):
-                    one[c] = variance[s, n, c]
                     here[c] = log_rgb[s, n, c] - moved
-                tell = _weights(one, own, float64(stiffness[s, n]), w)
+                tell = _weights(each[s], nothing, float64(stiffness[s, n]), w)
                 b = _blood(cells, w, here, a, middle, color)
                 weighted = _times(w, color[2])
                 information = max(_dot(weighted, color[2]), 1e-12)

@@ -309,3 +309,33 @@ def test_arguments_that_do_not_fit_are_named(table, prior):
             shared_melanin.weigh(rgb, table, prior=prior, **given)
     with pytest.raises(ChromophoreError, match="rgb: expected shape"):
         shared_melanin.weigh(np.ones(3), table, prior=prior)
+
+
+def test_an_own_error_of_a_state_counts_as_noise_that_goes_together(table, prior, rng):
+    """Channels that err together in one state: melanin and the change have its variance.
+
+    Expected: as drawn, within 4 sigma of 1500 pixels and 30 % for the bend of the table; errors
+    taken for independent between channels would be far off.
+    """
+    pixels = 1500
+    own = 4e-4 * np.array([[1.0, 0.2, -0.9], [0.2, 0.3, -0.2], [-0.9, -0.2, 1.0]])
+    rgb, variance = pictures(table, rng, noise=1.5e-3, pixels=pixels, blood=BLOOD[:2])
+    rgb[1] *= np.exp(rng.multivariate_normal(np.zeros(3), own, pixels))
+    given = np.zeros((2, pixels, 3, 3))
+    given[1] = own
+    found = shared_melanin.weigh(rgb, table, prior=prior, variance=variance, own_error=given)
+    low, high = chi_square_band(pixels)
+    for error, stderr in (
+        (found.melanin - MELANIN, found.stderr_melanin),
+        (found.change[1] - (BLOOD[1] - BLOOD[0]), found.stderr_change[1]),
+    ):
+        assert 0.7 * low < np.mean((error / stderr) ** 2) < 1.3 * high
+    without = shared_melanin.weigh(rgb, table, prior=prior, variance=variance)
+    assert np.median(without.stderr_change[1]) < 0.3 * np.median(found.stderr_change[1])
+
+
+def test_an_own_error_that_does_not_fit_is_refused(table, prior, rng):
+    rgb, variance = pictures(table, rng, noise=3e-4, pixels=4)
+    for wrong in (np.zeros((4, 3, 3)), np.full((len(rgb), 4, 3, 3), np.nan)):
+        with pytest.raises(ChromophoreError, match="own_error"):
+            shared_melanin.weigh(rgb, table, prior=prior, variance=variance, own_error=wrong)

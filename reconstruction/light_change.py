@@ -1,0 +1,78 @@
+"""How the light on a face changes from picture to picture, told by the colors of many pixels."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+LEAST_CHANGE = 0.002
+"""Least relative change of light from state to state that is allowed for in each pixel: what a
+flash's energy differs by from pop to pop."""
+CLEARLY = 3.0
+"""Standard errors from which on a pixel's light is said not to follow its neighbors'."""
+FREE_CHANGE = 1.0
+"""Most that matters: with more, the brightness tells nothing."""
+
+
+def smooth(
+    log_shading: Map, shading_variance: Map, good: Mask, shape: tuple[int, ...], window_px: float
+) -> tuple[Map, Map]:
+    """Return how the light of each state differs, smoothed, and one over the variance of the rest.
+
+    Parameters
+    ----------
+    log_shading, shading_variance
+        (S, n): log light on the pixels of each state by their colors alone, and its variance.
+    good
+        (S, n): where that means something.
+    shape
+        Rows and columns, H W = n.
+    window_px
+        Of the Gaussian that changes are averaged by, px.
+
+    Returns
+    -------
+    change, stiffness
+        (S, n): of log light from the mean of the states, and one over the variance that pixels
+        are off it by.
+    """
+    known = good & np.isfinite(shading_variance) & (shading_variance > 0.0)
+    light = np.where(known, log_shading, 0.0).astype(np.float64)
+    variance = np.where(known, shading_variance, 1.0).astype(np.float64)
+    share = np.where(known, 1.0 / variance, 0.0)
+    share /= np.maximum(share.sum(axis=0), 1e-300)
+    change = light - (share * light).sum(axis=0)
+    scatter = (1.0 - 2.0 * share) * variance + (share**2 * variance).sum(axis=0)
+    # a pixel seen in one state alone tells nothing of changes
+    weight = np.where(known & (share < 1.0 - 1e-9), 1.0 / np.maximum(scatter, 1e-12), 0.0)
+
+    def around(values: NDArray[np.float64], reach_px: float) -> NDArray[np.float64]:
+        stack = values.reshape(-1, *shape)
+        return np.stack([gaussian_filter(v, reach_px, mode="constant") for v in stack]).reshape(
+            values.shape
+        )
+
+    total = np.maximum(around(weight, window_px), 1e-9)
+    smooth = around(weight * change, window_px) / total
+    smooth_variance = around(weight, window_px / math.sqrt(2.0)) / (
+        4.0 * math.pi * window_px**2 * total**2
+    )
+    rest = weight * (np.square(change - smooth) - scatter)
+    wide = 3.0 * window_px
+    squares = np.maximum(around(weight**2, wide), 1e-9)
+    excess = around(weight * rest, wide) / squares
+    # by chance alone it is 0 within this
+    chance = np.sqrt(2.0 * around(weight**2, wide / math.sqrt(2.0)) / (4.0 * math.pi)) / (
+        wide * squares
+    )
+    # a wrinkle's shadow is narrower than that: a pixel that is clearly off is off by so much
+    apart = np.square(change - smooth)
+    alone = np.where(apart > CLEARLY**2 * scatter, apart, 0.0)
+    loose = np.maximum(np.maximum(excess, alone), 0.0) + chance + smooth_variance + LEAST_CHANGE**2
+    return smooth.astype(np.float32), (1.0 / np.minimum(loose, FREE_CHANGE**2)).astype(np.float32)

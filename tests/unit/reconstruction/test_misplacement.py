@@ -1,0 +1,122 @@
+"""What color errs by where a picture was laid over another one."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, shift
+
+from model import color_table
+from model.tissue_optics import ANISOTROPY_SKIN
+from reconstruction import dense_flow, misplacement, shading_prior, shared_melanin
+from reconstruction.expression_alignment import Alignment
+
+SIZE = 96
+
+
+def laid_over(error_px, size=SIZE):
+    rows, columns = np.indices((size, size))
+    everywhere = np.ones((size, size), bool)
+    return Alignment(
+        np.stack([columns, rows], axis=-1).astype(np.float32), everywhere,
+        np.full((size, size), error_px, np.float32), np.zeros((size, size), np.float32),
+        everywhere, 0.0, {}, 0.0, "landmarks", (size, size),
+    )  # fmt: skip
+
+
+def skin(rng, size=SIZE):
+    texture = gaussian_filter(rng.standard_normal((size, size)), 1.5, mode="wrap")
+    texture *= 0.05 / texture.std()
+    return np.exp(texture[..., None] * np.array([0.5, 1.0, 1.4])) * [0.5, 0.3, 0.2]
+
+
+def test_brightness_errs_by_the_slope_times_the_error_of_the_place(rng):
+    """A ramp of brightness: slope squared times the variance along its axis."""
+    columns = np.indices((SIZE, SIZE))[1]
+    rgb = np.exp(0.02 * columns)[..., None] * np.array([0.3, 0.2, 0.1])
+    found = misplacement.own_error(rgb, 0.0 * rgb, np.ones((SIZE, SIZE), bool), laid_over(0.4))
+    # at borders pixels have fewer neighbors along one axis than along the other
+    np.testing.assert_allclose(found[8:-8, 8:-8], 0.02**2 * 0.4**2 / 2, rtol=1e-4)
+
+
+def test_what_a_shifted_picture_differs_by_is_the_stated_covariance(rng):
+    """Shifts drawn with the stated error; brightness once, colors `SCALE` times; 25 % for the
+    bend of the texture between pixels and for 200 shifts."""
+    rgb, stated = skin(rng), 0.3
+    everywhere = np.ones((SIZE, SIZE), bool)
+    covariance = misplacement.own_error(rgb, 0.0 * rgb, everywhere, laid_over(stated))
+    squares = np.zeros((3, 3))
+    for _ in range(200):
+        by = rng.normal(0.0, stated / np.sqrt(2.0), 2)
+        moved = shift(np.log(rgb), (*by, 0), order=3, mode="grid-wrap")
+        off = (moved - np.log(rgb)).reshape(-1, 3)
+        squares += off.T @ off / len(off) / 200
+    brightness = np.ones(3) / 3.0
+    told = covariance.mean(axis=(0, 1))
+    assert brightness @ told @ brightness == pytest.approx(
+        brightness @ squares @ brightness, rel=0.25
+    )
+    color = np.array([1.0, 0.0, -1.0])
+    assert color @ told @ color == pytest.approx(
+        misplacement.SCALE * color @ squares @ color, rel=0.25
+    )
+
+
+def test_noise_is_no_slope_and_masked_pixels_count_for_nothing(rng):
+    rgb = np.broadcast_to([0.5, 0.3, 0.2], (SIZE, SIZE, 3))
+    noise = 0.02 * rgb
+    noisy = rgb + noise * rng.standard_normal(rgb.shape)
+    valid = np.ones((SIZE, SIZE), bool)
+    valid[:, 40:] = False
+    wild = np.where(valid[..., None], noisy, np.nan)
+    told = misplacement.own_error(wild, noise**2, valid, laid_over(0.5))
+    denied = misplacement.own_error(wild, 0.0 * noise, valid, laid_over(0.5))
+    assert np.isfinite(told).all()
+    assert not told[:, 40:].any()
+    # what is left of it by chance is positive: directions below 0 are 0
+    assert np.trace(told[:, :40].mean(axis=(0, 1))) < 0.35 * np.trace(
+        denied[:, :40].mean(axis=(0, 1))
+    )
+    assert np.linalg.eigvalsh(told).min() > -1e-9
+
+
+def test_changes_of_a_misplaced_face_are_covered_and_are_not_without_its_own_error(rng):
+    """Two pictures of one skin, the second 0.35 px off along each axis; true change 0.
+
+    Expected: at least the 68 % of the interval, less 8 for the texture of one face; without the
+    error of place far less.
+    """
+    table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+    blood = 0.03 * np.exp(0.25 * _texture(rng))
+    melanin = 0.015 * np.exp(0.15 * _texture(rng))
+    clean = 0.7 * table.lookup(melanin, blood)
+    moved = shift(clean, (0.35, 0.35, 0), order=3, mode="grid-wrap")
+    rgb = np.stack([clean, moved])
+    rgb *= 1.0 + 5e-4 * rng.standard_normal(rgb.shape)
+    variance = (5e-4 * np.stack([clean, moved])) ** 2
+    place = misplacement.own_error(
+        rgb[1], variance[1], np.ones((SIZE, SIZE), bool), laid_over(0.35 * np.sqrt(2.0))
+    )
+    shares = []
+    for own in (np.stack([0.0 * place, place]), None):
+        found = shared_melanin.weigh(
+            rgb, table, prior=shading_prior.of_faces(), variance=variance, own_error=own,
+            shading_window_px=shared_melanin.SHADING_WINDOW_PX,
+        )  # fmt: skip
+        good = found.valid_states[1] & ~found.misfits[1]
+        shares.append(np.mean(np.abs(found.change[1]) < found.stderr_change[1], where=good))
+    assert shares[0] > 0.6
+    assert shares[1] < shares[0] - 0.1
+
+
+def _texture(rng):
+    texture = gaussian_filter(rng.standard_normal((SIZE, SIZE)), 1.2, mode="wrap")
+    return texture / texture.std()
+
+
+@pytest.mark.parametrize("along", [(0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.3, 0.8)])
+def test_interpolated_noise_is_as_large_as_said(rng, along):
+    """Against noise that OpenCV interpolates; 3 % is 4 sigma of 40 000 pixels that share some."""
+    noise = rng.standard_normal((200, 200)).astype(np.float32)
+    at = dense_flow.grid((200, 200)) + np.asarray(along, np.float32)
+    seen = dense_flow.bilinear(noise, at, interpolation=2)[5:-5, 5:-5]
+    told = dense_flow.noise_left(at)[5:-5, 5:-5]
+    assert seen.var() == pytest.approx(float(told.mean()), rel=0.05)
