@@ -23,6 +23,8 @@ Known = Literal["estimated", "only below", "only above", "unknown"]
 
 BOUND_LEVEL = 0.95
 """Confidence of bounds."""
+GAUSSIAN_95 = 1.959964
+"""Half width of a 95 % interval in standard errors."""
 LEVEL_TEST = 0.001
 """Two levels differ when chance would make them differ as much at most so often."""
 _GRID = 97
@@ -156,9 +158,9 @@ def fit_course(
     stderr : array_like, optional
         Standard errors of the values, their shape.
     bend : float
-        By how much the values may be bent over the change, either way, in [0, 1): a part s of it
-        shows as s +- bend s (1 - s). The best constant is that of no bend; its interval holds those
-        of both bends, its standard error half of what lies between their constants.
+        Standard error of how the values are bent over the change, in [0, 1): a part s of it
+        shows as s +- bend s (1 - s). The best constant is that of no bend; what both bends move it
+        by is added to its errors in squares.
 
     Returns
     -------
@@ -201,20 +203,56 @@ def _with_bends(straight: RelaxationFit, bent: Sequence[RelaxationFit]) -> Relax
     """Return a fit whose time constant is as uncertain as what may have bent the values."""
     if not bent or straight.known == "unknown":
         return straight
-    every = (straight, *bent)
-    low = min(fit.interval_s[0] for fit in every)
-    high = max(fit.interval_s[1] for fit in every)
-    known: Known = "estimated"
-    if low == 0.0 or np.isinf(high):
-        known = "only below" if low == 0.0 else "only above"
     constants = [fit.time_constant_s for fit in bent]
+    middle = straight.time_constant_s
+    low, high = (
+        middle * np.exp(sign * np.hypot(np.log(end / middle), GAUSSIAN_95 * np.log(moved / middle)))
+        if 0.0 < end < np.inf
+        else end
+        for sign, end, moved in (
+            (-1.0, straight.interval_s[0], min(constants)),
+            (1.0, straight.interval_s[1], max(constants)),
+        )
+    )
     half = 0.5 * (max(constants) - min(constants))
-    stderr = float(np.hypot(straight.stderr_time_constant_s, half))
     return replace(
         straight,
-        interval_s=(low, high),
-        known=known,
-        stderr_time_constant_s=stderr if known == "estimated" else float("nan"),
+        interval_s=(float(low), float(high)),
+        stderr_time_constant_s=float(np.hypot(straight.stderr_time_constant_s, half)),
+    )
+
+
+def of_vessels(fit: RelaxationFit) -> RelaxationFit:
+    """Return the levels of blood of a fit to its square root.
+
+    Blood fills its vessels' cross-section: where their radius relaxes exponentially, so does the
+    root of blood, and blood itself does not.
+
+    Parameters
+    ----------
+    fit
+        Of roots of blood.
+
+    Returns
+    -------
+    RelaxationFit
+        With levels, their standard errors and the noise of blood.
+
+    Examples
+    --------
+    >>> time = np.linspace(0.0, 60.0, 12)
+    >>> found = of_vessels(fit_course(time, 0.15 + 0.03 * np.exp(-time / 20.0)))
+    >>> round(float(found.start[0]), 4), round(float(found.end[0]), 4), round(found.time_constant_s)
+    (0.0324, 0.0225, 20)
+    """
+    start, end = np.maximum(fit.start, 0.0), np.maximum(fit.end, 0.0)
+    return replace(
+        fit,
+        start=start**2,
+        end=end**2,
+        stderr_start=2.0 * start * fit.stderr_start,
+        stderr_end=2.0 * end * fit.stderr_end,
+        noise=(start + end) * fit.noise,
     )
 
 

@@ -28,7 +28,7 @@ from reconstruction import (
 )
 from reconstruction.evidence import Evidence, EvidenceError
 
-REVISION = 2
+REVISION = 3
 CURVES = "perfusion_curves"
 CURVES_FILE = "perfusion_curves.json"
 MAPS = (*flash_stages.MAPS, CURVES)
@@ -40,10 +40,11 @@ ALIASES = {"cheek": "cheek left", "nose": "nose tip", "temple": "temple left"}
 """Landmarks that stand for a place where a table does not have the place itself."""
 STILL_PX = 0.1
 """A face whose median pixel moves less has not moved."""
-BEND = 0.2
-"""By how much blood may show bent over its change: light that goes from skin to skin, of which the
-inversion knows nothing, is absorbed twice. Four simulated events showed -0.1 to 0.25 at cheek and
-forehead, more than their noise."""
+BEND = 0.07
+"""Standard error of how the root of blood is bent over its change: not all vessels follow alike,
+and light that goes from skin to skin, of which the inversion knows nothing, is absorbed twice. Set
+on 14 events of seeds 0 to 19, 192 px across: the least with which 95 % intervals hold 92 %; with
+none they hold 87 %."""
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -313,14 +314,16 @@ def _of_event(
     """Return the part of the document about what follows an event."""
     known = np.isfinite(time)
     usable = [k for k in range(len(names)) if np.isfinite(means.mean[k][known]).sum() >= 5]
-    fits = {
-        names[k]: _of_fit(perfusion_fit.fit_course(time[known], means.mean[k][known], bend=BEND), 0)
-        for k in usable
-    }
+    radius = np.sqrt(np.maximum(means.mean, 0.0))  # of vessels, up to a factor
+    at = time[known]
+
+    def fit(which: Any) -> perfusion_fit.RelaxationFit:
+        found = perfusion_fit.fit_course(at, radius[which][..., known], bend=BEND)
+        return perfusion_fit.of_vessels(found)
+
+    fits = {names[k]: _of_fit(fit(k), 0) for k in usable}
     before = {names[k]: float(np.nanmean(means.mean[k][~known])) for k in usable if (~known).any()}
-    together = None
-    if usable:
-        together = perfusion_fit.fit_course(time[known], means.mean[usable][:, known], bend=BEND)
+    together = fit(usable) if usable else None
     return {
         "before": before,
         "fits": fits,

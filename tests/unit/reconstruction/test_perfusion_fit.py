@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from reconstruction.perfusion_curves import CurveError
-from reconstruction.perfusion_fit import fit_course, fit_cycle
+from reconstruction.perfusion_fit import fit_course, fit_cycle, of_vessels
 
 CYCLE_S = 10.0
 PHASE = (5.5 * np.arange(22)) % CYCLE_S + 0.007
@@ -179,10 +179,40 @@ def test_a_course_that_shows_bent_is_found_where_bends_are_allowed(bent):
     seen += 2e-5 * np.random.default_rng(4).standard_normal(time.size)
     low, high = fit_course(time, seen).interval_s
     assert not low <= 20.0 <= high
-    found = fit_course(time, seen, bend=0.2)
+    found = fit_course(time, seen, bend=0.12)  # 1.7 standard errors off
     assert found.interval_s[0] <= 20.0 <= found.interval_s[1]
     assert found.known == "estimated"
     assert found.stderr_time_constant_s > fit_course(time, seen).stderr_time_constant_s
+
+
+def test_the_root_of_blood_finds_the_constant_of_vessels_that_blood_itself_misses():
+    """Vessels whose radius fades by 20 s: blood, their cross-section, fades faster at first."""
+    time = np.linspace(1.0, 60.0, 12)
+    noise = 3e-5 * np.random.default_rng(5).standard_normal(time.size)
+    blood = 0.028 * (1.0 + 0.24 * np.exp(-time / 20.0)) ** 2 + noise
+    high = fit_course(time, blood).interval_s[1]
+    assert high < 20.0
+    found = of_vessels(fit_course(time, np.sqrt(blood)))
+    assert found.interval_s[0] <= 20.0 <= found.interval_s[1]
+    for level, stderr, true in (
+        (found.start[0], found.stderr_start[0], 0.028 * 1.24**2),
+        (found.end[0], found.stderr_end[0], 0.028),
+    ):
+        assert abs(level - true) < 4 * stderr < 0.05 * true
+    assert 0.3 < found.noise[0] / 3e-5 < 3.0
+
+
+def test_a_bend_adds_to_an_interval_in_squares():
+    time = np.linspace(1.0, 60.0, 12)
+    rng = np.random.default_rng(6)
+    seen = 0.044 - 0.015 * (1.0 - np.exp(-time / 20.0)) + 1e-4 * rng.standard_normal(time.size)
+    plain, bent, twice = (fit_course(time, seen, bend=bend) for bend in (0.0, 0.05, 0.1))
+    for end in (0, 1):
+        shares = [
+            np.log(fit.interval_s[end] / fit.time_constant_s) ** 2 for fit in (plain, bent, twice)
+        ]
+        # twice the bend moves constants by twice, but for curvature
+        assert shares[2] - shares[0] == pytest.approx(4 * (shares[1] - shares[0]), rel=0.25)
 
 
 @pytest.mark.parametrize("bend", [-0.1, 1.0, np.nan])
