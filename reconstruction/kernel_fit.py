@@ -50,6 +50,8 @@ MOST_DRAWN = 64
 """Nearly-as-good kernels among which each draw finds its best."""
 DRAWN_WITHIN = 3.0
 """They are taken from within so many standard errors of the distance."""
+WITHIN = 0.6827
+"""Share of draws within a standard error of the best."""
 STARTS = ((0.0, 1.0), (0.6, 15.0), (-0.6, 15.0), (1.0, 30.0), (-1.5, 8.0))
 """alpha and sigma_um across the jaws that fits of both axes begin with."""
 
@@ -85,9 +87,10 @@ class KernelFit:
     alpha_refined, sigma_refined_um, distance_refined : float
         The best on a grid finer by ten in alpha and five in sigma, a step to either side.
     alpha_stderr, sigma_stderr_um : float
-        How far the best moves when both histograms are drawn anew, with the scatter that blocks
-        of the map show: what another patch of the same skin and size would change; at least a
-        grid step over sqrt(12). Infinite where not `valid`.
+        How far the best moves in 68 % of cases when both histograms are drawn anew, with the
+        scatter that blocks of the map show, neighbors together: what another patch of the same
+        skin and size would change; at least a grid step over sqrt(12). Infinite where not `valid`.
+        alpha and sigma make up for one another, so that their errors are not Gaussian.
     alpha_interval, sigma_interval_um : tuple of float
         Least and largest of `near_best`.
     at_edge : bool
@@ -349,8 +352,7 @@ def fit_two_axes(
     most_rounds : int
         Rounds of one fit along and one across, at least 1, from each start.
     starts : sequence of (float, float)
-        alpha and sigma_um across the jaws to begin with, tried in turn until the distance is
-        below that of chance (`KernelFit.floor`); the least distance is taken.
+        alpha and sigma_um across the jaws to begin with; the least distance is taken.
     settings
         Others of :func:`fit_kernel`.
     """
@@ -380,8 +382,6 @@ def fit_two_axes(
         found = TwoAxisFit(fits[0], fits[1], fits[1].distance, rounds, pair == before)
         if best is None or found.distance < best.distance:
             best = found
-        if best.distance < best.across.floor:
-            break
     assert best is not None  # noqa: S101
     return best
 
@@ -465,13 +465,13 @@ def _described(
     before = float(buckets.distances(start, (still, still), np.zeros(1))[0])
     i, j = found.best
     alpha, sigma, distance = float(alphas[j]), float(sigmas_um[i]), float(found.distance[i, j])
-    counts = _block_counts(relief, buckets, alpha, sigma)
-    effective = normal_histogram.effective_number(counts, samples)
+    counts, growth = _block_counts(relief, buckets, alpha, sigma)
+    effective = max(1.0, normal_histogram.effective_number(counts, samples) / growth)
     occupied = max(1, int(np.count_nonzero(counts.sum(axis=0))))
     theirs = effective if target_samples is None else float(target_samples)
     if not theirs > 0:
         raise KernelFitError(f"target_samples: got {target_samples}, expected above 0")
-    residuals = _block_residuals(counts)
+    residuals = _block_residuals(counts) * math.sqrt(growth)
     signs = np.sign(counts.sum(axis=0) / samples - buckets.target)
     # a sum of signs has a variance of at most 1 an independent sample; or what blocks show
     own = max(1.0 / effective, float(np.sum((residuals @ signs) ** 2)))
@@ -555,15 +555,25 @@ def _finer(grid: Floats, i: int, finer: int) -> Floats:
     return np.linspace(low, high, steps + 1)
 
 
-def _block_counts(relief: Relief, buckets: Buckets, alpha: float, sigma_um: float) -> Floats:
-    """Return counts in blocks of the map: (blocks, buckets)."""
+def _block_counts(
+    relief: Relief, buckets: Buckets, alpha: float, sigma_um: float
+) -> tuple[Floats, float]:
+    """Return counts in blocks of the map, (blocks, buckets), and what neighbors being alike costs.
+
+    The second is by how much larger the variance of the mean squared slope is than that of
+    independent blocks.
+    """
     shape = (relief.code.shape[0], relief.code.shape[1])
-    group, groups = normal_histogram.block_of(relief.places, shape, normal_histogram.BLOCKS)
+    blocks = normal_histogram.BLOCKS
+    group, groups = normal_histogram.block_of(relief.places, shape, blocks)
     da, db = relief.change(sigma_um)
     a, b = relief.along + np.float32(alpha) * da, relief.across + np.float32(alpha) * db
-    return np.asarray(
-        kernels.count_in_groups(-a, -b, group, groups, buckets.bins, buckets.limit), np.float64
-    )
+    counts = kernels.count_in_groups(-a, -b, group, groups, buckets.bins, buckets.limit)
+    steep = 1.0 + a * a + b * b
+    growth = [
+        normal_histogram.block_error(m * m / steep, group, groups, shape, blocks)[1] for m in (a, b)
+    ]
+    return np.asarray(counts, np.float64), 0.5 * (growth[0] + growth[1])
 
 
 def _block_residuals(counts: Floats) -> Floats:
@@ -582,7 +592,10 @@ def _block_residuals(counts: Floats) -> Floats:
 def _stderr(
     relief: Relief, buckets: Buckets, near: Floats, residuals: Floats, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Return root mean square ways of the best of `near` from its first over drawn histograms."""
+    """Return ways of the best of `near` from its first that 68 % of drawn histograms stay within.
+
+    Not their root mean square: a long valley leads few of them far away.
+    """
     some = near[np.unique(np.linspace(0, len(near) - 1, MOST_DRAWN).round().astype(int))]
     shares = np.empty((len(some), buckets.target.size))
     for sigma in np.unique(some[:, 1]):
@@ -599,4 +612,5 @@ def _stderr(
         scatter = rng.standard_normal(len(residuals)) @ residuals
         best[draw] = int(np.argmin(np.abs(gap + scatter).sum(axis=1)))
     ways = some[best, :2] - some[0, :2]
-    return float(np.sqrt(np.mean(ways[:, 0] ** 2))), float(np.sqrt(np.mean(ways[:, 1] ** 2)))
+    alpha, sigma = np.quantile(np.abs(ways), WITHIN, axis=0)
+    return float(alpha), float(sigma)

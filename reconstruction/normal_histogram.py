@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ive
 
 from reconstruction import kernel_fit_kernels as kernels
+from reconstruction.block_errors import stderr_of_mean
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -268,7 +269,8 @@ class NormalStatistics:
         Normals counted, and those beyond the limit.
     effective_samples : float
         Independent samples that would be as noisy: neighbouring normals are alike. From the
-        differences between blocks of the map; at most `samples`.
+        differences between blocks of the map, and how alike neighboring blocks are; at most
+        `samples`.
     occupied : int
         Buckets that hold anything.
     samples_per_bucket : float
@@ -278,7 +280,8 @@ class NormalStatistics:
     variance_x, variance_y : float
         Of n_x and n_y (n_s, n_t on turned axes) about their means, over all samples.
     stderr_x, stderr_y : float
-        Standard errors of the variances (jackknife over blocks); infinite below two blocks.
+        Standard errors of the variances, of what another patch of the same skin and size would
+        show (`reconstruction.block_errors`); infinite below five blocks.
     """
 
     histogram: Floats
@@ -335,6 +338,35 @@ def effective_number(counts: Floats, samples: int) -> float:
     if variance <= 0 or spread <= 0:
         return float(samples)
     return float(np.clip(spread / variance, 1.0, samples))
+
+
+def block_error(
+    values: NDArray[np.floating],
+    group: NDArray[np.int64],
+    groups: int,
+    shape: tuple[int, int],
+    blocks: int,
+) -> tuple[float, float]:
+    """Return the standard error of a mean of samples of a map, by its blocks.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        Of the samples.
+    group, groups, shape, blocks
+        Of `block_of`.
+
+    Returns
+    -------
+    tuple of float
+        As of `reconstruction.block_errors.stderr_of_mean`.
+    """
+    sizes = np.bincount(group, minlength=groups).astype(np.float64)
+    some = np.flatnonzero(sizes > 0)
+    means = np.bincount(group, values, groups)[some] / sizes[some]
+    across = max(1, min(blocks, shape[1] // 4))
+    places = np.stack(np.divmod(some, across), axis=1).astype(np.float64)
+    return stderr_of_mean(means, sizes[some], places)
 
 
 def measure(
@@ -400,36 +432,24 @@ def _measured(
     shares = _shares(counts.sum(axis=0)).reshape(bins, bins)
     w = 1.0 / np.sqrt(1.0 + p * p + q * q)
     x, y = -p * w, -q * w
-    sums = np.stack(
-        [np.bincount(group, moment, groups) for moment in (np.ones_like(x), x, x * x, y, y * y)], 1
-    )
-    whole = _variances(sums.sum(axis=0))
-    sums = sums[sums[:, 0] > 0]
-    n = len(sums)
-    stderr = np.full(2, np.inf)
-    if n > 1:
-        left_out = np.array([_variances(sums.sum(axis=0) - block) for block in sums])
-        stderr = np.sqrt((n - 1) / n * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
+    shape = (known.shape[0], known.shape[1])
+    errors = [block_error((m - m.mean()) ** 2, group, groups, shape, blocks) for m in (x, y)]
+    growth = 0.5 * (errors[0][1] + errors[1][1])
     samples = int(counts.sum())
     occupied = int(np.count_nonzero(shares))
     return NormalStatistics(
         histogram=shares,
         samples=samples,
         outside=outside,
-        effective_samples=effective_number(counts.astype(np.float64), samples),
+        effective_samples=max(1.0, effective_number(counts.astype(np.float64), samples) / growth),
         occupied=occupied,
         samples_per_bucket=samples / occupied,
         aliased=samples / occupied < SAMPLES_PER_BUCKET,
-        variance_x=float(whole[0]),
-        variance_y=float(whole[1]),
-        stderr_x=float(stderr[0]),
-        stderr_y=float(stderr[1]),
+        variance_x=float(np.var(x)),
+        variance_y=float(np.var(y)),
+        stderr_x=errors[0][0],
+        stderr_y=errors[1][0],
     )
-
-
-def _variances(sums: Floats) -> Floats:
-    n, x, xx, y, yy = sums
-    return np.maximum(np.array([xx - x * x / n, yy - y * y / n]) / n, 0.0)
 
 
 def distance(a: Floats, b: Floats) -> float:
