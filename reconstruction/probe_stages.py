@@ -19,13 +19,13 @@ from capture.rig import Probe
 from capture.session import Session
 from model.fresnel import ETA_SKIN
 from model.skin import SkinMap
-from reconstruction import anisotropy, stages, subsurface, translucency
+from reconstruction import anisotropy, nearest_medium, stages, subsurface, translucency
 from reconstruction.direction_harmonics import LEAST_DIRECTIONS
 from reconstruction.evidence import Evidence, EvidenceError
 from reconstruction.probe_images import Measurement, ProbeImages
 from reconstruction.subsurface import SubsurfaceFit
 
-REVISION = 1
+REVISION = 2
 """Grows when the code of a stage changes its result, so that older results are computed again."""
 
 MAPS = ("profiles", "subsurface", "anisotropy", "translucency")
@@ -43,9 +43,6 @@ FALSE_ALARMS = 0.01
 
 UNLIKE = 0.03
 """Relative misfit from which a profile is that of no homogeneous medium, but of layered tissue."""
-DIMMING = 1.0
-"""Standard deviation of the log of the factor by which a layer on top may dim all fibres alike. It
-is fitted along where the profile is unlike that of any medium."""
 
 Floats = NDArray[np.float64]
 
@@ -123,7 +120,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     Raises
     ------
     EvidenceError
-        When the session's rig has no probe.
+        When the session's rig has no probe, or the table of landmarks cannot be read.
     """
     probe = evidence.session.rig.probe
     if probe is None:
@@ -134,6 +131,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
     nominal = "the camera's gain and read noise are those of the rig file"
     sensor = evidence.load("sensor", [serial], nominal)
     fibres = _fibres(evidence)
+    places = _places(evidence)
     base = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
     return [
         stages.Stage(
@@ -155,7 +153,7 @@ def graph(evidence: Evidence) -> list[stages.Stage]:
         ),
         stages.Stage(
             "translucency", ("_sites",), ("translucency",),
-            lambda _sites: _translucency(_sites, evidence), base,
+            lambda _sites: _translucency(_sites, places, evidence), base,
         ),
     ]  # fmt: skip
 
@@ -259,22 +257,22 @@ def fit_profiles(
     common = np.stack([p.reflectance.common_per_mm2.transpose(0, 2, 1) for p in profiles], axis=1)
     every = np.concatenate([value[None], value[None] + common])
 
-    def invert(common_error: float) -> SubsurfaceFit:
-        return subsurface.invert(
-            first.radius_mm,
-            every,
-            variance=np.stack([p.reflectance.variance.T for p in profiles]),
-            valid=np.stack([p.reflectance.valid.T for p in profiles]),
-            method=method,
-            collection="fibre",
-            core_mm=probe.fibres[0].core_mm,
-            source_core_mm=probe.source_core_mm,
-            common_error=common_error,
-        )
-
-    fit = invert(0.0)
+    told: dict[str, Any] = {
+        "variance": np.stack([p.reflectance.variance.T for p in profiles]),
+        "valid": np.stack([p.reflectance.valid.T for p in profiles]),
+        "collection": "fibre",
+        "core_mm": probe.fibres[0].core_mm,
+        "source_core_mm": probe.source_core_mm,
+    }
+    fit = subsurface.invert(first.radius_mm, every, method=method, **told)
     if np.any(unlike := fit.model_error[0] > UNLIKE):
-        fit = _either(fit, invert(DIMMING), np.broadcast_to(unlike, fit.valid.shape))
+        if method == METHODS[0]:
+            other = subsurface.nearest_medium(first.radius_mm, every, **told)
+        else:
+            other = subsurface.invert(
+                first.radius_mm, every, method=method, common_error=nearest_medium.DIMMING, **told
+            )
+        fit = _either(fit, other, np.broadcast_to(unlike, fit.valid.shape))
 
     def change_of(coefficient: Floats) -> Floats:
         logs = np.log(coefficient)
@@ -438,11 +436,21 @@ def _anisotropy(fits: Sequence[ProfileFit]) -> bytes:
     )
 
 
-def _translucency(sites: Sequence[SiteValue], evidence: Evidence) -> Mapping[str, SkinMap]:
-    """Spread 1/sigma_tr over a face's texture from the sites whose place is known."""
+def _places(evidence: Evidence) -> Mapping[str, tuple[float, float]]:
+    """Return where sites lie on a face's texture, u and v by name; a bad table is told at once."""
     places = dict(translucency.SITE_UV)
-    if evidence.landmarks is not None:
-        places |= translucency.read_landmarks(evidence.landmarks, texture_px=MAP_SHAPE)
+    if evidence.landmarks is None:
+        return places
+    try:
+        return places | translucency.read_landmarks(evidence.landmarks, texture_px=MAP_SHAPE)
+    except translucency.TranslucencyError as error:
+        raise EvidenceError(f"landmarks: {error}") from error
+
+
+def _translucency(
+    sites: Sequence[SiteValue], places: Mapping[str, tuple[float, float]], evidence: Evidence
+) -> Mapping[str, SkinMap]:
+    """Spread 1/sigma_tr over a face's texture from the sites whose place is known."""
     placed = [site for site in sites if site.site in places]
     unplaced = [site.site for site in sites if site.site not in places]
     if not placed:

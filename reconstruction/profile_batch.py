@@ -67,6 +67,8 @@ class ProfileBatch:
     """Fibres left out as outliers."""
     spread: Floats
     """Relative model error found from the residuals, 0 without a misfit."""
+    erring: bool = True
+    """Whether `spread` is an error of what is estimated; not of what is nearest by definition."""
 
     @classmethod
     def of(cls, y: Floats, variance: Floats | None, used: Bools, prior: Floats) -> ProfileBatch:
@@ -98,15 +100,15 @@ class ProfileBatch:
             np.divide(1.0, variance / safe**2 + START_ERROR**2, out=weight, where=seen)
         g = float(self.prior[3, 0])
         best, second, rise = model.starts(logs, weight, g, float(self.prior[2, 1]))
-        self._run(model, chosen, y, variance, best)
+        self.run(model, chosen, y, variance, best)
         doubt = np.flatnonzero(np.isfinite(rise) & ((rise < RISE) | self._misfits(chosen)))
         if doubt.size:
-            self._run(model, chosen[doubt], y[doubt], variance[doubt], second[doubt], better=True)
+            self.run(model, chosen[doubt], y[doubt], variance[doubt], second[doubt], better=True)
         if self.logarithmic:
             for _ in range(2):
                 off = np.where(seen, y - np.log(np.maximum(self.predicted[chosen], 1e-290)), 0.0)
                 variance = _local_variance(model.radius_mm, off, seen)
-                self._run(model, chosen, y, variance, self.theta[chosen])
+                self.run(model, chosen, y, variance, self.theta[chosen])
         else:
             used = self.used[chosen].sum(axis=1)
             chance = gammaincc(np.maximum(used - 2, 1) / 2.0, self.chi2[chosen] / 2.0)
@@ -127,7 +129,7 @@ class ProfileBatch:
         """
         y, variance, used = self.y[chosen], self.variance[chosen], self.used[chosen]
         wide = variance + (START_ERROR * np.abs(y)) ** 2
-        self._run(model, chosen, y, wide, begin)
+        self.run(model, chosen, y, wide, begin)
         most = np.floor(MOST_OUTLIERS * used.sum(axis=1))
         for _ in range(2):
             m = np.maximum(self.predicted[chosen], 1e-290)
@@ -138,7 +140,7 @@ class ProfileBatch:
             odd = used & (off > OUTLIER * np.sqrt(stated + spread**2))
             odd &= (odd.sum(axis=1) <= most)[:, None]
             wide = np.where(odd, math.inf, variance + spread**2)
-            self._run(model, chosen, y, wide, self.theta[chosen])
+            self.run(model, chosen, y, wide, self.theta[chosen])
         m = self.predicted[chosen]
         kept = used & ~odd
         stated = variance + model.relative_variance(self.theta[chosen]) * m**2
@@ -177,9 +179,9 @@ class ProfileBatch:
         own = np.full(y.shape, math.inf)
         np.divide(variance, np.where(seen, y, 1.0) ** 2, out=own, where=seen)
         wide = own + UNLIKE**2
-        self._run(model, chosen, logs, wide, best, logarithmic=True)
+        self.run(model, chosen, logs, wide, best, logarithmic=True)
         told = np.flatnonzero(np.isfinite(second).all(axis=1))
-        self._run(
+        self.run(
             model, chosen[told], logs[told], wide[told], second[told], better=True, logarithmic=True
         )
         for _ in range(2):
@@ -188,7 +190,7 @@ class ProfileBatch:
             kept = np.maximum(seen.sum(axis=1), 3)
             spread = np.sqrt(np.maximum((off**2).sum(axis=1) / (kept - 2), LEAST_DEVIATION**2))
             wide = own + spread[:, None] ** 2
-            self._run(model, chosen, logs, wide, self.theta[chosen], logarithmic=True)
+            self.run(model, chosen, logs, wide, self.theta[chosen], logarithmic=True)
         m = self.predicted[chosen]
         self.total[chosen] = np.where(seen, wide * m**2, math.inf)
         stated = variance + model.relative_variance(self.theta[chosen]) * m**2
@@ -205,7 +207,7 @@ class ProfileBatch:
             (self.chi2[chosen] > dof + 4.0 * np.sqrt(2.0 * dof)) | (self.steps[chosen] < 0)
         )
 
-    def _run(
+    def run(
         self,
         model: ProfileModel,
         chosen: NDArray[np.intp],

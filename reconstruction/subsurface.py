@@ -37,13 +37,15 @@ doi:10.1145/383259.383319. Kienle and Patterson 1997, doi:10.1364/JOSAA.14.00024
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.fresnel import ETA_SKIN
+from reconstruction import nearest_medium as nearest
 from reconstruction import subsurface_kernels as kernels
 from reconstruction.profile_batch import ProfileBatch
 from reconstruction.subsurface_models import (
@@ -56,7 +58,10 @@ from reconstruction.subsurface_outcome import LEFT_OUT, Outcome, SubsurfaceFit, 
 
 __all__ = [
     "LEFT_OUT", "Outcome", "SubsurfaceError", "SubsurfaceFit", "fit_dipole", "invert",
+    "nearest_medium",
 ]  # fmt: skip
+
+Floats = NDArray[np.float64]
 
 G_SKIN, G_SKIN_ERROR = 0.825, 0.072
 """Asymmetry of soft tissue: mean and standard deviation of 0.7...0.95, all equally likely."""
@@ -134,39 +139,16 @@ def invert(
         method, collection, eta, core_mm=core_mm, source_core_mm=source_core_mm,
         common_error=common_error, g=g, g_error=g_error, model_error=model_error or 0.0,
     )  # fmt: skip
-    y = np.asarray(reflectance_per_mm2, np.float64)
-    if y.ndim == 0 or y.shape[-1] == 0:
-        raise SubsurfaceError(f"reflectance_per_mm2: got shape {y.shape}, expected (..., fibres)")
-    shape, fibres = y.shape[:-1], y.shape[-1]
-    radius = _spread("radius_mm", np.asarray(radius_mm, np.float64), y.shape)
-    if not np.all((radius >= 0.0) & np.isfinite(radius)):
-        raise SubsurfaceError("radius_mm: got negative or not finite values, expected at least 0")
-    y = y.reshape(-1, fibres)
-    spread = None
-    if variance is not None:
-        spread = _spread("variance", np.asarray(variance, np.float64), (*shape, fibres))
-        spread = spread.reshape(y.shape)
-    left_out = np.zeros(y.shape, np.uint8)
-    if valid is not None:
-        given = _spread("valid", np.asarray(valid, bool), (*shape, fibres)).reshape(y.shape)
-        left_out[~given] = 1
-    left_out[(left_out == 0) & ~np.isfinite(y)] = 2
-    if spread is None:
-        with np.errstate(invalid="ignore"):
-            left_out[(left_out == 0) & ~(y > 0.0)] = 4
-    else:
-        left_out[(left_out == 0) & ~((spread >= 0.0) & (spread < math.inf))] = 3
+    laid = _lay_out(radius_mm, reflectance_per_mm2, variance, valid)
+    y, left_out = laid.y, laid.left_out
     prior = np.zeros((kernels.PARAMETERS, 2))
     prior[:2, 1] = math.inf
     prior[2, 1] = common_error
     prior[3] = g, g_error if method == "photon_table" else 0.0
-    batch = ProfileBatch.of(y, spread, left_out == 0, prior)
-    rows = radius.reshape(-1, fibres) if radius.ndim > 1 else radius[None]
-    distinct, which = np.unique(rows, axis=0, return_inverse=True)
-    which = np.broadcast_to(which.reshape(-1), y.shape[:1])
+    batch = ProfileBatch.of(y, laid.variance, left_out == 0, prior)
     domain, bias = np.zeros(y.shape[0], np.bool_), np.zeros(y.shape[0])
     bounds = np.zeros((kernels.PARAMETERS, 2))
-    for number, own in enumerate(distinct):
+    for own, members in laid.by_radius():
         model = profile_model(
             method, np.ascontiguousarray(own), eta=float(eta), collection=collection,
             core_mm=float(core_mm), source_core_mm=float(source_core_mm), g=float(g),
@@ -175,14 +157,74 @@ def invert(
         if model_error is not None:
             model = replace(model, error=np.array([float(model_error), 0.0, 0.0]))
         bounds = model.bounds
-        members = np.flatnonzero(which == number)
         for begin in range(0, members.size, BATCH):
             chosen = members[begin : begin + BATCH]
             batch.fit(model, chosen)
             domain[chosen] = model.holds(batch.theta[chosen])
             if model_error is None:
                 bias[chosen] = model.systematic(batch.theta[chosen])
-    return judged(batch, bounds, domain, bias, left_out, shape, method)
+    return judged(batch, bounds, domain, bias, left_out, laid.shape, method)
+
+
+def nearest_medium(
+    radius_mm: ArrayLike,
+    reflectance_per_mm2: ArrayLike,
+    *,
+    variance: ArrayLike,
+    eta: float = ETA_SKIN,
+    collection: Collection = "fibre",
+    core_mm: float = 0.0,
+    source_core_mm: float = 0.0,
+    valid: ArrayLike | None = None,
+) -> SubsurfaceFit:
+    """Find the homogeneous medium whose profile is nearest to that of tissue that is none.
+
+    `reconstruction.nearest_medium` has the definition. The profile is compared up to a factor,
+    which is in `SubsurfaceFit.scale`, by the photon table; `SubsurfaceFit.model_error` says how far
+    it is off, and is no error of what is defined: intervals are of the readings.
+
+    Parameters
+    ----------
+    radius_mm, reflectance_per_mm2, eta, variance, collection, core_mm, source_core_mm, valid
+        As of :func:`invert`; reflectance in units of 1/mm^2, as the definition leaves out fibres
+        that take too little.
+
+    Returns
+    -------
+    SubsurfaceFit
+
+    Raises
+    ------
+    SubsurfaceError
+        As of :func:`invert`.
+
+    Examples
+    --------
+    >>> from model import photon_table
+    >>> r = np.linspace(0.3, 7.05, 28)
+    >>> profile = 0.5 * photon_table.reflectance(r, 0.1, 2.0, collection="fibre", core_mm=0.2)
+    >>> fit = nearest_medium(r, profile, variance=(0.01 * profile) ** 2, core_mm=0.2)
+    >>> float(fit.scale.round(2)), float(fit.sigma_s_prime_per_mm.round(1))
+    (0.5, 2.0)
+    """
+    _check_settings("photon_table", collection, eta, core_mm=core_mm, source_core_mm=source_core_mm)
+    laid = _lay_out(radius_mm, reflectance_per_mm2, variance, valid)
+    prior = np.zeros((kernels.PARAMETERS, 2))
+    prior[:2, 1] = math.inf
+    prior[2, 1], prior[3, 0] = nearest.DIMMING, nearest.G
+    batch = ProfileBatch.of(laid.y, laid.variance, laid.left_out == 0, prior)
+    batch.erring = False
+    domain, bounds = np.zeros(laid.y.shape[0], np.bool_), np.zeros((kernels.PARAMETERS, 2))
+    for own, members in laid.by_radius():
+        model = profile_model(
+            "photon_table", np.ascontiguousarray(own), eta=float(eta), collection=collection,
+            core_mm=float(core_mm), source_core_mm=float(source_core_mm), g=nearest.G, g_error=0.0,
+        )  # fmt: skip
+        bounds = model.bounds
+        nearest.fit_nearest(batch, model, members)
+        domain[members] = model.holds(batch.theta[members])
+    nothing = np.zeros(laid.y.shape[0])
+    return judged(batch, bounds, domain, nothing, laid.left_out, laid.shape, "photon_table")
 
 
 def fit_dipole(
@@ -214,6 +256,59 @@ def fit_dipole(
     return invert(
         radius_mm, reflectance_per_mm2, eta=eta, variance=variance, method="dipole", **settings
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Layout:
+    """Profiles one a row, (N, F), with what of them is used."""
+
+    y: Floats
+    variance: Floats | None
+    left_out: NDArray[np.uint8]
+    radius_mm: Floats
+    """(N or 1, F)."""
+    shape: tuple[int, ...]
+    """Leading axes of the profiles as given."""
+
+    def by_radius(self) -> Iterator[tuple[Floats, NDArray[np.intp]]]:
+        """Yield each set of radii with the rows that have it."""
+        distinct, which = np.unique(self.radius_mm, axis=0, return_inverse=True)
+        which = np.broadcast_to(which.reshape(-1), self.y.shape[:1])
+        for number, own in enumerate(distinct):
+            yield own, np.flatnonzero(which == number)
+
+
+def _lay_out(
+    radius_mm: ArrayLike,
+    reflectance_per_mm2: ArrayLike,
+    variance: ArrayLike | None,
+    valid: ArrayLike | None,
+) -> _Layout:
+    """Check profiles and lay them out, see `invert`."""
+    y = np.asarray(reflectance_per_mm2, np.float64)
+    if y.ndim == 0 or y.shape[-1] == 0:
+        raise SubsurfaceError(f"reflectance_per_mm2: got shape {y.shape}, expected (..., fibres)")
+    shape, fibres = y.shape[:-1], y.shape[-1]
+    radius = _spread("radius_mm", np.asarray(radius_mm, np.float64), y.shape)
+    if not np.all((radius >= 0.0) & np.isfinite(radius)):
+        raise SubsurfaceError("radius_mm: got negative or not finite values, expected at least 0")
+    y = y.reshape(-1, fibres)
+    spread = None
+    if variance is not None:
+        spread = _spread("variance", np.asarray(variance, np.float64), (*shape, fibres))
+        spread = spread.reshape(y.shape)
+    left_out = np.zeros(y.shape, np.uint8)
+    if valid is not None:
+        given = _spread("valid", np.asarray(valid, bool), (*shape, fibres)).reshape(y.shape)
+        left_out[~given] = 1
+    left_out[(left_out == 0) & ~np.isfinite(y)] = 2
+    if spread is None:
+        with np.errstate(invalid="ignore"):
+            left_out[(left_out == 0) & ~(y > 0.0)] = 4
+    else:
+        left_out[(left_out == 0) & ~((spread >= 0.0) & (spread < math.inf))] = 3
+    rows = radius.reshape(-1, fibres) if radius.ndim > 1 else radius[None]
+    return _Layout(y, spread, left_out, rows, shape)
 
 
 def _spread(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:

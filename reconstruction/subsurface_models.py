@@ -44,6 +44,12 @@ TABLE_SIGMA_S = (0.05, 200.0)
 """Of the table, 1/mm; layered tissue may look like more scattering than any medium has."""
 TABLE_ERROR = np.array([0.005, 0.0, 0.0])
 """Relative: the table's own noise."""
+DIFFUSE_FROM = 30.0
+"""Distance in 1/sigma_s' from which weakly absorbed light is diffuse: the table over Kienle and
+Patterson's diffusion changes by no more than its own noise beyond. Its last nodes, at 45 to 50, are
+off by up to 3 % under next to no absorption, and beyond it is no table."""
+DIFFUSE_RATIO = (0.003, 0.01)
+"""sigma_a/sigma_s' up to which diffusion continues the table, and from which it does not."""
 START_SIGMA_TR = np.geomspace(0.01, 15.0, 40)
 START_SIGMA_S = np.geomspace(0.06, 190.0, 19)
 """The pairs that each profile is compared with to find its starts, 1/mm."""
@@ -159,7 +165,8 @@ class ProfileModel:
                 if common_error > 0.0:
                     left = (given * off).sum(axis=1, keepdims=True) - given @ curves.T
                     firm = given.sum(axis=1, keepdims=True) + np.float32(common_error**-2)
-                    score -= left**2 / firm
+                    np.divide(left**2, firm, out=left, where=firm > 0.0)
+                    score -= left
             score += nowhere
             kernels.valleys(
                 score.reshape(-1, log_s.size, log_k.size), valley[:, part], place[:, part],
@@ -243,7 +250,10 @@ def _tabled(
     low, high = max(g - 3.0 * g_error, held[0]), min(g + 3.0 * g_error, held[-1])
     count = 4 if high - low > 1e-6 else 1
     asymmetries = np.linspace(low, high, count)
-    steps = np.array([0.1, 0.075, (high - low) / 3.0 if count > 1 else 1.0])
+    # a single asymmetry is for layered tissue, which looks like media of much scattering: between
+    # nodes log R bends with sigma_tr r, which grows with it
+    fine = 0.075 if count > 1 else 0.0375
+    steps = np.array([0.1, fine, (high - low) / 3.0 if count > 1 else 1.0])
     logs = np.arange(np.log(TABLE_SIGMA_S[0]), np.log(TABLE_SIGMA_S[1]) + steps[0], steps[0])
     most = np.log1p(10.0 * np.sqrt(photon_table.MAX_ABSORPTION_RATIO))
     roots = np.arange(0.0, most + steps[1], steps[1])
@@ -252,11 +262,19 @@ def _tabled(
     grid = np.empty((*a.shape, count, radius_mm.size))
     decay = np.sqrt(3.0 * a * (a + s))[..., None] * radius_mm  # makes what is left smooth
     for n, each in enumerate(asymmetries):
-        profile = photon_table.reflectance(
-            radius_mm, a[..., None], s[..., None], eta=eta, g=float(each), collection=collection,
-            core_mm=core_mm, source_core_mm=source_core_mm,
-        )  # fmt: skip
-        grid[:, :, n] = np.log(np.maximum(profile, 1e-290)) + decay
+
+        def told(r: Floats, own_mm: float, source_mm: float, g: float = float(each)) -> Floats:
+            profile = photon_table.reflectance(
+                r, a[..., None], s[..., None], eta=eta, g=g, collection=collection,
+                core_mm=own_mm, source_core_mm=source_mm,
+            )  # fmt: skip
+            return np.asarray(np.log(np.maximum(profile, 1e-290)))
+
+        # of points, as light turns diffuse within the cores of fibres where much is scattered
+        end = told(DIFFUSE_FROM / s[..., None], 0.0, 0.0)
+        point = np.where(radius_mm > 0.0, radius_mm, radius_mm.max(initial=1.0))
+        beyond = _diffused(told(point, 0.0, 0.0), point, a[..., None], s[..., None], end, eta)
+        grid[:, :, n] = told(radius_mm, core_mm, source_core_mm) + beyond + decay
     bounds = np.log(np.array([SIGMA_A_LIMITS, TABLE_SIGMA_S, SCALE_LIMITS, (1.0, 1.0)]))
     bounds[3] = low, high
     axes = np.stack([np.array([logs[0], roots[0], low]), steps], axis=1)
@@ -264,6 +282,26 @@ def _tabled(
         radius_mm, kernels.TABLE, np.zeros(4), axes, grid, bounds, TABLE_ERROR,
         (0.0, 0.0), photon_table.MAX_ABSORPTION_RATIO,
     )  # fmt: skip
+
+
+def _diffused(
+    log_profile: Floats, radius_mm: Floats, a: Floats, s: Floats, log_end: Floats, eta: float
+) -> Floats:
+    """Return what diffusion in place of a table's far end adds to its logarithms, (S, U, F).
+
+    Parameters
+    ----------
+    log_profile, log_end
+        Of the table at the radii, and (S, U, 1) at the distance from which light is diffuse.
+    radius_mm, a, s
+        That broadcast to the table.
+    """
+    near, far = DIFFUSE_RATIO
+    share = np.clip((far - a / s) / (far - near), 0.0, 1.0) * (radius_mm * s > DIFFUSE_FROM)
+    weak = np.minimum(a, far * s)  # the rest is not asked for
+    there, end = (diffusion.reflectance(r, weak, s, eta) for r in (radius_mm, DIFFUSE_FROM / s))
+    continued = log_end + np.log(np.maximum(there, 1e-290)) - np.log(np.maximum(end, 1e-290))
+    return np.asarray(share * (continued - log_profile))
 
 
 def _dipole(eta: float) -> tuple[Floats, Floats, tuple[float, float]]:

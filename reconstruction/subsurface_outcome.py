@@ -191,7 +191,7 @@ def judged(
         (reduced > 1.0) & np.logical_or(misfit, batch.logarithmic), np.sqrt(reduced), 1.0
     )
     residual = _residuals(batch)
-    widening = np.where(batch.spread > 0.0, _repeats(residual), 1.0)
+    widening = np.where((batch.spread > 0.0) & batch.erring, _repeats(residual), 1.0)
     if batch.logarithmic:
         widening = inflation**2
     logs = batch.covariance[:, :2, :2] * widening[:, None, None]

@@ -34,6 +34,15 @@ DIFFUSES: Final = 0.01
 """sigma_a / sigma_s' up to which the table is continued beyond its last distance: there its decay
 is that of diffusion to a thousandth."""
 
+DIFFUSED_FROM: Final = (12.0, 20.0)
+"""Distances between which what photons told of each goes over into what all of them tell of
+diffused light (`diffused`)."""
+DEPTH2: Final = 17.5
+"""Mean square depth of that light's source and its image, in 1 / sigma_s'^2: from the photons of
+sigma_a / sigma_s' of 0.003 to 0.009, which alone would say 17.0 to 17.4, and less surely 19.5 of
+none."""
+ALIKE: Final = 4.0
+"""Nodes of distance that share their error: the knots that photons are smoothed with."""
 DISC_RADII, DISC_TURNS = 2, 6
 """Points in a core: rings, and points on each."""
 
@@ -154,22 +163,57 @@ class WhiteFibre:
         y = np.full_like(x, float(absorption_axis(a)))
         fall = float(decay(a))
         log_f = shape.ev(x, y) - np.log(held) - fall * scaled
-        # far from its source diffused light is that of a dipole, (1 + u) exp(-u) / u^3
-        log_f += np.log1p(fall * scaled) - np.log1p(fall * held) - 3.0 * np.log(scaled / held)
+        # beyond the table: log_f has gone on with the fall of the last distance
+        log_f += (diffused(scaled, a) + fall * scaled) - (diffused(held, a) + fall * held)
         each = share * np.exp(log_f)
         value = sigma_s_prime_per_mm**2 * each.sum(axis=1)
         relative = error(np.stack([x, y], axis=-1))
         return value, np.asarray((relative * each).sum(axis=1) / each.sum(axis=1) * value)
 
 
+def diffused(distance: FloatArray, absorption: float) -> FloatArray:
+    """Return the logarithm of diffused light far from its source, up to a constant.
+
+    That of a dipole in the depth: (1 + k d) exp(-k d) / d^3 with d^2 = distance^2 + `DEPTH2`, and
+    k of transport theory to the second order of the phase function.
+
+    Parameters
+    ----------
+    distance
+        In 1 / sigma_s', any shape.
+    absorption
+        sigma_a / sigma_s'.
+    """
+    a = absorption
+    k = np.sqrt(3.0 * a * (1.0 + a)) / (1.0 + 0.4 * a / (1.0 + G))
+    d = np.sqrt(distance**2 + DEPTH2)
+    return np.asarray(np.log1p(k * d) - k * d - 3.0 * np.log(d))
+
+
+def _of_all(table: WhiteFibre) -> tuple[FloatArray, FloatArray]:
+    """Return shape and error with far nodes of weak absorption told by all of them together."""
+    shape, error = table.shape.copy(), table.relative_error.copy()
+    near, far = DIFFUSED_FROM
+    rows = table.distance > near
+    x = table.distance[rows]
+    share = np.clip(np.log(x / near) / np.log(far / near), 0.0, 1.0)
+    for column in np.flatnonzero(table.absorption <= DIFFUSES):
+        a = float(table.absorption[column])
+        curve = diffused(x, a) + np.log(x) + float(decay(a)) * x
+        weight = 1.0 / error[rows, column] ** 2
+        level = (weight * (shape[rows, column] - curve)).sum() / weight.sum()
+        shape[rows, column] += share * (curve + level - shape[rows, column])
+        together = np.sqrt(ALIKE / weight.sum())
+        error[rows, column] += share * (together - error[rows, column])
+    return shape, error
+
+
 @cache
 def _splines() -> tuple[RectBivariateSpline, RegularGridInterpolator]:
     table = WhiteFibre.load()
     axes = distance_axis(table.distance), absorption_axis(table.absorption)
-    return (
-        RectBivariateSpline(*axes, table.shape, s=0.0),
-        RegularGridInterpolator(axes, table.relative_error),
-    )
+    shape, error = _of_all(table)
+    return RectBivariateSpline(*axes, shape, s=0.0), RegularGridInterpolator(axes, error)
 
 
 @lru_cache(maxsize=8)

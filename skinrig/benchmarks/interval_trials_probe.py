@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +24,8 @@ from skinrig.simulating.simulation import Simulated, simulate_session
 PHOTONS: Final = "full"
 """Of phantom and media, whose coefficients are known: with fewer the simulation's own noise,
 two percent, passes for errors of the probe. Skin's truth is of the very profile that is read."""
+BLOCKS: Final = 90_000
+"""Added to a subject's seed for that of its phantom."""
 DIRECTIONS: Final = 8
 """Of the head on tissue that scatters by direction."""
 COEFFICIENTS: Final[Mapping[str, str]] = {
@@ -51,18 +54,8 @@ def probe(
     directed
         Seed of each and "anisotropic:SIGMA_A,SIGMA_S_PRIME,STRENGTH,AXIS_DEG": axis and ratio.
     """
-    phantom = folder / "session-phantom"
-    simulate_session("probe", phantom, target="phantom", seed=900, size=PHOTONS)
-    calibrate("fibre", [phantom], folder / "calibration")
     for seed, medium in media.items():
-        done = simulate_session(
-            "probe",
-            folder / "session-subject",
-            subject=medium,
-            sites=("cheek",),
-            seed=seed,
-            size=PHOTONS,
-        )
+        done = _subject(folder, medium, seed, sites=("cheek",), size=PHOTONS)
         found, truth = _maps(folder, done, "subsurface")
         name = f"{medium} {seed}"
         yield of_decay("sigma_tr of media", found, truth, subject=name, band=ANY_BAND)
@@ -70,20 +63,57 @@ def probe(
             yield of_coefficient(coefficient, found, truth, subject=name)
         forget(folder, done)
     for seed, preset in (skin or {}).items():
-        done = simulate_session("probe", folder / "session-subject", subject=preset, seed=seed)
+        done = _subject(folder, preset, seed)
         found, truth = _maps(folder, done, "subsurface")
         band = melanin_band_of(preset)
         yield of_decay("sigma_tr of skin", found, truth, subject=f"{preset} {seed}", band=band)
         forget(folder, done)
     for seed, medium in (directed or {}).items():
-        angles = tuple(360.0 / DIRECTIONS * k for k in range(DIRECTIONS))
-        done = simulate_session(
-            "probe", folder / "session-subject", subject=medium, sites=("cheek",), seed=seed,
-            angles=angles,
-        )  # fmt: skip
+        done = _subject(folder, medium, seed, sites=("cheek",), angles=(DIRECTIONS,))
         found, truth = _maps(folder, done, "anisotropy")
         yield from of_directions(found, truth, float(medium.rpartition(",")[2]), f"{medium} {seed}")
         forget(folder, done)
+
+
+def _subject(folder: Path, subject: str, seed: int, **asked: Any) -> Simulated:
+    """Simulate a subject under a probe that was calibrated for it, with a block of its own.
+
+    Subjects that share a calibration share its errors, and the block's: they are one draw.
+    """
+    phantom = folder / "session-phantom"
+    shutil.rmtree(phantom, ignore_errors=True)
+    shutil.rmtree(folder / "truth-phantom", ignore_errors=True)
+    simulate_session("probe", phantom, target="phantom", seed=BLOCKS + seed, size=PHOTONS)
+    paper = folder / "block.json"
+    paper.write_text(json.dumps(drawn_certificate(np.random.default_rng([seed, BLOCKS]))))
+    calibrate("fibre", [phantom], folder / "calibration", phantom=paper)
+    return simulate_session(
+        "probe", folder / "session-subject", subject=subject, seed=seed, **asked
+    )
+
+
+def drawn_certificate(rng: np.random.Generator) -> dict[str, Any]:
+    """Return a certificate that is off the simulated block by errors as it states them.
+
+    Parameters
+    ----------
+    rng
+        Of the two errors, of sigma_a and of sigma_s'.
+
+    Examples
+    --------
+    >>> one, two = (drawn_certificate(np.random.default_rng(k))["sigma_a_per_mm"] for k in (1, 2))
+    >>> round(one[0] / two[0], 3) == round(one[-1] / two[-1], 3) != 1.0
+    True
+    """
+    from rigsim.probe_tissue import AS_MADE, phantom_certificate
+
+    paper = dict(phantom_certificate())
+    for name, made in zip(COEFFICIENTS, AS_MADE, strict=True):
+        unsure = float(paper["uncertainty"][name])
+        factor = (1.0 + made * unsure) / (1.0 + unsure * float(rng.standard_normal()))
+        paper[f"{name}_per_mm"] = [factor * value for value in paper[f"{name}_per_mm"]]
+    return paper
 
 
 def melanin_band_of(preset: str) -> str:
