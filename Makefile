@@ -37,7 +37,7 @@ test: .venv/.ready
 	@$(PYTEST) -q $(WORKERS) -m "not long"
 
 test-long: .venv/.ready
-	@$(PYTEST) -q $(WORKERS) --durations 25 -m long
+	@$(PYTEST) -q $(WORKERS) --durations 25 -m long tests
 
 bench: .venv/.ready
 	@$(SKINRIG) bench

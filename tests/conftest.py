@@ -2,6 +2,7 @@
 
 import os
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 # Tests run in as many processes as there are cores. Threads of one that wait by spinning take
@@ -45,6 +46,32 @@ work."""
 
 def pytest_addoption(parser):
     parser.addoption("--device-port", default=None, help="serial URL of a real box")
+
+
+@cache
+def says_long(path):
+    """Tell whether a file names the marker `long`."""
+    return "mark.long" in path.read_text(encoding="utf-8")
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Leave unread what holds no long test where these alone are asked for.
+
+    A file's tests are long by its own words, or by those of what it shares with others: the modules
+    beside it that are no tests, and the conftest.py of each folder above.
+    """
+    one_of_tests = collection_path.match("test_*.py")
+    if config.getoption("markexpr") != "long" or not one_of_tests:
+        return None
+    folder = collection_path.parent
+    beside = [path for path in folder.glob("*.py") if not path.name.startswith("test_")]
+    above = [
+        conftest
+        for parent in folder.parents
+        if parent.is_relative_to(ROOT / "tests" / "") and parent != ROOT / "tests"
+        and (conftest := parent / "conftest.py").is_file()
+    ]  # fmt: skip
+    return None if any(map(says_long, (collection_path, *beside, *above))) else True
 
 
 @pytest.hookimpl(trylast=True)  # what is not asked for has been left out

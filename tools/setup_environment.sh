@@ -69,7 +69,7 @@ say "installing skinrig and its pinned dependencies into .venv (about a minute)"
   setuptools wheel 2> >(grep -v '^WARNING' >&2 || true)
 .venv/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt \
   --no-build-isolation -e '.[dev]' 2> >(grep -v '^WARNING' >&2 || true)
-say "compiling the kernels that the demo calls (two minutes on two cores; else the first run does it)"
+say "compiling the kernels that the demo calls (two to three minutes on two cores; else the first run does it)"
 .venv/bin/python tools/compile_kernels.py ||
   say "the kernels could not be compiled ahead: each is compiled when it is first called"
 touch .venv/.ready

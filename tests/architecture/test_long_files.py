@@ -1,0 +1,44 @@
+"""Where long tests alone are asked for, files without any are not read; none is lost by that."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+CONFTEST = Path(__file__).parents[1] / "conftest.py"
+MARK = "@pytest.mark." + "long\ndef test_it(): pass\n"  # in two parts: this file has none
+
+
+@pytest.fixture
+def ignored(request):
+    hooks = request.config.pluginmanager.get_plugin(str(CONFTEST))
+
+    def ask(path, asked="long"):
+        config = SimpleNamespace(getoption={"markexpr": asked}.get)
+        return hooks.pytest_ignore_collect(path, config)
+
+    return ask
+
+
+@pytest.mark.parametrize(("text", "expected"), [(MARK, None), ("def test_it(): pass\n", True)])
+def test_a_file_is_read_by_whether_it_has_long_tests(text, expected, tmp_path, ignored):
+    path = tmp_path / "test_skin.py"
+    path.write_text(text)
+    assert ignored(path) is expected
+    assert ignored(path, "not long") is None
+    assert ignored(path, "") is None
+
+
+@pytest.mark.parametrize("shared", ["conftest.py", "box_harness.py"])
+def test_a_file_is_read_where_what_it_shares_may_make_its_tests_long(shared, tmp_path, ignored):
+    path = tmp_path / "test_skin.py"
+    path.write_text("def test_it(): pass\n")
+    (tmp_path / shared).write_text(f"LONG = {MARK!r}")
+    assert ignored(path) is None
+
+
+def test_folders_and_shared_files_are_always_read(tmp_path, ignored):
+    (tmp_path / "test_folder").mkdir()
+    (tmp_path / "conftest.py").write_text("")
+    assert ignored(tmp_path / "conftest.py") is None
+    assert ignored(tmp_path / "test_folder") is None
