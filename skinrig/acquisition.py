@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -359,6 +360,8 @@ def capture_session(
         When a box or camera fails; what was captured stays and can be resumed.
     """
     box_urls, camera_urls = addresses(ports, "--port"), addresses(cameras, "--camera")
+    if force_limit_n is not None and not 0.0 < force_limit_n < math.inf:
+        raise UsageError(f"--force-limit: got {force_limit_n:g}, expected more than 0 newton")
     rig = load_rig(rig_name)
     chosen = choose_plan(
         rig, plan, target, angles=angles, steps=steps, sites=sites, repeats=repeats,

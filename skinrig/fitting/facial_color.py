@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from model import facial_color_document, store
+from model.facial_color import FacialColorError
 from model.skin import SkinMap
 from reconstruction import facial_color_fit, landmark_table, state_images
 from reconstruction.facial_color_fit import FacialColorFit
@@ -66,9 +67,18 @@ def fit_facial_color(
     dynamic_appearance.check_target(out)
     subject = state_images.read(sessions, calibration=calibration, progress=progress)
     marks, marked_by, unmarked = _landmarks(subject, sessions, landmarks)
-    found = facial_color_fit.fit(
-        subject, radius_px=radius_px, landmarks=marks, stored_size=stored_size, progress=progress
-    )
+    try:
+        found = facial_color_fit.fit(
+            subject, radius_px=radius_px, landmarks=marks, stored_size=stored_size,
+            progress=progress,
+        )  # fmt: skip
+    except FacialColorError as error:
+        if subject.has_white:
+            raise
+        raise FacialColorInputError(
+            f"{error}; a white calibration, which --calibration would bring, tells how light "
+            "lies on the face and so which blood"
+        ) from error
     maps, document = facial_color_document.to_maps(found.rig)
     maps["melanin"] = found.melanin
     for state, change in found.changes.items():

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from capture import raw
+from model.facial_color import FacialColorError
+from reconstruction import facial_color_fit
 from skinrig.cli import main
 from skinrig.simulating.simulation import simulate_session
 
@@ -172,6 +174,20 @@ def test_what_an_option_cannot_mean_is_refused_before_images_are_made(
     assert says in err
     assert len(err.splitlines()) == 1  # no line of progress before
     assert not (tmp_path / "out").exists()
+
+
+def test_blood_that_cannot_be_told_without_a_white_tile_says_what_would(
+    sound, tmp_path, monkeypatch, capsys
+):
+    def untold(*args, **kwargs):
+        raise FacialColorError("neutral: no pixel is valid, expected some")
+
+    monkeypatch.setattr(facial_color_fit, "fit", untold)
+    argv = ["fit", "facial-color", str(sound), "--out", str(tmp_path / "out")]
+    assert main(argv) == 3
+    err = capsys.readouterr().err
+    assert "no pixel is valid" in err
+    assert "a white calibration, which --calibration would bring" in err
 
 
 def test_a_session_without_a_neutral_state_is_refused_before_its_images_are_made(tmp_path, capsys):

@@ -78,6 +78,12 @@ def test_an_unknown_kind_of_camera_is_told_before_a_port_is_opened(tmp_path, cap
     assert "no-such-port" not in err
 
 
+@pytest.mark.parametrize("force", ["0", "-1", "nan", "inf"])
+def test_a_force_that_is_none_is_refused_even_in_a_dry_run(force, capsys):
+    assert main(["capture", "gradient", "--dry-run", "--force-limit", force]) == 2
+    assert f"--force-limit: got {force}, expected more than 0 newton" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("there_before", [True, False])
 def test_a_capture_that_fails_before_its_first_frame_leaves_no_session(
     tmp_path, sim, capsys, there_before
