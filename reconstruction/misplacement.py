@@ -25,8 +25,8 @@ noise would count as slope."""
 SCALE: Final = 3.3
 """Variance of what moved faces' colors differ by from still ones' over what place and slope give:
 so that, with noise, 68 % lie in the 68 % ellipse. Sites of the color filter array stand elsewhere
-on the skin's texture, and pixels are interpolated. Of 15 moved subjects of seeds 0 to 19, 192 px
-across, each alone holds 64 to 72 %."""
+on the skin's texture, and pixels are interpolated. Of 13 moved subjects of seeds 0 to 16, maps 192
+px across, each alone holds 64 to 72 %."""
 WITHOUT_BRIGHTNESS: Final = np.eye(3) - 1.0 / 3.0
 """Takes the mean of the channels away."""
 
