@@ -213,9 +213,10 @@ def choose(
     least = next(one for one in _candidates(rig) if one["power"] == 1.0)
     reasons = _out_of_reach(best, look, wants, valid_share)
     # what cannot be reached is not worth sixteen frames: the plan keeps those that still tell more
-    for settings in _candidates(rig):
+    told = [name for name in wants if np.isfinite(best.median(name))]  # less tells nothing as well
+    for settings in _candidates(rig) if told else ():
         now = predict(look, **settings)
-        if all(now.median(name) <= 1.05 * best.median(name) for name in wants):
+        if all(now.median(name) <= 1.05 * best.median(name) for name in told):
             least = settings
             break
     return _choice(
@@ -371,7 +372,8 @@ def _choice(
     if own["power"] < 1.0:
         left_out.append((
             f"{100.0 * (1.0 - own['power']):.3g} % of the flashes' energy",
-            "what is left reaches what is wanted",
+            "what is left errs by at most a twentieth more" if reasons
+            else "what is left reaches what is wanted",
         ))  # fmt: skip
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]
     pops = len([power for power in powers if power > 0])

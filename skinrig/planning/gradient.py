@@ -376,7 +376,8 @@ def _choice(
     if setting.exposure_s < EXPOSURE_S:
         left_out.append((
             f"{1e3 * (EXPOSURE_S - setting.exposure_s):.3g} of {1e3 * EXPOSURE_S:.3g} ms exposed",
-            "what is left reaches what is wanted",
+            "what is left errs by at most a twentieth more" if reasons
+            else "what is left reaches what is wanted",
         ))  # fmt: skip
     if not setting.darks:
         left_out.append(

@@ -87,6 +87,23 @@ def test_where_the_model_error_alone_is_too_large_more_frames_are_not_asked_for(
     assert "NOT REACHED" in said
 
 
+def test_where_no_light_tells_hemoglobin_none_is_left_out_as_if_it_were_reached(
+    small, rig, monkeypatch
+):
+    seen = flash.predict
+
+    def blind(*args, **settings):
+        found = seen(*args, **settings)
+        none = np.zeros_like(found.valid["hemoglobin"])
+        return replace(found, valid={**found.valid, "hemoglobin": none})
+
+    monkeypatch.setattr(flash, "predict", blind)
+    told = flash.choose(rig, {"hemoglobin": 20.0})
+    assert told.knobs["power"] == 1.0
+    assert told.reasons
+    assert not any("reaches" in why for _, why in told.left_out)
+
+
 def test_a_plan_without_crossed_frames_or_of_another_rig_is_refused(rig, small, tmp_path, capsys):
     whole = flash_plan(rig)
     bare = replace(
