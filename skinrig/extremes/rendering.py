@@ -94,7 +94,7 @@ def _light_behind(_: Real) -> str:
 def _zero_triangles(real: Real) -> str:
     from rigsim.mesh import build_mesh, vertex_normals
 
-    points = np.array([[0, 0, 0], [40, 0, 0], [0, 40, 0], [80, 0, 0], [40, 40, 9]], real)
+    points = as_real(np.array([[0, 0, 0], [40, 0, 0], [0, 40, 0], [80, 0, 0], [40, 40, 9]]), real)
     faces = np.array([[0, 1, 2], [0, 1, 3], [1, 4, 2]])  # the second has no area
     normals = vertex_normals(points, faces)
     near(np.linalg.norm(normals, axis=-1)[[0, 1, 2]], np.ones(3), absolute=1e-5)
@@ -105,7 +105,7 @@ def _zero_triangles(real: Real) -> str:
 def _wrong_unit(real: Real) -> str:
     from rigsim.mesh import MeshError, build_mesh
 
-    points = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], real)
+    points = as_real(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), real)
     return refused(
         lambda: build_mesh(points, np.array([[0, 1, 2]]), np.zeros((3, 2))),
         MeshError, "millimetres",

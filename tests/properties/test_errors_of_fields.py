@@ -1,0 +1,153 @@
+"""Errors of what is alike in neighbors: maps through windows, means of blocks, misplaced colors."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reconstruction import (
+    affine_fit,
+    block_errors,
+    dense_flow,
+    light_change,
+    misplacement,
+    normal_histogram,
+    perfusion_fit,
+)
+from reconstruction.expression_alignment import Alignment
+
+CHEAP = settings(derandomize=True, deadline=None, max_examples=25, database=None)
+
+SEEDS = st.integers(0, 2**32 - 1)
+UNIT = st.floats(1e-6, 1e6)
+
+
+def grid(side):
+    return np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2).astype(float)
+
+
+@CHEAP
+# the fit takes 1e-9 px for the least that windows scatter
+@given(seed=SEEDS, side=st.integers(3, 7), unit=st.floats(0.1, 1e3), noise=st.floats(1e-4, 0.1))
+def test_an_affine_map_comes_back_with_an_error_in_the_unit_of_the_places(seed, side, unit, noise):
+    rng = np.random.default_rng(seed)
+    places = grid(side) - (side - 1) / 2
+    linear, shift = np.eye(2) + 0.2 * rng.normal(size=(2, 2)), rng.normal(size=2)
+    found = places @ linear + shift + noise * rng.normal(size=places.shape)
+    told, covariance = affine_fit.fit_affine(places, found, window_px=1.0)
+    again, scaled = affine_fit.fit_affine(unit * places, unit * found, window_px=unit)
+    spread = np.sqrt(np.diag(covariance))
+    assert np.all(spread > 0.0)
+    assert np.linalg.eigvalsh(covariance).min() > -1e-9 * spread.max() ** 2
+    assert np.all(np.abs(told - np.vstack([linear, shift])).ravel() < 10.0 * spread)
+    np.testing.assert_allclose(again[:2], told[:2], rtol=1e-6, atol=1e-9)
+    by = np.repeat([1.0, unit], [4, 2])
+    np.testing.assert_allclose(np.sqrt(np.diag(scaled)), by * spread, rtol=1e-5)
+
+
+@CHEAP
+@given(count=st.integers(0, 12), seed=SEEDS)
+def test_points_on_a_line_make_no_map(count, seed):
+    along = np.random.default_rng(seed).normal(size=count)
+    places = np.stack([along, 2.0 * along], axis=1)
+    with pytest.raises(ValueError, match="places"):
+        affine_fit.fit_affine(places, places, window_px=1.0)
+
+
+@CHEAP
+@given(seed=SEEDS, side=st.integers(3, 8), unit=UNIT, shift=st.floats(-10.0, 10.0))
+def test_the_error_of_a_mean_has_the_unit_of_values_and_no_place_of_zero(seed, side, unit, shift):
+    rng = np.random.default_rng(seed)
+    values, sizes = rng.normal(size=side**2), rng.integers(1, 50, side**2).astype(float)
+    error, growth = block_errors.stderr_of_mean(values, sizes, grid(side))
+    assert growth >= 1.0
+    assert 0.3 / side < error < 6.0  # between independent blocks and one that stands for all
+    scaled, again = block_errors.stderr_of_mean(unit * (values + shift), sizes, grid(side))
+    assert scaled == pytest.approx(unit * error, rel=1e-4)
+    assert again == pytest.approx(growth, rel=1e-4)
+
+
+@CHEAP
+@given(count=st.integers(0, block_errors.LEAST_BLOCKS - 1))
+def test_too_few_blocks_have_an_endless_error(count):
+    told = block_errors.stderr_of_mean(np.zeros(count), np.ones(count), np.zeros((count, 2)))
+    assert told == (np.inf, 1.0)
+
+
+@CHEAP
+@given(x=st.floats(0.0, 1e4), y=st.floats(0.0, 1e4))
+def test_interpolation_leaves_noise_between_half_of_it_and_all(x, y):
+    left = dense_flow.noise_left(np.array([[[x, y], [np.floor(x), np.floor(y)]]], np.float32))
+    assert 0.3 < left[0, 0] <= 1.0 + 1e-5
+    assert left[0, 1] == pytest.approx(1.0, abs=1e-6)
+
+
+@CHEAP
+@given(start=st.floats(0.1, 0.5), end=st.floats(0.1, 0.5), tau=st.floats(5.0, 40.0), seed=SEEDS)
+def test_blood_of_vessels_is_the_square_of_its_root_with_its_error(start, end, tau, seed):
+    time = np.linspace(0.0, 90.0, 20)
+    course = end + (start - end) * np.exp(-time / tau)
+    noisy = course + 1e-3 * np.random.default_rng(seed).normal(size=20)
+    roots = perfusion_fit.fit_course(time, noisy)
+    blood = perfusion_fit.of_vessels(roots)
+    np.testing.assert_allclose(blood.start, np.maximum(roots.start, 0.0) ** 2)
+    step = 1e-6
+    slope = ((roots.end + step) ** 2 - (roots.end - step) ** 2) / (2.0 * step)
+    np.testing.assert_allclose(blood.stderr_end, np.abs(slope) * roots.stderr_end, rtol=1e-5)
+
+
+@CHEAP
+@given(seed=SEEDS, side=st.integers(24, 64), blocks=st.integers(3, 8))
+def test_blocks_of_a_map_have_the_error_of_their_means(seed, side, blocks):
+    values = np.random.default_rng(seed).normal(size=side * side)
+    group, groups = normal_histogram.block_of(np.arange(side * side), (side, side), blocks)
+    error, growth = normal_histogram.block_error(values, group, groups, (side, side), blocks)
+    # of samples that have nothing in common blocks tell about the error of independent ones
+    assert 0.3 / side < error < 6.0 / side
+    assert growth >= 1.0
+
+
+@CHEAP
+@given(seed=SEEDS, off=st.floats(0.0, 3.0), light=st.floats(1e-3, 1e3))
+def test_a_misplaced_picture_errs_with_the_square_of_its_place_whatever_the_light(seed, off, light):
+    skin = 0.3 + 0.1 * np.random.default_rng(seed).random((24, 24, 3))
+    valid = np.ones((24, 24), bool)
+    valid[:4] = False
+    skin[:4] = 0.0
+
+    def error(off_px, times):
+        columns = np.stack(np.indices((24, 24))[::-1], axis=-1).astype(np.float32)
+        laid = Alignment(
+            columns, valid, np.full((24, 24), off_px, np.float32),
+            np.zeros((24, 24), np.float32), np.ones((24, 24), bool), 0.0, {}, 0.0, "landmarks",
+            (24, 24),
+        )  # fmt: skip
+        return misplacement.own_error(times * skin, np.zeros_like(skin), valid, laid)
+
+    one, told = error(1.0, 1.0), error(off, light)
+    assert np.isfinite(told).all()
+    np.testing.assert_allclose(told[valid], off**2 * one[valid], rtol=1e-3, atol=1e-12)
+    assert np.linalg.eigvalsh(one).min() > -1e-9
+
+
+@CHEAP
+@given(seed=SEEDS, step=st.floats(-0.5, 0.5), noise=st.floats(1e-3, 0.3),
+       bad=st.sampled_from([np.nan, np.inf, 0.0, -1.0]))  # fmt: skip
+def test_light_that_changes_alike_everywhere_is_told_whatever_pixels_lack(seed, step, noise, bad):
+    rng = np.random.default_rng(seed)
+    side = 32
+    light = np.array([[0.0], [step]]) + noise * rng.normal(size=(2, side * side))
+    variance = np.full_like(light, noise**2)
+    gone = rng.random(side * side) < 0.1
+    variance[1, gone], light[0, gone] = bad, np.nan
+    good = np.ones(light.shape, bool)
+    good[0, gone] = False
+    change, stiffness = light_change.smooth(
+        light.astype(np.float32), variance.astype(np.float32), good, (side, side), 6.0
+    )
+    assert np.isfinite(change).all()
+    assert np.all(stiffness >= 1.0 / light_change.FREE_CHANGE**2 * (1.0 - 1e-6))
+    assert np.all(stiffness <= 1.0 / light_change.LEAST_CHANGE**2 * (1.0 + 1e-6))
+    middle = (change[1] - change[0]).reshape(side, side)[8:-8, 8:-8]
+    # about 200 pixels within a window, less those that lack a state
+    assert np.abs(middle - step).max() < 1.0 * noise + 1e-5
