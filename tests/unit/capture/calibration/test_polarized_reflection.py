@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from capture.calibration import polarized_reflection
 from capture.calibration.geometry import CameraPose
 from capture.calibration.glass_ball import mirrored
 from capture.calibration.polarization import PolarizationError
@@ -100,3 +101,11 @@ def test_lights_without_polarizers_are_named():
     bare = (*RIG.lights[:2], load_rig("dome").lights[0])
     with pytest.raises(PolarizationError, match=load_rig("dome").lights[0].name):
         by_ball(lights=bare)
+
+
+def test_cross_products_are_numpy_s_bit_by_bit(rng):
+    first, second = rng.normal(size=(7, 3)), rng.normal(size=(7, 3))
+    np.testing.assert_array_equal(polarized_reflection._cross(first, second),
+                                  np.cross(first, second))  # fmt: skip
+    np.testing.assert_array_equal(polarized_reflection._cross(first, second[0]),
+                                  np.cross(first, second[0]))  # fmt: skip
