@@ -118,7 +118,8 @@ def _starts(
     best, second, _ = model.starts(
         logs, counts / START_ERROR**2, float(batch.prior[3, 0]), float(batch.prior[2, 1])
     )
-    second = np.where(np.isfinite(second).all(axis=1)[:, None], second, best)
+    told = np.asarray(np.isfinite(second).all(axis=1))
+    second = np.where(told[:, None], second, best)
     dense = best.copy()
     dense[:, 1] = model.bounds[1, 1] - DENSE
     dense[:, 0] += best[:, 1] - dense[:, 1]  # sigma_tr as it was
@@ -141,7 +142,7 @@ def _nearest_of(
         alone = ProfileBatch.of(batch.y[chosen], batch.variance[chosen], batch.used[chosen],
                                 batch.prior)  # fmt: skip
         alone.run(model, np.arange(len(chosen)), logs, wide, start.copy(), logarithmic=True)
-        known = np.isfinite(wide)
+        known: Bools = np.isfinite(wide)
         off = np.where(known, logs - np.log(np.maximum(alone.predicted, 1e-290)), 0.0)
         prior = (START_ERROR * alone.theta[:, 2] / DIMMING) ** 2
         square.append(((off**2).sum(axis=1) + prior) / np.maximum(known.sum(axis=1), 1))
@@ -190,7 +191,7 @@ def _covariance(
     noise = np.where(np.isfinite(own), share**2 * np.where(np.isfinite(own), own, 0.0), 0.0)
     missing = np.where(owed, (1.0 - share) * spread[:, None], 0.0)
     apart = np.abs(np.arange(fibres)[:, None] - np.arange(fibres))
-    alike = _alike(off, np.isfinite(own))[:, None, None] ** apart
+    alike = _alike(off, np.asarray(np.isfinite(own)))[:, None, None] ** apart
     meat = np.einsum("npf,nf,nqf->npq", first, noise, first)
     meat += np.einsum("npf,nf,nfh,nh,nqh->npq", first, missing, alike, missing, first)
     covariance = np.full((count, 4, 4), 0.0)
