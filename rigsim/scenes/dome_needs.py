@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from capture.rig import Rig, Vector, View
 from model import spectra
+from rigsim.bounce_color import color_error
 from rigsim.effect_sizes import (
     bounced,
     edge_loss,
@@ -27,7 +28,6 @@ from rigsim.scenes.flash_needs import (
     SPECTRAL,
     bands,
     brightest_rgb,
-    color_error,
     further_bounces,
     lens,
     polarization,

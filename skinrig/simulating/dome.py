@@ -334,7 +334,7 @@ def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
     )  # fmt: skip
 
 
-def _light_of_skin(order: Order) -> dict[str, bool | None]:
+def _light_of_skin(order: Order) -> dict[str, Any]:
     """Return what of a face is built though it shows in no pixel, and what is not though it does.
 
     What changes pixels is built where nothing is asked for.

@@ -119,7 +119,7 @@ def make_scene(
     preset: str = "III",
     seed: int = 0,
     plan: Plan | None = None,
-    without: Mapping[str, bool] | None = None,
+    without: Mapping[str, Any] | None = None,
 ) -> Any:
     """Return what stands in the sphere, with LEDs as they were built.
 

@@ -147,7 +147,7 @@ class Order:
             if getattr(self, name) != value:
                 raise SimulationError(f"{name}: the {rig} rig knows nothing of it; leave it out")
 
-    def without(self, rig: str) -> dict[str, bool]:
+    def without(self, rig: str) -> dict[str, Any]:
         """Return arguments of a scene of skin that leave out what is to be left out.
 
         Raises
