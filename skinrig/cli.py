@@ -134,6 +134,8 @@ def main(argv: list[str] | None = None) -> int:
             error.show()
             return _failed(error, errors.USAGE, given, say=False)
         return _failed(error, errors.exit_code(error), given)
+    if result == errors.INTERRUPTED:  # Typer turns Ctrl-C into this code, without a word
+        return _failed(KeyboardInterrupt(), errors.INTERRUPTED, given)
     return int(result or 0)
 
 

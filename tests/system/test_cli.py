@@ -127,6 +127,17 @@ def test_with_json_an_error_too_is_one_document(argv, code, says, capsys, tmp_pa
     assert "skinrig.error" not in capsys.readouterr().out
 
 
+def test_an_interrupted_command_says_so(monkeypatch, capsys):
+    def interrupted(path):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("capture.session.verify", interrupted)
+    assert main(["verify", "session", "--json"]) == 130
+    out, err = capsys.readouterr()
+    assert "skinrig: interrupted; a capture or simulation goes on with --resume" in err
+    assert json.loads(out)["exit_code"] == 130
+
+
 def test_no_argument_shows_where_to_begin(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main([]) == 0
