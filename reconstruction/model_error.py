@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
@@ -35,6 +36,8 @@ SMOOTH: Final = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
 """Fourth differences, 1 at the middle: what is cubic over 5 pixels leaves nothing."""
 AROUND_PX: Final = 1.5
 """Standard deviation of the window that squares of differences are averaged in, px."""
+_AROUND_REACH: Final = int(4.0 * AROUND_PX + 0.5)
+_BAND_PIXELS: Final = 1 << 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,14 +120,29 @@ def of_picture(
     ((9, 9, 3, 3), True)
     """
     terms = color_errors() if errors is None else errors
-    good = usable_pixels(rgb, valid)
-    structure = fine_structure(rgb, variance, good)
-    color = np.where(good[..., None], rgb, 0.0).astype(np.float64)
-    color -= color.mean(axis=-1, keepdims=True)
-    color *= terms.bounced
-    covariance: Floats = terms.transport + structure[..., None, None] * terms.fine
-    covariance += color[..., :, None] * color[..., None, :]
+    structure = fine_structure(rgb, variance, usable_pixels(rgb, valid))
+    covariance = np.empty((*valid.shape, 3, 3))
+    for rows in _bands(valid.shape):
+        here = usable_pixels(rgb[rows], valid[rows])
+        color = np.where(here[..., None], rgb[rows], 0.0).astype(np.float64)
+        color -= color.mean(axis=-1, keepdims=True)
+        color *= terms.bounced
+        covariance[rows] = terms.transport + structure[rows][..., None, None] * terms.fine
+        covariance[rows] += color[..., :, None] * color[..., None, :]
     return covariance
+
+
+def _bands(shape: tuple[int, ...]) -> Iterator[slice]:
+    """Yield rows of a picture by bands: copies of the whole of it need gigabytes."""
+    count = max(1, _BAND_PIXELS // max(shape[1], 1))
+    for start in range(0, shape[0], count):
+        yield slice(start, min(start + count, shape[0]))
+
+
+def _with_rim(rows: slice, rim: int, height: int) -> tuple[slice, slice]:
+    """Return a band with `rim` rows more on either side, and where in it the band itself is."""
+    first = max(rows.start - rim, 0)
+    return slice(first, min(rows.stop + rim, height)), slice(rows.start - first, rows.stop - first)
 
 
 def usable_pixels(rgb: Image, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -154,6 +172,29 @@ def fine_structure(rgb: Image, variance: Image, valid: NDArray[np.bool_]) -> Flo
     >>> bool(fine_structure(smooth, 0.0 * smooth, np.ones((12, 12), bool)).max() < 1e-24)
     True
     """
+    reach = SMOOTH.size // 2
+    squares, count = np.empty(valid.shape), np.empty(valid.shape, np.uint8)
+    for rows in _bands(valid.shape):
+        wide, own = _with_rim(rows, reach, valid.shape[0])
+        found = _squared_differences(rgb[wide], variance[wide], valid[wide])
+        squares[rows], count[rows] = found[0][own], found[1][own]
+    total = count.sum()
+    usual = squares.sum() / total if total else 0.0
+    structure = np.empty(valid.shape)
+    for rows in _bands(valid.shape):
+        wide, own = _with_rim(rows, _AROUND_REACH, valid.shape[0])
+        around = gaussian_filter(count[wide].astype(np.float64), AROUND_PX, mode="constant")[own]
+        known = around > 1e-6
+        mean = gaussian_filter(squares[wide], AROUND_PX, mode="constant")[own]
+        mean = np.where(known, mean / np.where(known, around, 1.0), usual)
+        structure[rows] = np.where(valid[rows], np.maximum(mean, 0.0), 0.0)
+    return structure
+
+
+def _squared_differences(
+    rgb: Image, variance: Image, valid: NDArray[np.bool_]
+) -> tuple[Floats, Floats]:
+    """Return the sum of log color's squared fourth differences over both axes, and how many."""
     safe = np.where(valid[..., None], rgb, 1.0).astype(np.float64)
     log_rgb = np.log(safe)
     noise = np.where(valid, (variance / safe**2).mean(axis=-1), 0.0)
@@ -173,12 +214,7 @@ def fine_structure(rgb: Image, variance: Image, valid: NDArray[np.bool_]) -> Flo
         here = parts[reach]
         squares[here] += np.where(whole, np.mean(np.square(step), axis=-1) - noise_here, 0.0)
         count[here] += whole
-    around = gaussian_filter(count, AROUND_PX, mode="constant")
-    known = around > 1e-6
-    mean = gaussian_filter(squares, AROUND_PX, mode="constant") / np.where(known, around, 1.0)
-    total = count.sum()
-    mean = np.where(known, mean, squares.sum() / total if total else 0.0)
-    return np.where(valid, np.maximum(mean, 0.0), 0.0)
+    return squares, count
 
 
 def shading_histogram() -> Histogram:

@@ -1,5 +1,7 @@
 """What a picture tells of how far its colors are from the model's."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -149,3 +151,24 @@ def test_covariances_that_do_not_fit_the_pixels_are_refused(table, errors):
     rgb = np.repeat(table.lookup([0.01], [0.03]), 4, axis=0)
     with pytest.raises(ChromophoreError, match="model_error"):
         weigh(rgb, table, prior=lognormal(0.7, 0.6), variance=1e-6, model_error=errors)
+
+
+@pytest.mark.parametrize("pixels", [1, SIZE, 7 * SIZE])
+def test_a_picture_in_bands_is_the_whole_picture_to_the_last_bit(table, rng, monkeypatch, pixels):
+    rgb = picture(table, shading=np.exp(0.05 * rng.standard_normal((SIZE, SIZE))))
+    valid = rng.random((SIZE, SIZE)) < 0.95
+    valid[:12, :12] = False
+    valid[5, 5] = True  # with nothing near by: gets the mean of all
+    whole = model_error.of_picture(rgb, (0.01 * rgb) ** 2, valid)
+    monkeypatch.setattr(model_error, "_BAND_PIXELS", pixels)
+    np.testing.assert_array_equal(model_error.of_picture(rgb, (0.01 * rgb) ** 2, valid), whole)
+    assert np.ptp(whole[..., 0, 0]) > 0
+
+
+def test_the_error_of_a_picture_takes_little_memory_beside_itself(table, rng):
+    rgb = np.tile(picture(table), (12, 12, 1)).astype(np.float32)
+    tracemalloc.start()
+    found = model_error.of_picture(rgb, (0.01 * rgb) ** 2, np.ones(rgb.shape[:2], bool))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2.0 * found.nbytes  # 2.5 times it when copies were made of the whole picture
