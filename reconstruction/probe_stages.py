@@ -25,7 +25,7 @@ from reconstruction.evidence import Evidence, EvidenceError
 from reconstruction.probe_images import Measurement, ProbeImages
 from reconstruction.subsurface import SubsurfaceFit
 
-REVISION = 2
+REVISION = 3
 """Grows when the code of a stage changes its result, so that older results are computed again."""
 
 MAPS = ("profiles", "subsurface", "anisotropy", "translucency")
@@ -272,6 +272,7 @@ def fit_profiles(
             other = subsurface.invert(
                 first.radius_mm, every, method=method, common_error=nearest_medium.DIMMING, **told
             )
+        unlike = _layered(profiles, unlike, other.scale[0])
         fit = _either(fit, other, np.broadcast_to(unlike, fit.valid.shape))
 
     def change_of(coefficient: Floats) -> Floats:
@@ -289,6 +290,32 @@ def fit_profiles(
         )
         for number, profile in enumerate(profiles)
     ]  # fmt: skip
+
+
+def _layered(
+    profiles: Sequence[Profile], unlike: NDArray[np.bool_], factor: Floats
+) -> NDArray[np.bool_]:
+    """Return which profiles are fitted as those of layers, (M, C); a turn is of one tissue.
+
+    A layer on top dims in all directions. Tissue that scatters by direction is unlike any medium,
+    too, but the factors that it asks for lie on both sides of 1; fitted by some of its directions
+    with a factor and by others without, its sigma_tr would jump between them.
+    """
+    found = np.array(unlike)
+    for group in _turns(profiles).values():
+        if len({profiles[k].measurement.placement.angle_deg for k in group}) >= LEAST_DIRECTIONS:
+            dims = (factor[group] < 1.0).all(axis=0)
+            found[group] = dims & (2 * unlike[group].sum(axis=0) > len(group))
+    return found
+
+
+def _turns(profiles: Sequence[Profile]) -> dict[tuple[str, int], list[int]]:
+    """Return the numbers of profiles of each site and repeat, in all directions of the head."""
+    groups: dict[tuple[str, int], list[int]] = {}
+    for number, profile in enumerate(profiles):
+        placement = profile.measurement.placement
+        groups.setdefault((placement.site, placement.repeat), []).append(number)
+    return groups
 
 
 def _either(fit: SubsurfaceFit, other: SubsurfaceFit, there: NDArray[np.bool_]) -> SubsurfaceFit:
@@ -387,13 +414,10 @@ def _site_document(site: SiteValue, c: int) -> dict[str, Any]:
 
 def _anisotropy(fits: Sequence[ProfileFit]) -> bytes:
     """Tell the dependence on direction at every site and repeat with enough directions."""
-    groups: dict[tuple[str, int], list[ProfileFit]] = {}
-    for fit in fits:
-        placement = fit.profile.measurement.placement
-        groups.setdefault((placement.site, placement.repeat), []).append(fit)
     rows: list[dict[str, Any]] = []
     skipped: list[str] = []
-    for (site, repeat), own in groups.items():
+    for (site, repeat), group in _turns([fit.profile for fit in fits]).items():
+        own = [fits[number] for number in group]
         if len(own) < LEAST_DIRECTIONS:
             skipped.append(
                 f"{site}, repeat {repeat}: {len(own)} directions, expected at least "

@@ -4,9 +4,11 @@ Definition: of all half spaces of g = 0.8 and eta = 1.4 under air, the one whose
 fibre, by the stored Monte Carlo of `rigsim.white_fibre`, is up to a factor nearest to the given
 one: the logarithms of the ratios have the least variance over the fibres, all of one weight; fibres
 that take less than `FAINTEST_PER_MM2` are left out, as no camera of the probe tells them from
-noise. The factor is for what pigment in a thin layer on top takes from light on its way in and out,
-at all distances alike. Of dark skin the nearest medium scatters without bounds: its profile is that
-of a dipole at the surface, which tells sigma_tr and no more; the search ends at `MOST_SCATTERING`.
+noise. The factor is for what pigment in a thin layer on top takes from light on its way in and
+out, at all distances alike. Tissue without layers that scatters by direction has no such factor:
+with one its nearest media jump between far valleys from one direction to the next. Of dark skin the
+nearest medium scatters without bounds: its profile is that of a dipole at the surface, which tells
+sigma_tr and no more; the search ends at `MOST_SCATTERING`.
 """
 
 from __future__ import annotations
@@ -57,7 +59,8 @@ class HomogeneousFit:
     factor: float
     """R_f over that of the medium, geometric mean over the fibres used."""
     residual: float
-    """Standard deviation of log(R_f / R_f of the medium) over the fibres used."""
+    """Standard deviation of log(R_f / R_f of the medium) over the fibres used; its root mean
+    square where the factor is 1 by definition."""
     fibres: int
     """How many were used."""
 
@@ -68,7 +71,9 @@ class HomogeneousFit:
         return math.sqrt(3.0 * a * (a + self.sigma_s_prime_per_mm))
 
 
-def nearest_medium(reflectance_per_mm2: ArrayLike, fibres: Fibres) -> HomogeneousFit:
+def nearest_medium(
+    reflectance_per_mm2: ArrayLike, fibres: Fibres, *, dimmed: bool = True
+) -> HomogeneousFit:
     """Return the homogeneous medium that is nearest to a profile.
 
     Parameters
@@ -77,6 +82,8 @@ def nearest_medium(reflectance_per_mm2: ArrayLike, fibres: Fibres) -> Homogeneou
         R_f of the fibres, 1/mm^2, shape (F,).
     fibres
         The fibres.
+    dimmed
+        Whether a layer on top may take a share of the light: the factor is free, else 1.
 
     Returns
     -------
@@ -120,7 +127,7 @@ def nearest_medium(reflectance_per_mm2: ArrayLike, fibres: Fibres) -> Homogeneou
             return UNHELD * np.cos(np.arange(target.size))
         value, _ = table.profile(math.exp(logs[0]) * scattering, scattering, used)
         off = np.log(value) - target
-        return np.asarray(off - off.mean())
+        return np.asarray(off - off.mean()) if dimmed else off
 
     ends = [
         least_squares(
@@ -138,7 +145,7 @@ def nearest_medium(reflectance_per_mm2: ArrayLike, fibres: Fibres) -> Homogeneou
     return HomogeneousFit(
         absorption,
         scattering,
-        math.exp(float(np.mean(target - np.log(value)))),
+        math.exp(float(np.mean(target - np.log(value)))) if dimmed else 1.0,
         math.sqrt(2.0 * float(best.cost) / int(use.sum())),
         int(use.sum()),
     )

@@ -86,7 +86,8 @@ def _profile(scene: ProbeScene, probing: Probing) -> dict[str, object]:
         media = [(sigma_a, scattering, sigma_tr)] * 3
     else:
         kind = fibres_of(scene.profiles.probe)
-        fits = [nearest_medium(band, kind) for band in made.reflectance_per_mm2.T]
+        dimmed = tissue.kind != "anisotropic"  # has no layer on top
+        fits = [nearest_medium(band, kind, dimmed=dimmed) for band in made.reflectance_per_mm2.T]
         media = [(f.sigma_a_per_mm, f.sigma_s_prime_per_mm, f.sigma_tr_per_mm) for f in fits]
         out["fit_residual"] = [fit.residual for fit in fits]
         out["fit_factor"] = [fit.factor for fit in fits]

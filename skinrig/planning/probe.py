@@ -152,9 +152,11 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
         )
         truth = np.full((len(made), 3), math.sqrt(3.0 * a * (a + s)))
     else:
-        truth = np.array(
-            [[nearest_medium(band, kind).sigma_tr_per_mm for band in one.T] for one in reflectance]
-        )
+        dimmed = tissue.kind != "anisotropic"
+        truth = np.array([
+            [nearest_medium(band, kind, dimmed=dimmed).sigma_tr_per_mm for band in one.T]
+            for one in reflectance
+        ])  # fmt: skip
     phantom, common = _phantom(rig, PHANTOM, phantom_certificate())
     view = rig.views[0]
     from model import spectra

@@ -140,3 +140,20 @@ def test_a_profile_dimmed_by_a_layer_on_top_is_fitted_up_to_a_factor():
     assert fit["factor"] == pytest.approx(0.4, rel=0.05)
     # one that is not dimmed keeps its scale
     assert fit_of(documents([profile()])[1], "photon_table")["factor"] == 1.0
+
+
+def test_a_turn_of_the_head_is_fitted_as_one_tissue_layered_where_all_directions_are_dimmed():
+    """What dims in some directions and brightens in others is no layer: none gets a factor."""
+
+    def factors(scales):
+        fits = probe_stages.fit_profiles(
+            [profile(angle=45.0 * k, scale=scale) for k, scale in enumerate(scales)], PROBE
+        )
+        return np.array([fit.fit.scale for fit in fits])
+
+    np.testing.assert_allclose(factors([0.4] * 5), 0.4, rtol=0.05)
+    # one direction that is like a medium by chance does not make the tissue one
+    np.testing.assert_allclose(factors([0.4, 0.4, 0.4, 0.4, 0.97])[:4], 0.4, rtol=0.05)
+    np.testing.assert_array_equal(factors([0.4, 2.5, 0.4, 2.5, 0.4]), 1.0)
+    # few directions tell nothing of each other
+    np.testing.assert_allclose(factors([0.4, 2.5])[:, 1], [0.4, 2.5], rtol=0.1)

@@ -65,6 +65,16 @@ def test_the_fit_finds_out_a_wrong_medium():
     assert bent.residual > 0.15
 
 
+def test_a_factor_is_free_only_where_a_layer_may_dim():
+    value, _ = WhiteFibre.load().profile(0.1, 2.0, FIBRES)
+    free, fixed = (nearest_medium(0.5 * value, FIBRES, dimmed=dimmed) for dimmed in (True, False))
+    assert free.factor == pytest.approx(0.5, rel=1e-3)
+    assert free.residual < 1e-3
+    # half the light at all distances is not what any medium gives
+    assert fixed.factor == 1.0
+    assert fixed.residual > 0.05
+
+
 def test_what_cannot_be_fitted_is_refused():
     with pytest.raises(FitError, match="bright"):
         nearest_medium(np.full(28, 1e-9), FIBRES)
