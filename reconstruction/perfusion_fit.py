@@ -4,6 +4,10 @@ Levels enter a curve linearly: for each delay and time constant they are solved 
 remains is a landscape of two numbers, looked at as a whole. So a time constant far below the
 sampling interval is no failure of a search: the landscape is flat there, and what is told is the
 bound. The noise is that of what the best curve leaves.
+
+Where the face moves, what is found of the blood of one pose is off that of the other by an unknown
+step, the same in all samples of a pose. It comes as promptly as the movement and would be taken
+for quick blood; so it is one more level of each curve, with its standard error as prior.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, stats
 
 from reconstruction.perfusion_curves import CurveError
+from reconstruction.perfusion_samples import PoseStep, Samples
 
 Floats = NDArray[np.float64]
 Known = Literal["estimated", "only below", "only above", "unknown"]
@@ -29,6 +34,7 @@ LEVEL_TEST = 0.001
 """Two levels differ when chance would make them differ as much at most so often."""
 _GRID = 97
 _DELAYS = 81
+_DELAYS_OF_POSE = 41
 _SLOPE = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5])
 """Time constants since the beginning of a change at which samples are tried."""
 _COARSE = 3.0
@@ -59,11 +65,18 @@ class RelaxationFit:
     """Whether the time constant is estimated, or "only below" the interval's upper end, or "only
     above" its lower one, or the levels do not differ."""
     delay_s: float
-    """Time from prompt to change, s; 0 where none is fitted."""
+    """Time from prompt to change, s; 0 where none is fitted. With steps of a pose, the mean of what
+    it may be."""
     stderr_delay_s: float
-    """Half of its 68 % interval, s."""
+    """Half of its 68 % interval, s; with steps of a pose, the standard deviation."""
     delay_interval_s: tuple[float, float]
     """95 % interval of the delay, s: where the change is quick, the gap between two samples."""
+    stderr_change: Floats
+    """(P,): standard error of ``end`` less ``start``, which hang together."""
+    step: Floats
+    """(P,): what the samples of a moved face are off the curve by together; 0 where none is."""
+    stderr_step: Floats
+    """(P,)"""
     noise: Floats
     """(P,): standard deviation of one sample about the curve."""
     chi2: float
@@ -77,6 +90,8 @@ class RelaxationFit:
             return f"below {high:.3g} s"
         if self.known == "only above":
             return f"above {low:.3g} s"
+        if np.any(self.stderr_step > 0):
+            return "unknown: the levels do not differ by more than the pose may make"
         return "unknown: the levels do not differ"
 
 
@@ -87,6 +102,8 @@ def fit_cycle(
     cycle_s: float,
     change_s: float | None = None,
     stderr: ArrayLike | None = None,
+    pose: PoseStep | None = None,
+    bend: float = 0.0,
 ) -> RelaxationFit:
     """Fit blood that relaxes to one level after a prompt and back after the next, again and again.
 
@@ -102,6 +119,12 @@ def fit_cycle(
         When rest is asked for, s; None: after half of the cycle.
     stderr : array_like, optional
         Standard errors of the values, their shape: relative weights, and what ``chi2`` is by.
+    pose : PoseStep, optional
+        Which samples are of a moved face, and how well their values are joined to those at rest.
+        Blood is then taken to set out when the face does: without that, a late beginning and a
+        slow course look alike beside a free step. None: all are of one pose.
+    bend : float
+        As of `fit_course`.
 
     Returns
     -------
@@ -123,9 +146,10 @@ def fit_cycle(
     """
     middle = 0.5 * cycle_s if change_s is None else change_s
     phase = np.asarray(phase_s, np.float64)
-    data = _Data.of(phase, values, stderr)
+    _check_bend(bend)
+    data = Samples.of(phase, values, stderr, pose)
 
-    def shape(delay: Floats, constant: Floats) -> Floats:
+    def straight(delay: Floats, constant: Floats) -> Floats:
         """Part of the way to the expression's level, of the steady cycle."""
         on, off = middle, cycle_s - middle
         into = (phase - delay) % cycle_s
@@ -139,9 +163,17 @@ def fit_cycle(
 
     spacing = cycle_s / phase.size
     constants = np.geomspace(spacing / 50, 4 * cycle_s, _GRID)
-    delays = np.linspace(0.0, 0.5 * min(middle, cycle_s - middle), _DELAYS)
+    longest = 0.5 * min(middle, cycle_s - middle)
+    delays = np.linspace(0.0, longest, _DELAYS)
+    if data.stepped:
+        between = _moves_between(phase % cycle_s, data.moved > 0.0, middle, longest)
+        delays = np.linspace(*between, _DELAYS_OF_POSE)
     changes = np.concatenate([phase % cycle_s, (phase - middle) % cycle_s])
-    return _fit(data, shape, delays, constants, changes)
+    plain, *bent = (
+        _fit(data, _bent(straight, amount), delays, constants, changes)
+        for amount in ((0.0, -bend, bend) if bend else (0.0,))
+    )
+    return _with_bends(plain, bent)
 
 
 def fit_course(
@@ -172,31 +204,57 @@ def fit_course(
     CurveError
         For fewer than 5 samples after the event, a shape that does not fit, or a bend outside.
     """
-    if not 0.0 <= bend < 1.0:
-        raise CurveError(f"bend: got {bend}, expected 0 to 1, 1 not among them")
+    _check_bend(bend)
     time = np.asarray(time_s, np.float64)
     after = time >= 0
     time = time[after]
     shown = np.atleast_2d(np.asarray(values, np.float64))[:, after]
     errors = None if stderr is None else np.atleast_2d(np.asarray(stderr, np.float64))[:, after]
-    data = _Data.of(time, shown, errors)
+    data = Samples.of(time, shown, errors)
 
-    def bent_by(amount: float) -> Shape:
-        def shape(delay: Floats, constant: Floats) -> Floats:
-            """Part of the way to the new level, as it shows."""
-            part = -np.expm1(-time / constant)
-            return np.asarray(part + amount * part * (1.0 - part))
-
-        return shape
+    def course(delay: Floats, constant: Floats) -> Floats:
+        """Part of the way to the new level."""
+        return np.asarray(-np.expm1(-time / constant))
 
     span = float(np.ptp(time))
     spacing = span / max(1, time.size - 1)
     constants = np.geomspace(spacing / 50, 50 * span, _GRID)
     straight, *bent = (
-        _fit(data, bent_by(amount), np.zeros(1), constants, np.zeros(0))
+        _fit(data, _bent(course, amount), np.zeros(1), constants, np.zeros(0))
         for amount in ((0.0, -bend, bend) if bend else (0.0,))
     )
     return _with_bends(straight, bent)
+
+
+def _moves_between(
+    phase: Floats, moved: NDArray[np.bool_], middle: float, longest: float
+) -> tuple[float, float]:
+    """Return between which delays the face moves: when it last had not, and first had."""
+    since = np.where(phase < middle, phase, phase - middle)
+    done = moved == (phase < middle)  # shows what was asked for last
+    soon = since <= longest
+    not_yet = float(since[soon & ~done].max(initial=0.0))
+    already = float(since[soon & done].min(initial=longest))
+    # reactions differ: between the earliest that has and the latest that has not, where they cross
+    low, high = min(not_yet, already), max(not_yet, already)
+    return (low, high) if high > low else (0.0, longest)
+
+
+def _check_bend(bend: float) -> None:
+    if not 0.0 <= bend < 1.0:
+        raise CurveError(f"bend: got {bend}, expected 0 to 1, 1 not among them")
+
+
+def _bent(shape: Shape, amount: float) -> Shape:
+    """Return a shape as it shows where values are bent over their change."""
+    if amount == 0.0:
+        return shape
+
+    def bent(delay: Floats, constant: Floats) -> Floats:
+        part = shape(delay, constant)
+        return np.asarray(part + amount * part * (1.0 - part))
+
+    return bent
 
 
 def _with_bends(straight: RelaxationFit, bent: Sequence[RelaxationFit]) -> RelaxationFit:
@@ -252,60 +310,27 @@ def of_vessels(fit: RelaxationFit) -> RelaxationFit:
         end=end**2,
         stderr_start=2.0 * start * fit.stderr_start,
         stderr_end=2.0 * end * fit.stderr_end,
+        stderr_change=(start + end) * fit.stderr_change,
+        step=(start + end) * fit.step,
+        stderr_step=(start + end) * fit.stderr_step,
         noise=(start + end) * fit.noise,
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Data:
-    """Curves (P, N) with weights that sum to the number of samples of each; 0 where missing."""
-
-    values: Floats
-    weights: Floats
-    variance: Floats
-    """(P,): mean variance by the given errors; NaN without."""
-
-    @staticmethod
-    def of(at: Floats, values: ArrayLike, stderr: ArrayLike | None) -> _Data:
-        shown = np.atleast_2d(np.asarray(values, np.float64))
-        if shown.ndim != 2 or at.shape != shown.shape[1:]:
-            raise CurveError(f"values: got shape {shown.shape}, expected (P, {at.size})")
-        good = np.isfinite(shown) & np.isfinite(at)
-        variance = np.full(shown.shape, np.nan)
-        if stderr is not None:
-            variance = np.square(np.atleast_2d(np.asarray(stderr, np.float64)))
-            if variance.shape != shown.shape:
-                raise CurveError(f"stderr: got shape {variance.shape}, expected {shown.shape}")
-            good &= np.isfinite(variance) & (variance > 0)
-        if at.size < 5 or (good.sum(axis=1) < 5).any():
-            raise CurveError(f"values: got {int(good.sum(axis=1).min())} usable, expected >= 5")
-        inverse = np.where(good, 1.0 if stderr is None else 1.0 / variance, 0.0)
-        count = good.sum(axis=1, keepdims=True)
-        scale = count / inverse.sum(axis=1, keepdims=True)
-        known = scale[:, 0] if stderr is not None else np.full(len(shown), np.nan)
-        return _Data(np.where(good, shown, 0.0), inverse * scale, known)
-
-    def residual(self, shape: Floats) -> Floats:
-        """Return the weighted square sum of the best levels, (..., P), of shapes (..., N)."""
-        level, gap = self.levels(shape)
-        left = self.values - level[..., None] - gap[..., None] * shape[..., None, :]
-        return (self.weights * left**2).sum(axis=-1)
-
-    def levels(self, shape: Floats) -> tuple[Floats, Floats]:
-        """Return the best start and gap of each curve, (..., P)."""
-        w, b = self.weights, shape[..., None, :]
-        total = w.sum(axis=-1)
-        b_mean = (w * b).sum(axis=-1) / total
-        v_mean = (w * self.values).sum(axis=-1) / total
-        b_off, v_off = b - b_mean[..., None], self.values - v_mean[:, None]
-        square = (w * b_off**2).sum(axis=-1)
-        product = (w * b_off * v_off).sum(axis=-1)
-        gap = np.where(square > 1e-12 * total, product / np.maximum(square, 1e-300), 0.0)
-        return v_mean - gap * b_mean, gap
+def _fit(
+    given: Samples, curve: Shape, delays: Floats, constants: Floats, at: Floats
+) -> RelaxationFit:
+    data = given.with_free_step()
+    for _ in range(1 + data.stepped):
+        fit = _fit_once(data, curve, delays, constants, at)
+        # how much a step is held by its prior depends on the noise, which a free step leaves
+        data = given.with_prior(np.square(fit.noise))
+    return fit
 
 
-def _fit(data: _Data, curve: Shape, delays: Floats, constants: Floats, at: Floats) -> RelaxationFit:
-
+def _fit_once(
+    data: Samples, curve: Shape, delays: Floats, constants: Floats, at: Floats
+) -> RelaxationFit:
     def residuals(delay: Floats, constant: Floats) -> Floats:
         """(..., P) square sums for delays and constants that broadcast to (...)."""
         return data.residual(curve(delay[..., None], constant[..., None]))
@@ -368,10 +393,9 @@ def _fit(data: _Data, curve: Shape, delays: Floats, constants: Floats, at: Float
         stderr_delay = 0.5 * ((ends[1] if ends[1] is not None else float(delays[-1]))
                               - (ends[0] if ends[0] is not None else float(delays[0])))  # fmt: skip
 
-    level, gap = (
-        part[0] for part in data.levels(curve(np.array([[delay]]), np.array([[constant]])))
-    )
-    flat = ((data.weights * (data.values - _means(data)[:, None]) ** 2).sum(axis=1) / noise2).sum()
+    found_shape = curve(np.array([[delay]]), np.array([[constant]]))
+    level, gap = (part[0] for part in data.levels(found_shape))
+    flat = (data.residual(np.zeros_like(found_shape))[0] / noise2).sum()
     differ = (flat - least) / curves / max(least / nu, 1e-300)
     changes = stats.f.sf(differ, curves, nu) < LEVEL_TEST
     known: Known = "estimated"
@@ -381,15 +405,32 @@ def _fit(data: _Data, curve: Shape, delays: Floats, constants: Floats, at: Float
         known = "only below"
     elif np.isinf(interval[1]):
         known = "only above"
+    step = data.step(found_shape)[0]
     errors = _level_errors(data, curve, delay, constant, gap, noise2, known == "estimated",
-                           delays.size > 1)  # fmt: skip
-    given = data.variance
-    chi2 = float((by_curve[best] / given).sum() / nu) if np.isfinite(given).all() else float("nan")
+                           delays.size > 1 and not data.stepped)  # fmt: skip
+    if data.stepped:
+        # beside a step the delay trades with levels, and its end is as likely as its middle
+        weights = np.exp(-0.5 * along)
+        weights /= weights.sum()
+        best_constants = constants[np.argmin(total[:, : delays.size], axis=0)]
+        shapes = curve(delays[:, None], best_constants[:, None])
+        levels, gaps = data.levels(shapes)
+        away = (levels - level, levels + gaps - level - gap, gaps - gap, data.step(shapes) - step)
+        errors = tuple(
+            np.sqrt(error**2 + weights @ off**2) for error, off in zip(errors, away, strict=True)
+        )
+        delay = float(weights @ delays)
+        stderr_delay = float(np.sqrt(weights @ (delays - delay) ** 2))
+    usual = data.variance
+    chi2 = float((by_curve[best] / usual).sum() / nu) if np.isfinite(usual).all() else float("nan")
     return RelaxationFit(
         start=level,
         end=level + gap,
         stderr_start=errors[0],
         stderr_end=errors[1],
+        stderr_change=errors[2],
+        step=step,
+        stderr_step=errors[3],
         time_constant_s=constant,
         stderr_time_constant_s=stderr_constant if known == "estimated" else float("nan"),
         interval_s=interval,
@@ -409,10 +450,6 @@ def _near(since: Floats, constant: float, delays: Floats) -> Floats:
     """
     late = since[np.isfinite(since) & (since <= 2 * delays[-1])]
     return np.clip((late[:, None] - constant * _SLOPE).ravel(), delays[0], delays[-1])
-
-
-def _means(data: _Data) -> Floats:
-    return (data.weights * data.values).sum(axis=1) / data.weights.sum(axis=1)
 
 
 def _refined(
@@ -468,7 +505,7 @@ def _crossings(
 
 
 def _level_errors(
-    data: _Data,
+    data: Samples,
     curve: Shape,
     delay: float,
     constant: float,
@@ -476,8 +513,11 @@ def _level_errors(
     noise2: Floats,
     with_constant: bool,
     with_delay: bool,
-) -> tuple[Floats, Floats]:
-    """Return standard errors of start and end, with what delay and constant add where known."""
+) -> tuple[Floats, ...]:
+    """Return standard errors of start, end, their difference, and the step of a pose.
+
+    With what delay and constant add where they are known.
+    """
 
     def at(d: float, c: float) -> Floats:
         return np.asarray(curve(np.array([[d]]), np.array([[c]]))[0], np.float64)
@@ -490,15 +530,28 @@ def _level_errors(
         if with_delay and delay > 1e-3 * constant:
             slopes.append((at(delay + h, constant) - at(delay - h, constant)) / (2 * h))
     curves = len(gap)
-    size = 2 * curves + len(slopes)
+    size = 3 * curves + len(slopes)
     normal = np.zeros((size, size))
     for p in range(curves):
         rows = np.zeros((size, base.size))
         rows[2 * p], rows[2 * p + 1] = 1.0 - base, base  # start and end
+        rows[2 * curves + p] = data.moved
         for k, slope in enumerate(slopes):
-            rows[2 * curves + k] = gap[p] * slope
+            rows[3 * curves + k] = gap[p] * slope
         normal += (rows * data.weights[p] / noise2[p]) @ rows.T
+        step = 2 * curves + p
+        if data.stderr_of_pose[p] > 0 and normal[step, step] > 0:
+            normal[step, step] += 1.0 / data.stderr_of_pose[p] ** 2
+        else:  # no step: not a number of this fit
+            normal[step, :] = normal[:, step] = 0.0
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     covariance = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return errors[0 : 2 * curves : 2], errors[1 : 2 * curves : 2]
+    start, end = np.arange(0, 2 * curves, 2), np.arange(1, 2 * curves, 2)
+    change2 = errors[start] ** 2 + errors[end] ** 2 - 2.0 * covariance[start, end]
+    return (
+        errors[start],
+        errors[end],
+        np.asarray(np.sqrt(np.maximum(change2, 0.0))),
+        errors[2 * curves : 3 * curves],
+    )

@@ -28,6 +28,11 @@ Bools = NDArray[np.bool_]
 
 LIGHT_RADII, LEAST_LIGHT_PX = 3.0, 6.0
 """How smoothly the light of a place changes between frames: in radii of its disc, and px."""
+POSE_SHARE = 0.10
+"""Standard error, beside noise, of the blood of a moved face against that at rest, of the blood:
+light, shadows and what lies under a pixel change with the pose. Most likely of the cheeks, where
+the expression moves skin most, of 19 smiles of seeds 0 to 18, 192 px across; of noses 0.03, of
+places that hardly move less than 0.02."""
 ALWAYS = 0.9
 """Part of the frames in which a pixel must be usable."""
 
@@ -60,6 +65,8 @@ class PlaceBlood:
     stderr_of_pose: Floats
     """(P,): standard error that all frames of a moved face share, against those at rest; 0 where
     nothing has moved."""
+    moved: Bools
+    """(N,): frames in which the face has moved."""
 
 
 def blood_of_discs(
@@ -94,7 +101,7 @@ def blood_of_discs(
             for part in ("mean", "stderr", "pixels")
         )
     )
-    return PlaceBlood(joined, np.array([of_pose for _, of_pose in found]))
+    return PlaceBlood(joined, np.array([of_pose for _, of_pose in found]), moved)
 
 
 def usable(skin_map: SkinMap) -> Bools:
@@ -157,4 +164,8 @@ def _of_place(
         stderr[pose] = by_light.stderr[0]
         variances.append(float(np.square(by_color.stderr[0, pose][both]).sum()) / both.sum() ** 2)
     counted = np.where(np.isfinite(mean), by_color.pixels[0], 0)
-    return DiscMeans(mean[None], stderr[None], counted[None]), float(np.sqrt(np.sum(variances)))
+    found = DiscMeans(mean[None], stderr[None], counted[None])
+    if len(variances) < 2:  # one pose alone: nothing to be joined
+        return found, 0.0
+    of_light = POSE_SHARE * float(np.nanmean(mean))
+    return found, float(np.sqrt(np.sum(variances) + of_light**2))

@@ -27,8 +27,9 @@ from reconstruction import (
     stages,
 )
 from reconstruction.evidence import Evidence, EvidenceError
+from reconstruction.perfusion_samples import PoseStep
 
-REVISION = 3
+REVISION = 4
 CURVES = "perfusion_curves"
 CURVES_FILE = "perfusion_curves.json"
 MAPS = (*flash_stages.MAPS, CURVES)
@@ -260,10 +261,7 @@ def _of_cycle(
     for k in usable:
         value, stderr = values[k]
         good = np.isfinite(value)
-        fit = perfusion_fit.fit_cycle(
-            phase[known], value, cycle_s=cycle_s, stderr=_not_too_small(stderr)
-        )
-        fits[names[k]] = _of_fit(fit, 0, float(blood.stderr_of_pose[k]))
+        fits[names[k]] = _of_fit(_fit_prompts(phase[known], known, blood, [k], cycle_s), 0)
         seen[names[k]] = _of_transition(
             perfusion_curves.transition(
                 phase[known][good], value[good], cycle_s=cycle_s, stderr=stderr[good]
@@ -273,14 +271,7 @@ def _of_cycle(
         again[names[k]] = perfusion_curves.reproducibility(
             time[known][good], phase[known][good], value[good], cycle_s=cycle_s
         )
-    together = None
-    if usable:
-        together = perfusion_fit.fit_cycle(
-            phase[known],
-            np.array([values[k][0] for k in usable]),
-            cycle_s=cycle_s,
-            stderr=np.array([_not_too_small(values[k][1]) for k in usable]),
-        )
+    together = _fit_prompts(phase[known], known, blood, usable, cycle_s) if usable else None
     return {
         "cycle_s": cycle_s,
         "order": np.flatnonzero(known)[np.argsort(phase[known], kind="stable")],
@@ -299,6 +290,26 @@ def _of_cycle(
         "fits": fits,
         "fit_of_all": None if together is None else _of_fit(together, None),
     }
+
+
+def _fit_prompts(
+    phase: Floats,
+    known: Bools,
+    blood: sequence_blood.PlaceBlood,
+    which: Sequence[int],
+    cycle_s: float,
+) -> perfusion_fit.RelaxationFit:
+    """Fit the radius of the vessels of some places, of which blood is the cross-section."""
+    means = blood.means.mean[which][:, known]
+    root = np.sqrt(np.where(means > 0.0, means, np.nan))
+    slope = 0.5 / root  # of the root over blood
+    stderr = np.array([_not_too_small(row) for row in blood.means.stderr[which][:, known] * slope])
+    of_pose = blood.stderr_of_pose[which] * np.nanmean(slope, axis=1)
+    found = perfusion_fit.fit_cycle(
+        phase, root, cycle_s=cycle_s, stderr=stderr, bend=BEND,
+        pose=PoseStep(blood.moved[known], of_pose),
+    )  # fmt: skip
+    return perfusion_fit.of_vessels(found)
 
 
 def _not_too_small(stderr: Floats) -> Floats:
@@ -331,9 +342,7 @@ def _of_event(
     }
 
 
-def _of_fit(
-    fit: perfusion_fit.RelaxationFit, curve: int | None, of_pose: float = 0.0
-) -> dict[str, Any]:
+def _of_fit(fit: perfusion_fit.RelaxationFit, curve: int | None) -> dict[str, Any]:
     """Return a fit's document, and how many standard errors its levels lie apart."""
     document = {
         "time_constant_s": fit.time_constant_s,
@@ -351,11 +360,13 @@ def _of_fit(
             "end": fit.end[curve],
             "stderr_start": fit.stderr_start[curve],
             "stderr_end": fit.stderr_end[curve],
+            "stderr_change": fit.stderr_change[curve],
+            "step_of_pose": fit.step[curve],
+            "stderr_step_of_pose": fit.stderr_step[curve],
             "noise": fit.noise[curve],
         }
-        apart = float(fit.end[curve] - fit.start[curve])
-        error = np.sqrt(fit.stderr_start[curve] ** 2 + fit.stderr_end[curve] ** 2 + of_pose**2)
-        document["levels_apart_sigmas"] = abs(apart) / max(float(error), 1e-300)
+        apart = abs(float(fit.end[curve] - fit.start[curve]))
+        document["levels_apart_sigmas"] = apart / max(float(fit.stderr_change[curve]), 1e-300)
     return document
 
 

@@ -8,6 +8,7 @@ from scipy import stats
 
 from reconstruction.perfusion_curves import CurveError
 from reconstruction.perfusion_fit import fit_course, fit_cycle, of_vessels
+from reconstruction.perfusion_samples import PoseStep, Samples
 
 CYCLE_S = 10.0
 PHASE = (5.5 * np.arange(22)) % CYCLE_S + 0.007
@@ -219,3 +220,100 @@ def test_a_bend_adds_to_an_interval_in_squares():
 def test_a_bend_outside_its_range_is_refused(bend):
     with pytest.raises(CurveError, match="bend"):
         fit_course(np.arange(8.0), np.arange(8.0), bend=bend)
+
+
+MOVED = (PHASE > 0.16) & (PHASE < 5.16)
+
+
+def with_step(rng, *, constant_s, step, noise=2e-4, gap=0.01):
+    """Return a curve whose samples of a moved face lie off the others by a step."""
+    curve = 0.03 + gap * relaxing(PHASE, constant_s) + step * MOVED
+    return curve + noise * rng.standard_normal(PHASE.size)
+
+
+@pytest.mark.parametrize("constant_s", [1.0, 2.0, 4.0])
+def test_what_a_pose_adds_to_its_samples_does_not_pass_for_quick_blood(constant_s):
+    """Steps are drawn from their prior: intervals hold the truth, and plain fits do not."""
+    rng = np.random.default_rng(11)
+    runs, spread, held, plain = 24, 4e-3, 0, 0
+    for _ in range(runs):
+        value = with_step(rng, constant_s=constant_s, step=spread * rng.standard_normal())
+        found = fit_cycle(PHASE, value, cycle_s=CYCLE_S, pose=PoseStep(MOVED, np.array([spread])))
+        low, high = found.interval_s
+        held += low <= constant_s <= high
+        low, high = fit_cycle(PHASE, value, cycle_s=CYCLE_S).interval_s
+        plain += low <= constant_s <= high
+    assert held >= stats.binom.ppf(0.001, runs, 0.95)
+    assert plain < stats.binom.ppf(0.001, runs, 0.95)
+
+
+def test_steps_and_changes_lie_within_their_errors():
+    rng = np.random.default_rng(12)
+    runs, spread, pulls = 24, 4e-3, []
+    for _ in range(runs):
+        step = spread * rng.standard_normal()
+        found = fit_cycle(
+            PHASE, with_step(rng, constant_s=1.0, step=step), cycle_s=CYCLE_S,
+            pose=PoseStep(MOVED, np.array([spread])),
+        )  # fmt: skip
+        change = found.end[0] - found.start[0]
+        pulls.append([(found.step[0] - step) / found.stderr_step[0],
+                      (change - 0.01) / found.stderr_change[0]])  # fmt: skip
+    squares = np.square(pulls).sum(axis=0)
+    assert (squares < stats.chi2.ppf(0.999, runs)).all()
+    # the delay is the same in all runs and near the middle of what it may be: less than its error
+    assert (squares > 0.05 * runs).all()
+
+
+def test_a_step_of_pose_alone_leaves_the_constant_unknown():
+    """Blood so quick that poses alone show it: as large as poses may make it, it tells nothing."""
+    rng = np.random.default_rng(13)
+    value = with_step(rng, constant_s=1.0, step=5e-3, gap=0.0)
+    found = fit_cycle(PHASE, value, cycle_s=CYCLE_S, pose=PoseStep(MOVED, np.array([4e-3])))
+    assert found.known == "unknown"
+    assert "the pose may make" in str(found)
+    # six times what a pose may make is blood, and it was quick
+    found = fit_cycle(PHASE, value, cycle_s=CYCLE_S, pose=PoseStep(MOVED, np.array([8e-4])))
+    assert found.known == "only below"
+
+
+def test_blood_sets_out_when_the_face_moves():
+    rng = np.random.default_rng(14)
+    value = with_step(rng, constant_s=2.0, step=0.0)
+    found = fit_cycle(PHASE, value, cycle_s=CYCLE_S, pose=PoseStep(MOVED, np.array([4e-3])))
+    low, high = found.delay_interval_s
+    # the last sample at rest was 0.007 s after the prompt, the first of the smile 0.507 s
+    assert 0.007 - 1e-9 <= low <= 0.16 <= high <= 0.507 + 1e-9
+    assert low <= found.delay_s <= high
+
+
+def test_a_prior_as_a_covariance_of_the_samples_gives_the_same_squares():
+    """Against generalized least squares with the step's variance written out."""
+    rng = np.random.default_rng(15)
+    value, noise2, spread = with_step(rng, constant_s=2.0, step=3e-3), 4e-8, 1e-3
+    shape = relaxing(PHASE, 2.0)
+    samples = Samples.of(PHASE, value, None, PoseStep(MOVED, np.array([spread]))).with_prior(
+        np.array([noise2])
+    )
+    covariance = noise2 * np.eye(PHASE.size) + spread**2 * np.outer(MOVED, MOVED)
+    inverse = np.linalg.inv(covariance)
+    columns = np.stack([np.ones(PHASE.size), shape], axis=-1)
+    level, gap = np.linalg.solve(columns.T @ inverse @ columns, columns.T @ inverse @ value)
+    left = value - level - gap * shape
+    assert samples.residual(shape)[0] / noise2 == pytest.approx(left @ inverse @ left, rel=1e-9)
+    assert samples.levels(shape)[1][0] == pytest.approx(gap, rel=1e-9)
+    mean = spread**2 * (MOVED @ inverse @ left)  # of a normal step, given the samples
+    assert samples.step(shape)[0] == pytest.approx(mean, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("pose", "named"),
+    [
+        (PoseStep(MOVED[:5], np.array([1e-3])), "shapes"),
+        (PoseStep(MOVED, np.array([1e-3, 1e-3])), "shapes"),
+        (PoseStep(MOVED, np.array([np.nan])), "standard errors"),
+    ],
+)
+def test_steps_that_do_not_fit_the_samples_are_refused(pose, named):
+    with pytest.raises(CurveError, match=named):
+        fit_cycle(PHASE, relaxing(PHASE, 2.0), cycle_s=CYCLE_S, pose=pose)
