@@ -42,6 +42,9 @@ LONGEST = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0, LONGEST_S)
 REPEATS = (1, 2, 4)
 DARKS = (1, 2)
 SATURATED = 0.95
+CROSSTALK_ERROR = (0.0, 8.5e-6, 6.3e-6, 1e-6, 3e-7)
+"""Standard error of the share of a fibre's light in a spot so many places away, the last of all
+farther ones, as simulated calibrations of the shipped rig state it."""
 FORECAST_SPREAD = 0.6
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
 MAP_PX = 32
@@ -58,6 +61,9 @@ class Sight:
     """(S, 3) sigma_tr in 1/mm of the nearest homogeneous medium."""
     phantom: Floats
     """(F, 3) of the block that the probe is calibrated with."""
+    phantom_error: Floats
+    """(F, 3) relative error of what the block is expected to give, each fibre's own: the photon
+    table's."""
     common: Floats
     """(T, F, 3) relative errors of all gains together, by the certificate."""
     unit: Floats
@@ -133,9 +139,10 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
     from rigsim.homogeneous_fit import nearest_medium
     from rigsim.probe_build import SPOT_RADIUS_PX
     from rigsim.probe_profile import Profiles, fibres_of
-    from rigsim.probe_tissue import PHANTOM, HomogeneousTissue, parse_subject, phantom_certificate
+    from rigsim.probe_tissue import HomogeneousTissue, parse_subject
     from rigsim.scenes.probe import DARK_E_PER_S, METER_RATE_PER_S, VIGNETTING
     from rigsim.sensor import sensor_of
+    from skinrig.phantom_reflectance import expected_reflectance, packaged_certificate
     from skinrig.simulating.probe import PHOTONS
 
     if rig.probe is None:
@@ -157,14 +164,14 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
             [nearest_medium(band, kind, dimmed=dimmed).sigma_tr_per_mm for band in one.T]
             for one in reflectance
         ])  # fmt: skip
-    phantom, common = _phantom(rig, PHANTOM, phantom_certificate())
+    block = expected_reflectance(packaged_certificate(), rig)
     view = rig.views[0]
     from model import spectra
 
     white = spectra.camera_white(view.spectral_sensitivity, rig.lights[0].illuminant)
     area = math.pi * SPOT_RADIUS_PX**2
     return Sight(
-        tuple(sites), reflectance, truth, phantom, common,
+        tuple(sites), reflectance, truth, block.per_mm2, block.stderr / block.per_mm2, block.common,
         METER_RATE_PER_S * np.asarray(white, np.float64), area * np.array([0.25, 0.5, 0.25]),
         sensor_of(view, dark_e_per_s=DARK_E_PER_S, vignetting=VIGNETTING), rig.probe,
     )  # fmt: skip
@@ -196,7 +203,8 @@ def predict(look: Sight, setting: Setting) -> Prediction:
         found[k] = fit.fit.sigma_tr_per_mm
         common[k] = np.sqrt((fit.log_common**2).sum(axis=0))
         stays = np.minimum(quiet.log_stderr, fit.log_stderr)
-        noise = (fit.log_stderr**2 - stays**2) / setting.repeats
+        noise = np.where(np.isfinite(stays), fit.log_stderr**2, np.inf) / setting.repeats
+        noise -= np.where(np.isfinite(stays), stays**2, 0.0) / setting.repeats
         still[k] = np.hypot(stays, common[k])
         sigma[k] = np.sqrt(still[k] ** 2 + noise)
         bias[k] = found[k] / look.truth[k] - 1.0
@@ -213,8 +221,9 @@ def _fits(look: Sight, setting: Setting, places: Sequence[int], *, noise: bool) 
 
     names = tuple(fibre.name for fibre in look.probe.fibres)
     radius = np.array(look.probe.radius_mm)
-    # gains are known from a series of all exposures on the phantom
+    # gains are known from a series of all exposures on the phantom, as far as its light is known
     gain = _variance(look, look.phantom, exposure_series_s(), 4, 1.0) / look.phantom**2
+    gain += look.phantom_error**2
     profiles = []
     for k in places:
         value = look.reflectance[k]
@@ -222,8 +231,9 @@ def _fits(look: Sight, setting: Setting, places: Sequence[int], *, noise: bool) 
         valid = np.isfinite(own)
         variance = np.where(valid, own, 0.0) if noise else np.zeros_like(own)
         reflectance = FibreReflectance(
-            names, radius, value, variance + gain * value**2, value * look.common, valid, ~valid
-        )
+            names, radius, value, variance + gain * value**2 + _crosstalk_variance(look, value),
+            value * look.common, valid, ~valid,
+        )  # fmt: skip
         head = Measurement(
             Placement(look.sites[k], 0.0, 0), len(setting.exposures_s), 1.0, math.nan, 5.0
         )
@@ -426,34 +436,18 @@ def _variance(
         return np.asarray(1.0 / (told * look.pixels * np.square(level * look.unit)))
 
 
-def _phantom(rig: Rig, block: Any, certificate: Mapping[str, Any]) -> tuple[Floats, Floats]:
-    """Return what the fibres take from the phantom, and its relative errors by the certificate."""
-    from model import photon_table
+def _crosstalk_variance(look: Sight, value: Floats) -> Floats:
+    """Return the variance that uncertain cross-talk adds, 1/mm^4, (F, 3).
 
-    probe = rig.probe
-    if probe is None:
-        raise PlanningError(f"rig: got {rig.name!r} without a probe, expected one with fibres")
-    radius = np.array(probe.radius_mm)
-    # one coefficient for all colors: their errors are common to the wavelengths, too
-    middle = len(certificate["wavelength_nm"]) // 2
-    a = float(certificate["sigma_a_per_mm"][middle])
-    s = float(certificate["sigma_s_prime_per_mm"][middle])
-    unsure = certificate["uncertainty"]
-
-    def taken(sigma_a: float, sigma_s_prime: float) -> Floats:
-        found = photon_table.reflectance(
-            radius, sigma_a, sigma_s_prime, g=float(certificate["g"]), collection="fibre",
-            core_mm=probe.fibres[0].core_mm, source_core_mm=probe.source_core_mm,
-        )  # fmt: skip
-        return np.asarray(found, np.float64)
-
-    value = taken(a, s)
-    more = [
-        taken(a * (1.0 + float(unsure["sigma_a"])), s),
-        taken(a, s * (1.0 + float(unsure["sigma_s_prime"]))),
-    ]
-    common = np.stack([np.repeat((1.0 - one / value)[:, None], 3, axis=1) for one in more])
-    return np.repeat(value[:, None], 3, axis=1), common
+    The nearest fibres are brighter than the farthest by a million times on skin and by a thousand
+    on the phantom; what a calibration has wrong of their light in far spots cancels only as far as
+    the two are alike.
+    """
+    place = np.arange(len(value))
+    apart = np.minimum(np.abs(place[:, None] - place), len(CROSSTALK_ERROR) - 1)
+    error = np.array(CROSSTALK_ERROR)[apart]
+    moved = value[None] - (value / look.phantom)[:, None] * look.phantom[None]
+    return np.asarray(np.einsum("ji,jic->jc", error**2, moved**2))
 
 
 def _between(look: Sight, found: Floats, sigma: Floats, good: NDArray[np.bool_]) -> Floats:
