@@ -33,6 +33,7 @@ FINEST = 2e-4
 """Least relative error of a color that is told apart: smaller noise is taken for this much, with
 which melanin is known to some 0.3 percent."""
 _TASK_PIXELS = 1024
+_BAND_PIXELS = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,11 +175,15 @@ def _covariances(
             f"model_error: expected shape {(*shape, 3, 3)} for the pixels, got {each.shape}"
         )
     each = each.reshape(-1, 3, 3)
-    diagonal = np.einsum("nii->ni", each)
-    if not (np.isfinite(each).all() and (diagonal >= 0.0).all()):
-        raise ChromophoreError("model_error: expected finite covariances without negatives")
     floor = (RELATIVE_NOISE**2 if default_noise else 1e-12) + FINEST**2
-    brightness = diagonal.mean(axis=1) + floor + 1e-6
-    triangles = each[(slice(None), *_UPPER)] + brightness[:, None]
-    triangles[:, [0, 3, 5]] += floor
+    triangles = np.empty((len(each), 6))
+    for start in range(0, len(each), _BAND_PIXELS):  # copies of a whole picture need gigabytes
+        band = each[start : start + _BAND_PIXELS]
+        diagonal = np.einsum("nii->ni", band)
+        if not (np.isfinite(band).all() and (diagonal >= 0.0).all()):
+            raise ChromophoreError("model_error: expected finite covariances without negatives")
+        brightness = diagonal.mean(axis=1) + floor + 1e-6
+        part = band[(slice(None), *_UPPER)] + brightness[:, None]
+        part[:, [0, 3, 5]] += floor
+        triangles[start : start + _BAND_PIXELS] = part
     return each.mean(axis=0) if len(each) else None, triangles
