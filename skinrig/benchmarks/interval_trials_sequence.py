@@ -1,5 +1,7 @@
 """Trials of intervals in time: time constants of blood after an event, and of its prompted change.
 
+Of prompts the delay, too: the mean time from prompt to movement.
+
 A subject is a person with a time constant of their own; the places of the face are the truths.
 """
 
@@ -7,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +20,7 @@ from reconstruction import pipeline
 from skinrig.benchmarks.interval_coverage import GAUSSIAN_95, Trial
 from skinrig.benchmarks.interval_trials import band_of, calibrated, forget, truth_of
 from skinrig.sequences import SequenceOrder
+from skinrig.simulating.sequence import COURSE_FILE
 from skinrig.simulating.simulation import simulate_session
 
 CONSTANTS_S: Final[Mapping[str, Sequence[float]]] = {
@@ -30,7 +33,7 @@ CONSTANTS_S: Final[Mapping[str, Sequence[float]]] = {
 def sequences(
     folder: Path, subjects: Mapping[int, str], *, width_px: int, state: str
 ) -> Iterator[Trial]:
-    """Yield trials of the time constant at each place of a face.
+    """Yield trials of the time constant at each place of a face, and of the delay after prompts.
 
     Parameters
     ----------
@@ -56,17 +59,31 @@ def sequences(
             calibration=folder / "calibration", landmarks=truth / "landmarks.csv",
         )  # fmt: skip
         told = json.loads((folder / "maps" / "perfusion_curves.json").read_text("utf-8"))
-        yield of_fits(
-            f"time constant after {state}", told["fits"].values(), constant_s,
-            subject=f"{preset} {seed}", band=_band(truth),
-        )  # fmt: skip
+        subject, band = f"{preset} {seed}", _band(truth)
+        fits = list(told["fits"].values())
+        yield of_fits(f"time constant after {state}", fits, constant_s, subject=subject, band=band)
+        course = json.loads((truth / COURSE_FILE).read_text("utf-8"))["constants_s"]
+        if "reaction_s" in course:
+            yield of_fits(
+                f"delay of {state}", fits, course["reaction_s"],
+                subject=subject, band=band, delay=True,
+            )  # fmt: skip
         forget(folder, done)
 
 
-def of_fits(quantity: str, fits: Any, constant_s: float, *, subject: str, band: str) -> Trial:
-    """Compare fits with the true time constant.
+def of_fits(
+    quantity: str,
+    fits: Iterable[Mapping[str, Any]],
+    true_s: float,
+    *,
+    subject: str,
+    band: str,
+    delay: bool = False,
+) -> Trial:
+    """Compare fits with the true time constant, or the true delay.
 
-    Fits that tell a bound alone, or nothing, have no standard error and are left out.
+    Fits that tell a bound alone, or nothing, have no standard error and are left out; of delays as
+    well, which mean nothing where blood does not change.
 
     Parameters
     ----------
@@ -74,20 +91,23 @@ def of_fits(quantity: str, fits: Any, constant_s: float, *, subject: str, band: 
         Of the trial.
     fits
         As in the document of curves.
-    constant_s
-        True one, s.
+    true_s
+        The true time, s.
+    delay
+        Whether it is the delay.
     """
+    name, ends = ("delay", "delay_interval_s") if delay else ("time_constant", "interval_s")
     off, widths = [], []
     for fit in fits:
         if fit["known"] != "estimated":
             continue
-        stderr = float(fit["stderr_time_constant_s"])
-        low, high = (math.inf if end is None else float(end) for end in fit["interval_s"])
-        away = abs(float(fit["time_constant_s"]) - constant_s) / stderr
+        stderr = float(fit[f"stderr_{name}_s"])
+        low, high = (math.inf if end is None else float(end) for end in fit[ends])
+        away = abs(float(fit[f"{name}_s"]) - true_s) / max(stderr, 1e-300)
         # the 95 % interval is no multiple of the standard error: it says itself what is inside
-        inside = low <= constant_s <= high
+        inside = low <= true_s <= high
         off.append(min(away, GAUSSIAN_95) if inside else max(away, 1.001 * GAUSSIAN_95))
-        widths.append(100.0 * stderr / constant_s)
+        widths.append(100.0 * stderr / true_s)
     width = float(np.median(widths)) if widths else float("nan")
     return Trial(quantity, subject, band, np.array(off), width, "%", GAUSSIAN_95)
 

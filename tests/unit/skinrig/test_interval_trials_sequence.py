@@ -65,3 +65,17 @@ def test_bounds_alone_are_left_out():
     }  # fmt: skip
     one = of_fits("x", [fit], CONSTANT_S, subject="a", band="any")
     assert one.deviation.size == 0
+
+
+@pytest.mark.parametrize(
+    ("true_s", "held_68", "held_95"), [(0.16, 1, 1), (0.45, 0, 1), (0.7, 0, 0)]
+)
+def test_delays_count_by_their_own_interval(true_s, held_68, held_95):
+    fit = {
+        "known": "estimated", "time_constant_s": 35.0, "stderr_time_constant_s": 2.0,
+        "interval_s": [30.0, 40.0], "delay_s": 0.25, "stderr_delay_s": 0.14,
+        "delay_interval_s": [0.01, 0.51],
+    }  # fmt: skip
+    one = of_fits("x", [fit], true_s, subject="a", band="any", delay=True)
+    assert (one.share(68), one.share(95)) == (held_68, held_95)
+    assert one.width == pytest.approx(100 * 0.14 / true_s)
