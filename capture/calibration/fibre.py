@@ -188,7 +188,9 @@ class FibreCalibration:
         own = spread / gain**2 + (value * self.gain_stderr / gain) ** 2
         # the phantom's light has the same error of stray light, which cancels in part
         stray = -self.crosstalk.offset_common / gain * (1.0 - ratio)
-        common = np.concatenate([value * self.common, stray[None]])
+        # weighed as if each fibre's own, and once more as what moves all far fibres together
+        mixed = self.crosstalk.shared_changes(light, self.light, ratio) / gain
+        common = np.concatenate([value * self.common, stray[None], mixed])
         return FibreReflectance(
             self.names,
             self.radius_mm,

@@ -18,6 +18,8 @@ FloatArray = NDArray[np.float64]
 
 DISTANCE_EDGES: Final = (1, 2, 3, 4, 6, 9, 14, 21)
 """First distance, in fibres, of each group that is taken to be alike."""
+FAR: Final = 4
+"""Places apart, out of `DISTANCE_EDGES`, from which pairs are known by their group's mean alone."""
 LEAST_SCATTER: Final = 0.3
 """Of pairs as far apart about their mean, relative: a few of them may agree by chance."""
 OVERLAP: Final = 0.05
@@ -119,6 +121,27 @@ class CrossTalk:
         # -d(u_j) = sum_i dX_ji u_i to first order, and the same of the reference times the ratio
         moved = light[None] - ratio[:, None] * reference[None]  # (F j, F i, C)
         return np.asarray(np.einsum("ji,jic->jc", self.stderr**2, moved**2))
+
+    def shared_changes(
+        self, light: FloatArray, reference: FloatArray, ratio: FloatArray
+    ) -> FloatArray:
+        """Change of `light` for one standard error of each far group of pairs, shape (G, F, C).
+
+        Pairs of fibres that are `FAR` places apart or more are fainter than their noise: what is
+        known of them is the mean of their group, whose error is the same in all of them.
+
+        Parameters
+        ----------
+        light, reference, ratio : ndarray of float64, shape (F, C)
+            As of `matrix_variance`.
+        """
+        place = np.arange(len(light))
+        group = np.searchsorted(DISTANCE_EDGES, np.abs(place[:, None] - place), side="right") - 1
+        moved = light[None] - ratio[:, None] * reference[None]
+        each = range(DISTANCE_EDGES.index(FAR), len(DISTANCE_EDGES))
+        return np.stack(
+            [-np.einsum("ji,jic->jc", np.where(group == g, self.stderr, 0.0), moved) for g in each]
+        )
 
 
 def no_crosstalk(count: int, colors: int) -> CrossTalk:

@@ -71,7 +71,7 @@ def probe(
     for seed, medium in (directed or {}).items():
         done = _subject(folder, medium, seed, sites=("cheek",), angles=(DIRECTIONS,))
         found, truth = _maps(folder, done, "anisotropy")
-        yield from of_directions(found, truth, float(medium.rpartition(",")[2]), f"{medium} {seed}")
+        yield from of_directions(found, truth, _farthest_deg(medium), f"{medium} {seed}")
         forget(folder, done)
 
 
@@ -197,7 +197,7 @@ def of_directions(
     found, truth
         With the anisotropy's document, and with true profiles in each direction.
     axis_deg
-        The medium's own: along it least is scattered.
+        The medium's own direction in which least is scattered.
     subject
         Of the trials.
 
@@ -231,6 +231,12 @@ def _maps(folder: Path, done: Simulated, want: str) -> tuple[SkinAppearance, Ski
         done.session, want=[want], out=folder / "maps", calibration=folder / "calibration"
     )
     return store.read(folder / "maps"), store.read(truth_of(done))
+
+
+def _farthest_deg(medium: str) -> float:
+    """Return the direction in which light goes farthest: where it is scattered least."""
+    strength, axis_deg = (float(number) for number in medium.split(",")[2:4])
+    return axis_deg if strength < 0.0 else axis_deg + 90.0
 
 
 def _width(relative: Floats) -> float:

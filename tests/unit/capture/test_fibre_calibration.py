@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from capture.calibration import store
 from capture.calibration.fibre import FibreCalibration, FibreError, calibrate_fibres
-from capture.calibration.fibre_crosstalk import measure_crosstalk
+from capture.calibration.fibre_crosstalk import CrossTalk, measure_crosstalk
 from capture.calibration.fibre_readings import FibreReadings
 from capture.calibration.fibre_spots import FibreSpots
 from capture.calibration.phantom import (
@@ -299,3 +299,21 @@ def test_a_certificate_is_read_and_its_faults_are_listed(tmp_path):
         read_certificate(path)
     with pytest.raises(CertificateError, match="cannot be read"):
         read_certificate(tmp_path / "none.json")
+
+
+def test_what_a_mean_of_far_pairs_has_wrong_moves_all_their_fibres_together():
+    count, rng = 12, np.random.default_rng(0)
+    light, reference, ratio = (rng.uniform(1.0, 9.0, (count, 3)) for _ in range(3))
+    place = np.arange(count)
+    error = 1e-6 * np.abs(place[:, None] - place)
+    nothing = np.zeros((count, 3))
+    matrix = CrossTalk(np.eye(count), error, nothing, nothing, nothing, True)
+    found = matrix.shared_changes(light, reference, ratio)
+    for edge, (low, high) in enumerate(((4, 6), (6, 9), (9, 14))):
+        for j in place:
+            pairs = [i for i in place if low <= abs(i - j) < high]
+            told = -sum((error[j, i] * (light[i] - ratio[j] * reference[i]) for i in pairs), 0.0)
+            np.testing.assert_allclose(found[edge, j], told, atol=1e-15)
+    # what lets through as much as the reference did is not moved: the gain had the same error
+    same = matrix.shared_changes(0.5 * reference, reference, np.full((count, 3), 0.5))
+    np.testing.assert_allclose(same, 0.0, atol=1e-18)
