@@ -100,7 +100,7 @@ class Prediction:
     draw of the misfit that `sigma` states: counting both would count it twice, and judging plans by
     it would choose those that suit this person by luck."""
     common: Floats
-    """(S, 3) the certificate's part."""
+    """(S, 3) the calibration's part: certificate and far cross-talk."""
     misfit: Floats
     """(S, 3) what stays without any noise."""
     valid: NDArray[np.bool_]
@@ -224,15 +224,18 @@ def _fits(look: Sight, setting: Setting, places: Sequence[int], *, noise: bool) 
     # gains are known from a series of all exposures on the phantom, as far as its light is known
     gain = _variance(look, look.phantom, exposure_series_s(), 4, 1.0) / look.phantom**2
     gain += look.phantom_error**2
+    mixed = _crosstalk(len(radius))
     profiles = []
     for k in places:
         value = look.reflectance[k]
         own = _variance(look, value, setting.exposures_s, setting.darks, setting.level)
         valid = np.isfinite(own)
         variance = np.where(valid, own, 0.0) if noise else np.zeros_like(own)
+        told = (value, look.phantom, value / look.phantom)
+        doubt, shared = mixed.matrix_variance(*told), mixed.shared_changes(*told)
         reflectance = FibreReflectance(
-            names, radius, value, variance + gain * value**2 + _crosstalk_variance(look, value),
-            value * look.common, valid, ~valid,
+            names, radius, value, variance + gain * value**2 + doubt,
+            np.concatenate([value * look.common, shared]), valid, ~valid,
         )  # fmt: skip
         head = Measurement(
             Placement(look.sites[k], 0.0, 0), len(setting.exposures_s), 1.0, math.nan, 5.0
@@ -436,18 +439,20 @@ def _variance(
         return np.asarray(1.0 / (told * look.pixels * np.square(level * look.unit)))
 
 
-def _crosstalk_variance(look: Sight, value: Floats) -> Floats:
-    """Return the variance that uncertain cross-talk adds, 1/mm^4, (F, 3).
+def _crosstalk(count: int) -> Any:
+    """Return cross-talk of none, known as well as a calibration leaves it.
 
     The nearest fibres are brighter than the farthest by a million times on skin and by a thousand
     on the phantom; what a calibration has wrong of their light in far spots cancels only as far as
     the two are alike.
     """
-    place = np.arange(len(value))
+    from capture.calibration.fibre_crosstalk import CrossTalk
+
+    place = np.arange(count)
     apart = np.minimum(np.abs(place[:, None] - place), len(CROSSTALK_ERROR) - 1)
+    nothing = np.zeros((count, 3))
     error = np.array(CROSSTALK_ERROR)[apart]
-    moved = value[None] - (value / look.phantom)[:, None] * look.phantom[None]
-    return np.asarray(np.einsum("ji,jic->jc", error**2, moved**2))
+    return CrossTalk(np.eye(count), error, nothing, nothing, nothing, True)
 
 
 def _between(look: Sight, found: Floats, sigma: Floats, good: NDArray[np.bool_]) -> Floats:
@@ -522,11 +527,11 @@ def _choice(
 def _why(look: Sight, whole: Prediction, target: float) -> str:
     """Say why no plan reaches what is wanted."""
     stays = 100.0 * median_of_normals(whole.misfit)
-    certificate = 100.0 * median_of_normals(whole.common)
+    calibration = 100.0 * median_of_normals(whole.common)
     return (
         f"sigma_tr: the rig's own series leave {100.0 * whole.median:.2g} %; without any noise "
-        f"layers unlike any homogeneous medium and the phantom's certificate leave {stays:.2g} %, "
-        f"the certificate alone {certificate:.2g} %; "
+        f"layers unlike any homogeneous medium and the calibration (the phantom's certificate, far "
+        f"cross-talk) leave {stays:.2g} %, the calibration alone {calibration:.2g} %; "
         + (
             "more exposures or placements will not help"
             if stays > 100.0 * target
