@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from skinrig import errors
+from skinrig import errors, kernel_cache
 from skinrig.commands import (
     analysing,
     capturing,
@@ -152,6 +152,7 @@ def _failed(error: BaseException, code: int, given: Sequence[str], *, say: bool 
 
 def run() -> None:
     """Entry point of the console script."""
+    kernel_cache.provide(os.environ)
     sys.exit(main())
 
 
