@@ -43,7 +43,9 @@ MEDIA: Final = (
 """Fractions in 1/mm of absorption and reduced scattering, and g."""
 SKIN: Final = ("II", "IV", "VI", "I", "III", "V")
 """Presets under the probe: a band of melanin each, twice."""
-DIRECTED: Final = "anisotropic:0.25,2,-1,0"
+DIRECTED: Final = ("anisotropic:0.25,2,-1,35", "anisotropic:0.25,2,1,110")
+"""Axes at which a turn the other way, or a quarter of a turn, shows: at 0 and 90 degrees the first
+cannot."""
 DOME: Final = ("I", "III", "V", "II", "IV", "VI")
 
 Trials = Iterable[Trial]
@@ -107,7 +109,7 @@ def _full() -> Mapping[str, Callable[[Path], Trials]]:
             folder,
             media,
             skin=skin,
-            directed=dict.fromkeys(range(FIRST_SEED, FIRST_SEED + 2), DIRECTED),
+            directed={FIRST_SEED + k: medium for k, medium in enumerate(DIRECTED)},
         ),
     }
 
@@ -123,7 +125,9 @@ def _small() -> Mapping[str, Callable[[Path], Trials]]:
 
 def _point(row: Covered, timing: Timing) -> Point:
     off = abs(100.0 * row.share - row.level)
-    away = [abs(100.0 * end - row.level) for end in row.interval]
+    low, high = (100.0 * end - row.level for end in row.interval)
+    # an interval of the coverage that holds the nominal one allows a distance of 0
+    least = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
     return Point(
         {
             "quantity": row.quantity, "skin": row.band, "nominal %": row.level,
@@ -135,7 +139,7 @@ def _point(row: Covered, timing: Timing) -> Point:
         },
         timing,
         off,
-        (min(off, *away), max(off, *away)),
+        (min(off, least), max(off, abs(low), abs(high))),
     )  # fmt: skip
 
 

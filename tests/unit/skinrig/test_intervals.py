@@ -1,0 +1,52 @@
+"""Points and media of the benchmark of intervals."""
+
+import numpy as np
+import pytest
+
+from reconstruction import anisotropy
+from skinrig.benchmark import Timing
+from skinrig.benchmarks import interval_trials_probe, intervals
+from skinrig.benchmarks.interval_coverage import Covered
+
+ONCE = Timing(1.0, (1.0, 1.0), 1.0, None)
+
+
+def point(share, interval):
+    return intervals._point(Covered("x", "any", 68, share, interval, 6, 1.0, "%"), ONCE)
+
+
+def test_an_interval_that_holds_the_nominal_coverage_allows_a_distance_of_0():
+    found = point(0.72, (0.60, 0.80))
+    assert found.error == pytest.approx(4.0)
+    assert found.error_interval == pytest.approx((0.0, 12.0))
+
+
+@pytest.mark.parametrize(("share", "interval"), [(0.5, (0.4, 0.6)), (0.86, (0.76, 0.96))])
+def test_an_interval_beside_it_does_not(share, interval):
+    found = point(share, interval)
+    assert found.error == pytest.approx(18.0)
+    assert found.error_interval == pytest.approx((8.0, 28.0))
+
+
+def test_media_show_an_axis_turned_the_other_way_or_across():
+    """10 degrees tell them apart: the axis is known to a few.
+
+    Rationale: at 0 and 90 degrees a direction and its mirror image are one; at 45 a direction
+    across is the mirror image.
+    """
+    for medium in intervals.DIRECTED:
+        true_deg = interval_trials_probe._farthest_deg(medium)
+        for wrong_deg in (-true_deg, true_deg + 90.0, 90.0 - true_deg):
+            turn = abs((wrong_deg - true_deg + 90.0) % 180.0 - 90.0)
+            assert turn >= 10.0
+
+
+@pytest.mark.parametrize("medium", intervals.DIRECTED)
+def test_the_estimator_finds_the_axis_that_media_are_judged_by(medium):
+    """Exact decays: least along the direction in which light goes farthest."""
+    true_deg = interval_trials_probe._farthest_deg(medium)
+    angle = np.radians(np.arange(8) * 22.5)
+    along = np.cos(2.0 * (angle - np.radians(true_deg)))
+    found = anisotropy.estimate(angle, (0.5 - 0.05 * along)[:, None] * np.ones(3), outliers=False)
+    turn = (np.degrees(found.axis_rad) - true_deg + 90.0) % 180.0 - 90.0
+    np.testing.assert_allclose(turn, 0.0, atol=2.0)
