@@ -7,7 +7,6 @@ comes next, or the real one. Boxes live as long as their world, not as long as t
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import math
 import threading
@@ -15,23 +14,21 @@ import time
 import zlib
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar, cast
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from capture.devices.camera import Exposure
-from capture.rig import LedLimits, Rig, View, load_rig
+from capture.rig import Rig, View, load_rig
 
-from .boxes.caliper import CaliperUnit
-from .boxes.controller import Controller, Device
-from .boxes.dome import DomeUnit, LedPulse
-from .boxes.flash import FlashPop, FlashUnit
-from .boxes.gradient_sphere import GradientSphereUnit, PatternLight
-from .boxes.probe import ProbeUnit, SourceLight
+from .boxes.controller import Controller
 from .faults import NO_FAULTS, Faults
+from .light_record import FlashPop, LedPulse, Light, LightRecord, PatternLight, SourceLight
 from .link import Link
+from .rig_boxes import Wiring, make_box
+from .scene_protocols import CaliperScene, ProbeScene, Scene
 from .suction import CameraCooler, HeadState, SuckedHead
 from .taped_skin import GripState, TapedSkin
 
@@ -54,68 +51,7 @@ __all__ = [
     "get",
 ]
 
-SERIAL_NUMBERS = {
-    "flash": "FL-0001",
-    "dome": "DM-0001",
-    "gradient_sphere": "GS-0001",
-    "caliper": "CA-0001",
-    "probe": "PR-0001",
-}
-RIG_OF_BOX = {
-    "flash": "flash",
-    "dome": "dome",
-    "gradient_sphere": "gradient",
-    "caliper": "gradient",
-    "probe": "probe",
-}
-"""Which rig that ships has a box."""
 TRANSCRIPT_LINES = 4096
-
-Light = FlashPop | LedPulse | PatternLight | SourceLight
-"""Light out of a box: a pop of the flash, or a stretch of an LED's, a pattern's or a fibre's."""
-
-
-class Scene(Protocol):
-    """What is in front of the cameras."""
-
-    def exposure(
-        self, view_name: str, *, pops: Sequence[Any], exposure_s: float, seed: int
-    ) -> NDArray[np.uint16]:
-        """Return the DN, shape (H, W), of one exposure lit by `pops`.
-
-        They are what the rig's box gives: `FlashPop` of the flash, `LedPulse` of the dome, or
-        `PatternLight` of the gradient sphere, clipped to the time in which the shutter was open.
-        """
-
-
-class CaliperScene(Protocol):
-    """What is in front of the cameras of a rig with a caliper."""
-
-    def exposure(
-        self,
-        view_name: str,
-        *,
-        pops: Sequence[Any],
-        exposure_s: float,
-        seed: int,
-        grip: GripState,
-    ) -> NDArray[np.uint16]:
-        """Return the DN, shape (H, W), of one exposure, see `Scene`; of skin held by `grip`."""
-
-
-class ProbeScene(Protocol):
-    """What is in front of the fibres of a rig with a contact probe."""
-
-    def exposure(
-        self,
-        view_name: str,
-        *,
-        pops: Sequence[Any],
-        exposure_s: float,
-        seed: int,
-        head: HeadState,
-    ) -> NDArray[np.uint16]:
-        """Return the DN, shape (H, W), of one exposure, see `Scene`; `head` is of its start."""
 
 
 class WorldClock:
@@ -189,10 +125,9 @@ class World:
         self.virtual = clock == "virtual"
         self.scene = scene
         self.faults = NO_FAULTS if faults is None else faults
-        self.pops: list[FlashPop] = []
-        self.pulses: list[LedPulse] = []
-        self.patterns: list[PatternLight] = []
-        self.sources: list[SourceLight] = []
+        self._light = light = LightRecord()
+        self.pops, self.pulses = light.pops, light.pulses
+        self.patterns, self.sources = light.patterns, light.sources
         self.grips: list[tuple[float, GripState]] = []
         self.skin: TapedSkin | None = None
         if self.rig.caliper is not None:
@@ -218,113 +153,16 @@ class World:
         self._name = ""
         self._shots_made = dict(shots_made or {})
         self._cameras: dict[str, CameraBody] = {}
-        self._dome: DomeUnit | None = None
-        self._sphere: GradientSphereUnit | None = None
-        self._probe: ProbeUnit | None = None
-        self._links = {name: self._make_box(name) for name in self.rig.boxes}
-
-    def _make_box(self, name: str) -> Link:
-        kinds = {
-            "flash": self._make_flash,
-            "dome": self._make_dome,
-            "gradient_sphere": self._make_sphere,
-            "caliper": self._make_caliper,
-            "probe": self._make_probe,
-        }
-        if name not in kinds:
-            raise ValueError(f"boxes: got {name!r}, expected one of {', '.join(kinds)}")
-        rng = self.rng_for("box", name)
-        box = Controller(
-            kinds[name](rng),
-            serial=self.faults.serial or SERIAL_NUMBERS[name],
-            protocol=self.faults.protocol,
-            rng=rng,
+        wiring = Wiring(
+            self.rig, self.faults, light, self._trigger, self._note_grip, self.skin, self.head
         )
+        self._links = {name: self._make_link(name, wiring) for name in self.rig.boxes}
+
+    def _make_link(self, name: str, wiring: Wiring) -> Link:
+        box = make_box(name, wiring, rng=self.rng_for("box", name))
         return Link(
             box, faults=self.faults, rng=self.rng_for("link", name), record=self._record_bytes
         )
-
-    def _make_flash(self, rng: np.random.Generator) -> Device:
-        return FlashUnit(
-            on_pop=self.pops.append,
-            on_trigger=self._trigger,
-            recycle_s=self.rig.recycle_s,
-            pops_per_min=self.rig.max_pops_per_min,
-            move_s=self.rig.polarizer_move_s,
-            misfire=self.faults.misfire,
-            slow_charge=self.faults.slow_charge,
-            lamp_dead=self.faults.lamp_dead,
-            heat=self.faults.heat,
-            interlock=self.faults.interlock,
-            rng=rng,
-        )
-
-    def _make_dome(self, rng: np.random.Generator) -> Device:
-        self._dome = DomeUnit(
-            self.rig.lights,
-            self.rig.leds or LedLimits(),
-            cameras=len(self.rig.views),
-            on_pulse=self.pulses.append,
-            on_trigger=self._trigger,
-            dead=self.faults.dead_leds,
-            weak=self.faults.weak_leds,
-            heat=self.faults.heat,
-            interlock=self.faults.interlock,
-        )
-        return self._dome
-
-    def _make_sphere(self, rng: np.random.Generator) -> Device:
-        self._sphere = GradientSphereUnit(
-            self.rig.lights,
-            self.rig.leds or LedLimits(),
-            cameras=len(self.rig.views),
-            move_s=self.rig.polarizer_move_s,
-            on_pattern=self.patterns.append,
-            on_trigger=self._trigger,
-            dead=self.faults.dead_leds,
-            weak=self.faults.weak_leds,
-            heat=self.faults.heat,
-            interlock=self.faults.interlock,
-        )
-        return self._sphere
-
-    def _make_caliper(self, rng: np.random.Generator) -> Device:
-        if self.rig.caliper is None or self.skin is None:
-            raise ValueError(
-                f"caliper: got none in rig {self.rig.name!r}, expected its description"
-            )
-        return CaliperUnit(
-            self.rig.caliper,
-            self.skin,
-            on_change=self._note_grip,
-            stall=self.faults.jaw_stall,
-            home_missed=self.faults.home_missed,
-            sensor_dead=self.faults.force_dead,
-            interlock=self.faults.interlock,
-            interlock_after=self.faults.interlock_after,
-            rng=rng,
-        )
-
-    def _make_probe(self, rng: np.random.Generator) -> Device:
-        if self.rig.probe is None or self.head is None:
-            raise ValueError(f"probe: got none in rig {self.rig.name!r}, expected its description")
-        self._probe = ProbeUnit(
-            self.rig.probe,
-            self.rig.lights[0],
-            self.rig.leds or LedLimits(),
-            self.head,
-            on_light=self.sources.append,
-            on_trigger=self._trigger,
-            shutter_stuck=self.faults.shutter_stuck,
-            shutter_jam=self.faults.shutter_jam,
-            gauge_dead_after=self.faults.gauge_dead_after,
-            interlock=self.faults.interlock,
-            interlock_after=self.faults.interlock_after,
-            dead=0 in self.faults.dead_leds,
-            weak=self.faults.weak_leds.get(0, 1.0),
-            rng=rng,
-        )
-        return self._probe
 
     def rng_for(self, *names: str) -> np.random.Generator:
         """Return a generator that depends on the world's seed and on `names` only."""
@@ -414,21 +252,12 @@ class World:
     def light_between(self, start: float, end: float) -> tuple[Light, ...]:
         """Return pops from `start` to `end`, both included, and LEDs' light clipped to them."""
         with self.lock:
-            now = self.now
-            pulses = [] if self._dome is None else self._dome.light_now(now)
-            patterns = [] if self._sphere is None else self._sphere.light_now(now)
-            sources = [] if self._probe is None else self._probe.light_now(now)
-            return (
-                *self.pops_between(start, end),
-                *_clipped(self.pulses, pulses, start, end),
-                *_clipped(self.patterns, patterns, start, end),
-                *_clipped(self.sources, sources, start, end),
-            )
+            return self._light.between(start, end, now=self.now)
 
     def pops_between(self, start: float, end: float) -> tuple[FlashPop, ...]:
         """Return the pops from `start` to `end`, both included, in s."""
         with self.lock:
-            return tuple(pop for pop in self.pops if start <= pop.t_s <= end)
+            return self._light.pops_between(start, end)
 
     def grip_at(self, t_s: float) -> GripState:
         """Return what the caliper held at a world time, s.
@@ -549,21 +378,6 @@ def get(name: str) -> World:
         known = ", ".join(_BENCH) or "none"
         raise KeyError(f"world: got {name!r}, expected a registered one: {known}")
     return _BENCH[name]
-
-
-_Switched = TypeVar("_Switched", bound=LedPulse | PatternLight | SourceLight)
-
-
-def _clipped(
-    ended: Sequence[_Switched], going_on: Sequence[_Switched], start: float, end: float
-) -> list[_Switched]:
-    """Return light, in the order in which it ended, clipped to what lies from start to end."""
-    first = bisect_right(ended, start, key=lambda light: light.t_off_s)
-    return [
-        dataclasses.replace(light, t_on_s=max(light.t_on_s, start), t_off_s=min(light.t_off_s, end))
-        for light in [*ended[first:], *going_on]
-        if light.t_on_s < end and light.t_off_s > start
-    ]
 
 
 def _dark_frame(view: View, rng: np.random.Generator) -> NDArray[np.uint16]:

@@ -28,7 +28,8 @@ from capture.rig import load_rig
 from rigsim import world as worlds
 from rigsim.faults import Faults
 from rigsim.link import Link, LinkStalled, Unplugged
-from rigsim.world import RIG_OF_BOX, World
+from rigsim.rig_boxes import RIG_OF_BOX
+from rigsim.world import World
 
 __all__ = ["Serial", "world_of_url"]
 

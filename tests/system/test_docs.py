@@ -138,7 +138,8 @@ def test_the_manual_lists_every_command_of_the_domes_box():
 )
 def test_the_manual_lists_every_command_of_a_later_rigs_boxes(box_name, heading):
     from capture.rig import load_rig
-    from rigsim.world import RIG_OF_BOX, World
+    from rigsim.rig_boxes import RIG_OF_BOX
+    from rigsim.world import World
 
     dome = World(load_rig("dome")).box("dome").device.commands()
     shared = dome if box_name == "gradient_sphere" else {}

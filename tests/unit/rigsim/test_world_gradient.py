@@ -13,8 +13,9 @@ from capture.devices.port import Port
 from capture.rig import load_rig
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.faults import Faults
+from rigsim.rig_boxes import RIG_OF_BOX, SERIAL_NUMBERS
 from rigsim.taped_skin import GripState
-from rigsim.world import RIG_OF_BOX, SERIAL_NUMBERS, World
+from rigsim.world import World
 
 RIG = load_rig("gradient").cropped(16)
 NAMES = (f"world-gradient-{number}" for number in itertools.count())
