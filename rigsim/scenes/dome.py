@@ -35,10 +35,11 @@ from rigsim.relief_shadow import ReliefShadow
 from rigsim.render import Caster
 from rigsim.scene_needs import Noise, SceneNeeds
 from rigsim.scenes import dome_truth, dome_views, flash_needs, olat
-from rigsim.scenes.dome_exposures import Exposures, Pulse, SceneError
+from rigsim.scenes.dome_exposures import Exposures, Pulse
 from rigsim.scenes.dome_glow import DomeGlow
 from rigsim.scenes.dome_needs import dome_needs, noise_of
 from rigsim.scenes.dome_rows import DomeRows
+from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.flash_needs import BOUNCES, LATERAL, LENS, SPECTRAL, WRINKLES
 from rigsim.scenes.olat import Hits, Lamp
 from rigsim.sensor import Sensor, sensor_of

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from capture.rig import View
 from rigsim.dome_build import BuiltDome
 from rigsim.mesh import Float32Array
+from rigsim.scenes.exposing import LitLight, full_power_s
 from rigsim.sensor import Sensor, expose
 
 POWER_DEVIATION: Final = 0.001
@@ -22,28 +23,12 @@ KEPT_BYTES: Final = 2**28
 """Latest frames that are kept, the more of the two, so that a second exposure costs nothing."""
 
 
-class SceneError(ValueError):
-    """A scene is asked for something that it does not hold."""
-
-
-class Pulse(Protocol):
+class Pulse(LitLight, Protocol):
     """A lit LED, as the world reports it, clipped to the exposure."""
 
     @property
     def led(self) -> int:
         """Index of the light in the rig."""
-
-    @property
-    def level(self) -> float:
-        """Fraction of full power, 0 to 1."""
-
-    @property
-    def t_on_s(self) -> float:
-        """World time at which it went on, s."""
-
-    @property
-    def t_off_s(self) -> float:
-        """World time at which it went off, s."""
 
 
 class Exposures:
@@ -98,14 +83,7 @@ class Exposures:
         rng = np.random.default_rng([self._seed, seed])
         light = np.zeros((view.height_px, view.width_px, 3), np.float32)
         for pulse in pops:
-            if not 0.0 <= pulse.level <= 1.0:
-                raise SceneError(f"level of LED {pulse.led}: got {pulse.level}, expected 0 to 1")
-            if not pulse.t_off_s >= pulse.t_on_s:
-                raise SceneError(
-                    f"pulse of LED {pulse.led}: got {pulse.t_on_s} to {pulse.t_off_s} s, "
-                    "expected an end after its beginning"
-                )
-            on_s = pulse.level * (pulse.t_off_s - pulse.t_on_s)
+            on_s = full_power_s(pulse, f"LED {pulse.led}")
             energy = on_s * (1.0 + POWER_DEVIATION * rng.standard_normal())
             if energy > 0.0:
                 middle = instant(0.5 * (pulse.t_on_s + pulse.t_off_s))

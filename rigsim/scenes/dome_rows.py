@@ -17,7 +17,7 @@ from rigsim.led_light import lobe_exponent
 from rigsim.mesh import Float32Array
 from rigsim.render import Caster
 from rigsim.scenes import dome_views
-from rigsim.scenes.dome_exposures import SceneError
+from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.olat import Hits, Lamp
 from rigsim.scenes.olat_vector import VectorLight
 from rigsim.subject import Subject

@@ -12,9 +12,7 @@ behind crossed films, whatever stands there later.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Final, Protocol
-from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +21,19 @@ from capture.rig import Rig, RigError, View
 from model import spectra
 from rigsim import landmarks, shading
 from rigsim.depth_of_field import facing_depths, lens_spread
-from rigsim.effect_sizes import exchange_share
 from rigsim.films import Films, films_of
 from rigsim.lateral import line_spread_mm
 from rigsim.mesh import Float32Array, Mesh
 from rigsim.relief_shadow import ReliefShadow
-from rigsim.render import Caster, camera_rays
+from rigsim.render import camera_rays
 from rigsim.scene_needs import Noise, SceneNeeds, strictest
-from rigsim.scenes import flash_needs
+from rigsim.scenes import flash_needs, flash_truth
+from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.flash_needs import BOUNCES, LATERAL, LENS, SPECTRAL, WRINKLES
+from rigsim.scenes.flash_stage import stage_of
 from rigsim.scenes.picture import Look, Picture
 from rigsim.scenes.skin_glow import SkinGlow, SurfaceLight, light_skin, light_surface
 from rigsim.sensor import Sensor, expose, sensor_of
-from rigsim.skin_bounce import SkinBounce, bounce_on
 from rigsim.subject import Subject
 from rigsim.targets import Target
 from rigsim.variant import VariantChoice
@@ -46,18 +44,8 @@ METER_LEVEL: Final = 0.8
 FLAT_LEVEL: Final = 0.9
 """Fraction of full scale of the integrating sphere in its strongest channel at power 1."""
 
-HAIR_LIMIT: Final = 0.02
-"""Pixels with more hair than this part are not skin."""
-
-LENS_LIMIT: Final = 0.01
-"""Pixels that get more of their light than this from off the skin, by the lens, are not skin."""
-
 POWER_DEVIATION: Final = 0.002
 """Relative standard deviation of a flash's energy from pop to pop."""
-
-
-class SceneError(ValueError):
-    """A scene is asked for something that it does not hold."""
 
 
 class Pop(Protocol):
@@ -78,47 +66,6 @@ class Pop(Protocol):
     @property
     def analyser_deg(self) -> float | None:
         """Reading of the analyser's rotator in degrees; ``None`` for that of the state."""
-
-
-@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
-class _Stage:
-    """What scenes of one geometry have in common, whatever the blood does."""
-
-    held: tuple[Mesh, object]
-    """The mesh and the normals; while they are held their ids are theirs."""
-    caster: Caster
-    light: dict[object, SurfaceLight] = field(default_factory=dict)
-    """Light on the face, by what it comes from."""
-    hollows: dict[str, float] = field(default_factory=dict)
-    """`exchange_share` of the mesh, once it was asked for."""
-    bounce: dict[str, SkinBounce] = field(default_factory=dict)
-    """How light goes from skin to skin, once a scene needed it."""
-
-    def share(self) -> float:
-        """Return `exchange_share` of the mesh."""
-        if not self.hollows:
-            self.hollows["share"] = exchange_share(self.caster)
-        return self.hollows["share"]
-
-    def exchange(self) -> SkinBounce:
-        """Return how light goes from skin to skin."""
-        if not self.bounce:
-            self.bounce["skin"] = bounce_on(self.caster)
-        return self.bounce["skin"]
-
-
-_stages: WeakValueDictionary[tuple[object, ...], _Stage] = WeakValueDictionary()
-
-
-def _stage(subject: Subject | Target, choice: VariantChoice | None) -> _Stage:
-    """Return the stage of a geometry; the same as long as any scene holds it."""
-    normal = subject.normal if isinstance(subject, Subject) else None
-    key = (id(subject.mesh), id(normal), choice)
-    stage = _stages.get(key)
-    if stage is None:
-        stage = _Stage((subject.mesh, normal), Caster(subject.mesh, choice=choice))
-        _stages[key] = stage
-    return stage
 
 
 class FlashScene:
@@ -212,7 +159,7 @@ class FlashScene:
         }
         self._weights = _light_weights(rig)
         self._choice = choice
-        self._stage = _stage(subject, choice)
+        self._stage = stage_of(subject, choice)
         self._caster = self._stage.caster
         self._glow: dict[str, SkinGlow] = {}
         self._pictures: dict[str, Picture] = {}
@@ -359,7 +306,8 @@ class FlashScene:
             ``normals``: unit, rig frame, with relief; ``position_mm``: rig frame;
             ``roughness``: GGX alpha; ``uv``: texture coordinates, (H, W, 2);
             ``hair``: part covered by hair (brows, lashes);
-            ``mask``: bool, pixels wholly on skin, whose light comes from skin within `LENS_LIMIT`.
+            ``mask``: bool, pixels wholly on skin, whose light comes from skin within
+            `rigsim.scenes.flash_truth.LENS_LIMIT`.
 
             All are of the face as it has moved. For a state other than "neutral" there are also
             ``melanin_at_rest``, ``hemoglobin_at_rest``: the fractions of this state as they would
@@ -376,13 +324,13 @@ class FlashScene:
             raise SceneError(f"truth: got the target {self.subject.name!r}, expected a face")
         view = self._view(view_name)
         picture = self._picture(view)
-        white = self.white_rgb(view.name)
         passes_deg = self.films.passes_deg(view, "crossed", None)
-        truth: dict[str, NDArray[np.generic]] = {**picture.maps, **self._blurred(view, picture)}
-        truth["shading"] = self._analysed(picture.shading, view, passes_deg)
-        truth["diffuse"] = picture.diffuse[:, :, 0] * white
-        truth["specular"] = picture.specular[:, :, :1] * white
-        truth["mask"] = _whole_skin(picture)
+        truth = flash_truth.maps_of(
+            picture,
+            self._blurred(view, picture),
+            shading=self._analysed(picture.shading, view, passes_deg),
+            white_rgb=self.white_rgb(view.name),
+        )
         if self.state != "neutral":
             truth |= self._at_rest(view, truth)
         return truth
@@ -491,13 +439,15 @@ class FlashScene:
     def _blurred(self, view: View, picture: Picture) -> Mapping[str, Float32Array]:
         """Return the maps that are blurred as the light is; nothing but the truth needs them."""
         subject = self.subject
-        names = ("reflectance", "melanin", "hemoglobin")
         if not self.lateral or not isinstance(subject, Subject):
-            return {f"{name}_blurred": picture.maps[name] for name in names}
+            return flash_truth.unblurred_maps(picture)
         if view.name not in self._blurs:
             look = Look(self.rig, view, self.films, self._weights, self.subpixels)
-            maps = look.blurred_maps(subject, self.state, self._skin_glow(view))
-            self._blurs[view.name] = look.at_maps(self._caster, subject, maps).maps
+            glow = self._skin_glow(view)
+            caster = self._stage.caster
+            self._blurs[view.name] = flash_truth.blurred_maps(
+                look, caster, subject, self.state, glow
+            )
         return self._blurs[view.name]
 
     def _at_rest(
@@ -506,21 +456,10 @@ class FlashScene:
         """Return the fractions of this state as seen on the face at rest."""
         subject = self.subject
         if not isinstance(subject, Subject) or subject.rest is None:
-            return {f"{name}_at_rest": moved[name] for name in ("melanin", "hemoglobin", "mask")}
+            return flash_truth.unmoved_maps(moved)
         rest = subject.rest
-        look = self._look(view, rest.mesh)
-        layers = {
-            "melanin": rest.melanin,
-            "hemoglobin": rest.hemoglobin(self.state),
-            "hair": rest.hair,
-        }
-        stage = _stage(rest, self._choice)
-        picture = look.at_maps(stage.caster, rest, layers)
-        return {
-            "melanin_at_rest": picture.maps["melanin"],
-            "hemoglobin_at_rest": picture.maps["hemoglobin"],
-            "mask_at_rest": _whole_skin(picture),
-        }
+        caster = stage_of(rest, self._choice).caster
+        return flash_truth.maps_at_rest(self._look(view, rest.mesh), caster, rest, self.state)
 
     def _look(self, view: View, mesh: Mesh) -> Look:
         spread = None
@@ -543,12 +482,6 @@ class FlashScene:
                 picture = look.at_target(self._caster, self.subject)
             self._pictures[view.name] = picture
         return self._pictures[view.name]
-
-
-def _whole_skin(picture: Picture) -> NDArray[np.bool_]:
-    """Return the pixels that are wholly on skin, and get light from there alone."""
-    whole = (picture.coverage > 1.0 - 1e-6) & (picture.reached > 1.0 - LENS_LIMIT)
-    return whole & (picture.maps["hair"] < HAIR_LIMIT)
 
 
 def _light_weights(rig: Rig) -> NDArray[np.float64]:

@@ -19,7 +19,8 @@ from rigsim import landmarks
 from rigsim.mesh import Float32Array
 from rigsim.perfusion_course import Course, with_blood
 from rigsim.scene_needs import SceneNeeds, unmodeled
-from rigsim.scenes.flash import POWER_DEVIATION, FlashScene, SceneError
+from rigsim.scenes.exposing import SceneError
+from rigsim.scenes.flash import POWER_DEVIATION, FlashScene
 from rigsim.sensor import expose
 from rigsim.subject import Subject
 

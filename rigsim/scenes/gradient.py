@@ -29,6 +29,7 @@ from rigsim.mesh import Float32Array
 from rigsim.microrelief import MicroSkin
 from rigsim.patch_motion import PatchMotion, Pose, shifted
 from rigsim.scene_needs import Noise, SceneNeeds
+from rigsim.scenes.exposing import LitLight, SceneError, full_power_s
 from rigsim.scenes.flash_needs import BOUNCES, LATERAL, SHADOWS
 from rigsim.scenes.glass_ball import ball_center_mm, ball_stokes
 from rigsim.scenes.gradient_lighting import Lighting, light_skin
@@ -68,28 +69,12 @@ KEPT_RELIEFS: Final = 4
 """Stretched patches that are kept."""
 
 
-class SceneError(ValueError):
-    """A scene is asked for something that it does not hold."""
-
-
-class Pattern(Protocol):
+class Pattern(LitLight, Protocol):
     """A stretch of light, see `rigsim.boxes.gradient_sphere.PatternLight`."""
 
     @property
     def pattern(self) -> str:
         """One of `rigsim.sphere_build.PATTERN_WEIGHTS`."""
-
-    @property
-    def level(self) -> float:
-        """Fraction of full power, 0 to 1."""
-
-    @property
-    def t_on_s(self) -> float:
-        """World time at which it went on, s."""
-
-    @property
-    def t_off_s(self) -> float:
-        """World time at which it went off, s."""
 
     @property
     def analyser_deg(self) -> float:
@@ -344,14 +329,7 @@ class GradientScene:
         rng = np.random.default_rng([self.seed, seed])
         light = np.zeros((self._view.height_px, self._view.width_px), np.float32)
         for pop in pops:
-            if not 0.0 <= pop.level <= 1.0:
-                raise SceneError(f"level of {pop.pattern!r}: got {pop.level}, expected 0 to 1")
-            if not pop.t_off_s >= pop.t_on_s:
-                raise SceneError(
-                    f"pattern {pop.pattern!r}: got {pop.t_on_s} to {pop.t_off_s} s, "
-                    "expected an end after its beginning"
-                )
-            energy = pop.level * (pop.t_off_s - pop.t_on_s)
+            energy = full_power_s(pop, f"pattern {pop.pattern!r}")
             energy *= 1.0 + POWER_DEVIATION * rng.standard_normal()
             if energy > 0.0 and any(_weights(pop.pattern)):
                 light += np.float32(energy) * self.radiance(

@@ -22,6 +22,7 @@ from rigsim.probe_build import ProbeBuild, build_probe, unit_images
 from rigsim.probe_profile import Profile, Profiles
 from rigsim.probe_tissue import ProbedTissue, TissueError
 from rigsim.scene_needs import Noise, SceneNeeds
+from rigsim.scenes.exposing import LitLight, SceneError, full_power_s
 from rigsim.scenes.probe_needs import probe_needs
 from rigsim.sensor import Sensor, expose, sensor_of
 from rigsim.suction import HeadState
@@ -59,24 +60,8 @@ PHOTONS: Final = 200_000
 """Photons for each site and angle."""
 
 
-class SceneError(ValueError):
-    """A scene is asked for something that it does not hold."""
-
-
-class Light(Protocol):
+class Light(LitLight, Protocol):
     """A stretch of light, see `rigsim.boxes.source_shutter.SourceLight`."""
-
-    @property
-    def level(self) -> float:
-        """Fraction of full power, 0 to 1."""
-
-    @property
-    def t_on_s(self) -> float:
-        """World time at which it went on, s."""
-
-    @property
-    def t_off_s(self) -> float:
-        """World time at which it went off, s."""
 
     @property
     def fibre(self) -> int | None:
@@ -252,14 +237,7 @@ class ProbeScene:
         rng = np.random.default_rng([self.seed, seed])
         total = np.zeros((len(self.build.gain), 3))
         for pop in pops:
-            if not 0.0 <= pop.level <= 1.0:
-                raise SceneError(f"level: got {pop.level}, expected 0 to 1")
-            if not pop.t_off_s >= pop.t_on_s:
-                raise SceneError(
-                    f"light: got {pop.t_on_s} to {pop.t_off_s} s, "
-                    "expected an end after its beginning"
-                )
-            energy = pop.level * (pop.t_off_s - pop.t_on_s)
+            energy = full_power_s(pop, "the source")
             energy *= 1.0 + self.build.ripple * float(rng.standard_normal())
             total += max(energy, 0.0) * self.fibre_light(head, fibre=pop.fibre)
         if (not head.placed and head.site != CAP) or not head.site:

@@ -12,7 +12,8 @@ from rigsim.dome_build import BuiltDome, Tolerances, bend, build
 from rigsim.head_motion import MotionError, head_motion
 from rigsim.led_light import METER_RATE_PER_S
 from rigsim.scenes import olat
-from rigsim.scenes.dome import DomeScene, SceneError
+from rigsim.scenes.dome import DomeScene
+from rigsim.scenes.exposing import SceneError
 from rigsim.subject import make_subject
 from rigsim.targets import make_target
 from rigsim.variant import VariantChoice, choose_variant

@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 
 from capture.rig import load_rig
+from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.films import IDEAL
 from rigsim.microrelief import make_micro_skin
 from rigsim.patch_motion import PatchMotion
-from rigsim.scenes.gradient import (
-    FLAT_REFLECTANCE,
-    METER_RATE_PER_S,
-    GradientScene,
-    SceneError,
-)
+from rigsim.scenes.exposing import SceneError
+from rigsim.scenes.gradient import FLAT_REFLECTANCE, METER_RATE_PER_S, GradientScene
 from rigsim.scenes.gradient_resolution import Waves, wavy_scene
 from rigsim.sensor import fixed_pattern
 from rigsim.sphere_build import PATTERN_WEIGHTS, build_sphere
@@ -210,6 +207,12 @@ def test_nonsense_is_refused(rig, skin, scene):
         scene.radiance("full")
     with pytest.raises(SceneError, match="pattern: got 'w'"):
         scene.radiance("w", grip=NEUTRAL)
+    for light, message in (
+        (PatternLight("full", 1.5, 0.0, 0.01, 0.0), "level of pattern 'full': got 1.5"),
+        (PatternLight("x", 1.0, 0.02, 0.01, 0.0), "light of pattern 'x': got 0.02 to 0.01 s"),
+    ):
+        with pytest.raises(SceneError, match=message):
+            scene.exposure("cam", pops=[light], exposure_s=0.1, seed=0, grip=NEUTRAL)
     with pytest.raises(SceneError, match="sectors"):
         GradientScene(rig, skin, sectors=7)
     with pytest.raises(SceneError, match="subject"):

@@ -19,7 +19,8 @@ from rigsim.probe_build import (
     unit_images,
 )
 from rigsim.probe_tissue import HomogeneousTissue
-from rigsim.scenes.probe import DARK_E_PER_S, METER_RATE_PER_S, ProbeScene, SceneError
+from rigsim.scenes.exposing import SceneError
+from rigsim.scenes.probe import DARK_E_PER_S, METER_RATE_PER_S, ProbeScene
 from rigsim.suction import HeadState
 
 RIG = load_rig("probe")

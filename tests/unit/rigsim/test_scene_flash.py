@@ -10,7 +10,8 @@ import pytest
 from capture.calibration.chart import find_chart
 from capture.rig import Rig, load_rig
 from rigsim.films import IDEAL, FilmError, Films, films_of
-from rigsim.scenes.flash import FLAT_LEVEL, METER_LEVEL, FlashScene, SceneError
+from rigsim.scenes.exposing import SceneError
+from rigsim.scenes.flash import FLAT_LEVEL, METER_LEVEL, FlashScene
 from rigsim.sensor import sensor_of
 from rigsim.subject import Subject, make_subject
 from rigsim.targets import make_target, patch_centers_mm
