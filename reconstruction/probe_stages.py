@@ -25,7 +25,7 @@ from reconstruction.evidence import Evidence, EvidenceError
 from reconstruction.probe_images import Measurement, ProbeImages
 from reconstruction.subsurface import SubsurfaceFit
 
-REVISION = 4
+REVISION = 5
 """Grows when the code of a stage changes its result, so that older results are computed again."""
 
 MAPS = ("profiles", "subsurface", "anisotropy", "translucency")
@@ -42,7 +42,8 @@ FALSE_ALARMS = 0.01
 """Chance at which isotropic tissue is called anisotropic, per site and channel."""
 
 UNLIKE = 0.03
-"""Relative misfit from which a profile is that of no homogeneous medium, but of layered tissue."""
+"""Relative misfit from which a bent profile is that of no homogeneous medium, but of layered
+tissue. What each fibre has off by itself, as by dirt on it, bends none."""
 
 Floats = NDArray[np.float64]
 
@@ -265,7 +266,7 @@ def fit_profiles(
         "source_core_mm": probe.source_core_mm,
     }
     fit = subsurface.invert(first.radius_mm, every, method=method, **told)
-    if np.any(unlike := fit.model_error[0] > UNLIKE):
+    if np.any(unlike := fit.bent[0] & (fit.model_error[0] > UNLIKE)):
         if method == METHODS[0]:
             other = subsurface.nearest_medium(first.radius_mm, every, **told)
         else:

@@ -32,6 +32,10 @@ CLEAR = 0.2
 """Standard error of log sigma_tr up to which its interval is symmetric in the logarithm."""
 SHARE = 0.6827
 """Of the interval."""
+BY_CHANCE = 2.0
+"""Standard deviations of the correlation of independent neighbours up to which it says nothing."""
+MOST_OFF = 2.0
+"""Times the misfit that a fibre counts there at most: one must not hide what all others say."""
 
 
 class Outcome(IntFlag):
@@ -93,6 +97,10 @@ class SubsurfaceFit:
     model_error : ndarray, shape (...)
         Relative error of the model at all fibres that explains a misfit; the fit and its standard
         errors are made with it. 0 without.
+    bent : ndarray of bool, shape (...)
+        The misfit is one of the profile: neighbouring fibres agree about it by more than chance.
+        Tissue that is none of the model's bends a profile smoothly, while fibres that are each off
+        by themselves, as by dirt, do not agree. False without a misfit.
     used : ndarray of bool, shape (..., F)
     left_out : ndarray of uint8, shape (..., F)
         Index into `LEFT_OUT`, 0 where used.
@@ -124,6 +132,7 @@ class SubsurfaceFit:
     p_value: Floats
     inflation: Floats
     model_error: Floats
+    bent: Bools
     used: Bools
     left_out: NDArray[np.uint8]
     outcome: Codes
@@ -258,6 +267,7 @@ def judged(
         p_value=p_value.reshape(shape),
         inflation=inflation.reshape(shape),
         model_error=batch.spread.reshape(shape),
+        bent=_bent(batch).reshape(shape),
         used=batch.used.reshape((*shape, fibres_in_all)),
         left_out=left_out.reshape((*shape, fibres_in_all)),
         outcome=outcome.reshape(shape),
@@ -278,6 +288,26 @@ def _residuals(batch: ProfileBatch) -> Floats:
     residual = np.zeros(batch.y.shape)
     np.divide(batch.y - value, np.sqrt(batch.total), out=residual, where=batch.used)
     return residual
+
+
+def _bent(batch: ProfileBatch) -> Bools:
+    """Return whose neighbouring fibres agree about the misfit by more than chance, (N,).
+
+    By their correlation, of fibres as far as their noise is below the misfit: that of n
+    independent ones is off from 0 by 1 / sqrt(n).
+    """
+    there = batch.used & (batch.spread[:, None] > 0.0)
+    m, y = np.where(there, batch.predicted, 1.0), np.where(there, batch.y, 0.0)
+    noise = np.where(there, batch.variance, 0.0) / (1.0 if batch.logarithmic else m**2)
+    square = np.broadcast_to(batch.spread[:, None] ** 2, y.shape)
+    share = np.divide(square, square + noise, out=np.zeros(y.shape), where=there)
+    off = y - np.log(m) if batch.logarithmic else y / m - 1.0
+    most = MOST_OFF * batch.spread[:, None]
+    off = share * np.clip(off, -most, most)
+    pairs = np.maximum((share[:, 1:] * share[:, :-1]).sum(axis=1), 1e-290)
+    alone = np.maximum((share**2).sum(axis=1), 1e-290)
+    alike = (off[:, 1:] * off[:, :-1]).sum(axis=1) / pairs
+    return np.asarray(alike > BY_CHANCE / np.sqrt(pairs) * (off**2).sum(axis=1) / alone)
 
 
 def _repeats(residual: Floats) -> Floats:

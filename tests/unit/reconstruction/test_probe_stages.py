@@ -142,6 +142,20 @@ def test_a_profile_dimmed_by_a_layer_on_top_is_fitted_up_to_a_factor():
     assert fit_of(documents([profile()])[1], "photon_table")["factor"] == 1.0
 
 
+def test_fibres_that_are_off_each_by_itself_make_no_layers():
+    """Twenty draws of 5 % a fibre, as of dirt since the calibration; none is stated as noise."""
+    rng = np.random.default_rng(8)
+    torn = [profile(noise=1e-3, repeat=k) for k in range(20)]
+    for one in torn:
+        one.reflectance.reflectance_per_mm2[:] *= np.exp(0.05 * rng.standard_normal((28, 3)))
+    fits = probe_stages.fit_profiles(torn, PROBE)
+    layered = np.array([fit.fit.scale != 1.0 for fit in fits])
+    off = np.array([np.log(fit.fit.sigma_tr_per_mm / SIGMA_TR) / fit.log_stderr for fit in fits])
+    assert np.array([fit.fit.model_error > probe_stages.UNLIKE for fit in fits]).mean() > 0.9
+    assert layered.mean() <= 0.05
+    assert 0.5 < np.sqrt(np.mean(off[~layered] ** 2)) < 1.4
+
+
 def test_a_turn_of_the_head_is_fitted_as_one_tissue_layered_where_all_directions_are_dimmed():
     """What dims in some directions and brightens in others is no layer: none gets a factor."""
 
