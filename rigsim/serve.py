@@ -14,6 +14,7 @@ import logging
 import os
 import selectors
 import threading
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Self
 
@@ -46,6 +47,7 @@ def serve(
     seed: int = 0,
     scene: Scene | CaliperScene | ProbeScene | None = None,
     faults: Faults | None = None,
+    shots_made: Mapping[str, int] | None = None,
     world: World | None = None,
 ) -> Served:
     """Serve the boxes and cameras of a rig until the result is closed.
@@ -61,7 +63,7 @@ def serve(
         order of the rig, then all cameras one.
     allow_remote
         Permit an address that other machines can reach.
-    seed, scene, faults
+    seed, scene, faults, shots_made
         Of the world that is made, see `World`; without `faults`, bytes take no time beyond that
         of the pty or the network.
     world
@@ -87,7 +89,9 @@ def serve(
     if world is None:
         rig = rig_name if isinstance(rig_name, Rig) else load_rig(rig_name)
         faults = Faults(baud=0.0) if faults is None else faults
-        world = World(rig, seed=seed, clock="real", scene=scene, faults=faults)
+        world = World(
+            rig, seed=seed, clock="real", scene=scene, faults=faults, shots_made=shots_made
+        )
     if world.virtual:
         raise ServeError("clock: got a virtual one, expected 'real': other programs share our time")
     return Served(world, pty=pty, host_port=_host_port(tcp, allow_remote))

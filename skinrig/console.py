@@ -34,6 +34,17 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
+def counted(number: int, noun: str) -> str:
+    """Return how many there are of what a noun with a plural in s names.
+
+    Examples
+    --------
+    >>> counted(1, "photograph"), counted(0, "frame")
+    ('1 photograph', '0 frames')
+    """
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 @dataclass(slots=True)
 class Console:
     """Where a command writes.

@@ -17,6 +17,7 @@ import numpy as np
 from model import store
 from reconstruction import pipeline
 from skinrig.calibrating.calibrate import calibrate
+from skinrig.light_safety import light_rows
 from skinrig.simulating.simulation import Simulated, simulate_session
 
 FLASH_SUBJECTS = ("II", "IV")
@@ -158,7 +159,7 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
         {
             "title": "Light of the dome's capture",
             "head": ["figure", "value"],
-            "rows": [[name, value] for name, value in capture.light.items()],
+            "rows": [list(row) for row in light_rows(capture.light)],
         }
     )
     found.tables.append(_left_out("dome", capture))
@@ -194,7 +195,7 @@ def _gradient(out: Path, seed: int, share: Share, width_px: int | None, found: F
         {
             "title": "Light of a state's scan in the gradient sphere",
             "head": ["figure", "value"],
-            "rows": [[name, value] for name, value in capture.light.items()],
+            "rows": [list(row) for row in light_rows(capture.light)],
         }
     )
     found.tables.append(_left_out("gradient sphere", capture))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Final
 
 from capture.plan import Plan
 from capture.plan.dose import dose_report
@@ -10,6 +11,42 @@ from capture.plan.fibre_light import SKIN_APERTURE_MM, fibre_light
 from capture.plan.flicker import flicker_report
 from capture.plan.gradient import scan_duty, states
 from capture.rig import LedLimits, Rig
+
+WORDS: Final[Mapping[str, str]] = {
+    "flashes_per_s": "flashes in the worst second",
+    "flicker_rms": "flicker of 3 to 65 Hz, root mean square over the mean",
+    "open_eyes": "open eyes",
+    "led": "LED that gives most",
+    "led_ws": "energy from that LED, Ws",
+    "limit_ws": "energy from an LED that is allowed, Ws",
+    "blue_share": "of the blue-light limit of one that is stared at, %",
+    "eye_j_m2": "light at the eyes, J/m²",
+    "state_s": "light in a state of the skin, s",
+    "duty": "mean level of an LED",
+    "placement_ws": "energy in a placement, Ws",
+    "skin_w_m2": "light into the skin, W/m²",
+    "stare_s": "until an eye at the bare fibre would be at its blue-light limit, s",
+}
+"""What the figures of `light_figures` are, for tables that people read."""
+
+
+def light_rows(figures: Mapping[str, float | str]) -> list[tuple[str, float | str]]:
+    """Return figures of `light_figures` in words, with units, for a table.
+
+    Parameters
+    ----------
+    figures
+        By the names that `light_figures` gives them.
+
+    Examples
+    --------
+    >>> light_rows({"open_eyes": "allowed", "blue_share": 0.25})
+    [('open eyes', 'allowed'), ('of the blue-light limit of one that is stared at, %', 25.0)]
+    """
+    return [
+        (WORDS[name], 100 * float(value) if name == "blue_share" else value)
+        for name, value in figures.items()
+    ]
 
 
 def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:

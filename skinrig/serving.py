@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from capture.rig import Probe, Rig, load_rig
+from capture.session import Session
 from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
+from skinrig.simulating.shot_numbers import shots_made
 from skinrig.simulating.simulation import SIZES, SimulationError
 
 if TYPE_CHECKING:
@@ -34,6 +38,7 @@ def serve_rig(
     size: str,
     seed: int,
     site: str | None = None,
+    resume: Path | None = None,
     seconds: float | None = None,
 ) -> None:
     """Print the addresses of boxes and cameras, one ``NAME URL`` a line, and serve.
@@ -55,6 +60,9 @@ def serve_rig(
         Permit an address that other machines reach.
     subject, size, seed, site
         As for a simulation.
+    resume
+        Session of which an earlier server of the same seed made the frames that there are: noise is
+        drawn by the number of a shot, and shots are counted on from those. None: from 0 on.
     seconds
         How long; None serves until Ctrl-C.
     """
@@ -63,6 +71,7 @@ def serve_rig(
     if size not in SIZES:
         raise SimulationError(f"size: got {size!r}, expected one of {', '.join(SIZES)}")
     rig = load_rig(rig_name)
+    made = _shots_made(resume, rig)
     if site is not None and rig.caliper is None:
         raise SimulationError("site: only the gradient rig knows of it; leave it out")
     if "gradient_sphere" in rig.boxes:
@@ -82,7 +91,9 @@ def serve_rig(
         width = (simulating_dome if dome else flash).WIDTHS_PX[size]
         rig = rig.resized(width) if width != rig.views[0].width_px else rig
         scene = _dome_scene(rig, subject, seed) if dome else _flash_scene(rig, subject, seed)
-    with serve(rig, pty=pty, tcp=tcp, allow_remote=allow_remote, seed=seed, scene=scene) as served:
+    with serve(
+        rig, pty=pty, tcp=tcp, allow_remote=allow_remote, seed=seed, scene=scene, shots_made=made
+    ) as served:
         for name, url in served.addresses.items():
             print(f"{name} {url}", flush=True)
         boxes = " ".join(f"--port {n}={served.addresses[n]}" for n in rig.boxes)
@@ -98,6 +109,18 @@ def serve_rig(
         except KeyboardInterrupt:
             print("no longer served; the lights are dark", file=sys.stderr)
             raise
+
+
+def _shots_made(session: Path | None, rig: Rig) -> Mapping[str, int]:
+    """Return the shots that a session's cameras have made; none without a session."""
+    if session is None:
+        return {}
+    opened = Session.open(session)
+    if opened.rig.name != rig.name:
+        raise SimulationError(
+            f"resume: got a session of rig {opened.rig.name!r}, expected one of {rig.name!r}"
+        )
+    return shots_made(opened)
 
 
 def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:

@@ -66,7 +66,10 @@ def read_contents(path: Path) -> Contents:
 
     def no_session() -> SessionError:
         advice = "Name the folder of a session; skinrig simulate and skinrig capture make one."
-        found = "no such folder" if not path.is_dir() else f"no {MANIFEST} in it"
+        if path.is_dir():
+            found = f"no {MANIFEST} in it"
+        else:
+            found = "a file" if path.exists() else "no such folder"
         faults = [Fault("folder", found, f"a folder with {MANIFEST}")]
         if (path / JOURNAL).is_file() and (path / JOURNAL).stat().st_size > 0:
             advice = f"Restore {MANIFEST} from a copy: frames were committed here."
@@ -74,6 +77,8 @@ def read_contents(path: Path) -> Contents:
             return SessionDamage(what, where=str(path), faults=faults, advice=advice)
         return NotASession("is not a session", where=str(path), faults=faults, advice=advice)
 
+    if path.is_file():
+        raise no_session()
     where = path / MANIFEST
     data = read_file(where, limit=MAX_MANIFEST_BYTES, what="manifest", missing=no_session)
     manifest, seal = decode(data, where=str(where))

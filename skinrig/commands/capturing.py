@@ -27,7 +27,7 @@ from skinrig.commands.options import (
     Sites,
     Steps,
 )
-from skinrig.console import Console
+from skinrig.console import Console, counted
 
 
 def capture(
@@ -111,6 +111,13 @@ def serve(
     site: Site = None,
     size: Annotated[str, typer.Option(help="small or full.")] = "small",
     seed: Seed = 0,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            help="Session that was captured from an earlier server of this rig and seed and is to "
+            "be gone on with: noise of its shots does not come again."
+        ),
+    ] = None,
 ) -> None:
     """Serve a simulated rig to any client; the first lines are the addresses.
 
@@ -120,7 +127,7 @@ def serve(
 
     serve_rig(
         rig, pty=pty, tcp=tcp, allow_remote=anywhere, subject=subject, size=size, seed=seed,
-        site=site,
+        site=site, resume=resume,
     )  # fmt: skip
 
 
@@ -140,7 +147,7 @@ def verify(
     for text in found.problems:
         console.say(f"damaged: {text}")
     console.say(
-        f"{session}: {'sound' if found.ok else 'DAMAGED'}, {found.frames} frames, "
+        f"{session}: {'sound' if found.ok else 'DAMAGED'}, {counted(found.frames, 'frame')}, "
         f"{found.bytes / 1e6:.1f} MB"
     )
     console.document(

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 import typer
 
 from skinrig.commands.options import Json, Out
-from skinrig.console import Console
+from skinrig.console import Console, counted
 from skinrig.errors import UsageError
 
 NEXT: Final[Mapping[str, str]] = {
@@ -142,7 +142,7 @@ def export(
     after = NEXT.get(to, "hand the folder on; `ascmhl verify` tells whether it is still whole")
     for what, why in done.left_out:
         console.say(f"left out: {what}: {why}")
-    console.say(f"{done.path}: {done.files} files, listed in {done.manifest}")
+    console.say(f"{done.path}: {counted(done.files, 'file')}, listed in {done.manifest}")
     console.say(f"next: {after}")
     console.document(
         "skinrig.export/1",

@@ -9,7 +9,7 @@ import typer
 
 from skinrig.commands.help import Subcommands
 from skinrig.commands.options import Consent, ConsentExpires, Json, Out
-from skinrig.console import Console
+from skinrig.console import Console, counted
 
 import_app = typer.Typer(
     cls=Subcommands, help="Bring in what other devices made.", no_args_is_help=True
@@ -43,7 +43,9 @@ def import_photos(
         console.say(f"assumed: {text}")
     for name in done.ignored:
         console.say(f"ignored: {name}")
-    console.say(f"{done.path}: {done.frames} photographs, states {', '.join(done.states)}")
+    console.say(
+        f"{done.path}: {counted(done.frames, 'photograph')}, states {', '.join(done.states)}"
+    )
     state = "" if "neutral" in done.states else f" --state {done.states[0]}"
     console.say(
         f"next: skinrig reconstruct {out} --want melanin,hemoglobin --out appearance{state}"
@@ -122,7 +124,7 @@ def import_lp(
     )  # fmt: skip
     for text in done.assumed:
         console.say(f"assumed: {text}")
-    console.say(f"{done.path}: {done.frames} pictures, lights of {done.lights}")
+    console.say(f"{done.path}: {counted(done.frames, 'picture')}, lights of {done.lights}")
     console.say(f"next: skinrig reconstruct {out} --want normals,albedo --out appearance")
     console.document(
         "skinrig.import/1",

@@ -27,7 +27,7 @@ from skinrig.commands.options import (
     Sites,
     Steps,
 )
-from skinrig.console import Console
+from skinrig.console import Console, counted
 
 
 def simulate(
@@ -175,7 +175,8 @@ def simulate(
         plan=None if plan is None else read_plan(plan), leave_out=names_of(leave_out) or (),
     )  # fmt: skip
     console.say(
-        f"{done.session}: {done.frames} frames" + (f", truth in {done.truth}" if done.truth else "")
+        f"{done.session}: {counted(done.frames, 'frame')}"
+        + (f", truth in {done.truth}" if done.truth else "")
     )
     console.say(f"next: {after_session(rig, out, target if sequence is None else 'sequence')}")
     console.document("skinrig.simulate/1", done.document())

@@ -28,6 +28,12 @@ FORMATS: Final[Mapping[str, str]] = {
 """Format to the module of this package whose ``write`` makes it: each imports its own libraries."""
 
 
+SURFACES: Final = ("mtlx", "gltf", "usd")
+"""Formats of a surface in space, which a dome's maps hold and a photograph's do not."""
+_OF_A_SURFACE: Final = ("position", "normals", "normals_refined", "r_d")
+"""Maps of which a dome's reconstruction holds one at least."""
+
+
 def writer(to: str) -> Write:
     """Return what writes a format of `FORMATS`.
 
@@ -77,7 +83,7 @@ def export_appearance(
     capture.session.ConsentError
         Where a subject has not agreed to the use, or not any more.
     ExportError
-        For an unknown format, or a folder that exists.
+        For an unknown format, one of surfaces for maps of none, or a folder that exists.
     model.store.StoreError
         For a folder that is none of maps, or damaged.
     ValueError
@@ -87,6 +93,12 @@ def export_appearance(
         raise ExportError(f"to: got {to!r}, expected one of {', '.join(FORMATS)}")
     target = fresh(out)
     appearance = allowed(appearance_path, use, today=today)
+    if to in SURFACES and not any(name in appearance.maps for name in _OF_A_SURFACE):
+        others = ", ".join(name for name in FORMATS if name not in SURFACES)
+        raise ExportError(
+            f"to: got {to!r}, which is of a dome's maps (position, normals, r_d, lobes), but "
+            f"{appearance_path} holds {', '.join(appearance.maps) or 'none'}; expected {others}"
+        )
     order = delivery or Delivery()
     if order.onto is not None:
         allowed(order.onto, use, today=today)  # its maps are handed on, too

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -22,6 +23,8 @@ WIDTH_PX = 200
 SHOWN = 3
 """Measurements drawn; the tables list all."""
 COLORS = {"red": "#c8402f", "green": "#3f8f4f", "blue": "#2a78b8"}
+_NAME = re.compile(r"(.+)_r(\d+)_a(\d+\.\d)")
+"""Of a measurement in documents: site, repeat, angle in degrees."""
 METHOD_NAMES = {"photon_table": "photon table", "diffusion": "diffusion", "dipole": "dipole"}
 
 
@@ -185,8 +188,8 @@ def _errors(
             ("measurement", "channel", "fibres", "median |error| %", "worst %",
              "68 % interval covers %"),
             [
-                (row.name, row.channel, row.fibres, 100 * row.median, 100 * row.worst,
-                 100 * row.coverage)
+                (_words_of_name(row.name), row.channel, row.fibres, 100 * row.median,
+                 100 * row.worst, 100 * row.coverage)
                 for row in profiles
             ],
             caption="Over fibres whose signal is ten times its standard error",
@@ -202,7 +205,8 @@ def _by_channel(rows: Sequence[evaluation.FitError]) -> str:
     for method, words in METHOD_NAMES.items():
         errors = {f"{r.name}, {r.channel}": r.relative for r in rows if r.method == method}
         series[words] = [100.0 * errors.get(label, float("nan")) for label in labels]
-    short = [label.replace("_r0_a000.0", "").replace(", ", "\n") for label in labels]
+    parts = [label.rpartition(", ") for label in labels]
+    short = [f"{_words_of_name(name)}\n{channel}" for name, _, channel in parts]
     return f"<div class='plots'>{figures.bars('error of sigma_tr', short, series, unit='%')}</div>"
 
 
@@ -279,6 +283,23 @@ def _one_of_each_site(measurements: Sequence[Mapping[str, Any]]) -> list[Mapping
     for entry in measurements:
         first.setdefault(entry["site"], entry)
     return list(first.values())
+
+
+def _words_of_name(name: str) -> str:
+    """Return a measurement in words, from its name in documents.
+
+    Examples
+    --------
+    >>> _words_of_name("forehead_r0_a000.0"), _words_of_name("cheek_r1_a022.5")
+    ('forehead', 'cheek, repeat 1, 22.5°')
+    >>> _words_of_name("cheek, as published")
+    'cheek, as published'
+    """
+    found = _NAME.fullmatch(name)
+    if found is None:
+        return name
+    site, repeat, angle = found.groups()
+    return _words({"site": site, "repeat": int(repeat), "angle_deg": float(angle)})
 
 
 def _words(entry: Mapping[str, Any]) -> str:

@@ -74,6 +74,8 @@ def test_the_promised_commands_are_there():
         (["capture", "flash", "--out", "x"], 2, "--port flash=URL"),
         (["capture", "flash", "--out", "x", "--port", "flash"], 2, "NAME=URL"),
         (["verify", "."], 3, "is not a session"),
+        (["verify", "photo.jpg"], 3, "got a file, expected a folder with session.json"),
+        (["serve", "flash", "--resume", "nothing"], 3, "nothing: is not a session"),
         (["demo", "--rigs", "submarine"], 3, "submarine"),
         (["import", "photos", "nothing", "--out", "x"], 3, "nothing"),
     ],
@@ -82,10 +84,13 @@ def test_bad_input_gives_one_clear_error_and_its_exit_code(
     argv, code, says, capsys, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "photo.jpg").write_bytes(b"no session")
     assert main(argv) == code
     out, err = capsys.readouterr()
-    assert says in out + err
-    assert "Traceback" not in out + err
+    told = " ".join((out + err).split())
+    assert says in told
+    assert "DAMAGED" not in told
+    assert "Traceback" not in told
     assert not (tmp_path / "x").exists()
 
 

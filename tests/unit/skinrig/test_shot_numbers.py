@@ -5,7 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
+from capture.devices.camera import Exposure, Trigger, open_camera
+from capture.rig import load_rig
 from capture.session import Session
+from rigsim.serve import serve
 from skinrig.simulating.shot_numbers import shots_made
 from skinrig.simulating.simulation import simulate_session
 
@@ -88,6 +91,30 @@ def test_no_two_shots_of_skin_in_a_caliper_that_is_taped_anew_share_their_noise(
     seeds = [seed_of[session.read(record).cfa.tobytes()] for record in session.frames()]
     assert len(seeds) == len(session.frames()) > 40
     assert len(set(seeds)) == len(seeds)
+
+
+def test_a_server_that_goes_on_does_not_give_the_noise_of_its_first_shots_again():
+    """Frames of no scene are noise alone, drawn by the number of the shot."""
+    rig = load_rig("flash").resized(16)
+
+    def shots(count, **made):
+        with serve(rig, seed=5, **made) as served:
+            camera = open_camera(served.addresses["cam"])
+            camera.configure(Exposure(0.001, 100))
+            images = []
+            for _ in range(count):
+                camera.arm(1, Trigger.SOFTWARE)
+                camera.fire()
+                images.append(camera.frame(10.0).image)
+            camera.close()
+        return images
+
+    first, second, third = shots(3)
+    (again,) = shots(1)
+    np.testing.assert_array_equal(again, first)
+    (after,) = shots(1, shots_made={"cam": 2})
+    np.testing.assert_array_equal(after, third)
+    assert (after != second).any()
 
 
 def test_a_new_session_begins_at_none(tmp_path):

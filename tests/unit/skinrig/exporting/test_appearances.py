@@ -8,7 +8,7 @@ import pytest
 
 from capture.session import ConsentError
 from model import store
-from model.skin import SkinAppearance, SkinMap
+from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig import consent
 from skinrig.errors import UsageError
 from skinrig.exporting.appearances import FORMATS, export_appearance, export_brdfs
@@ -38,6 +38,18 @@ def test_maps_of_a_person_leave_only_as_agreed_and_only_in_time(measured, tmp_pa
             export(use=use, today=today)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["measured"]
     assert export(use="research", today=LAST).files > 0
+
+
+@pytest.mark.parametrize("to", ["mtlx", "gltf", "usd"])
+def test_a_photographs_maps_are_told_that_they_are_no_surface(tmp_path, to):
+    """Not to reconstruct a position, which no session of the flash rig has."""
+    values, valid = np.full((4, 4), 0.02, np.float32), np.ones((4, 4), bool)
+    flat = SkinMap(values, UNITS["melanin"], valid=valid)
+    maps = store.write(tmp_path / "flash", SkinAppearance({"melanin": flat}, "simulated"))
+    with pytest.raises(ExportError, match="holds melanin; expected maps, spectral, metahuman"):
+        export_appearance(maps, tmp_path / "out", to=to)
+    assert not (tmp_path / "out").exists()
+    assert export_appearance(maps, tmp_path / "out", to="maps").files > 1
 
 
 def test_what_was_simulated_needs_no_consent(face_folder, tmp_path):
