@@ -119,7 +119,8 @@ def match_sliding(
 def _checked(
     neutral: ArrayLike, target: ArrayLike, valid: Mask | None, valid_target: Mask | None
 ) -> tuple[Floats, Floats, Mask, Mask]:
-    a, b = (np.ascontiguousarray(x, np.float64) for x in (neutral, target))
+    # copies: compiled loops are declared for arrays that may be written
+    a, b = (np.array(x, np.float64, order="C") for x in (neutral, target))
     if a.ndim != 2 or not a.size or b.shape != a.shape:
         raise DiscStatisticsError(
             f"neutral, target: got shapes {a.shape}, {b.shape}, expected (H, W) for both"

@@ -47,7 +47,7 @@ def fit_affine(places: Floats, found: Floats, *, window_px: float) -> tuple[Floa
     Raises
     ------
     ValueError
-        For fewer points, or points on a line.
+        For fewer points, points on a line, or what is no number.
 
     Examples
     --------
@@ -57,6 +57,8 @@ def fit_affine(places: Floats, found: Floats, *, window_px: float) -> tuple[Floa
     [[1.1, 0.0], [0.0, 0.9], [2.0, 2.0]]
     """
     count = len(places)
+    if not (np.isfinite(places).all() and np.isfinite(found).all()):
+        raise ValueError("places, found: got what is no number, expected finite px")
     design = np.column_stack([places, np.ones(count)])
     if count < 7 or np.linalg.matrix_rank(design) < 3:
         raise ValueError(f"places: got {count} points, expected at least 7, not all on one line")

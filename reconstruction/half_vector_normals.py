@@ -9,6 +9,7 @@ import math
 import os
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -105,6 +106,8 @@ def estimate(
         raise HalfVectorError(
             f"values: got {samples.dtype} of shape {samples.shape}, expected floats (P, M)"
         )
+    kind: Any = np.float64 if samples.dtype == np.float64 else np.float32  # of the machine's order
+    samples = samples.astype(kind, copy=False)
     points, count = samples.shape
     cameras = np.asarray(view)
     mask = np.broadcast_to(np.True_, samples.shape) if valid is None else np.asarray(valid)
@@ -124,8 +127,9 @@ def estimate(
     views = np.zeros(points, np.int32)
 
     def solve(span: slice) -> None:
+        to_lights, to_cameras = (np.asarray(each[span], kind) for each in (light_dir, view_dir))
         _estimate(
-            samples[span], np.asarray(light_dir[span]), np.asarray(view_dir[span]), cameras,
+            samples[span], to_lights, to_cameras, cameras,
             mask[span], int(cameras.max(initial=-1)) + 1, normals[span], stderr[span], views[span],
         )  # fmt: skip
 

@@ -69,7 +69,7 @@ def own_error(
     >>> float(own_error(skin, 0.0 * skin, np.ones((40, 40), bool), still).max())
     0.0
     """
-    good = model_error.usable_pixels(rgb, valid)
+    good = model_error.usable_pixels(rgb, valid, variance)
     safe = np.where(good[..., None], rgb, 1.0).astype(np.float64)
     noise = np.where(good[..., None], variance / safe**2, 0.0)
     place = np.square(alignment.error_px.astype(np.float64))

@@ -120,10 +120,10 @@ def of_picture(
     ((9, 9, 3, 3), True)
     """
     terms = color_errors() if errors is None else errors
-    structure = fine_structure(rgb, variance, usable_pixels(rgb, valid))
+    structure = fine_structure(rgb, variance, usable_pixels(rgb, valid, variance))
     covariance = np.empty((*valid.shape, 3, 3))
     for rows in _bands(valid.shape):
-        here = usable_pixels(rgb[rows], valid[rows])
+        here = usable_pixels(rgb[rows], valid[rows], variance[rows])
         color = np.where(here[..., None], rgb[rows], 0.0).astype(np.float64)
         color -= color.mean(axis=-1, keepdims=True)
         color *= terms.bounced
@@ -145,10 +145,22 @@ def _with_rim(rows: slice, rim: int, height: int) -> tuple[slice, slice]:
     return slice(first, min(rows.stop + rim, height)), slice(rows.start - first, rows.stop - first)
 
 
-def usable_pixels(rgb: Image, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return where a picture has a color that has a logarithm, (H, W)."""
-    with np.errstate(invalid="ignore"):
-        return np.asarray(valid & np.isfinite(rgb).all(axis=-1) & (rgb > 0.0).all(axis=-1))
+def usable_pixels(
+    rgb: Image, valid: NDArray[np.bool_], variance: Image | None = None
+) -> NDArray[np.bool_]:
+    """Return where a picture has a color that has a logarithm, and known noise, (H, W).
+
+    Parameters
+    ----------
+    rgb, valid, variance
+        As of `of_picture`; without a variance noise is not asked for. A single pixel whose noise
+        over its color is no number would spoil what is said of all around it.
+    """
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        good = valid & np.isfinite(rgb).all(axis=-1) & (rgb > 0.0).all(axis=-1)
+        if variance is not None:
+            good &= np.isfinite(variance / np.square(rgb)).all(axis=-1)
+    return np.asarray(good)
 
 
 def fine_structure(rgb: Image, variance: Image, valid: NDArray[np.bool_]) -> Floats:

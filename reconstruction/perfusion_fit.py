@@ -134,7 +134,7 @@ def fit_cycle(
     Raises
     ------
     CurveError
-        For fewer than 6 samples, or a shape that does not fit.
+        For fewer than 6 samples, a shape that does not fit, or a cycle without both changes.
 
     Examples
     --------
@@ -147,7 +147,12 @@ def fit_cycle(
     middle = 0.5 * cycle_s if change_s is None else change_s
     phase = np.asarray(phase_s, np.float64)
     _check_bend(bend)
+    if not (0.0 < middle < cycle_s < np.inf):
+        raise CurveError(
+            f"cycle_s, change_s: got {cycle_s}, {middle} s, expected 0 < change_s < cycle_s"
+        )
     data = Samples.of(phase, values, stderr, pose)
+    phase = np.where(np.isfinite(phase), phase, 0.0)  # of weight 0, but a number
 
     def straight(delay: Floats, constant: Floats) -> Floats:
         """Part of the way to the expression's level, of the steady cycle."""
@@ -206,7 +211,7 @@ def fit_course(
     """
     _check_bend(bend)
     time = np.asarray(time_s, np.float64)
-    after = time >= 0
+    after = (time >= 0) & np.isfinite(time)
     time = time[after]
     shown = np.atleast_2d(np.asarray(values, np.float64))[:, after]
     errors = None if stderr is None else np.atleast_2d(np.asarray(stderr, np.float64))[:, after]

@@ -311,11 +311,11 @@ def _light_arrays(
 ) -> tuple[Floating, Floating, Floating, Floating]:
     none2, none3 = np.zeros((1, 3), kind), np.zeros((1, 1, 3), kind)
     if way == kernels.SHARED:
-        return geometry[0].astype(kind), none3, none2, none2
+        return geometry[0].astype(kind, order="C"), none3, none2, none2
     if way == kernels.PER_POINT:
         return none2, geometry[0], none2, none2
     # float32 keeps millimetres to 1e-4 at the size of a room
-    return none2, none3, geometry[0].astype(kind), geometry[1].astype(kind)
+    return none2, none3, geometry[0].astype(kind, order="C"), geometry[1].astype(kind)
 
 
 def _strength(
