@@ -159,7 +159,8 @@ def of_columns(
     Parameters
     ----------
     columns
-        BRDFs at the nodes, 1/sr, shape (32, N_phi, 90, K); see `BrdfBasis.table`.
+        BRDFs at the nodes, 1/sr, shape (32, N_phi, 90, K); see `BrdfBasis.table`. Values below 0
+        count as 0.
     names
         Of the K materials.
     light_radius_rad

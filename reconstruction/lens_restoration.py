@@ -156,7 +156,7 @@ def restore(
     RestorationError
         Where no normal is valid, or pixels are so large that no frequency is beyond the lens.
     """
-    known = valid & (normals[..., 2] > LEAST_COSINE)
+    known = valid & (normals[..., 2] > LEAST_COSINE) & np.isfinite(normals).all(axis=-1)
     if not known.any():
         raise RestorationError("valid: got no pixel with a normal towards the view")
     z = np.where(known, normals[..., 2], 1.0)

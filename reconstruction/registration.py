@@ -17,6 +17,11 @@ class RegistrationError(ValueError):
     """Images or points that cannot be registered."""
 
 
+LEAST_TOP = 1e-12
+"""Brightest value below which, or above one over which, a picture's unit is not kept: local spreads
+would fall below the floor that stands for no texture at all, or overflow."""
+
+
 @dataclass(frozen=True, slots=True)
 class Tracks:
     """Where points went.
@@ -58,7 +63,11 @@ def evened(image: Image, *, sigma_px: float = 8.0) -> NDArray[np.uint8]:
             f"image: got shape {np.shape(image)}, expected (H, W), 16 x 16 or more"
         )
     known = np.isfinite(image)
-    values = np.sqrt(np.maximum(np.where(known, image, 0.0), 0.0)).astype(np.float32)
+    values = np.maximum(np.where(known, image, 0.0), 0.0)
+    top = float(values.max())
+    if top > 0.0 and not LEAST_TOP < top < 1.0 / LEAST_TOP:
+        values = values / top  # squares in single precision hold no more
+    values = np.sqrt(values).astype(np.float32)
     mean = cv2.GaussianBlur(values, (0, 0), sigma_px)
     rest = values - mean
     spread = np.sqrt(cv2.GaussianBlur(rest * rest, (0, 0), 2 * sigma_px))

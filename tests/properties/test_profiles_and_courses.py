@@ -15,6 +15,7 @@ from reconstruction import (
     perfusion_curves,
     perfusion_fit,
     repeatability,
+    smooth_misfit,
     subsurface,
     tiles,
     translucency,
@@ -306,3 +307,26 @@ def test_usual_places_lie_on_the_face_s_own_rectangle(seed, sides):
     for none in (np.zeros(sides, bool), np.ones(3, bool), np.ones((2, 2, 2), bool)):
         with pytest.raises(perfusion_curves.CurveError, match="skin"):
             perfusion_curves.usual_places(none)
+
+
+@CHEAP
+@given(seed=SEED, line=st.tuples(*[st.floats(-1.0, 1.0)] * 2), lost=st.integers(0, 10))
+def test_what_is_straight_in_the_root_of_the_distance_is_kept_whatever_fibres_are_lost(
+    seed, line, lost
+):
+    rng = np.random.default_rng(seed)
+    radius = rng.permutation(RADIUS)
+    straight = line[0] + line[1] * np.sqrt(radius)
+    variance = rng.uniform(1e-4, 1e-2, (2, 18))
+    variance[1, :lost] = np.inf
+    curve, covariance = smooth_misfit.smooth_misfit(radius, np.stack([straight] * 2), variance)
+    np.testing.assert_allclose(curve, np.stack([straight] * 2), atol=1e-6)
+    assert (np.linalg.eigvalsh(covariance) > -1e-12).all()
+    read = np.isfinite(variance)
+    told = np.einsum("nff->nf", covariance)
+    assert (told[read] <= variance[read] * (1 + 1e-9)).all()
+    order = rng.permutation(18)
+    values = rng.standard_normal((1, 18))
+    one = smooth_misfit.smooth_misfit(radius, values, variance[:1])[0]
+    other = smooth_misfit.smooth_misfit(radius[order], values[:, order], variance[:1, order])[0]
+    np.testing.assert_allclose(other, one[:, order], atol=1e-9)

@@ -1,0 +1,243 @@
+"""Mixtures of tabulated BRDFs, meshes and tables of colors over their declared domains."""
+
+import functools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model import (
+    brdf_tables,
+    color_table,
+    facial_color_basis,
+    lobe_edits,
+    skin_reflectance,
+    texture_space,
+    trait_vectors,
+    traits,
+)
+from reconstruction import brdf_basis, brdf_space, chromophore_start, mesh_repair
+
+CHEAP = settings(derandomize=True, deadline=None, max_examples=20, database=None)
+FEW = settings(CHEAP, max_examples=8)
+SEED = st.integers(0, 9999)
+SIDES = st.tuples(st.integers(1, 12), st.integers(1, 12))
+NO_NUMBER = st.sampled_from([np.nan, np.inf, -np.inf])
+
+
+def blinn(power):
+    """A lobe about the half vector, of no physical material but cheap."""
+
+    def brdf(light, view):
+        half = light + view
+        half = half / np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-12)
+        return 0.1 + np.clip(half[..., 2], 0.0, 1.0) ** power
+
+    return brdf
+
+
+@functools.cache
+def three():
+    return brdf_tables.tabulate({f"n{p}": blinn(p) for p in (1, 20, 200)})
+
+
+def directions(rng, count):
+    ways = rng.standard_normal((count, 3))
+    return ways / np.linalg.norm(ways, axis=-1, keepdims=True)
+
+
+@CHEAP
+@given(seed=SEED, factor=st.sampled_from([1e-30, 0.5, 1e30]))
+def test_a_mixture_is_linear_reciprocal_and_dark_below_the_horizon(seed, factor):
+    rng = np.random.default_rng(seed)
+    basis, up = three(), np.array([0.0, 0.0, 1.0])
+    light, view, share = directions(rng, 20), directions(rng, 20), rng.random((20, 3))
+    found = brdf_basis.evaluate(share, basis, light, view, up)
+    assert (found >= 0.0).all()
+    assert (found[(light[:, 2] < 0.0) | (view[:, 2] < 0.0)] == 0.0).all()
+    np.testing.assert_allclose(
+        brdf_basis.evaluate(factor * share, basis, light, view, up), factor * found, rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        brdf_basis.evaluate(share, basis, view, light, up), found, rtol=1e-5, atol=1e-7
+    )
+    same = skin_reflectance.lobe_brdf(basis, share, light, view, up)
+    np.testing.assert_allclose(same, found, rtol=1e-12)
+    ball = brdf_basis.lit_sphere(share[0], basis, size_px=16)
+    assert (ball >= 0.0).all() or np.isnan(ball).any()
+
+
+@FEW
+@given(seed=SEED, bad=st.sampled_from([np.nan, np.inf]))
+def test_tables_keep_their_columns_and_refuse_those_of_no_numbers(seed, bad):
+    basis = three()
+    columns = basis.table[..., : basis.size].copy()
+    again = brdf_tables.of_columns(columns, basis.names, light_radius_rad=0.0)
+    np.testing.assert_array_equal(again.table, basis.table)
+    place = seed % columns.size
+    columns.flat[place] = -1.0
+    clipped = brdf_tables.of_columns(columns, basis.names, light_radius_rad=0.0)
+    assert clipped.table[..., : basis.size].flat[place] == 0.0
+    columns.flat[place] = bad
+    with pytest.raises(brdf_tables.BasisError):
+        brdf_tables.of_columns(columns, basis.names, light_radius_rad=0.0)
+
+
+@FEW
+@given(seed=SEED, compress=st.sampled_from(["cbrt", "none"]), bad=NO_NUMBER)
+def test_a_point_of_no_numbers_is_masked_and_spoils_no_others(seed, compress, bad):
+    rng = np.random.default_rng(seed)
+    basis, up = three(), np.broadcast_to([0.0, 0.0, 1.0], (3, 3))
+    light, view = (np.abs(directions(rng, 3 * 40)).reshape(3, 40, 3) for _ in range(2))
+    true = rng.random((3, 3))
+    f = brdf_basis.evaluate(true[:, None], basis, light, view, np.array([0.0, 0.0, 1.0]))
+
+    def fit(values):
+        samples = brdf_basis.surface_samples(
+            values[..., None], light, view, up, np.zeros((3, 1)), eta=1.4
+        )
+        return brdf_basis.fit_weights(samples, basis, compress=compress)
+
+    first = fit(f)
+    assert first.valid.all()
+    assert (first.weights >= 0.0).all()
+    spoilt = f.copy()
+    spoilt[1] = bad
+    again = fit(spoilt)
+    assert again.valid.tolist() == [True, False, True]
+    assert (again.weights[1] == 0.0).all()
+    # the misfit of the whole set is shared, so others move by what the fit leaves open
+    seen = [
+        brdf_basis.evaluate(w[:, None], basis, light, view, np.array([0.0, 0.0, 1.0]))
+        for w in (first.weights, again.weights)
+    ]
+    np.testing.assert_allclose(seen[1][[0, 2]], seen[0][[0, 2]], rtol=0.05, atol=0.02)
+
+
+@CHEAP
+@given(seed=SEED, rank=st.integers(1, 3), bad=st.sampled_from([np.nan, -1e-9]))
+def test_common_mixtures_have_sum_one_and_refining_them_is_never_worse(seed, rank, bad):
+    rng = np.random.default_rng(seed)
+    basis, shares = three(), rng.random((12, 3)) ** 3
+    found, mix, error = brdf_basis.reduce(shares, rank, basis=basis)
+    np.testing.assert_allclose(mix.sum(axis=1), 1.0)
+    assert (found >= 0.0).all()
+    assert 0.0 <= error < 1.0
+    gram = brdf_space.metric(basis)
+    assert np.linalg.eigvalsh(gram).min() >= -1e-9 * np.abs(gram).max()
+    finer = brdf_space.refine(shares, mix, basis, sweeps=5)
+    np.testing.assert_allclose(finer.sum(axis=1), 1.0)
+    assert (finer >= 0.0).all()
+    assert _left(shares, finer, gram) <= _left(shares, mix, gram) * (1 + 1e-9) + 1e-18
+    assert not brdf_space.usable(np.vstack([shares, 0.0 * shares[:1]]), basis)[-1]
+    assert brdf_space.repeatability(shares, shares, basis) == 0.0
+    twice = brdf_space.repeatability(shares, 1.1 * shares, basis)
+    assert twice == pytest.approx(0.1 / np.sqrt(1.0 + 1.1**2), rel=1e-9)
+    wrong = shares.copy()
+    wrong[0, 0] = bad
+    for call in (brdf_space.usable, lambda w, b: brdf_basis.reduce(w, rank, basis=b)):
+        with pytest.raises(ValueError, match="weights"):
+            call(wrong, basis)
+
+
+def _left(shares, mix, gram):
+    """Squared error of the shares' BRDFs from their best mixtures, by many plain projections."""
+    products, cross = mix @ gram @ mix.T, shares @ gram @ mix.T
+    coordinates = np.zeros((len(shares), len(mix)))
+    step = 1.0 / np.linalg.eigvalsh(products)[-1]
+    for _ in range(20000):
+        coordinates = np.maximum(coordinates - step * (coordinates @ products - cross), 0.0)
+    gap = shares - coordinates @ mix
+    return float(np.einsum("pk,kl,pl->", gap, gram, gap))
+
+
+@CHEAP
+@given(seed=SEED, amount=st.floats(-3.0, 3.0), bad=NO_NUMBER)
+def test_edited_lobes_are_no_less_than_nothing_and_an_edit_of_nothing_changes_nothing(
+    seed, amount, bad
+):
+    rng = np.random.default_rng(seed)
+    people, weights, mix = rng.random((8, 4)), rng.random((5, 2)), rng.random((2, 4))
+    space = traits.TraitSpace.fit(people, {"oil": [False, True] * 4})
+    kept = lobe_edits.edit_weights(weights, mix, space, {"oil": 0.0})
+    np.testing.assert_array_equal(kept.weights, weights)
+    found = lobe_edits.edit_weights(weights, mix, space, {"oil": amount})
+    assert (found.weights >= 0.0).all()
+    assert np.isfinite(found.weights).all()
+    assert (found.clipped >= 0.0).all()
+    with pytest.raises(trait_vectors.TraitError):
+        lobe_edits.edit_weights(weights, mix, space, {"oil": bad})
+
+
+@CHEAP
+@given(seed=SEED, rows=st.integers(2, 5), far=st.floats(10.0, 1e3))
+def test_the_largest_surface_stays_and_what_lies_outside_a_box_goes(seed, rows, far):
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: rows + 1, : rows + 1].astype(float)
+    large = np.stack([x.ravel(), y.ravel(), 0.01 * rng.random(x.size)], -1)
+    cell = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = (
+        part.ravel() for part in (cell[:-1, :-1], cell[:-1, 1:], cell[1:, 1:], cell[1:, :-1])
+    )
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+    small = np.array([[0.0, 0, far], [1, 0, far], [0, 1, far]])
+    mesh = mesh_repair.TriangleMesh(
+        np.concatenate([large, small]), np.concatenate([faces, [[x.size, x.size + 1, x.size + 2]]])
+    )
+    found = mesh_repair.largest_surface(mesh)
+    assert len(found.faces) == len(faces)
+    assert found.vertices_mm[:, 2].max() < 1.0
+    box = ((-1.0, -1.0, -1.0), (rows + 1.0, rows + 1.0, 1.0))
+    assert len(mesh_repair.crop(mesh, box_mm=box).faces) == len(faces)
+    with pytest.raises(ValueError, match="crop"):
+        mesh_repair.crop(mesh, box_mm=((-9.0, -9.0, -9.0), (-8.0, -8.0, -8.0)))
+
+
+@CHEAP
+@given(seed=SEED, sides=SIDES, unit=st.sampled_from([1e-100, 1e-3, 1e3, 1e100]), bad=NO_NUMBER)
+def test_the_area_of_a_texture_knows_no_unit_and_is_at_least_a_pixel(seed, sides, unit, bad):
+    rng = np.random.default_rng(seed)
+    base, valid = rng.standard_normal(sides), rng.random(sides) < 0.8
+    found = facial_color_basis.texture_area_px(base, valid)
+    assert found >= 1.0
+    assert facial_color_basis.texture_area_px(unit * base, valid) == pytest.approx(found)
+    spoilt = np.where(valid, base, bad)
+    assert facial_color_basis.texture_area_px(spoilt, valid) == found
+
+
+@CHEAP
+@given(seed=SEED, sides=SIDES, channels=st.integers(0, 4), bad=NO_NUMBER,
+       kind=st.sampled_from(["<f2", "<f4", "<f8", ">f8", "i8"]))  # fmt: skip
+def test_images_of_textures_are_finite_where_they_are_valid(seed, sides, channels, bad, kind):
+    rng = np.random.default_rng(seed)
+    shape = (*sides, channels) if channels else sides
+    image = (100 * rng.random(shape)).astype(kind)
+    valid = rng.random(sides) < 0.7
+    valid[0, 0] = True
+    values, mask = texture_space.checked_image(image, valid)
+    assert values.shape == (*sides, channels or 1)
+    assert values.dtype == (np.float64 if np.dtype(kind) == np.float64 else np.float32)
+    np.testing.assert_array_equal(mask, valid)
+    if image.dtype.kind == "f":
+        image[0, 0] = bad
+        with pytest.raises(texture_space.TextureError, match="not finite"):
+            texture_space.checked_image(image, valid)
+
+
+@functools.cache
+def colors():
+    return color_table.build("Nikon 5100 (NPL)", "D55", size=8)
+
+
+@CHEAP
+@given(seed=SEED, step=st.floats(1e-7, 1e-6))
+def test_colors_between_nodes_are_finite_and_change_as_their_derivatives_say(seed, step):
+    rng = np.random.default_rng(seed)
+    a, b = rng.uniform(0.05, 0.95, (2, 9))
+    color, by_a, by_b = chromophore_start.evaluate(colors(), a, b)
+    assert np.isfinite(color).all()
+    for slope, da, db in ((by_a, step, 0.0), (by_b, 0.0, step)):
+        up, down = (chromophore_start.evaluate(colors(), a + s * da, b + s * db)[0]
+                    for s in (1, -1))  # fmt: skip
+        np.testing.assert_allclose((up - down) / (2 * step), slope, rtol=1e-3, atol=1e-5)
