@@ -65,7 +65,7 @@ def flip(file, byte, bit):
 
 @pytest.mark.parametrize("kind", ["closed", "interrupted"])
 @pytest.mark.parametrize(
-    "flips_per_file", [30, pytest.param(1500, marks=pytest.mark.long, id="1500")]
+    "flips_per_file", [30, pytest.param(500, marks=pytest.mark.long, id="500")]
 )
 def test_one_flipped_bit_in_any_file_is_named(request, rng, kind, flips_per_file):
     path = request.getfixturevalue(kind)
