@@ -12,7 +12,8 @@ from skinrig.commands.options import (
     Json,
     Out,
 )
-from skinrig.console import Console
+from skinrig.console import Console, counted
+from skinrig.errors import UsageError
 
 
 def calibrate(
@@ -60,6 +61,37 @@ def calibrate(
     )  # fmt: skip
 
 
+def check_rank(rank: int | None, basis: Path | None) -> None:
+    """Raise unless a basis has as many materials as lobes are asked for.
+
+    Parameters
+    ----------
+    rank
+        Lobes that a dome's points share; None: as many as usual.
+    basis
+        Folder of MERL tables; None: the built-in materials.
+
+    Raises
+    ------
+    skinrig.errors.UsageError
+        More lobes than materials; that there are fewer than one is told by the reconstruction.
+    """
+    if rank is None or (basis is not None and not basis.is_dir()):
+        return
+    if basis is None:
+        from model import brdf_recipe
+
+        most = sum(1 for _ in brdf_recipe.materials())
+    else:
+        most = sum(file.suffix.lower() == ".binary" for file in basis.iterdir())
+    if rank > most:
+        where = "the built-in basis" if basis is None else str(basis)
+        raise UsageError(
+            f"--rank: got {rank}, expected at most {most}: lobes are mixtures of the "
+            f"{counted(most, 'material')} of {where}"
+        )
+
+
 def reconstruct(
     session: Annotated[Path, typer.Argument(help="SESSION/ folder.")],
     want: Annotated[
@@ -99,6 +131,7 @@ def reconstruct(
     from skinrig.demo import truth_beside
 
     console = Console(json)
+    check_rank(rank, basis)
     truth = truth_beside(session)
     done = pipeline.reconstruct(
         session, want=[w.strip() for w in want.split(",") if w.strip()], out=out,

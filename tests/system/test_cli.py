@@ -68,6 +68,16 @@ def test_the_promised_commands_are_there():
         (["simulate", "dome", "--out", "x", "--subject", "P99"], 3, "P01 to P87"),
         (["simulate", "flash", "--out", "x", "--subject", "green"], 3, "green"),
         (["reconstruct", "nothing", "--want", "melanin", "--out", "x"], 3, "nothing"),
+        (
+            ["reconstruct", "s", "--want", "normals", "--out", "x", "--rank", "1000"],
+            2,
+            "--rank: got 1000, expected at most 59",
+        ),
+        (
+            ["reconstruct", "s", "--want", "normals", "--out", "x", "--rank", "3", "--basis", "."],
+            2,
+            "expected at most 0",
+        ),
         (["calibrate", "sensor", "nothing"], 3, "nothing"),
         (["simulate", "flash", "--out", "x", "--state", "happy"], 3, "happiness"),
         (["bench", "--stage", "coffee"], 3, "coffee"),
