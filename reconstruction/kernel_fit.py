@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.microstructure import ALPHA_LIMITS
+from reconstruction import kernel_errors, kernel_search, normal_histogram
 from reconstruction import kernel_fit_kernels as kernels
-from reconstruction import kernel_search, normal_histogram
 from reconstruction.kernel_search import Buckets, Found, Relief
 
 Floats = NDArray[np.float64]
@@ -44,14 +44,6 @@ SIGMAS_UM = np.linspace(1.0, 100.0, 199)
 """The paper's grid of standard deviations, by 0.5 um."""
 FINER_ALPHA, FINER_SIGMA = 10, 5
 """The refinement's steps are so much smaller than the grid's, within one step to either side."""
-DRAWS = 200
-"""Histograms drawn for the standard errors."""
-MOST_DRAWN = 64
-"""Nearly-as-good kernels among which each draw finds its best."""
-DRAWN_WITHIN = 3.0
-"""They are taken from within so many standard errors of the distance."""
-WITHIN = 0.6827
-"""Share of draws within a standard error of the best."""
 STARTS = ((0.0, 1.0), (0.6, 15.0), (-0.6, 15.0), (1.0, 30.0), (-1.5, 8.0))
 """alpha and sigma_um across the jaws that fits of both axes begin with."""
 
@@ -288,19 +280,14 @@ def fit_kernel(
         For shapes, ranges or sums that do not fit, or a relief without slopes.
     """
     normal_histogram.check_buckets(bins, limit)
-    alphas_ = _grid("alphas", ALPHAS if alphas is None else alphas, *ALPHA_LIMITS)
-    sigmas = _grid("sigmas_um", SIGMAS_UM if sigmas_um is None else sigmas_um, 1e-9, math.inf)
-    if search not in ("hierarchical", "exhaustive"):
-        raise KernelFitError(f'search: got {search!r}, expected "hierarchical" or "exhaustive"')
-    if first_sample < 2:
-        raise KernelFitError(f"first_sample: got {first_sample}, expected at least 2")
     target = _target(target_histogram, bins, transposed=axis in ("y", 0))
     relief = relief_of(
         neutral_height_um, stretch=stretch, axis=axis, pixel_um=pixel_um,
         stretch_across=stretch_across, valid=valid, y_up=y_up,
     )  # fmt: skip
     return fit_relief(
-        relief, Buckets(target, bins, float(limit)), alphas_, sigmas, search=search,
+        relief, Buckets(target, bins, float(limit)), ALPHAS if alphas is None else alphas,
+        SIGMAS_UM if sigmas_um is None else sigmas_um, search=search,
         target_samples=target_samples, first_sample=first_sample, seed=seed,
     )  # fmt: skip
 
@@ -434,24 +421,32 @@ def _target(histogram: NDArray[np.floating], bins: int, *, transposed: bool) -> 
 def fit_relief(
     relief: Relief,
     buckets: Buckets,
-    alphas: Floats,
-    sigmas_um: Floats,
+    alphas: ArrayLike,
+    sigmas_um: ArrayLike,
     *,
     search: Literal["hierarchical", "exhaustive"],
     target_samples: float | None,
     first_sample: int,
     seed: int,
 ) -> KernelFit:
-    """Fit the kernel of a prepared relief; see :func:`fit_kernel`."""
+    """Fit the kernel of a prepared relief; parameters and errors as of :func:`fit_kernel`."""
+    strengths = _grid("alphas", alphas, *ALPHA_LIMITS)
+    widths = _grid("sigmas_um", sigmas_um, 1e-9, math.inf)
+    if search not in ("hierarchical", "exhaustive"):
+        raise KernelFitError(f'search: got {search!r}, expected "hierarchical" or "exhaustive"')
+    if first_sample < 2:
+        raise KernelFitError(f"first_sample: got {first_sample}, expected at least 2")
+    if not (target_samples is None or target_samples > 0):
+        raise KernelFitError(f"target_samples: got {target_samples}, expected above 0")
     rng = np.random.default_rng(seed)
     if search == "exhaustive":
-        found = kernel_search.exhaustive(relief, buckets, alphas, sigmas_um)
+        found = kernel_search.exhaustive(relief, buckets, strengths, widths)
     else:
         found = kernel_search.hierarchical(
-            relief, buckets, alphas, sigmas_um, first_sample=first_sample, rng=rng
+            relief, buckets, strengths, widths, first_sample=first_sample, rng=rng
         )
     with kernels.threads_for(500 * relief.places.size):
-        return _described(relief, buckets, alphas, sigmas_um, found, search, target_samples, rng)
+        return _described(relief, buckets, strengths, widths, found, search, target_samples, rng)
 
 
 def _described(
@@ -465,19 +460,13 @@ def _described(
     before = float(buckets.distances(start, (still, still), np.zeros(1))[0])
     i, j = found.best
     alpha, sigma, distance = float(alphas[j]), float(sigmas_um[i]), float(found.distance[i, j])
-    counts, growth = _block_counts(relief, buckets, alpha, sigma)
-    effective = max(1.0, normal_histogram.effective_number(counts, samples) / growth)
-    occupied = max(1, int(np.count_nonzero(counts.sum(axis=0))))
+    blocks = kernel_errors.of_kernel(relief, buckets, alpha, sigma)
+    effective, occupied = blocks.effective_samples, blocks.occupied
     theirs = effective if target_samples is None else float(target_samples)
-    if not theirs > 0:
-        raise KernelFitError(f"target_samples: got {target_samples}, expected above 0")
-    residuals = _block_residuals(counts) * math.sqrt(growth)
-    signs = np.sign(counts.sum(axis=0) / samples - buckets.target)
-    # a sum of signs has a variance of at most 1 an independent sample; or what blocks show
-    own = max(1.0 / effective, float(np.sum((residuals @ signs) ** 2)))
-    noise = math.sqrt(own * (1.0 + effective / theirs))
+    noise = blocks.noise(buckets.target, theirs)
     floor = normal_histogram.noise_floor(buckets.target, effective, theirs)
-    near = _near_best(found.distance, alphas, sigmas_um, (i, j), noise)
+    rows, columns = kernel_errors.nearly_as_good(found, alphas, sigmas_um, noise).T
+    near = np.stack([alphas[columns], sigmas_um[rows], found.distance[rows, columns]], axis=1)
     reason = ""
     if np.ptp(relief.along) == 0.0 and np.ptp(relief.across) == 0.0:
         reason = "the neutral relief is flat: every kernel leaves it so"
@@ -489,9 +478,10 @@ def _described(
     stderr = (math.inf, math.inf)
     if not reason:
         refined = _refined(relief, buckets, alphas, sigmas_um, (i, j), distance)
-        wide = _near_best(found.distance, alphas, sigmas_um, (i, j), DRAWN_WITHIN * noise)
-        scatter = residuals * math.sqrt(1.0 + effective / theirs)
-        stderr = _stderr(relief, buckets, wide, scatter, rng)
+        stderr = kernel_errors.stderr_of_best(
+            relief, buckets, found, alphas, sigmas_um,
+            noise=noise, scatter=blocks.scatter(theirs), rng=rng,
+        )  # fmt: skip
         least = [float(np.diff(g).min()) / math.sqrt(12) if g.size > 1 else 0.0
                  for g in (alphas, sigmas_um)]  # fmt: skip
         stderr = (math.hypot(stderr[0], least[0]), math.hypot(stderr[1], least[1]))
@@ -522,16 +512,6 @@ def _described(
     )
 
 
-def _near_best(
-    distance: Floats, alphas: Floats, sigmas_um: Floats, best: tuple[int, int], noise: float
-) -> Floats:
-    i, j = np.nonzero(distance <= distance[best] + noise)
-    rows = np.stack([alphas[j], sigmas_um[i], distance[i, j]], axis=1)
-    first = (i == best[0]) & (j == best[1])
-    order = np.lexsort((rows[:, 1], np.abs(rows[:, 0]), rows[:, 2], ~first))
-    return rows[order]
-
-
 def _refined(
     relief: Relief, buckets: Buckets, alphas: Floats, sigmas: Floats, best: tuple[int, int],
     distance: float,
@@ -553,64 +533,3 @@ def _finer(grid: Floats, i: int, finer: int) -> Floats:
     low, high = grid[max(i - 1, 0)], grid[min(i + 1, grid.size - 1)]
     steps = finer * (int(i > 0) + int(i < grid.size - 1))
     return np.linspace(low, high, steps + 1)
-
-
-def _block_counts(
-    relief: Relief, buckets: Buckets, alpha: float, sigma_um: float
-) -> tuple[Floats, float]:
-    """Return counts in blocks of the map, (blocks, buckets), and what neighbors being alike costs.
-
-    The second is by how much larger the variance of the mean squared slope is than that of
-    independent blocks.
-    """
-    shape = (relief.code.shape[0], relief.code.shape[1])
-    blocks = normal_histogram.BLOCKS
-    group, groups = normal_histogram.block_of(relief.places, shape, blocks)
-    da, db = relief.change(sigma_um)
-    a, b = relief.along + np.float32(alpha) * da, relief.across + np.float32(alpha) * db
-    counts = kernels.count_in_groups(-a, -b, group, groups, buckets.bins, buckets.limit)
-    steep = 1.0 + a * a + b * b
-    growth = [
-        normal_histogram.block_error(m * m / steep, group, groups, shape, blocks)[1] for m in (a, b)
-    ]
-    return np.asarray(counts, np.float64), 0.5 * (growth[0] + growth[1])
-
-
-def _block_residuals(counts: Floats) -> Floats:
-    """Return each block's part in the error of the shares, (blocks, buckets).
-
-    With independent unit normal factors on the blocks, the sum scatters as the shares do over
-    other patches of the same skin, neighbouring buckets together.
-    """
-    sizes = counts.sum(axis=1)
-    counts, sizes = counts[sizes > 0], sizes[sizes > 0]
-    n = len(sizes)
-    p = counts.sum(axis=0) / sizes.sum()
-    return (counts - sizes[:, None] * p) / sizes.sum() * math.sqrt(n / max(n - 1, 1))
-
-
-def _stderr(
-    relief: Relief, buckets: Buckets, near: Floats, residuals: Floats, rng: np.random.Generator
-) -> tuple[float, float]:
-    """Return ways of the best of `near` from its first that 68 % of drawn histograms stay within.
-
-    Not their root mean square: a long valley leads few of them far away.
-    """
-    some = near[np.unique(np.linspace(0, len(near) - 1, MOST_DRAWN).round().astype(int))]
-    shares = np.empty((len(some), buckets.target.size))
-    for sigma in np.unique(some[:, 1]):
-        rows = np.flatnonzero(some[:, 1] == sigma)
-        counts = buckets.count(
-            (relief.along, relief.across), relief.change(float(sigma)), some[rows, 0]
-        )
-        shares[rows] = counts.sum(axis=0) / relief.places.size
-    gap = shares - buckets.target
-    used = np.flatnonzero(gap.any(axis=0) | residuals.any(axis=0))
-    gap, residuals = gap[:, used], residuals[:, used]
-    best = np.empty(DRAWS, int)
-    for draw in range(DRAWS):
-        scatter = rng.standard_normal(len(residuals)) @ residuals
-        best[draw] = int(np.argmin(np.abs(gap + scatter).sum(axis=1)))
-    ways = some[best, :2] - some[0, :2]
-    alpha, sigma = np.quantile(np.abs(ways), WITHIN, axis=0)
-    return float(alpha), float(sigma)

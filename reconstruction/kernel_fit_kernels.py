@@ -17,6 +17,8 @@ from numba import njit, prange
 
 BLOCK = 4096
 """Samples whose slopes stay in the cache while all alphas pass over them."""
+LANES = 64
+"""Buckets whose sums are taken side by side."""
 MOST_THREADS = 8
 """Each thread holds a histogram of every alpha (5 MB at 301 and 64 x 64)."""
 
@@ -186,7 +188,13 @@ def windows(
             per_down = np.float32(1.0) / (down * (two if (c & 12) == 12 else np.float32(1.0)))
             a0 = own[x0] - own[x1]
             b0 = above[x] - below[x]
-            for k in range(1, reach + 1):
+            inside = min(reach, x0, columns - 1 - x1)
+            for k in range(1, inside + 1):
+                a = (own[x0 + k] - own[x1 + k]) + (own[x0 - k] - own[x1 - k]) - two * a0
+                b = (above[x + k] - below[x + k]) + (above[x - k] - below[x - k]) - two * b0
+                along[block, k - 1, i] = a * per_right
+                across[block, k - 1, i] = b * per_down
+            for k in range(inside + 1, reach + 1):
                 p0, m0 = _mirrored(x0 + k, columns), _mirrored(x0 - k, columns)
                 p1, m1 = _mirrored(x1 + k, columns), _mirrored(x1 - k, columns)
                 p, m = _mirrored(x + k, columns), _mirrored(x - k, columns)
@@ -312,26 +320,35 @@ def bounds(
     out = np.empty((kinds, 2))
     grown = (pixels - before) / fresh
     for j in prange(kinds):
-        lows = np.zeros(signs.shape[0])
-        own = 0.0
-        total = 0.0
-        for b in range(cells):
-            x, y = 0, 0
+        # sums of every LANES-th bucket, so that neighbours are added at once; then the sums' sums
+        total, own = np.zeros(LANES), np.zeros(LANES)
+        lows = np.zeros((signs.shape[0], LANES))
+        x, y, gap = np.empty(LANES), np.empty(LANES), np.empty(LANES)
+        for begin in range(0, cells, LANES):
+            size = min(LANES, cells - begin)
+            x[:] = 0.0
+            y[:] = 0.0
             for part in range(parts):
-                x += first[part, j, b]
-                y += second[part, j, b]
-            h = target[b]
-            if x + y == 0 and h == 0.0:
-                continue
-            total += abs(h - (x + y) / (before + fresh))
-            # as the old pixels have it exactly, and the fresh ones tell the rest
-            gap = h - (x + y * grown) / pixels
-            old = h - x / before
-            own += gap if old > 0.0 else -gap if old < 0.0 else 0.0
-            for s in range(lows.size):
-                lows[s] += signs[s, b] * gap
-        for s in range(lows.size):
-            own = max(own, lows[s])
-        out[j, 0] = total
-        out[j, 1] = own
+                old, new = first[part, j, begin:], second[part, j, begin:]
+                for i in range(size):
+                    x[i] += old[i]
+                    y[i] += new[i]
+            wanted = target[begin:]
+            for i in range(size):
+                h = wanted[i]
+                total[i] += abs(h - (x[i] + y[i]) / (before + fresh))
+                # as the old pixels have it exactly, and the fresh ones tell the rest
+                g = h - (x[i] + y[i] * grown) / pixels
+                gap[i] = g
+                so_far = h - x[i] / before
+                own[i] += g if so_far > 0.0 else (-g if so_far < 0.0 else 0.0)
+            for s in range(signs.shape[0]):
+                sign, low = signs[s, begin:], lows[s]
+                for i in range(size):
+                    low[i] += sign[i] * gap[i]
+        best = own.sum()
+        for s in range(signs.shape[0]):
+            best = max(best, lows[s].sum())
+        out[j, 0] = total.sum()
+        out[j, 1] = best
     return out
