@@ -32,6 +32,38 @@ def _far_lights(real: Real) -> str:
     return "at 1 km as without a distance; at infinity refused"
 
 
+def _one_photon(real: Real) -> str:
+    from capture import hdr
+    from reconstruction import photometric_stereo as stereo
+
+    rng = np.random.default_rng(9)
+    turn = np.arange(24) * (np.pi / 12)
+    way = np.stack([0.6 * np.cos(turn), 0.6 * np.sin(turn), np.full(24, 0.8)], -1)
+
+    def seen(photons: float) -> stereo.NormalMaps:
+        electrons = rng.poisson(photons, (24, 1, 1, 2000)) + rng.standard_normal((24, 1, 1, 2000))
+        frames = np.rint(512.0 + electrons / 0.5).astype(np.uint16)
+        merged = [
+            hdr.merge(frame, (1.0,), gain=0.5, read_noise=1.0, black=512.0, white=16383.0)
+            for frame in frames
+        ]
+        radiance, variance, valid = (np.stack(part) for part in zip(*merged, strict=True))
+        return stereo.estimate_normals(
+            as_real(radiance, real), way, variance=as_real(variance, real), valid=valid
+        )
+
+    dark, bright = seen(1.0), seen(100.0)
+    masked(dark.valid, share=(0.0, 0.05))
+    clean(dark.normals, np.ones_like(dark.valid))
+    masked(bright.valid, share=(1.0, 1.0))
+    off = np.arccos(np.clip(bright.normals[..., 2], -1.0, 1.0))
+    # of two alike Gaussian errors 68.27 % are within 1.0714 of the root mean square
+    held = float(np.mean(off <= 1.0714 * bright.stderr_rad))
+    return f"{dark.valid.sum()} of 2000 given a normal; of 100 photons " + within_bounds(
+        held, 0.60, 0.76, what="share inside"
+    )
+
+
 def _one_turned_triangle(real: Real) -> str:
     from model import microstructure
 
@@ -112,6 +144,9 @@ CASES = (
     Case("light at infinity", "photometric stereo", "no distance, 1 km, and infinity as a place",
          "infinity over infinity in the falloff", "the same normals; PhotometricStereoError",
          _far_lights),
+    Case("one photon per pixel", "photometric stereo", "1 photon, 1 electron of noise",
+         "chance passes for shape", "at most 5 % given a normal; of 100 photons all, 68 % held",
+         _one_photon),
     Case("one triangle turned over", "strain", "one of 128 wound the other way",
          "its stretch changes sign among its neighbors'", "the stretch of all, 1.1",
          _one_turned_triangle),
