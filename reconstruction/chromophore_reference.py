@@ -13,6 +13,7 @@ from scipy.optimize import brentq
 
 from model.color_table import ColorTable
 from reconstruction.chromophore_start import LOWEST, evaluate, start_for
+from reconstruction.face_distribution import FaceDistribution
 from reconstruction.shading_prior import ShadingPrior
 
 Floats = NDArray[np.float64]
@@ -96,6 +97,7 @@ def weigh(
     covariance: Floats,
     prior: ShadingPrior,
     *,
+    face: FaceDistribution | None = None,
     size: tuple[int, int] = (1200, 500),
 ) -> Floats:
     """Sum the probability of one pixel's chromophores over a dense plane of their cube roots.
@@ -110,6 +112,8 @@ def weigh(
         Shape (3, 3), of the relative errors: noise and model.
     prior
         Of the log shading.
+    face
+        Of melanin and blood; None: any are as probable.
     size
         Places along melanin and along blood.
 
@@ -127,6 +131,9 @@ def weigh(
     color = weights - np.outer(weights.sum(axis=0), weights.sum(axis=0)) / whole
     log_density = np.einsum("...c,cd,...d->...", residual, -0.5 * color, residual)
     log_density += np.interp(shading, prior.nodes, np.log(prior.density)) - np.log(a)
+    if face is not None:
+        log_density += np.log(face.melanin.relative_density(np.log(table.c_m_max * a**3)))
+        log_density += np.log(face.blood.relative_density(b))
     density = np.exp(log_density - log_density.max())
     return np.array(
         [

@@ -2,9 +2,11 @@
 
 For every melanin of a grid the blood that fits best is followed along the ridge of the
 likelihood, over the fold where dark skin takes the colors of lighter skin; between the grid's
-lines the cost is interpolated by its values and slopes. `reconstruction.chromophore_posterior` is
-the door; `reconstruction.chromophore_reference` sums the same over a dense plane and is what this
-is tested against.
+lines the cost is interpolated by its values and slopes. Where it is known how blood and melanin
+are distributed over the face, the ridge is that of the product, and each line is looked at from
+the face's blood too. `reconstruction.chromophore_posterior` is the door;
+`reconstruction.chromophore_reference` sums the same over a dense plane and is what this is tested
+against.
 """
 
 from __future__ import annotations
@@ -29,6 +31,10 @@ REACH = 0.12
 """Longest step in blood, as a fraction of its axis."""
 CLOSE = 0.02
 """Step, in standard errors of blood, after which the next one would not matter."""
+ROUGH = 1.0
+"""The same up to which the last step is taken for granted."""
+MISSED = 2.0
+"""Cost below the ridge's from which on a place beside it is taken for the ridge."""
 PROBES = 8
 """Places between two lines where the cost is looked at first."""
 FINE = 160
@@ -64,6 +70,10 @@ _LOW = float(LOWEST)
 _STEP_A = (1.0 - _LOW) / (LINES - 1)
 _STEP_B = (1.0 - _LOW) / (NODES - 1)
 _ROOM = (LINES - 1) * FEWEST + FINE
+PER_LINE = 32
+"""Nodes of melanin's probability from line to line."""
+MELANIN_AXIS = np.linspace(_LOW, 1.0, (LINES - 1) * PER_LINE + 1)
+"""Fractions of the melanin axis, its cube root, that they stand at."""
 _FAST = {"contract"}
 
 Floats = NDArray[np.float64]
@@ -139,6 +149,72 @@ def _prior_cost(prior, low, step, t):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=_FAST)
+def _blood_cost(of_face, b):  # type: ignore[no-untyped-def]
+    """Return -2 log p of blood over the greatest p, its force on b, and its stiffness, >= 0.
+
+    `of_face`: mean, spread, height of the bell over that of any blood, part of the skin with any;
+    1 if there is no face.
+    """
+    away = (b - of_face[0]) / of_face[1]
+    bell = (1.0 - of_face[3]) * of_face[2] * math.exp(-0.5 * away * away)
+    whole = bell + of_face[3]
+    share = bell / whole
+    cost = 2.0 * math.log(((1.0 - of_face[3]) * of_face[2] + of_face[3]) / whole)
+    return cost, -share * away / of_face[1], share / (of_face[1] * of_face[1])
+
+
+@njit(fastmath=_FAST)
+def _melanin_cost(of_face, k, x):  # type: ignore[no-untyped-def]
+    """Return -2 log p of melanin over the greatest p, a part x of the way past line k."""
+    y = x * PER_LINE
+    i = min(int(y), PER_LINE - 1)
+    i0 = k * PER_LINE + i
+    return of_face[i0] + (y - i) * (of_face[i0 + 1] - of_face[i0])
+
+
+@njit(fastmath=_FAST)
+def _descend(log_rgb, by_b, k, b, seen, w, of_face):  # type: ignore[no-untyped-def]
+    """Return the blood on line k near which color and face are the most probable.
+
+    Also the last step that would be left, by how much blood is stiff there by the color and in
+    all, the residuals' products with the color's derivative and themselves, and residuals.
+    """
+    for turn in range(NEWTON_STEPS + 1):
+        f0, f1, f2, g0, g1, g2, j, x = _color(log_rgb, by_b, k, b)
+        e0, e1, e2 = seen[0] - f0, seen[1] - f1, seen[2] - f2
+        by_color = _form(w, g0, g1, g2, g0, g1, g2) + 1e-9
+        pushed = _form(w, g0, g1, g2, e0, e1, e2)
+        _, force, stiff = _blood_cost(of_face, b)
+        step = (pushed + force) / (by_color + stiff)
+        moved = min(max(b + min(max(step, -REACH), REACH), _LOW), 1.0) - b
+        if turn == NEWTON_STEPS or moved * moved * (by_color + stiff) < CLOSE * CLOSE:
+            break
+        b += moved
+    if of_face[3] < 1.0 and step * step * (by_color + stiff) > ROUGH * ROUGH:
+        step = 0.0  # not found: what a parabola says of places that far off is worth nothing
+    return b, step, by_color, by_color + stiff, pushed, e0, e1, e2, g0, g1, g2, j, x
+
+
+@njit(fastmath=_FAST)
+def _cost_after(w, s, found, of_face):  # type: ignore[no-untyped-def]
+    """Return blood, cost, the face's part of it and shading after the last step of `_descend`.
+
+    Also whether it is held: a place at an end of the axis that would go on stays there.
+    """
+    b, step, by_color, _, pushed, e0, e1, e2, g0, g1, g2 = found[:11]
+    held = (b <= _LOW and step < 0.0) or (b >= 1.0 and step > 0.0)
+    square = _form(w, e0, e1, e2, e0, e1, e2)
+    after = b
+    if not held:
+        after = min(max(b + step, _LOW), 1.0)
+        square += step * (step * by_color - 2.0 * pushed)
+    more, _, _ = _blood_cost(of_face, after)
+    shade = s[0] * e0 + s[1] * e1 + s[2] * e2
+    shade -= (s[0] * g0 + s[1] * g1 + s[2] * g2) * (after - b)
+    return after, max(square, 0.0) + more, more, shade, held
+
+
+@njit(fastmath=_FAST)
 def _volume(k, x, end):  # type: ignore[no-untyped-def]
     """Return the volume fraction of melanin a part x of the way past line k."""
     a = _LOW + (k + x) * _STEP_A
@@ -201,6 +277,8 @@ def _given(dtype: types.Type, axes: int) -> types.Array:
         _given(float64, 1),  # -2 log probability of log shading
         float64,  # log shading at the first node of it
         float64,  # and its step
+        _given(float64, 1),  # -2 log probability of melanin at MELANIN_AXIS, 0 at the greatest
+        _given(float64, 1),  # of blood: see _blood_cost
         float32[:, ::1],  # maps (6, n): see MAPS
         int64,  # pixels a task
     ),
@@ -224,6 +302,8 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
     prior,
     prior_low,
     prior_step,
+    melanin_of_face,
+    blood_of_face,
     maps,
     block,
 ):
@@ -234,7 +314,8 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
         cost, slope = np.empty(LINES), np.empty(LINES)
         blood, blood_slope = np.empty(LINES), np.empty(LINES)
         spread, pull = np.empty(LINES), np.empty(LINES)
-        shade, shade_by_b = np.empty(LINES), np.empty(LINES)
+        second = np.empty(LINES)
+        shade, face_cost = np.empty(LINES), np.empty(LINES)
         between = np.empty(LINES - 1)
         edges_a, total_a = np.empty(_ROOM + LINES), np.empty(_ROOM + LINES)
         across, coarse = np.empty((LINES, ACROSS)), np.empty(COARSE)
@@ -281,36 +362,39 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                 count = LINES - first if side == 0 else first
                 for index in range(count):
                     k = first + index if side == 0 else first - 1 - index
-                    f0, f1, f2, g0, g1, g2, j, x = _color(log_rgb, by_b, k, b)
-                    e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
-                    bb = _form(w, g0, g1, g2, g0, g1, g2) + 1e-9
-                    step = _form(w, g0, g1, g2, e0, e1, e2) / bb
-                    for _ in range(NEWTON_STEPS):
-                        moved = min(max(b + min(max(step, -REACH), REACH), _LOW), 1.0) - b
-                        if moved * moved * bb < CLOSE * CLOSE:
-                            break
-                        b += moved
-                        f0, f1, f2, g0, g1, g2, j, x = _color(log_rgb, by_b, k, b)
-                        e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
-                        bb = _form(w, g0, g1, g2, g0, g1, g2) + 1e-9
-                        step = _form(w, g0, g1, g2, e0, e1, e2) / bb
-                    held = (b <= _LOW and step < 0.0) or (b >= 1.0 and step > 0.0)
+                    found = _descend(log_rgb, by_b, k, b, (l0, l1, l2), w, blood_of_face)
+                    after, least, more, t, held = _cost_after(w, (s0, s1, s2), found, blood_of_face)
+                    b, second[k] = found[0], after
+                    if abs(after - blood_of_face[0]) > 2.0 * blood_of_face[1]:
+                        # the same melanin may have the color with blood that the face has
+                        other = _descend(
+                            log_rgb, by_b, k, blood_of_face[0], (l0, l1, l2), w, blood_of_face
+                        )
+                        o_after, o_least, o_more, o_t, o_held = _cost_after(
+                            w, (s0, s1, s2), other, blood_of_face
+                        )
+                        better = least + _prior_cost(prior, prior_low, prior_step, t)
+                        better -= o_least + _prior_cost(prior, prior_low, prior_step, o_t)
+                        if better > 0.0:
+                            second[k] = after if better < FAR else o_after
+                            found, after, least, more, t, held = (
+                                other, o_after, o_least, o_more, o_t, o_held
+                            )  # fmt: skip
+                        elif better > -FAR:
+                            second[k] = o_after
+                    _, step, _, stiff, _, e0, e1, e2, g0, g1, g2, j, x = found
                     h0 = by_a[k, j, 0] + x * (by_a[k, j + 1, 0] - by_a[k, j, 0])
                     h1 = by_a[k, j, 1] + x * (by_a[k, j + 1, 1] - by_a[k, j, 1])
                     h2 = by_a[k, j, 2] + x * (by_a[k, j + 1, 2] - by_a[k, j, 2])
-                    blood[k] = b
-                    blood_slope[k] = 0.0 if held else -_form(w, h0, h1, h2, g0, g1, g2) / bb
-                    spread[k] = 1.0 / math.sqrt(bb)
+                    blood_slope[k] = 0.0 if held else -_form(w, h0, h1, h2, g0, g1, g2) / stiff
+                    spread[k] = 1.0 / math.sqrt(stiff)
                     pull[k] = step if held else 0.0
-                    gain = 0.0 if held else step * step * bb
-                    cost[k] = max(_form(w, e0, e1, e2, e0, e1, e2) - gain, 0.0)
+                    cost[k], face_cost[k], blood[k] = least, more, after
                     o0, o1, o2 = e0, e1, e2
                     if not held:
                         o0, o1, o2 = e0 - g0 * step, e1 - g1 * step, e2 - g2 * step
-                        blood[k] = min(max(b + step, _LOW), 1.0)
                     slope[k] = -2.0 * _form(w, h0, h1, h2, o0, o1, o2)
-                    shade_by_b[k] = -(s0 * g0 + s1 * g1 + s2 * g2)
-                    shade[k] = s0 * e0 + s1 * e1 + s2 * e2 + shade_by_b[k] * (blood[k] - b)
+                    shade[k] = t
             # The lowest cost, and between which lines there is probability at all.
             lowest, color_lowest = np.inf, np.inf
             for k in range(LINES - 1):
@@ -319,9 +403,11 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                     x = float64(i) / PROBES
                     value, _ = _hermite(cost[k], cost[k + 1], slope[k], slope[k + 1], x, _STEP_A)
                     value = max(value, 0.0)
-                    color_lowest = min(color_lowest, value)
+                    more = face_cost[k] + x * (face_cost[k + 1] - face_cost[k])
+                    color_lowest = min(color_lowest, max(value - more, 0.0))
                     t = shade[k] + x * (shade[k + 1] - shade[k])
                     value += _prior_cost(prior, prior_low, prior_step, t)
+                    value += _melanin_cost(melanin_of_face, k, x)
                     least = min(least, value)
                 between[k] = least
                 lowest = min(lowest, least)
@@ -338,7 +424,8 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                 reach = 2.6 * spread[k]
                 if pull[k] != 0.0:
                     reach = min(reach, 5.0 * spread[k] * spread[k] / abs(pull[k]))
-                low, high = max(b - reach, _LOW), min(b + reach, 1.0)
+                low = max(min(b, second[k]) - reach, _LOW)
+                high = min(max(b, second[k]) + reach, 1.0)
                 wide[k] = high - low > WIDE
                 if wide[k]:
                     # The curvature says little of the far ends: look where probability ends.
@@ -352,6 +439,8 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                         t = s0 * e0 + s1 * e1 + s2 * e2
                         value = _form(w, e0, e1, e2, e0, e1, e2)
                         value += _prior_cost(prior, prior_low, prior_step, t)
+                        more, _, _ = _blood_cost(blood_of_face, _LOW + (i + 0.5) * width)
+                        value += more
                         coarse[i] = value
                         least = min(least, value)
                     low, high = 1.0, _LOW
@@ -364,13 +453,22 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                 if beside < lowest + 10.0:
                     b_low, b_high = min(b_low, low), max(b_high, high)
                 here = cost[k] + _prior_cost(prior, prior_low, prior_step, shade[k])
+                deepest = 0.0
                 for i in range(ACROSS):
                     f0, f1, f2, g0, g1, g2, j, x = _color(log_rgb, by_b, k, low + (i + 0.5) * width)
                     e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
                     t = s0 * e0 + s1 * e1 + s2 * e2
-                    more = _form(w, e0, e1, e2, e0, e1, e2) - here
+                    more, _, _ = _blood_cost(blood_of_face, low + (i + 0.5) * width)
+                    more += _form(w, e0, e1, e2, e0, e1, e2) - here
                     more += _prior_cost(prior, prior_low, prior_step, t)
                     across[k, i] = width * math.exp(-0.5 * max(more, -NEGLIGIBLE))
+                    deepest = min(deepest, max(more, -NEGLIGIBLE))
+                if blood_of_face[3] < 1.0 and deepest < -MISSED:
+                    # The ridge is not where the probability is; what lines have must not differ by
+                    # much more than their neighbors', or the sum between them is of neither.
+                    cost[k] += deepest
+                    for i in range(ACROSS):
+                        across[k, i] *= math.exp(0.5 * deepest)
             per_b = BINS / max(b_high - b_low, 1e-9)
             bins[:] = 0.0
             # Sum over melanin along the ridge, and over blood across it.
@@ -390,7 +488,9 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                     x = (f + 0.5) / each
                     value, _ = _hermite(cost[k], cost[k + 1], slope[k], slope[k + 1], x, _STEP_A)
                     t = shade[k] + x * (shade[k + 1] - shade[k])
-                    value = max(value, 0.0) + _prior_cost(prior, prior_low, prior_step, t) - lowest
+                    value = max(value, min(0.0, cost[k], cost[k + 1]))
+                    value += _prior_cost(prior, prior_low, prior_step, t) - lowest
+                    value += _melanin_cost(melanin_of_face, k, x)
                     mass = 0.0
                     if value < NEGLIGIBLE:
                         # every ratio of melanin is as likely as any other

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from model.skin import UNITS, SkinMap
 from model.tissue_optics import ANISOTROPY_SKIN
 from reconstruction import (
     chromophore_posterior,
+    face_chromophores,
     model_error,
     polarization,
     shading_prior,
@@ -30,7 +32,7 @@ from reconstruction import (
 from reconstruction.detectability import detectable
 from reconstruction.evidence import Evidence, EvidenceError
 
-REVISION = 3
+REVISION = 4
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
 MAPS = (
@@ -324,11 +326,14 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
         prior = prior.broadened(EXPOSURE_SPREAD)
     rgb = np.where(_valid(diffuse)[..., None], diffuse.values, np.nan)
     variance = np.square(_stderr(diffuse))
-    found = chromophore_posterior.weigh(
-        rgb, table, prior=prior, variance=variance,
-        model_error=model_error.of_picture(diffuse.values, variance, _valid(diffuse)),
+    errors = model_error.of_picture(diffuse.values, variance, _valid(diffuse))
+    # of a face in light of unknown strength its pixels together tell no more
+    face = None if inputs.white is None else face_chromophores.in_known_light(
+        rgb, table, variance=variance, model_error=errors
     )  # fmt: skip
-    noise_alone = chromophore_posterior.weigh(rgb, table, prior=prior, variance=variance)
+    known = partial(chromophore_posterior.weigh, rgb, table, prior=prior, face=face)
+    found = known(variance=variance, model_error=errors)
+    noise_alone = known(variance=variance)
     usable = found.valid
 
     def chromophore(

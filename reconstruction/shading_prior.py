@@ -25,6 +25,8 @@ UNEXPECTED = 0.01
 UNEXPECTED_SPREAD = 1.5
 """... but a normal one this wide in log shading, about the same mean."""
 _LOW, _HIGH, _STEP = -8.0, 5.0, 0.05
+SHARPEST = _STEP
+"""Least softness: the bins' and nodes' own width."""
 
 
 class ShadingPriorError(ValueError):
@@ -111,7 +113,9 @@ def lognormal(center: float, spread: float) -> ShadingPrior:
     )
 
 
-def from_samples(low: float, step: float, counts: ArrayLike) -> ShadingPrior:
+def from_samples(
+    low: float, step: float, counts: ArrayLike, *, softness: float = SOFTNESS
+) -> ShadingPrior:
     """Return the prior that a histogram of log shading gives, a little softened.
 
     Parameters
@@ -120,7 +124,11 @@ def from_samples(low: float, step: float, counts: ArrayLike) -> ShadingPrior:
         Lower edge and width of the bins, in log shading; between -7 and 4.
     counts
         (n,) what fell into the bins.
+    softness
+        Spread of log shading that is added, 0.05 or more: the nodes stand that far apart.
     """
+    if not _STEP <= softness < 2.0:
+        raise ShadingPriorError(f"softness: got {softness}, expected {_STEP} up to 2")
     heights = np.asarray(counts, dtype=np.float64)
     if heights.ndim != 1 or (heights < 0.0).any() or not heights.sum() > 0.0:
         raise ShadingPriorError("counts: expected a list of numbers, not negative, not all zero")
@@ -129,17 +137,19 @@ def from_samples(low: float, step: float, counts: ArrayLike) -> ShadingPrior:
     if places[0] < _LOW + 1.0 or places[-1] > _HIGH - 1.0:
         raise ShadingPriorError(f"bins: got {places[0]:.2f} to {places[-1]:.2f}, expected -7 to 4")
     share = heights / heights.sum()
-    density = (share * _normal(nodes[:, None] - places, SOFTNESS)).sum(axis=1)
+    density = (share * _normal(nodes[:, None] - places, softness)).sum(axis=1)
     mean = float((share * places).sum())
     rest = _normal(nodes - mean, UNEXPECTED_SPREAD)
     return ShadingPrior(_LOW, _STEP, (1.0 - UNEXPECTED) * density + UNEXPECTED * rest)
 
 
-def of_faces() -> ShadingPrior:
+def of_faces(*, softness: float = SOFTNESS) -> ShadingPrior:
     """Return the prior of a face before the flash rig, relative to a white tile in its place.
 
     The distribution over the skin of the simulated subjects of seeds 0 to 19, all skin types, in
     their mean and width and shape; ``tools/fit_model_error.py`` measures it. No other seeds set it.
+    `softness` as of `from_samples`: as small as it gets for light that a face's pixels do not have
+    in common.
 
     Examples
     --------
@@ -148,7 +158,7 @@ def of_faces() -> ShadingPrior:
     (True, True)
     """
     found = model_error.shading_histogram()
-    return from_samples(found.low, found.step, found.counts)
+    return from_samples(found.low, found.step, found.counts, softness=softness)
 
 
 def _normal(away: Floats, spread: float) -> Floats:

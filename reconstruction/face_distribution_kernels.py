@@ -1,0 +1,65 @@
+"""How probable each pixel's color is over a plane of chromophores, one pixel after the other."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import float32, float64, int64, njit, prange, types, void
+
+_FAST = {"contract"}
+NEGLIGIBLE = 36.0
+"""-2 log p above the pixel's lowest from which on probability is left out."""
+
+
+def _given(dtype: types.Type, axes: int) -> types.Array:
+    """Return the type of a contiguous argument that is only read, and may be read-only."""
+    return types.Array(dtype, axes, "C", readonly=True)
+
+
+@njit(
+    void(
+        _given(float64, 2),  # log rgb (n, 3)
+        _given(float64, 3),  # weights of its errors, brightness projected out (n, 3, 3)
+        _given(float64, 2),  # weights of its mean that tells shading (n, 3), their sum is 1
+        _given(float64, 3),  # log color of the plane (m, b, 3)
+        _given(float64, 1),  # -2 log probability of log shading
+        float64,  # log shading at the first node of it
+        float64,  # and its step
+        int64,  # places in blood that are summed
+        float32[:, :, ::1],  # probability (n, m, b / summed), 0 before
+    ),
+    parallel=True,
+    fastmath=_FAST,
+    cache=True,
+    nogil=True,
+    boundscheck=False,
+    error_model="numpy",
+)
+def plane_probability(  # type: ignore[no-untyped-def]
+    log_rgb, weights, mean, plane, prior, prior_low, prior_step, summed, probability
+):
+    """Sum each pixel's probability over the plane, 1 at its greatest."""
+    rows, columns = plane.shape[0], plane.shape[1]
+    for n in prange(log_rgb.shape[0]):
+        cost = np.empty((rows, columns))
+        w = weights[n]
+        lowest = np.inf
+        for i in range(rows):
+            for j in range(columns):
+                e0 = log_rgb[n, 0] - plane[i, j, 0]
+                e1 = log_rgb[n, 1] - plane[i, j, 1]
+                e2 = log_rgb[n, 2] - plane[i, j, 2]
+                value = w[0, 0] * e0 * e0 + w[1, 1] * e1 * e1 + w[2, 2] * e2 * e2
+                value += 2.0 * (w[0, 1] * e0 * e1 + w[0, 2] * e0 * e2 + w[1, 2] * e1 * e2)
+                y = mean[n, 0] * e0 + mean[n, 1] * e1 + mean[n, 2] * e2
+                y = (y - prior_low) / prior_step
+                k = min(max(math.floor(y), 0), prior.shape[0] - 2)
+                value += prior[k] + (y - k) * (prior[k + 1] - prior[k])
+                cost[i, j] = value
+                lowest = min(lowest, value)
+        for i in range(rows):
+            for j in range(columns):
+                more = cost[i, j] - lowest
+                if more < NEGLIGIBLE:
+                    probability[n, i, j // summed] += np.float32(math.exp(-0.5 * more))
