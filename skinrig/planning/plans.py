@@ -47,7 +47,7 @@ class Forecast:
     name: str
     unit: str
     value: float
-    """Predicted median error, in the unit."""
+    """Predicted median error, in the unit; infinite where no estimate would be kept."""
     interval: tuple[float, float]
     """68 % interval of what a capture will show, from how far forecasts were off."""
     wanted: float | None
@@ -298,6 +298,12 @@ def lines(choice: Choice) -> list[str]:
     out = []
     for one in choice.forecasts:
         asked = "" if one.wanted is None else f", wanted {one.wanted:g} {one.unit}"
+        if not math.isfinite(one.value):
+            out.append(
+                f"forecast: {one.name} keeps no estimate anywhere on this subject{asked}"
+                f"{'' if one.reached else ': NOT REACHED'}"
+            )
+            continue
         out.append(
             f"forecast: {one.name} {one.value:.3g} {one.unit} in the median "
             f"({one.interval[0]:.3g} to {one.interval[1]:.3g}{asked}"

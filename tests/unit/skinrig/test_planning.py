@@ -2,11 +2,12 @@
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
 
-from capture.plan import Plan
+from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
 from reconstruction import light_selection
 from skinrig.cli import main
@@ -32,6 +33,16 @@ def test_what_cannot_be_wanted_is_told(text, word):
 def test_a_rig_that_has_no_plans_of_its_own_is_told(capsys):
     assert main(["plan", "moon", "--want", "normals<=1deg"]) == 3
     assert "expected one of dome" in capsys.readouterr().err
+
+
+def test_a_quantity_that_keeps_no_estimate_is_said_to_and_not_given_an_infinite_error():
+    rig = load_rig("flash")
+    told = plans.Forecast("hemoglobin", "%", math.inf, (math.inf, math.inf), 20.0)
+    choice = plans.Choice(rig, flash_plan(rig), (told,), 1.0, 2.0, {}, ())
+    first = plans.lines(choice)[0]
+    assert "inf" not in first
+    assert "hemoglobin keeps no estimate" in first
+    assert "wanted 20 %: NOT REACHED" in first
 
 
 @pytest.fixture(scope="module")
