@@ -177,7 +177,12 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
     )  # fmt: skip
 
 
-def predict(look: Sight, setting: Setting) -> Prediction:
+Memory = dict[tuple[Any, ...], Sequence[Any]]
+"""Fits of one `Sight` by what they hang on: plans that differ in placements alone share them, and
+without noise nearly all do."""
+
+
+def predict(look: Sight, setting: Setting, *, memory: Memory | None = None) -> Prediction:
     """Return the errors that a plan leaves.
 
     Placements lower what the readings' noise leaves, and neither the misfit of layers nor what the
@@ -189,14 +194,19 @@ def predict(look: Sight, setting: Setting) -> Prediction:
         See `sight`.
     setting
         Sites, exposures, placements and darks.
+    memory
+        Fits of earlier plans of the same sight, which is added to; None: none are kept.
     """
+    memory = {} if memory is None else memory
     shape = (len(look.sites), 3)
     sigma, bias, common = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)
     still, found = np.full(shape, np.inf), np.ones(shape)
     valid = np.zeros(shape, np.bool_)
     measured = np.zeros(len(look.sites), np.bool_)
     places = [k for k, site in enumerate(look.sites) if site in setting.sites]
-    with_noise, without = (_fits(look, setting, places, noise=noise) for noise in (True, False))
+    with_noise, without = (
+        _fits(look, setting, places, noise=noise, memory=memory) for noise in (True, False)
+    )
     for k, fit, quiet in zip(places, with_noise, without, strict=True):
         measured[k] = True
         valid[k] = fit.fit.valid
@@ -213,8 +223,27 @@ def predict(look: Sight, setting: Setting) -> Prediction:
     return Prediction(look.sites, sigma, bias, common, still, valid, measured)
 
 
-def _fits(look: Sight, setting: Setting, places: Sequence[int], *, noise: bool) -> Sequence[Any]:
+def _fits(
+    look: Sight, setting: Setting, places: Sequence[int], *, noise: bool, memory: Memory
+) -> Sequence[Any]:
     """Return the fits of each site's profile as a plan would read it, or without its noise."""
+    read = [
+        _variance(look, look.reflectance[k], setting.exposures_s, setting.darks, setting.level)
+        for k in places
+    ]
+    # of the readings' noise a fit without it asks only which fibres are read at all
+    told = np.array(read) if noise else np.isfinite(read)
+    count = len(setting.exposures_s)
+    key = (noise, tuple(places), count, told.tobytes())
+    if key not in memory:
+        memory[key] = _fitted(look, read, places, count, noise=noise)
+    return memory[key]
+
+
+def _fitted(
+    look: Sight, read: Sequence[Floats], places: Sequence[int], exposures: int, *, noise: bool
+) -> Sequence[Any]:
+    """Return the fits of profiles with these variances of their readings."""
     from capture.calibration.fibre import FibreReflectance
     from reconstruction.probe_images import Measurement
     from reconstruction.probe_stages import Profile, fit_profiles
@@ -226,9 +255,8 @@ def _fits(look: Sight, setting: Setting, places: Sequence[int], *, noise: bool) 
     gain += look.phantom_error**2
     mixed = _crosstalk(len(radius))
     profiles = []
-    for k in places:
+    for k, own in zip(places, read, strict=True):
         value = look.reflectance[k]
-        own = _variance(look, value, setting.exposures_s, setting.darks, setting.level)
         valid = np.isfinite(own)
         variance = np.where(valid, own, 0.0) if noise else np.zeros_like(own)
         told = (value, look.phantom, value / look.phantom)
@@ -237,9 +265,7 @@ def _fits(look: Sight, setting: Setting, places: Sequence[int], *, noise: bool) 
             names, radius, value, variance + gain * value**2 + doubt,
             np.concatenate([value * look.common, shared]), valid, ~valid,
         )  # fmt: skip
-        head = Measurement(
-            Placement(look.sites[k], 0.0, 0), len(setting.exposures_s), 1.0, math.nan, 5.0
-        )
+        head = Measurement(Placement(look.sites[k], 0.0, 0), exposures, 1.0, math.nan, 5.0)
         profiles.append(Profile(head, reflectance))
     return fit_profiles(profiles, look.probe) if profiles else []
 
@@ -267,7 +293,8 @@ def choose(
     if not wants:
         return _choice(rig, look, own, setting_of(own), wants)
     target = wants.get("sigma_tr", math.inf) / 100.0
-    whole = predict(look, setting_of(own))
+    memory: Memory = {}
+    whole = predict(look, setting_of(own), memory=memory)
 
     def good(found: Prediction) -> bool:
         left = found.sigma[~found.measured]
@@ -280,7 +307,7 @@ def choose(
 
     tried: list[tuple[Setting, Plan, Prediction]] = []
     for setting, plan in candidates(rig, look):
-        tried.append((setting, plan, predict(look, setting)))
+        tried.append((setting, plan, predict(look, setting, memory=memory)))
         if good(tried[-1][2]):
             break
     path = tuple(

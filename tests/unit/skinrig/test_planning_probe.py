@@ -45,6 +45,22 @@ def test_longer_exposures_and_placements_lower_the_error_down_to_the_common_one(
     assert sigma(0.00115, 0.01, darks=1) > short
 
 
+def test_fits_that_plans_share_leave_the_forecast_to_the_bit_as_it_is(look):
+    memory = {}
+    settings = [
+        Setting(SITES, exposures_s, repeats, darks)
+        for exposures_s in ((0.00115, 0.01), (0.00115, 0.1))
+        for repeats in (1, 4)
+        for darks in (1, 2)
+    ]
+    for setting in settings:
+        alone, shared = (probe.predict(look, setting, memory=kept) for kept in (None, memory))
+        for name in ("sigma", "bias", "common", "misfit", "valid"):
+            np.testing.assert_array_equal(getattr(shared, name), getattr(alone, name))
+    # placements share all fits, and fits without noise those of all darks and times
+    assert len(memory) < len(settings)
+
+
 def test_variance_of_a_reading_follows_its_photons_and_saturation(look):
     series = exposure_series_s()
     skin = look.reflectance[0]
