@@ -39,7 +39,7 @@ from reconstruction.scan_mesh import RefinedScan
 from reconstruction.surface_estimates import PointValues
 from reconstruction.surface_texture import SurfaceTexture
 
-REVISION = 3
+REVISION = 4
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
 RANK: Final = 4

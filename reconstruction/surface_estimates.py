@@ -34,6 +34,8 @@ LEAST_COS_VIEW: Final = 0.2
 """Normals are not estimated from flatter samples: the boundary's transmittance bends there."""
 GRAZING_COS: Final = 0.05
 """Light lower than this over the estimated surface is as good as none."""
+LEAST_COS_STRIP: Final = 0.05
+"""Flatter views count as if they were so flat; the albedo's fit leaves them out."""
 HIGHLIGHT_RAD: Final = np.radians(35.0)
 """Samples whose half vector lies nearer to the normal hold too much of the highlight: skin's
 facets have a Beckmann slope of about 0.3 (Weyrich et al. 2005), of which 98 % lie below this."""
@@ -245,12 +247,17 @@ def albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> P
     Notes
     -----
     The standard errors hold noise alone: see `surface_errors.of_albedo` for the rest.
+
+    A pixel that sees the surface aslant averages a strip of it that is 1 / cos(view) long, and near
+    a rim what lies behind the face as well: its deviation from the point's own light counts in
+    proportion to that length.
     """
     samples = at_normals(samples, normals)
+    strip = 1.0 / np.maximum(samples.cos_view, LEAST_COS_STRIP)[..., None]
     found = diffuse_albedo.estimate(
         samples.f, samples.light_dir, samples.view_dir,
         np.where(normals.valid[:, None], normals.values, np.nan).astype(np.float32),
-        eta=fresnel.ETA_SKIN, variance=samples.variance, valid=samples.valid,
+        eta=fresnel.ETA_SKIN, variance=samples.variance * np.square(strip), valid=samples.valid,
         normal_stderr_rad=stderr_rad,
     )  # fmt: skip
     good = found.valid & normals.valid & np.isfinite(found.stderr).all(axis=-1)

@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from model import brdf_tables, fresnel
+from reconstruction import diffuse_albedo
 from reconstruction import surface_estimates as estimates
 from reconstruction.lumitexels import Lumitexels
 
@@ -218,6 +219,29 @@ def test_albedo_does_not_know_how_far_the_scans_normals_were_off():
     scanned = dataclasses.replace(samples, cos_light=make(truth, lights=lights).cos_light)
     taken = estimates.albedo(scanned, known(truth), stderr_rad=1e-3)
     assert np.median(np.abs(taken.values / R_D - 1.0)) > 0.01
+
+
+def test_views_aslant_whose_pixels_reach_beyond_the_point_count_less_in_the_albedo():
+    truth = cap(30, 0.3)
+    aslant = np.array([[0.95, 0.0, 0.3], [-0.93, 0.2, 0.3], [0.1, -0.95, 0.3], [0.0, 0.95, 0.3]])
+    aslant /= np.linalg.norm(aslant, axis=1, keepdims=True)
+    rng = np.random.default_rng(6)
+    samples = make(truth, views=np.concatenate([VIEWS, aslant]), noise=1e-3, rng=rng)
+    # what a strip 1 / cos long averages is darker in proportion to its length squared
+    lost = 0.004 / np.square(np.maximum(samples.cos_view, 0.1))
+    darker = dataclasses.replace(samples, f=samples.f * (1.0 - lost)[..., None].astype(np.float32))
+
+    def off(r_d):
+        return np.median(np.abs(r_d / R_D - 1.0))
+
+    alike = diffuse_albedo.estimate(
+        darker.f, darker.light_dir, darker.view_dir, truth.astype(np.float32),
+        eta=fresnel.ETA_SKIN, variance=darker.variance, valid=darker.valid, normal_stderr_rad=1e-3,
+    )  # fmt: skip
+    found = estimates.albedo(darker, known(truth), stderr_rad=1e-3)
+    assert found.valid.all()
+    assert off(found.values) < 0.75 * off(alike.r_d)
+    assert 0.004 < off(found.values)  # what views from the front lose stays
 
 
 def test_samples_at_other_normals_keep_their_radiance():
