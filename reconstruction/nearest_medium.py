@@ -5,17 +5,17 @@ of asymmetry `G` the one whose profile is nearest up to a factor, by the mean sq
 logarithms of the ratios over all fibres that take `FAINTEST_PER_MM2` or more, each of one weight.
 What is left of the profile then is no error of that medium: residuals that are there without any
 noise move it as little as they move the mean of a sample. So they must not widen its interval, and
-no fibre may be left out for the sake of its residual, or weighed by its noise where that is less
-than the misfit: any other weights tell of another medium.
+no fibre may be left out for the sake of its residual, or weighed by its noise: any other weights
+tell of another medium, its sigma_tr off by as much as a tenth where the misfit is a tenth.
 
-With residuals r0 of the noiseless profile of deviation tau, noise e of relative deviation s, and
-weights k = tau^2 / (tau^2 + s^2), the medium found is off by::
+So two things are told apart. First what the profile is without noise, at all of the definition's
+fibres: readings, and that what layers do to a profile is smooth (`reconstruction.smooth_misfit`).
+Then the medium nearest to that, all fibres alike. A profile that is off by e, of covariance V,
+moves the medium by::
 
-    A^-1 J' (k e - (1 - k) r0),   A = J' k J - sum k r J2,   J' r0 = 0
+    A^-1 J' e,   A = J' J - sum r J2
 
-J and J2 the first and second derivatives of log R. The first term is noise, as far as it counts.
-The second is what the definition's medium owes to fibres that hardly show: known only as far as
-neighbours are alike, of which the residuals tell.
+with J and J2 the first and second derivatives of log R and r what is left.
 
 References
 ----------
@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from reconstruction.profile_batch import LEAST_DEVIATION, START_ERROR, ProfileBatch
-from reconstruction.subsurface_models import ProfileModel
+from reconstruction.smooth_misfit import smooth_misfit
+from reconstruction.subsurface_models import LEAST_LOG, ProfileModel
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -41,7 +42,10 @@ G: Final = 0.8
 FAINTEST_PER_MM2: Final = 1e-7
 """Of the definition's fibres: what 23 exposures up to 30 s still tell to about a tenth."""
 MOST_NOISE: Final = 0.3
-"""Relative deviation of a reading up to which its logarithm is used."""
+"""Relative deviation of a reading up to which it counts as used, and fits begin with it."""
+BY_LOGARITHM: Final = 0.1
+"""Likewise up to which its logarithm is compared. Of fainter ones that would leave out the low
+readings; they are compared as they are, with the profile found so far."""
 DIMMING: Final = 1.0
 """Standard deviation of the log of the factor: a layer on top dims, and does not do so by a hundred
 or brighten, as media of next to no scattering would ask for."""
@@ -52,14 +56,12 @@ TABLE_RISE: Final = (5.0, 30.0)
 """Reduced distances between which it comes in."""
 DENSE: Final = 0.1
 """Below the logarithm of the most scattering: a start there."""
-ROUNDS: Final = 3
-"""Times the misfit and the fibres that count are taken anew."""
-MOMENTS: Final = 8
-"""Times the misfit's own weights are taken anew."""
+ROUNDS: Final = 4
+"""Times the profile without noise and the fibres that count are taken anew."""
+VALLEYS_AFTER: Final = 1
+"""Of them, those before all valleys of the misfit are looked at again, by the profile found."""
 STEP: Final = 1e-3
 """Of parameters, for second derivatives."""
-MOST_ALIKE: Final = 0.95
-"""Correlation of the misfit of neighbours."""
 FREE: Final = 3
 """Parameters that are fitted: log sigma_a, log sigma_s', log of the factor."""
 
@@ -83,32 +85,59 @@ def fit_nearest(batch: ProfileBatch, model: ProfileModel, chosen: NDArray[np.int
     told = batch.seen[chosen] & (noise < MOST_NOISE)
     # the mean of a logarithm is below the logarithm of the mean
     logs = np.where(told, np.log(safe) + 0.5 * np.where(told, noise, 0.0) ** 2, 0.0)
-    own = np.where(told, noise**2 + model.error[0] ** 2, np.inf)
     counts = told & (y >= FAINTEST_PER_MM2)
+    wide = np.where(counts, noise**2 + model.error[0] ** 2 + START_ERROR**2, np.inf)
+    _nearest_of(batch, model, chosen, logs, wide, _starts(batch, model, logs, counts))
+    profile = np.log(np.maximum(batch.predicted[chosen], 1e-290))
     spread = np.full(len(chosen), START_ERROR)
-    starts = _starts(batch, model, logs, counts)
     doubt = np.zeros((len(chosen), 4, 4))
     for round_ in range(ROUNDS):
-        wide = np.where(counts, own + spread[:, None] ** 2, np.inf)
-        if round_ == 0:
-            doubt = _nearest_of(batch, model, chosen, logs, wide, starts)
+        medium = np.log(np.maximum(batch.predicted[chosen], 1e-290))
+        reading, own = _readings(batch, model, chosen, profile)
+        misfit, error = smooth_misfit(model.radius_mm, reading - medium, own)
+        profile = medium + misfit
+        owed = profile >= np.log(FAINTEST_PER_MM2)
+        alike = np.where(owed, np.maximum(spread, LEAST_DEVIATION)[:, None] ** 2, np.inf)
+        if round_ == VALLEYS_AFTER:
+            starts = _starts(batch, model, profile, owed)
+            doubt = _nearest_of(batch, model, chosen, profile, alike, starts, error)
         else:
-            batch.run(model, chosen, logs, wide, batch.theta[chosen], logarithmic=True)
-        off = np.where(counts, logs - np.log(np.maximum(batch.predicted[chosen], 1e-290)), 0.0)
-        spread = _misfit(off, own, counts)
-        counts = told & (batch.predicted[chosen] >= FAINTEST_PER_MM2)
-    owed = batch.predicted[chosen] >= FAINTEST_PER_MM2
-    m = batch.predicted[chosen]
+            batch.run(model, chosen, profile, alike, batch.theta[chosen], logarithmic=True)
+        m = batch.predicted[chosen]
+        off = np.where(owed, profile - np.log(np.maximum(m, 1e-290)), 0.0)
+        spread = np.sqrt((off**2).sum(axis=1) / np.maximum(owed.sum(axis=1), 1))
     batch.covariance[chosen] = doubt + _covariance(
-        model, batch.theta[chosen], off, np.where(counts, own, np.inf), spread, owed
+        model, batch.theta[chosen], off, owed, error, spread
     )
+    counts = told & owed
     stated = variance + model.relative_variance(batch.theta[chosen]) * m**2
     square = np.where(counts, (y - m) ** 2, 0.0)
     batch.chi2[chosen] = (square / np.where(counts, stated, 1.0)).sum(axis=1)
+    wide = np.where(counts, own + spread[:, None] ** 2, np.inf)
     batch.total[chosen] = np.where(counts, wide * m**2, np.inf)
     batch.used[chosen] = counts
     batch.seen[chosen] &= counts
     batch.spread[chosen] = spread
+
+
+def _readings(
+    batch: ProfileBatch, model: ProfileModel, chosen: NDArray[np.intp], profile: Floats
+) -> tuple[Floats, Floats]:
+    """Return logarithms of readings about a profile's, and their variances, each (N, F).
+
+    Parameters
+    ----------
+    profile
+        Logarithms of what they are without noise, as far as it is known, (N, F).
+    """
+    m, y = np.exp(np.maximum(profile, LEAST_LOG)), batch.y[chosen]
+    known = batch.used[chosen] & np.isfinite(batch.variance[chosen])
+    relative = np.where(known, batch.variance[chosen], 0.0) / m**2
+    bright = known & (y > 0.0) & (relative < BY_LOGARITHM**2)
+    reading = profile + y / m - 1.0
+    reading = np.where(bright, np.log(np.where(bright, y, 1.0)) + 0.5 * relative, reading)
+    own = np.where(known, relative + model.error[0] ** 2, np.inf)
+    return np.where(known, reading, profile), own
 
 
 def _starts(
@@ -128,15 +157,16 @@ def _starts(
 
 def _nearest_of(
     batch: ProfileBatch, model: ProfileModel, chosen: NDArray[np.intp], logs: Floats,
-    wide: Floats, starts: tuple[Floats, ...],
+    wide: Floats, starts: tuple[Floats, ...], error: Floats | None = None,
 ) -> Floats:  # fmt: skip
     """Fit from every start, keep the nearest medium; return what the others leave in doubt.
 
     Media may be as near as each other and far apart. Which one is nearest, a table that is off by
     `TABLE_ERROR` at many fibres alike then decides by chance: its mean square misfit of deviation d
-    has the error 2 d `TABLE_ERROR`. The others' distances join the covariance, each with its odds.
+    has the error 2 d `TABLE_ERROR`, to which that of the profile adds (``error``, (N, F, F)). The
+    others' distances join the covariance, each with its odds.
     """
-    square, theta = [], []
+    square, theta, offs = [], [], []
     for number, start in enumerate(starts):
         batch.run(model, chosen, logs, wide, start.copy(), better=number > 0, logarithmic=True)
         alone = ProfileBatch.of(batch.y[chosen], batch.variance[chosen], batch.used[chosen],
@@ -147,60 +177,44 @@ def _nearest_of(
         prior = (START_ERROR * alone.theta[:, 2] / DIMMING) ** 2
         square.append(((off**2).sum(axis=1) + prior) / np.maximum(known.sum(axis=1), 1))
         theta.append(alone.theta)
+        offs.append(off)
     misfit, places = np.stack(square), np.stack(theta)
     least = misfit.min(axis=0)
-    sure = np.maximum(2.0 * np.sqrt(least) * TABLE_ERROR, 1e-12)
+    sure = np.broadcast_to(np.maximum(2.0 * np.sqrt(least) * TABLE_ERROR, 1e-12), misfit.shape)
+    if error is not None:
+        residual = np.stack(offs)
+        best = np.take_along_axis(residual, misfit.argmin(axis=0)[None, :, None], axis=0)
+        count = np.maximum(np.isfinite(wide).sum(axis=1), 1)
+        moved = 2.0 * (residual - best) / count[:, None]
+        sure = np.sqrt(sure**2 + np.einsum("knf,nfh,knh->kn", moved, error, moved))
     odds = ndtr(-(misfit - least) / sure)
     away = places - batch.theta[chosen]
     away[..., FREE:] = 0.0
     return np.asarray(np.einsum("kn,knp,knq->npq", odds, away, away))
 
 
-def _misfit(off: Floats, own: Floats, counts: Bools) -> Floats:
-    """Return the deviation of noiseless profiles from the media, (N,): residuals less the noise.
-
-    By moments of weights that are those of the fit, else a single noisy fibre would hide all misfit
-    (Paule and Mandel 1982, doi:10.6028/jres.087.022).
-    """
-    kept = counts.sum(axis=1)
-    spared = kept / np.maximum(kept - FREE, 1)  # residuals of a fit are smaller than errors
-    square = off**2 * spared[:, None]
-    variance = np.full(len(off), START_ERROR**2)
-    noise = np.where(counts, own, 1.0)
-    for _ in range(MOMENTS):
-        weight = np.where(counts, 1.0 / (noise + variance[:, None]) ** 2, 0.0)
-        excess = (weight * (square - noise)).sum(axis=1)
-        total = np.maximum(weight.sum(axis=1), 1e-290)
-        variance = np.maximum(excess / total, LEAST_DEVIATION**2)
-    return np.asarray(np.sqrt(variance))
-
-
 def _covariance(
-    model: ProfileModel, theta: Floats, off: Floats, own: Floats, spread: Floats, owed: Bools
+    model: ProfileModel, theta: Floats, off: Floats, owed: Bools, error: Floats, spread: Floats
 ) -> Floats:
-    """Return the covariance of the parameters, (N, 4, 4); see the module."""
-    count, fibres = off.shape
-    share = spread[:, None] ** 2 / (spread[:, None] ** 2 + own)  # k
+    """Return the covariance of the parameters, (N, 4, 4), by that of profiles; see the module."""
+    share = owed.astype(np.float64)
     first = _slopes(model, theta)
     bread = np.einsum("npf,nf,nqf->npq", first, share, first)
+    bread[:, 2, 2] += np.maximum(spread, LEAST_DEVIATION) ** 2 / DIMMING**2
     for q in range(FREE):
         shift = np.zeros(theta.shape[1])
         shift[q] = STEP
         second = (_slopes(model, theta + shift) - _slopes(model, theta - shift)) / (2.0 * STEP)
         bread[:, :, q] -= np.einsum("nf,nf,npf->np", share, off, second)
-    noise = np.where(np.isfinite(own), share**2 * np.where(np.isfinite(own), own, 0.0), 0.0)
-    missing = np.where(owed, (1.0 - share) * spread[:, None], 0.0)
-    apart = np.abs(np.arange(fibres)[:, None] - np.arange(fibres))
-    alike = _alike(off, np.asarray(np.isfinite(own)))[:, None, None] ** apart
-    meat = np.einsum("npf,nf,nqf->npq", first, noise, first)
-    meat += np.einsum("npf,nf,nfh,nh,nqh->npq", first, missing, alike, missing, first)
-    covariance = np.full((count, 4, 4), 0.0)
+    along = first * share[:, None]
+    meat = along @ error @ along.transpose(0, 2, 1)
     reduced = model.radius_mm * np.exp(theta[:, 1:2])
     rise = np.log(reduced / TABLE_RISE[0]) / np.log(TABLE_RISE[1] / TABLE_RISE[0])
     table = np.einsum("npf,nf->np", first, share * TABLE_ERROR * np.clip(rise, 0.0, 1.0))
     meat += table[:, :, None] * table[:, None, :]
     definite = np.all(np.linalg.eigvalsh(0.5 * (bread + bread.transpose(0, 2, 1))) > 0.0, axis=1)
     inverse = np.linalg.inv(np.where(definite[:, None, None], bread, np.eye(FREE)))
+    covariance = np.zeros((len(theta), 4, 4))
     covariance[:, :FREE, :FREE] = inverse @ meat @ inverse.transpose(0, 2, 1)
     covariance[~definite] = np.inf
     return covariance
@@ -210,11 +224,3 @@ def _slopes(model: ProfileModel, theta: Floats) -> Floats:
     """Return the derivatives of log R by the free parameters, (N, 3, F)."""
     value, slope = model.profiles(np.ascontiguousarray(theta))
     return np.asarray(slope[:, :FREE] / np.maximum(value, 1e-290)[:, None])
-
-
-def _alike(off: Floats, counts: Bools) -> Floats:
-    """Return the correlation of residuals of neighbours, (N,)."""
-    both = counts[:, 1:] & counts[:, :-1]
-    pairs = np.where(both, off[:, 1:] * off[:, :-1], 0.0).sum(axis=1)
-    squares = np.maximum((np.where(counts, off, 0.0) ** 2).sum(axis=1), 1e-290)
-    return np.asarray(np.clip(pairs / squares, 0.0, MOST_ALIKE))

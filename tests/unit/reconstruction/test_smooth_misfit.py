@@ -1,0 +1,81 @@
+"""Smooth curves through noisy fibres, against splines and kriging written anew."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import make_smoothing_spline
+
+from reconstruction.smooth_misfit import SPREAD, STRENGTHS, USUAL, smooth_misfit
+
+RADIUS = 0.3 + 0.25 * np.arange(28)
+PLACE = np.sqrt(RADIUS)
+CURVE = 0.1 * np.sin(3.0 * PLACE)
+
+
+def kriged(value, variance, strength):
+    """Return log posterior, curve and covariance by the integrated Wiener process's kernel."""
+    x = PLACE - PLACE[0]
+    low, high = np.minimum(x[:, None], x), np.maximum(x[:, None], x)
+    kernel = strength * low**2 * (3.0 * high - low) / 6.0
+    lines = np.stack([np.ones_like(x), x], axis=1)
+    inverse = np.linalg.inv(kernel + np.diag(variance))
+    firm = lines.T @ inverse @ lines
+    beta = np.linalg.solve(firm, lines.T @ inverse @ value)
+    rest = value - lines @ beta
+    likely = -0.5 * (
+        np.linalg.slogdet(kernel + np.diag(variance))[1] + np.linalg.slogdet(firm)[1]
+        + rest @ inverse @ rest + (np.log(strength / USUAL) / SPREAD) ** 2
+    )  # fmt: skip
+    left = lines - kernel @ inverse @ lines
+    covariance = kernel - kernel @ inverse @ kernel + left @ np.linalg.solve(firm, left.T)
+    return likely, lines @ beta + kernel @ inverse @ rest, covariance
+
+
+@pytest.mark.parametrize("noise", [0.003, 0.03, 0.3])
+def test_curve_and_errors_are_those_of_kriging_at_the_likeliest_strength(noise):
+    rng = np.random.default_rng(2)
+    spread = noise * np.exp(0.2 * RADIUS)
+    value = CURVE + spread * rng.standard_normal(28)
+    each = [kriged(value, spread**2, strength) for strength in STRENGTHS]
+    best = int(np.argmax([one[0] for one in each]))
+    curve, covariance = smooth_misfit(RADIUS, value[None], (spread**2)[None])
+    np.testing.assert_allclose(curve[0], each[best][1], atol=1e-4 * noise)
+    np.testing.assert_allclose(covariance[0], each[best][2], atol=1e-3 * noise**2)
+    spline = make_smoothing_spline(PLACE, value, w=spread**-2.0, lam=1.0 / STRENGTHS[best])
+    np.testing.assert_allclose(curve[0], spline(PLACE), atol=1e-4 * noise)
+
+
+def test_fibres_that_read_nothing_go_straight_on_with_growing_errors():
+    value = np.broadcast_to(CURVE, (3, 28))
+    variance = np.full((3, 28), 0.002**2)
+    variance[1, 20:] = np.inf
+    variance[2] = np.inf
+    curve, covariance = smooth_misfit(RADIUS, value, variance)
+    error = np.sqrt(np.einsum("nff->nf", covariance))
+    assert np.isfinite(curve).all()
+    assert (np.diff(error[1, 19:]) > 0).all()
+    bend = np.diff(curve[1, 19:]) / np.diff(PLACE[19:])
+    np.testing.assert_allclose(bend[1:], bend[1], rtol=1e-3)
+    assert np.abs(curve[1] - CURVE)[20:].max() < 3.0 * error[1, 27]
+    assert (error[2] > 100.0).all()  # nothing is told
+
+
+def test_errors_are_those_of_the_noise_over_the_fibres_together():
+    """Intervals of splines hold on the average of all places (Wahba 1983); 400 draws."""
+    rng = np.random.default_rng(3)
+    noise = 0.02
+    value = CURVE + noise * rng.standard_normal((400, 28))
+    curve, covariance = smooth_misfit(RADIUS, value, np.full((400, 28), noise**2))
+    error = np.sqrt(np.einsum("nff->nf", covariance))
+    held = np.abs(curve - CURVE) < error
+    assert 0.60 < held.mean() < 0.76
+    assert np.median(error) < 0.6 * noise
+
+
+def test_the_order_of_the_fibres_does_not_matter():
+    rng = np.random.default_rng(4)
+    value, variance = CURVE[None] + 0.01 * rng.standard_normal((1, 28)), np.full((1, 28), 1e-4)
+    mixed = rng.permutation(28)
+    curve, covariance = smooth_misfit(RADIUS, value, variance)
+    again, other = smooth_misfit(RADIUS[mixed], value[:, mixed], variance)
+    np.testing.assert_allclose(again[0], curve[0, mixed], atol=1e-9)
+    np.testing.assert_allclose(other[0], covariance[0][np.ix_(mixed, mixed)], atol=1e-9)
