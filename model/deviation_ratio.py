@@ -65,6 +65,9 @@ def estimate(numerator: Floats, denominator: Floats, variance: Floats, held: Mas
     >>> found.value.round(2).tolist()
     [1.5, 1.5, 1.5, 1.5]
     """
+    # one that is no number, or has no variance, would be in the prior of all
+    known_of = [np.isfinite(x) for x in (numerator, denominator, variance)]
+    held = held & np.logical_and.reduce(known_of) & (np.nan_to_num(variance) >= 0.0)
     a, b, v = (np.where(held, x, 0.0) for x in (numerator, denominator, variance))
     prior = overall(a, b)
     gain, error = prior**2 * b, prior**2 * b**2 + v

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from model import histogram_matching
+from model import deviation_ratio, histogram_matching
 from reconstruction import (
     affine_fit,
     half_vector_normals,
@@ -159,3 +159,19 @@ def test_a_sample_without_a_time_is_left_out():
 def test_a_cycle_without_both_changes_is_refused_by_name(cycle_s, change_s):
     with pytest.raises(CurveError, match="cycle_s"):
         perfusion_fit.fit_cycle(*cycle(), cycle_s=cycle_s, change_s=change_s)
+
+
+@pytest.mark.parametrize("part", [0, 1, 2])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_place_that_is_no_number_has_the_ratio_of_the_others(rng, part, bad):
+    given = [1.5 * rng.random(30), rng.random(30), np.full(30, 1e-4)]
+    held = np.ones(30, bool)
+    without = held.copy()
+    without[4] = False
+    wanted = deviation_ratio.estimate(*given, without)
+    given[part][4] = bad
+    found = deviation_ratio.estimate(*given, held)
+    assert np.isfinite(found.value).all()
+    assert found.prior == wanted.prior
+    np.testing.assert_array_equal(found.value, wanted.value)
+    np.testing.assert_array_equal(found.stderr, wanted.stderr)
