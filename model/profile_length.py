@@ -62,6 +62,11 @@ def surface_length(height_um: ArrayLike, *, spacing_um: float) -> Floats:
     >>> float(surface_length([0.0, 3.0, 0.0], spacing_um=4.0))
     10.0
     """
+    height = _heights(height_um, spacing_um)
+    return np.asarray(np.hypot(np.diff(height, axis=-1), spacing_um).sum(axis=-1))
+
+
+def _heights(height_um: ArrayLike, spacing_um: float) -> Floats:
     height = np.asarray(height_um, np.float64)
     if height.ndim < 1 or height.shape[-1] < 2 or not np.isfinite(height).all():
         raise ProfileError(
@@ -69,7 +74,7 @@ def surface_length(height_um: ArrayLike, *, spacing_um: float) -> Floats:
         )
     if not (math.isfinite(spacing_um) and spacing_um > 0):
         raise ProfileError(f"spacing_um: got {spacing_um}, expected a finite number above 0")
-    return np.asarray(np.hypot(np.diff(height, axis=-1), spacing_um).sum(axis=-1))
+    return height
 
 
 def convolved(height_um: ArrayLike, alpha: float, sigma_um: float, *, spacing_um: float) -> Floats:
@@ -85,8 +90,15 @@ def convolved(height_um: ArrayLike, alpha: float, sigma_um: float, *, spacing_um
         Standard deviation, um, > 0.
     spacing_um : float
         Distance of heights, um, > 0.
+
+    Raises
+    ------
+    ProfileError
+        For heights, a strength or lengths that are not finite, or lengths that are not above 0.
     """
-    height = np.asarray(height_um, np.float64)
+    height = _heights(height_um, spacing_um)
+    if not math.isfinite(alpha):
+        raise ProfileError(f"alpha: got {alpha}, expected a finite strength")
     return height + alpha * _change(height, sigma_um, spacing_um)
 
 

@@ -281,9 +281,15 @@ def mixture_coordinates(
     Raises
     ------
     TraitError
-        For what is not finite.
+        For what is not finite, and a metric that is none of samples of this length.
     """
     unit, own = exponent_of(samples), exponent_of(basis)
+    d = basis.shape[1]
+    if metric is not None:
+        if metric.shape not in ((d,), (d, d)) or not np.isfinite(metric).all():
+            raise TraitError(
+                f"metric: got shape {metric.shape}, expected ({d},) or ({d}, {d}), finite"
+            )
     materials = np.ldexp(basis, -own)
     products = times_metric(materials, metric)
     gram = products @ materials.T

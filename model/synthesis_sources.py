@@ -24,6 +24,10 @@ MAX_SOURCE_PX = 150_000_000
 """Pixels of all patches at all scales, 12 bytes each with their transposes and tables."""
 
 
+FARTHEST_UM = 1e30
+"""Heights beyond have no sums in single precision."""
+
+
 class SynthesisError(ValueError):
     """Patches, sizes, regions or knobs that nothing can be grown from."""
 
@@ -57,7 +61,8 @@ def leveled(
     Raises
     ------
     SynthesisError
-        For a patch without heights, or a pixel or cut-off that is not positive.
+        For a patch without heights, heights beyond single precision, or a pixel or cut-off that is
+        not positive.
 
     Notes
     -----
@@ -96,6 +101,9 @@ def _checked(
         known &= mask
     if not known.any():
         raise SynthesisError(f"{name}: got no valid height")
+    most = float(np.abs(values[known]).max())
+    if most > FARTHEST_UM:
+        raise SynthesisError(f"{name}: got a height of {most:g} um, expected up to {FARTHEST_UM:g}")
     return values, known
 
 

@@ -110,12 +110,25 @@ class Bins:
         ndarray, shape and dtype of values
             Under the identical histogram the same values, to rounding.
 
+        Raises
+        ------
+        HistogramError
+            For values that are not finite, and a target of another shape, with a negative share or
+            without any above 0.
+
         Notes
         -----
         A density is even inside a bin, so that the outcome has no steps. Values beyond the edges
         widen the end bins of both histograms to where they reach.
         """
         flat = np.ascontiguousarray(values).reshape(-1)
+        _check_shares("target", target, BINS)
+        wrong = flat.size - np.count_nonzero(np.isfinite(flat))
+        if wrong:
+            raise HistogramError(
+                f"values: got {wrong} of {flat.size} that are NaN or infinite, expected finite "
+                "ones: leave out what is masked"
+            )
         own, wanted = cumulated(source.shares), cumulated(target)
         edges = self.edges.copy()
         edges[0], edges[-1] = min(edges[0], source.least), max(edges[-1], source.most)
@@ -124,9 +137,27 @@ class Bins:
         return moved
 
 
-def cumulated(shares: ArrayLike) -> Floats:
-    """Return the cumulated shares at all edges, (..., 257), from 0 to exactly 1."""
+def _check_shares(name: str, shares: ArrayLike, bins: int | None = None) -> Floats:
     h = np.asarray(shares, np.float64)
+    if h.ndim < 1 or not h.shape[-1] or (bins is not None and h.shape[-1] != bins):
+        raise HistogramError(f"{name}: got shape {h.shape}, expected (..., {bins or BINS})")
+    if not (np.isfinite(h).all() and (h >= 0.0).all() and (h.sum(axis=-1) > 0.0).all()):
+        raise HistogramError(
+            f"{name}: got NaN, infinite or negative shares, or none above 0, expected shares that "
+            "sum to 1"
+        )
+    return h
+
+
+def cumulated(shares: ArrayLike) -> Floats:
+    """Return the cumulated shares at all edges, (..., 257), from 0 to exactly 1.
+
+    Raises
+    ------
+    HistogramError
+        For shares that are not finite, negative, or all 0.
+    """
+    h = _check_shares("shares", shares)
     run = np.concatenate([np.zeros((*h.shape[:-1], 1)), np.cumsum(h, axis=-1)], axis=-1)
     run /= run[..., -1:]
     return np.asarray(np.minimum(run, 1.0))
@@ -147,13 +178,23 @@ def distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Floats:
         The earth mover's distance over the width of the middle half of the bins. In a fitted
         space that is about the spread of the population.
 
+    Raises
+    ------
+    HistogramError
+        For shares that are not finite, negative or all 0, and edges that do not rise.
+
     Examples
     --------
     >>> float(distance(np.eye(256)[3], np.eye(256)[131], np.arange(257.0)))
     1.0
     """
     e = np.asarray(edges, np.float64)
-    apart = np.abs(cumulated(a) - cumulated(b))
+    first, second = _check_shares("a", a, BINS), _check_shares("b", b, BINS)
+    if e.ndim < 1 or e.shape[-1] != BINS + 1:
+        raise HistogramError(f"edges: got shape {e.shape}, expected (..., {BINS + 1})")
+    if not (np.isfinite(e).all() and (np.diff(e, axis=-1) > 0.0).all()):
+        raise HistogramError("edges: got some that do not rise, expected finite rising edges")
+    apart = np.abs(cumulated(first) - cumulated(second))
     moved = np.sum(0.5 * (apart[..., 1:] + apart[..., :-1]) * np.diff(e, axis=-1), axis=-1)
     quarter = BINS // 4
     return np.asarray(moved / (e[..., 3 * quarter] - e[..., quarter]))

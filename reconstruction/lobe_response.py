@@ -180,10 +180,34 @@ class Response:
     frame: Floats
 
 
+def _require_finite(name: str, values: Floats) -> None:
+    wrong = int(np.size(values) - np.count_nonzero(np.isfinite(values)))
+    if wrong:
+        raise SphereLightsError(
+            f"{name}: got {wrong} of {np.size(values)} numbers that are NaN or infinite, expected "
+            "finite ones: leave out what is masked"
+        )
+
+
 def frame_of(view: ArrayLike) -> Floats:
-    """Return the orthonormal frame about a view, rows right, up, view; identity for +z."""
+    """Return the orthonormal frame about a view, rows right, up, view; identity for +z.
+
+    Parameters
+    ----------
+    view : array_like, shape (3,)
+        Of any length above 0.
+
+    Raises
+    ------
+    SphereLightsError
+        For a view that points nowhere.
+    """
     v = np.asarray(view, np.float64)
-    v = v / np.linalg.norm(v)
+    most = float(np.abs(v).max()) if v.shape == (3,) else np.nan
+    if not 0.0 < most < np.inf:
+        raise SphereLightsError(f"view: got {v.tolist()}, expected a finite vector of 3, not 0")
+    v = v / most
+    v /= np.linalg.norm(v)
     up = np.array([0.0, 1.0, 0.0]) if abs(v[1]) < 0.99 else np.array([0.0, 0.0, -1.0])
     right = np.cross(up, v)
     right /= np.linalg.norm(right)
@@ -195,11 +219,17 @@ def normal_at(place: Floats) -> Floats:
 
     The horizon is at a length of sqrt(2); places beyond it have the normal of the horizon there.
 
+    Raises
+    ------
+    SphereLightsError
+        For places that are not finite.
+
     Examples
     --------
     >>> normal_at(np.array([1.0, 0.0])).round(4).tolist()
     [0.866, 0.0, 0.5]
     """
+    _require_finite("place", place)
     length = np.hypot(place[..., :1], place[..., 1:])
     seen = place * np.minimum(1.0, np.sqrt(2.0) / np.maximum(length, 1e-9))
     square = np.minimum(length, np.sqrt(2.0)) ** 2
@@ -207,7 +237,14 @@ def normal_at(place: Floats) -> Floats:
 
 
 def place_of(normal: Floats) -> Floats:
-    """Return the places (..., 2) of unit normals (..., 3), in the frame of the view."""
+    """Return the places (..., 2) of unit normals (..., 3), in the frame of the view.
+
+    Raises
+    ------
+    SphereLightsError
+        For normals that are not finite.
+    """
+    _require_finite("normal", normal)
     return np.asarray(normal[..., :2] * np.sqrt(2.0 / np.maximum(1.0 + normal[..., 2:], 1e-9)))
 
 
@@ -215,7 +252,19 @@ def facet_reflectance(lights: SphereLights, view: Floats, eta: float) -> Floats:
     """Return what facets that mirror each light into the view send through the analyser, (L,).
 
     Over the light's own irradiance, after its film; the same for every normal, as the facet is.
+
+    Raises
+    ------
+    SphereLightsError
+        For a view that is no unit vector or within 0.06 degrees of the analyser's axis, or a
+        refractive index outside 1...4.
     """
+    view, eta = _unit_vectors("view", np.asarray(view, np.float64)[None])[0], _index(eta)
+    if abs(float(view @ np.asarray(lights.analyser))) > 1.0 - 5e-7:
+        raise SphereLightsError(
+            f"view: got {view.tolist()}, the axis {list(lights.analyser)} of the analyser:"
+            " expected one across it"
+        )
     light = lights.directions
     facet = light + view
     length = np.linalg.norm(facet, axis=1, keepdims=True)
@@ -272,8 +321,8 @@ def specular(
     """
     if not 0.02 <= alpha <= 1.0:
         raise SphereLightsError(f"alpha: got {alpha}, expected a roughness in [0.02, 1]")
-    if not alpha_stderr >= 0.0:
-        raise SphereLightsError(f"alpha_stderr: got {alpha_stderr}, expected 0 or more")
+    if not 0.0 <= alpha_stderr < np.inf:
+        raise SphereLightsError(f"alpha_stderr: got {alpha_stderr}, expected 0 or more, finite")
     way = _direction(view)
     return _cached(_key(lights), way, float(alpha), _index(eta), near, float(alpha_stderr))
 
@@ -459,7 +508,13 @@ def seen(vector: Floats, mirror: bool) -> tuple[Floats, Floats]:
     -------
     place : ndarray, shape (P, 2)
     slope : ndarray, shape (P, 2, 3)
+
+    Raises
+    ------
+    SphereLightsError
+        For vectors that are not finite.
     """
+    _require_finite("vector", vector)
     size = np.maximum(np.linalg.norm(vector, axis=1), 1e-300)[:, None]
     n = vector / size
     turn = (np.eye(3) - n[:, :, None] * n[:, None, :]) / size[:, :, None]

@@ -208,9 +208,10 @@ def from_slopes(
     angle_rad: float = 0.0,
 ) -> Floats:
     """Return the histogram of normals given as slopes dh/dx, dh/dy; see :func:`histogram`."""
-    p, q = turned(np.asarray(slope_x, np.float64), np.asarray(slope_y, np.float64), angle_rad)
-    if not (np.isfinite(p).all() and np.isfinite(q).all()):
+    given = np.asarray(slope_x, np.float64), np.asarray(slope_y, np.float64)
+    if not (np.isfinite(given[0]).all() and np.isfinite(given[1]).all()):
         raise HistogramError("slope_x, slope_y: got NaN or infinity, expected finite slopes")
+    p, q = turned(*given, angle_rad)
     counts, _ = bucket_counts(p, q, bins=bins, limit=limit)
     return _shares(counts)
 
@@ -249,12 +250,35 @@ def _shares(counts: NDArray[np.int64]) -> Floats:
     return counts / total
 
 
-def turned(a: Floats, b: Floats, angle_rad: float) -> tuple[Floats, Floats]:
-    """Return the components of plane vectors (a, b) along axes turned by an angle, rad."""
+def turned(
+    a: NDArray[np.floating], b: NDArray[np.floating], angle_rad: float
+) -> tuple[Floats, Floats]:
+    """Return the components of plane vectors (a, b) along axes turned by an angle, rad.
+
+    Raises
+    ------
+    HistogramError
+        For vectors or an angle that are not finite.
+
+    Examples
+    --------
+    >>> x, y = turned(np.array([1.0]), np.array([0.0]), math.pi / 2)
+    >>> x.round(6).tolist(), y.round(6).tolist()
+    ([0.0], [-1.0])
+    """
+    if not math.isfinite(angle_rad):
+        raise HistogramError(f"angle_rad: got {angle_rad}, expected a finite angle")
+    for name, part in (("a", a), ("b", b)):
+        wrong = int(np.size(part) - np.count_nonzero(np.isfinite(part)))
+        if wrong:
+            raise HistogramError(
+                f"{name}: got {wrong} of {np.size(part)} values that are NaN or infinite, expected "
+                "finite ones: leave out what is masked"
+            )
     if angle_rad == 0.0:
-        return a, b
+        return np.asarray(a, np.float64), np.asarray(b, np.float64)
     c, s = math.cos(angle_rad), math.sin(angle_rad)
-    return c * a + s * b, c * b - s * a
+    return np.asarray(c * a + s * b), np.asarray(c * b - s * a)
 
 
 @dataclass(frozen=True, slots=True)
@@ -458,6 +482,11 @@ def distance(a: Floats, b: Floats) -> float:
     Half of it, 0...1, is what is elsewhere called the total variation distance
     (`model.metrics` and others): the share of samples that would have to change their bucket.
 
+    Raises
+    ------
+    HistogramError
+        For histograms of different shapes, or shares that are not finite.
+
     Examples
     --------
     >>> distance(np.array([1.0, 0.0]), np.array([0.0, 1.0]))
@@ -465,7 +494,10 @@ def distance(a: Floats, b: Floats) -> float:
     """
     if a.shape != b.shape:
         raise HistogramError(f"b: got shape {b.shape}, expected {a.shape}")
-    return float(np.abs(a - b).sum())
+    apart = float(np.abs(a - b).sum())
+    if not math.isfinite(apart):
+        raise HistogramError(f"a, b: got a sum of differences of {apart}, expected finite shares")
+    return apart
 
 
 def halved_distance(a: Floats, b: Floats) -> float:
@@ -487,7 +519,12 @@ def noise_floor(histogram: Floats, samples: float, other_samples: float | None =
     -------
     float
         ``sum E|X - Y|`` of two Poisson counts in each bucket, exact for equal numbers of samples;
-        for others the number whose variance is the mean of both is taken.
+        for others the number whose variance is the mean of both is taken. 0 for infinitely many.
+
+    Raises
+    ------
+    HistogramError
+        For shares that are not finite or below 0, and numbers that are not above 0.
 
     Examples
     --------
@@ -498,7 +535,13 @@ def noise_floor(histogram: Floats, samples: float, other_samples: float | None =
     other = samples if other_samples is None else other_samples
     if not (samples > 0 and other > 0):
         raise HistogramError(f"samples: got {samples}, {other}, expected above 0")
-    n = 2.0 / (1.0 / samples + 1.0 / other)
-    x = 2.0 * n * np.asarray(histogram, np.float64)
+    shares = np.asarray(histogram, np.float64)
+    if not (np.isfinite(shares).all() and (shares >= 0).all()):
+        raise HistogramError("histogram: got NaN, infinite or negative shares, expected 0...1")
+    both = 1.0 / samples + 1.0 / other
+    if both < np.finfo(np.float64).tiny:
+        return 0.0
+    n = 2.0 / both
+    x = 2.0 * n * shares
     # E|X - Y| of two Poisson variables of mean x / 2: x exp(-x) (I_0(x) + I_1(x))
     return float(np.sum(x * (ive(0, x) + ive(1, x)))) / n

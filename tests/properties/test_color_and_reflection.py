@@ -333,6 +333,52 @@ def test_places_of_normals_come_back(place, view):
     np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-9)
 
 
+RING = lobe_response.SphereLights(np.concatenate([np.eye(3), -np.eye(3)]))
+
+
+@CHEAP
+@given(view=VECTOR, eta=st.floats(1.01, 3.9),
+       vector=st.tuples(*[st.floats(-1e9, 1e9)] * 3), mirror=st.booleans())  # fmt: skip
+def test_what_lights_show_of_a_lobe_is_finite_in_its_domain(view, eta, vector, mirror):
+    across = 1.0 - unit(view)[1] ** 2  # of the analyser, squared: 1 where it faces the view
+    if abs(unit(view)[1]) > 0.9999995:
+        with pytest.raises(lobe_response.SphereLightsError, match="analyser"):
+            lobe_response.facet_reflectance(RING, unit(view), eta)
+    else:
+        sent = lobe_response.facet_reflectance(RING, unit(view), eta)
+        assert sent.shape == (6,)
+        assert ((sent >= 0.0) & (sent * across <= 1.0 + 1e-9)).all()
+    place, slope = lobe_response.seen(np.array([vector]), mirror)
+    assert np.hypot(*place[0]) <= 2.0 + 1e-9
+    assert np.isfinite(slope).all() or not np.any(vector)
+
+
+@FEW
+@given(bad=st.sampled_from([np.nan, np.inf, -np.inf]))
+def test_lobes_of_what_is_not_finite_are_an_error(bad):
+    up = np.array([0.0, 0.0, 1.0])
+    with pytest.raises(lobe_response.SphereLightsError, match="place"):
+        lobe_response.normal_at(np.array([0.1, bad]))
+    with pytest.raises(lobe_response.SphereLightsError, match="normal"):
+        lobe_response.place_of(np.array([0.1, bad, 1.0]))
+    with pytest.raises(lobe_response.SphereLightsError, match="view"):
+        lobe_response.frame_of([0.0, bad, 1.0])
+    with pytest.raises(lobe_response.SphereLightsError, match="view"):
+        lobe_response.frame_of([0.0, 0.0, 0.0])
+    with pytest.raises(lobe_response.SphereLightsError, match="view"):
+        lobe_response.facet_reflectance(RING, np.array([bad, 0.0, 1.0]), 1.4)
+    with pytest.raises(lobe_response.SphereLightsError, match="eta"):
+        lobe_response.facet_reflectance(RING, up, bad)
+    with pytest.raises(lobe_response.SphereLightsError, match="vector"):
+        lobe_response.seen(np.array([[0.0, bad, 1.0]]), True)
+    with pytest.raises(lobe_response.SphereLightsError, match="alpha"):
+        lobe_response.specular(RING, view=up, alpha=bad, eta=1.4)
+    with pytest.raises(lobe_response.SphereLightsError, match="alpha_stderr"):
+        lobe_response.specular(RING, view=up, alpha=0.3, eta=1.4, alpha_stderr=bad)
+    with pytest.raises(lobe_response.SphereLightsError, match="eta"):
+        lobe_response.diffuse(RING, view=up, eta=bad)
+
+
 @CHEAP
 @given(seed=st.integers(0, 999), scale=st.sampled_from([1e-30, 1.0, 1e30]))
 def test_model_errors_of_a_relief_only_widen_and_scale_with_it(seed, scale):

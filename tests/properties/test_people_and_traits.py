@@ -104,6 +104,17 @@ def test_mixtures_of_a_basis_are_its_own_shares(seed, unit, n, size):
 
 
 @CHEAP
+@given(bad=st.sampled_from([np.nan, np.inf, -np.inf]), where=st.sampled_from(["s", "b", "m"]))
+def test_mixtures_of_what_is_not_finite_are_refused(bad, where):
+    samples, basis, metric = np.ones((3, 4)), np.eye(2, 4), np.eye(4)
+    {"s": samples, "b": basis, "m": metric}[where][1, 1] = bad
+    with pytest.raises(trait_vectors.TraitError):
+        reduced_spaces.mixture_coordinates(samples, basis, metric)
+    with pytest.raises(trait_vectors.TraitError, match="shape"):
+        reduced_spaces.mixture_coordinates(np.ones((3, 4)), np.eye(2, 4), np.eye(3))
+
+
+@CHEAP
 @given(bad=st.sampled_from([np.nan, np.inf, -1.0]))
 def test_what_is_no_basis_and_no_sample_is_refused(bad):
     basis, samples = np.eye(2, 3), np.arange(6.0).reshape(2, 3)

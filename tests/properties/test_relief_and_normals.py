@@ -13,6 +13,8 @@ from reconstruction import (
     head_motion,
     height_errors,
     height_filters,
+    kernel_fit,
+    kernel_search,
     kernel_table,
     landmark_field,
     light_selection,
@@ -83,6 +85,45 @@ def test_every_normal_is_in_a_bucket_or_outside(slope, bins, limit, turn):
         assert normal_histogram.noise_floor(shares, 500.0) <= floor + 1e-12
         number = normal_histogram.effective_number(np.stack([counts.ravel()] * 3), 3 * x.size)
         assert 0.0 < number <= 3 * x.size
+
+
+@FEW
+@given(bad=st.sampled_from([np.nan, np.inf, -np.inf]))
+def test_histograms_and_kernels_of_what_is_not_finite_are_an_error(bad):
+    shares = np.full((4, 4), 1.0 / 16.0)
+    wrong = shares.copy()
+    wrong[1, 2] = bad
+    for pair in ((shares, wrong), (wrong, shares)):
+        with pytest.raises(normal_histogram.HistogramError, match="differences"):
+            normal_histogram.distance(*pair)
+    with pytest.raises(normal_histogram.HistogramError, match="histogram"):
+        normal_histogram.noise_floor(wrong, 100.0)
+    with pytest.raises(normal_histogram.HistogramError, match="samples"):
+        normal_histogram.noise_floor(shares, np.nan)
+    assert normal_histogram.noise_floor(shares, np.inf) == 0.0
+    for pair in ((np.array([bad]), np.ones(1)), (np.ones(1), np.array([bad]))):
+        for angle in (0.0, 0.3):
+            with pytest.raises(normal_histogram.HistogramError, match=r"[ab]: got"):
+                normal_histogram.turned(*pair, angle)
+    with pytest.raises(normal_histogram.HistogramError, match="angle_rad"):
+        normal_histogram.turned(np.ones(1), np.ones(1), bad)
+    height = np.random.default_rng(0).standard_normal((12, 12))
+    relief = kernel_fit.relief_of(height, stretch=1.0, axis="x", pixel_um=10.0)
+    buckets = kernel_search.Buckets(np.append(shares.reshape(-1), 0.0), 4, 1.0)
+    told = {"search": "exhaustive", "target_samples": 50.0, "first_sample": 2, "seed": 0}
+    for grids, name in ((([-1.0, bad], [5.0]), "alphas"), (([-1.0, 0.0], [bad]), "sigmas_um")):
+        with pytest.raises(kernel_fit.KernelFitError, match=name):
+            kernel_fit.fit_relief(relief, buckets, *map(np.array, grids), **told)
+    with pytest.raises(kernel_fit.KernelFitError, match="target_samples"):
+        kernel_fit.fit_relief(
+            relief, buckets, np.zeros(1), np.ones(1), **(told | {"target_samples": np.nan})
+        )
+    with pytest.raises(profile_length.ProfileError, match="height_um"):
+        profile_length.convolved([0.0, bad, 1.0], 0.5, 10.0, spacing_um=5.0)
+    with pytest.raises(profile_length.ProfileError, match="alpha"):
+        profile_length.convolved([0.0, 1.0, 0.5], bad, 10.0, spacing_um=5.0)
+    with pytest.raises(profile_length.ProfileError, match="spacing_um"):
+        profile_length.convolved([0.0, 1.0, 0.5], 0.5, 10.0, spacing_um=bad)
 
 
 @CHEAP

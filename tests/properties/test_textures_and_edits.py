@@ -183,6 +183,44 @@ def test_the_nearest_histogram_is_one_and_its_own(vector, scale):
 
 
 @FEW
+@given(bad=st.sampled_from([np.nan, np.inf, -np.inf]))
+def test_histograms_of_textures_that_are_not_finite_are_an_error(bad):
+    error = texture_histograms.HistogramError
+    even, edges = np.full(256, 1.0 / 256.0), np.arange(257.0)
+    wrong, bent = even.copy(), edges.copy()
+    wrong[7], bent[7] = bad, bad
+    bins = texture_histograms.Bins.over(edges)
+    values = np.linspace(1.0, 250.0, 50)
+    source = bins.count(values)
+    assert np.isfinite(bins.match(values, source, even)).all()
+    with pytest.raises(error, match="target"):
+        bins.match(values, source, wrong)
+    with pytest.raises(error, match="values"):
+        bins.match(np.array([1.0, bad]), source, even)
+    for pair in ((even, wrong), (wrong, even), (even, np.zeros(256))):
+        with pytest.raises(error, match=r"[ab]: got"):
+            texture_histograms.distance(*pair, edges)
+    with pytest.raises(error, match="edges"):
+        texture_histograms.distance(even, even, bent)
+    with pytest.raises(error, match="shares"):
+        texture_histograms.cumulated(wrong)
+
+
+@FEW
+@given(far=st.floats(1e31, 1e300), bad=st.sampled_from([np.nan, np.inf]))
+def test_heights_that_no_patch_holds_are_holes_or_an_error(far, bad):
+    height = np.zeros((6, 7))
+    height[2, 3] = bad
+    found = synthesis_sources.leveled(height, pixel_um=10.0, cutoff_um=30.0)
+    np.testing.assert_array_equal(np.isnan(found), ~np.isfinite(height))
+    height[2, 3] = far
+    with pytest.raises(synthesis_sources.SynthesisError, match="height_um"):
+        synthesis_sources.leveled(height, pixel_um=10.0, cutoff_um=30.0)
+    with pytest.raises(synthesis_sources.SynthesisError, match="height_um"):
+        synthesis_sources.leveled(np.full((6, 7), bad), pixel_um=10.0)
+
+
+@FEW
 @given(seed=SEED, bins=st.integers(2, 30))
 def test_color_histograms_of_groups_count_every_valid_texel(seed, bins):
     rng = np.random.default_rng(seed)
