@@ -99,9 +99,9 @@ def serve_rig(
         boxes = " ".join(f"--port {n}={served.addresses[n]}" for n in rig.boxes)
         cameras = " ".join(f"--camera {v.name}={served.addresses[v.name]}" for v in rig.views)
         more = "" if rig.caliper is None else " --force-limit 2 --eyes closed"
+        out = "session" if resume is None else f"{resume} --resume"
         print(
-            f"next: skinrig capture {rig_name} {boxes} {cameras}{more} --out session\n"
-            "Ctrl-C ends it",
+            f"next: skinrig capture {rig_name} {boxes} {cameras}{more} --out {out}\nCtrl-C ends it",
             file=sys.stderr,
         )
         try:

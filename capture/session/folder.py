@@ -51,8 +51,8 @@ def require_free(path: Path) -> None:
     """Raise unless the folder is new, empty, or the debris of an interrupted creation."""
     advice = "Choose a new folder, or resume the session that is there."
     if path.is_symlink() or (path.exists() and not path.is_dir()):
-        found = "a link" if path.is_symlink() else "a file"
-        faults = [Fault("folder", found, "a new or empty folder")]
+        kind = "a link" if path.is_symlink() else "a file"
+        faults = [Fault("folder", kind, "a new or empty folder")]
         raise SessionError("cannot start here", where=str(path), faults=faults, advice=advice)
     if not path.parent.is_dir():
         faults = [Fault("parent", "no such folder", "an existing folder")]
