@@ -24,7 +24,8 @@ pytestmark = pytest.mark.render
 
 WIDTH_PX = 768  # the demo's
 TODAY = date.today()
-NARROW = {"subject": "II", "seed": 114}
+PLAIN = ("lateral", "interreflections", "spectral", "optics", "relief_shadows")
+NARROW = {"subject": "II", "seed": 114, "leave_out": PLAIN}
 WANT = ["melanin", "hemoglobin", "diffuse"]  # the last states the noise, for the bounds
 
 
