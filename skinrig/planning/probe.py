@@ -42,9 +42,9 @@ LONGEST = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0, LONGEST_S)
 REPEATS = (1, 2, 4)
 DARKS = (1, 2)
 SATURATED = 0.95
-CROSSTALK_ERROR = (0.0, 8.5e-6, 6.3e-6, 1e-6, 3e-7)
+CROSSTALK_ERROR = (0.0, 8.5e-6, 6.3e-6, 9.3e-7, 2.5e-7)
 """Standard error of the share of a fibre's light in a spot so many places away, the last of all
-farther ones, as simulated calibrations of the shipped rig state it."""
+farther ones: medians of twenty simulated calibrations of the shipped rig, seeds 0 to 19."""
 FORECAST_SPREAD = 0.6
 """Relative deviation of measured from predicted medians, see docs/planning.md."""
 MAP_PX = 32
