@@ -57,8 +57,6 @@ class Sight:
     sites: tuple[str, ...]
     reflectance: Floats
     """(S, F, 3) in 1/mm^2."""
-    truth: Floats
-    """(S, 3) sigma_tr in 1/mm of the nearest homogeneous medium."""
     phantom: Floats
     """(F, 3) of the block that the probe is calibrated with."""
     phantom_error: Floats
@@ -94,11 +92,8 @@ class Prediction:
     sites: tuple[str, ...]
     sigma: Floats
     """(S, 3) standard error: readings, misfit, certificate; of sites that are not measured what
-    the others and people in general leave open."""
-    bias: Floats
-    """(S, 3) by how much a fit without noise is off on this skin; 0 where not measured. It is one
-    draw of the misfit that `sigma` states: counting both would count it twice, and judging plans by
-    it would choose those that suit this person by luck."""
+    the others and people in general leave open. What a fit without noise is off on this skin is
+    one draw of the misfit that this states, and not counted beside it."""
     common: Floats
     """(S, 3) the calibration's part: certificate and far cross-talk."""
     misfit: Floats
@@ -136,10 +131,9 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
     sites
         Where the head may be placed.
     """
-    from rigsim.homogeneous_fit import nearest_medium
     from rigsim.probe_build import SPOT_RADIUS_PX
-    from rigsim.probe_profile import Profiles, fibres_of
-    from rigsim.probe_tissue import HomogeneousTissue, parse_subject
+    from rigsim.probe_profile import Profiles
+    from rigsim.probe_tissue import parse_subject
     from rigsim.scenes.probe import DARK_E_PER_S, METER_RATE_PER_S, VIGNETTING
     from rigsim.sensor import sensor_of
     from skinrig.phantom_reflectance import expected_reflectance, packaged_certificate
@@ -151,19 +145,6 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
     profiles = Profiles(rig, tissue, photons=PHOTONS["small"], seed=seed)
     made = [profiles.profile(site, 0.0, rig.probe.suction_mbar) for site in sites]
     reflectance = np.stack([one.reflectance_per_mm2 for one in made])
-    kind = fibres_of(rig.probe)
-    if isinstance(tissue, HomogeneousTissue) and not tissue.wavelength_nm:
-        a, s = (
-            float(np.squeeze(value))
-            for value in (tissue.sigma_a_per_mm, tissue.sigma_s_prime_per_mm)
-        )
-        truth = np.full((len(made), 3), math.sqrt(3.0 * a * (a + s)))
-    else:
-        dimmed = tissue.kind != "anisotropic"
-        truth = np.array([
-            [nearest_medium(band, kind, dimmed=dimmed).sigma_tr_per_mm for band in one.T]
-            for one in reflectance
-        ])  # fmt: skip
     block = expected_reflectance(packaged_certificate(), rig)
     view = rig.views[0]
     from model import spectra
@@ -171,7 +152,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
     white = spectra.camera_white(view.spectral_sensitivity, rig.lights[0].illuminant)
     area = math.pi * SPOT_RADIUS_PX**2
     return Sight(
-        tuple(sites), reflectance, truth, block.per_mm2, block.stderr / block.per_mm2, block.common,
+        tuple(sites), reflectance, block.per_mm2, block.stderr / block.per_mm2, block.common,
         METER_RATE_PER_S * np.asarray(white, np.float64), area * np.array([0.25, 0.5, 0.25]),
         sensor_of(view, dark_e_per_s=DARK_E_PER_S, vignetting=VIGNETTING), rig.probe,
     )  # fmt: skip
@@ -199,7 +180,7 @@ def predict(look: Sight, setting: Setting, *, memory: Memory | None = None) -> P
     """
     memory = {} if memory is None else memory
     shape = (len(look.sites), 3)
-    sigma, bias, common = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)
+    sigma, common = np.full(shape, np.inf), np.zeros(shape)
     still, found = np.full(shape, np.inf), np.ones(shape)
     valid = np.zeros(shape, np.bool_)
     measured = np.zeros(len(look.sites), np.bool_)
@@ -217,10 +198,9 @@ def predict(look: Sight, setting: Setting, *, memory: Memory | None = None) -> P
         noise -= np.where(np.isfinite(stays), stays**2, 0.0) / setting.repeats
         still[k] = np.hypot(stays, common[k])
         sigma[k] = np.sqrt(still[k] ** 2 + noise)
-        bias[k] = found[k] / look.truth[k] - 1.0
     rest = _between(look, found, sigma, valid & measured[:, None])
     sigma[~measured] = rest[~measured]
-    return Prediction(look.sites, sigma, bias, common, still, valid, measured)
+    return Prediction(look.sites, sigma, common, still, valid, measured)
 
 
 def _fits(

@@ -55,7 +55,7 @@ def test_fits_that_plans_share_leave_the_forecast_to_the_bit_as_it_is(look):
     ]
     for setting in settings:
         alone, shared = (probe.predict(look, setting, memory=kept) for kept in (None, memory))
-        for name in ("sigma", "bias", "common", "misfit", "valid"):
+        for name in ("sigma", "common", "misfit", "valid"):
             np.testing.assert_array_equal(getattr(shared, name), getattr(alone, name))
     # placements share all fits, and fits without noise those of all darks and times
     assert len(memory) < len(settings)
