@@ -289,10 +289,16 @@ def reduce(
     shares = np.asarray(
         weights.weights if isinstance(weights, BasisWeights) else weights, dtype=np.float64
     )
-    if shares.ndim != 2 or not np.all(shares >= 0.0):
-        raise ValueError(f"weights: got shape {shares.shape}, expected (P, K) of values at least 0")
+    if shares.ndim != 2 or not np.all((shares >= 0.0) & (shares < np.inf)):
+        raise ValueError(
+            f"weights: got shape {shares.shape}, expected (P, K) of finite values at least 0"
+        )
     if not 1 <= rank <= min(shares.shape):
         raise ValueError(f"rank: got {rank}, expected 1 to {min(shares.shape)}")
+    top = float(shares.max())
+    if top > 0.0 and not 1e-100 < top < 1e100:  # squares would under- or overflow
+        found, mix, error = reduce(shares / top, rank, basis=basis, seed=seed)
+        return found * top, mix, error
     scale = np.ones(shares.shape[1]) if basis is None else basis.strength()
     scaled = shares * scale
     total = scaled.sum()

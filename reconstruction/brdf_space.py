@@ -276,9 +276,11 @@ def metric(basis: BrdfBasis) -> FloatArray:
 
 def _checked(weights: ArrayLike, basis: BrdfBasis) -> FloatArray:
     values = np.asarray(weights, dtype=np.float64)
-    if values.ndim != 2 or values.shape[1] != basis.size or not np.all(values >= 0.0):
+    good = values.ndim == 2 and values.shape[1] == basis.size
+    if not good or not np.all((values >= 0.0) & (values < np.inf)):
         raise ValueError(
-            f"weights: got shape {values.shape}, expected (P, {basis.size}) of values at least 0"
+            f"weights: got shape {values.shape}, expected (P, {basis.size}) of finite values at "
+            "least 0"
         )
     return values
 

@@ -115,8 +115,8 @@ def test_a_point_of_no_numbers_is_masked_and_spoils_no_others(seed, compress, ba
     np.testing.assert_allclose(seen[1][[0, 2]], seen[0][[0, 2]], rtol=0.05, atol=0.02)
 
 
-@CHEAP
-@given(seed=SEED, rank=st.integers(1, 3), bad=st.sampled_from([np.nan, -1e-9]))
+@FEW
+@given(seed=SEED, rank=st.integers(1, 3), bad=st.sampled_from([np.nan, np.inf, -1e-9]))
 def test_common_mixtures_have_sum_one_and_refining_them_is_never_worse(seed, rank, bad):
     rng = np.random.default_rng(seed)
     basis, shares = three(), rng.random((12, 3)) ** 3
@@ -124,6 +124,9 @@ def test_common_mixtures_have_sum_one_and_refining_them_is_never_worse(seed, ran
     np.testing.assert_allclose(mix.sum(axis=1), 1.0)
     assert (found >= 0.0).all()
     assert 0.0 <= error < 1.0
+    for unit in (1e-320, 1e300):  # shares of some units have squares that no number holds
+        _, _, same = brdf_basis.reduce(unit * shares, rank, basis=basis)
+        assert same == pytest.approx(error, rel=0.1, abs=0.01)
     gram = brdf_space.metric(basis)
     assert np.linalg.eigvalsh(gram).min() >= -1e-9 * np.abs(gram).max()
     finer = brdf_space.refine(shares, mix, basis, sweeps=5)
@@ -146,7 +149,7 @@ def _left(shares, mix, gram):
     products, cross = mix @ gram @ mix.T, shares @ gram @ mix.T
     coordinates = np.zeros((len(shares), len(mix)))
     step = 1.0 / np.linalg.eigvalsh(products)[-1]
-    for _ in range(20000):
+    for _ in range(4000):
         coordinates = np.maximum(coordinates - step * (coordinates @ products - cross), 0.0)
     gap = shares - coordinates @ mix
     return float(np.einsum("pk,kl,pl->", gap, gram, gap))
