@@ -26,7 +26,6 @@ from skinrig.planning.plans import (
     Choice,
     Forecast,
     PlanningError,
-    interval_of,
     light_of,
     median_of_normals,
 )
@@ -45,8 +44,11 @@ SATURATED = 0.95
 CROSSTALK_ERROR = (0.0, 8.5e-6, 6.3e-6, 9.3e-7, 2.5e-7)
 """Standard error of the share of a fibre's light in a spot so many places away, the last of all
 farther ones: medians of twenty simulated calibrations of the shipped rig, seeds 0 to 19."""
-FORECAST_SPREAD = 0.6
-"""Relative deviation of measured from predicted medians, see docs/planning.md."""
+FORECAST_SPREAD = 0.2
+"""Relative deviation of standard errors that sessions state from those that were forecast: those
+of three sessions were 0.7 to 1.5 times as large, about two of it either way."""
+DRAWS = 40_000
+"""Of calibrations and readings, for the interval of a median."""
 MAP_PX = 32
 
 
@@ -94,8 +96,9 @@ class Prediction:
     """(S, 3) standard error: readings, misfit, certificate; of sites that are not measured what
     the others and people in general leave open. What a fit without noise is off on this skin is
     one draw of the misfit that this states, and not counted beside it."""
-    common: Floats
-    """(S, 3) the calibration's part: certificate and far cross-talk."""
+    shared: Floats
+    """(T, S, 3) the calibration's part, certificate and far cross-talk: what each of its errors
+    does to all sites and colors together, which no median averages out."""
     misfit: Floats
     """(S, 3) what stays without any noise."""
     valid: NDArray[np.bool_]
@@ -112,6 +115,30 @@ class Prediction:
     def median(self) -> float:
         """Predicted median relative error over measured sites and colors."""
         return median_of_normals(self.total)
+
+    @property
+    def common(self) -> Floats:
+        """Standard error of the calibration's part, (S, 3)."""
+        return np.asarray(np.sqrt(np.square(self.shared).sum(axis=0)))
+
+    def interval(self) -> tuple[float, float]:
+        """Return the interval that holds 68 % of the medians of a session's errors.
+
+        Errors that all fits share move the median as a whole: nine fits of one calibration are
+        hardly more than one.
+        """
+        good = self.valid & self.measured[:, None]
+        if not good.any():
+            return math.inf, math.inf
+        shared = self.shared[:, good]
+        own = np.sqrt(np.maximum(self.sigma[good] ** 2 - np.square(shared).sum(axis=0), 0.0))
+        rng = np.random.default_rng(0)
+        off = rng.standard_normal((DRAWS, len(shared))) @ shared
+        off += own * rng.standard_normal((DRAWS, own.size))
+        ends = np.quantile(np.median(np.abs(off), axis=1), (0.16, 0.84))
+        # that, and how well a session's standard errors are known beforehand, as logarithms
+        low, high = np.hypot(np.log(ends / self.median), math.log(1.0 + FORECAST_SPREAD))
+        return self.median * math.exp(-low), self.median * math.exp(high)
 
     @property
     def valid_share(self) -> float:
@@ -180,7 +207,7 @@ def predict(look: Sight, setting: Setting, *, memory: Memory | None = None) -> P
     """
     memory = {} if memory is None else memory
     shape = (len(look.sites), 3)
-    sigma, common = np.full(shape, np.inf), np.zeros(shape)
+    sigma, shared = np.full(shape, np.inf), np.zeros((0, *shape))
     still, found = np.full(shape, np.inf), np.ones(shape)
     valid = np.zeros(shape, np.bool_)
     measured = np.zeros(len(look.sites), np.bool_)
@@ -192,15 +219,18 @@ def predict(look: Sight, setting: Setting, *, memory: Memory | None = None) -> P
         measured[k] = True
         valid[k] = fit.fit.valid
         found[k] = fit.fit.sigma_tr_per_mm
-        common[k] = np.sqrt((fit.log_common**2).sum(axis=0))
+        if not len(shared):
+            shared = np.zeros((len(fit.log_common), *shape))
+        shared[:, k] = fit.log_common
+        common = np.sqrt(np.square(fit.log_common).sum(axis=0))
         stays = np.minimum(quiet.log_stderr, fit.log_stderr)
         noise = np.where(np.isfinite(stays), fit.log_stderr**2, np.inf) / setting.repeats
         noise -= np.where(np.isfinite(stays), stays**2, 0.0) / setting.repeats
-        still[k] = np.hypot(stays, common[k])
+        still[k] = np.hypot(stays, common)
         sigma[k] = np.sqrt(still[k] ** 2 + noise)
     rest = _between(look, found, sigma, valid & measured[:, None])
     sigma[~measured] = rest[~measured]
-    return Prediction(look.sites, sigma, common, still, valid, measured)
+    return Prediction(look.sites, sigma, shared, still, valid, measured)
 
 
 def _fits(
@@ -491,9 +521,8 @@ def _choice(
     found = predict(look, setting)
     full = probe_plan(rig, repeats=setting.repeats)
     value = 100.0 * found.median
-    forecast = Forecast(
-        "sigma_tr", "%", value, interval_of(value, FORECAST_SPREAD), wants.get("sigma_tr")
-    )
+    low, high = found.interval()
+    forecast = Forecast("sigma_tr", "%", value, (100.0 * low, 100.0 * high), wants.get("sigma_tr"))
     left_out = []
     if len(setting.exposures_s) < BRACKETS:
         left_out.append((

@@ -61,6 +61,25 @@ def test_fits_that_plans_share_leave_the_forecast_to_the_bit_as_it_is(look):
     assert len(memory) < len(settings)
 
 
+def test_the_interval_is_wide_where_all_fits_share_their_error_and_narrow_where_none_does():
+    shape = (12, 3)
+    every, one = np.ones(shape, bool), np.full(shape, 0.01)
+    told = (one, every, np.ones(12, bool))
+
+    def ends(shared):
+        sigma, valid, measured = told
+        found = probe.Prediction(("x",) * 12, sigma, shared, sigma, valid, measured)
+        return np.array(found.interval()) / found.median
+
+    # one error alone: |z| over its median 0.6745, of which 68 % lie between 0.299 and 2.083
+    # (|z| of 0.2019 and 1.4051), and what is not known of it beforehand
+    known = np.log(1.0 + probe.FORECAST_SPREAD)
+    exact = np.exp([-1.0, 1.0] * np.hypot(np.log([0.2019 / 0.6745, 1.4051 / 0.6745]), known))
+    np.testing.assert_allclose(ends(one[None]), exact, rtol=0.04)
+    low, high = ends(np.zeros((0, *shape)))
+    assert 0.7 < low < 1.0 < high < 1.4
+
+
 def test_variance_of_a_reading_follows_its_photons_and_saturation(look):
     series = exposure_series_s()
     skin = look.reflectance[0]
