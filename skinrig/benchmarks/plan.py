@@ -94,7 +94,8 @@ MEASURED_S: Final[dict[str, float]] = {
     "diffuse-albedo": 12, "efficiency": 12, "microstructure-passes": 13, "hdr": 15, "brdf": 17,
     "wrinkles": 18, "wrinkle-sum": 19, "dome-lights": 21, "misalignment": 22, "dome-geometry": 26,
     "color-table": 26, "shared-melanin": 28, "subsurface-fit": 30, "perfusion-curves": 31,
-    "render-gradient": 34, "head-motion": 34, "texture-fill": 35, "lumitexels": 35,
+    "skin-stretch": 32, "render-gradient": 34, "head-motion": 34, "texture-fill": 35,
+    "lumitexels": 35,
     "normals": 37, "facial-color": 38, "chromophores": 39, "layered-reflectance": 39,
     "expression-alignment": 39, "brdf-space": 40, "render-flash": 44, "reflectance": 46,
     "gradient-normals": 50, "texture-matching": 53, "probe-session": 41, "editing": 42,
@@ -106,8 +107,8 @@ the processor seconds of the main thread and half of those of all others, which 
 What errors by melanin band add to that is estimated from small sizes."""
 
 GUESSED_S: Final[dict[str, float]] = {
-    "skin-stretch": 150, "microstructure": 150,
-    "displacement-synthesis": 200, "kernel-fit": 300, "omissions": 300, "intervals": 600,
+    "microstructure": 150, "displacement-synthesis": 200, "kernel-fit": 300, "omissions": 300,
+    "intervals": 600,
 }  # fmt: skip
 """The same, not measured: careful guesses. One that is too low makes a run outlast its budget, one
 that is too high leaves a stage at its small size."""
