@@ -106,6 +106,8 @@ NOT_DRIVEN = {
                 "reconstruction.brdf_space": "curve",
                 "reconstruction.chromophore_reference": "fit weigh",
                 "reconstruction.kernel_errors": "nearly_as_good of_kernel stderr_of_best",
+                "reconstruction.face_chromophores": "in_known_light of_colors",
+                "reconstruction.face_distribution": "fit",
                 "reconstruction.kernel_fit": (
                     "convolved convolved_histogram fit_kernel fit_two_axes"
                 ),

@@ -17,7 +17,13 @@ from model import (
     trait_vectors,
     traits,
 )
-from reconstruction import brdf_basis, brdf_space, chromophore_start, mesh_repair
+from reconstruction import (
+    brdf_basis,
+    brdf_space,
+    chromophore_start,
+    face_distribution,
+    mesh_repair,
+)
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=20, database=None)
 FEW = settings(CHEAP, max_examples=8)
@@ -244,3 +250,24 @@ def test_colors_between_nodes_are_finite_and_change_as_their_derivatives_say(see
         up, down = (chromophore_start.evaluate(colors(), a + s * da, b + s * db)[0]
                     for s in (1, -1))  # fmt: skip
         np.testing.assert_allclose((up - down) / (2 * step), slope, rtol=1e-3, atol=1e-5)
+
+
+@CHEAP
+@given(steps=st.lists(st.tuples(*[st.floats(-2.0, 2.0)] * 2), max_size=5))
+def test_errors_that_all_pixels_share_add_in_squares_in_either_sense(steps):
+    def face(melanin, blood):
+        return face_distribution.FaceDistribution(
+            face_distribution.Bell(melanin, 0.3, 0.01, -9.0, 0.0),
+            face_distribution.Bell(blood, 0.1, 0.01, 0.0, 1.0),
+        )
+
+    usual = face(-3.0, 0.4)
+    moved = [(face(-3.0 - a, 0.4 - 0.1 * b), face(-3.0 + a, 0.4 + 0.1 * b)) for a, b in steps]
+    found = face_distribution.with_common_errors(usual, moved)
+    assert found.melanin.mean == usual.melanin.mean
+    assert found.melanin.stderr == pytest.approx(np.hypot.reduce([0.0, *(a for a, _ in steps)]))
+    assert found.blood.stderr == pytest.approx(
+        np.hypot.reduce([0.0, *(0.1 * b for _, b in steps)]), abs=1e-12
+    )
+    turned = face_distribution.with_common_errors(usual, [pair[::-1] for pair in moved])
+    assert turned.melanin.stderr == pytest.approx(found.melanin.stderr)
