@@ -46,6 +46,9 @@ MOST_NOISE: Final = 0.3
 BY_LOGARITHM: Final = 0.1
 """Likewise up to which its logarithm is compared. Of fainter ones that would leave out the low
 readings; they are compared as they are, with the profile found so far."""
+MOST_STEP: Final = 3.0
+"""Logarithms by which such a reading may move the profile in a round: noise of no light does not
+lift it by orders of magnitude."""
 DIMMING: Final = 1.0
 """Standard deviation of the log of the factor: a layer on top dims, and does not do so by a hundred
 or brighten, as media of next to no scattering would ask for."""
@@ -134,7 +137,7 @@ def _readings(
     known = batch.used[chosen] & np.isfinite(batch.variance[chosen])
     relative = np.where(known, batch.variance[chosen], 0.0) / m**2
     bright = known & (y > 0.0) & (relative < BY_LOGARITHM**2)
-    reading = profile + y / m - 1.0
+    reading = profile + np.clip(y / m - 1.0, -MOST_STEP, MOST_STEP)
     reading = np.where(bright, np.log(np.where(bright, y, 1.0)) + 0.5 * relative, reading)
     own = np.where(known, relative + model.error[0] ** 2, np.inf)
     return np.where(known, reading, profile), own

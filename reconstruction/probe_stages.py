@@ -25,7 +25,7 @@ from reconstruction.evidence import Evidence, EvidenceError
 from reconstruction.probe_images import Measurement, ProbeImages
 from reconstruction.subsurface import SubsurfaceFit
 
-REVISION = 6
+REVISION = 7
 """Grows when the code of a stage changes its result, so that older results are computed again."""
 
 MAPS = ("profiles", "subsurface", "anisotropy", "translucency")

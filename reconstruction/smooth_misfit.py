@@ -63,7 +63,7 @@ def smooth_misfit(radius_mm: Floats, value: Floats, variance: Floats) -> tuple[F
     penalty[np.ix_(order, order)] = _penalty(np.sqrt(radius_mm[order]))
     weight = np.full(variance.shape, WEAKEST)
     np.divide(1.0, variance, out=weight, where=variance < 1.0 / WEAKEST)
-    weighed = weight * value
+    weighed = np.where(weight > WEAKEST, weight * value, 0.0)
     best = np.full(len(value), -np.inf)
     strength = np.full(len(value), STRENGTHS[0])
     for each in STRENGTHS:
