@@ -100,14 +100,14 @@ MEASURED_S: Final[dict[str, float]] = {
     "expression-alignment": 39, "brdf-space": 40, "render-flash": 44, "reflectance": 46,
     "gradient-normals": 50, "texture-matching": 53, "probe-session": 41, "editing": 42,
     "render-model": 41, "subsurface-gather": 64, "normal-integration": 65, "render-dome": 70,
-    "sphere-lights": 85, "traits": 90, "photon-transport": 103,
+    "sphere-lights": 85, "traits": 90, "microstructure": 100, "photon-transport": 103,
 }  # fmt: skip
 """About how many seconds each takes at full size on two cores that do nothing else: of a run alone,
 the processor seconds of the main thread and half of those of all others, which share two cores.
 What errors by melanin band add to that is estimated from small sizes."""
 
 GUESSED_S: Final[dict[str, float]] = {
-    "microstructure": 150, "displacement-synthesis": 200, "kernel-fit": 300, "omissions": 300,
+    "displacement-synthesis": 200, "kernel-fit": 300, "omissions": 300,
     "intervals": 600,
 }  # fmt: skip
 """The same, not measured: careful guesses. One that is too low makes a run outlast its budget, one
