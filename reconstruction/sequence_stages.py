@@ -29,7 +29,7 @@ from reconstruction import (
 from reconstruction.evidence import Evidence, EvidenceError
 from reconstruction.perfusion_samples import PoseStep
 
-REVISION = 4
+REVISION = 5
 CURVES = "perfusion_curves"
 CURVES_FILE = "perfusion_curves.json"
 MAPS = (*flash_stages.MAPS, CURVES)
@@ -213,7 +213,12 @@ def _laid_over_rest(
         return still, list(maps)
     both = on_valid & off_valid
     moved = np.array([_more_like(m, on, off, both) for m in maps])
-    laid = [alignment.warp_map(m) if is_on else m for m, is_on in zip(maps, moved, strict=True)]
+    # all moved frames are laid by one alignment: what it is off by is no noise from frame to frame,
+    # but part of the step between poses
+    laid = [
+        alignment.warp_map(m, place=False) if is_on else m
+        for m, is_on in zip(maps, moved, strict=True)
+    ]
     return moved, laid
 
 
