@@ -22,6 +22,7 @@ from model.skin import UNITS, SkinMap
 from model.tissue_optics import ANISOTROPY_SKIN
 from reconstruction import (
     chromophore_posterior,
+    dark_spots,
     face_chromophores,
     model_error,
     polarization,
@@ -32,7 +33,7 @@ from reconstruction import (
 from reconstruction.detectability import detectable
 from reconstruction.evidence import Evidence, EvidenceError
 
-REVISION = 4
+REVISION = 5
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
 MAPS = (
@@ -331,15 +332,24 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     face = None if inputs.white is None else face_chromophores.in_known_light(
         rgb, table, variance=variance, model_error=errors
     )  # fmt: skip
-    known = partial(chromophore_posterior.weigh, rgb, table, prior=prior, face=face)
-    found = known(variance=variance, model_error=errors)
-    noise_alone = known(variance=variance)
+    known = partial(chromophore_posterior.weigh, rgb, table, prior=prior)
+    found = by_face = known(face=face, variance=variance, model_error=errors)
+    noise_alone = known(face=face, variance=variance)
+    if face is not None:  # what is darker than its surroundings may be no skin of that face
+        spots = dark_spots.darker_than_around(rgb, variance=variance)
+        alone = partial(known, variance=variance, valid=spots)
+        found = dark_spots.either(found, alone(model_error=errors), spots)
+        noise_alone = dark_spots.either(noise_alone, alone(), spots)
     usable = found.valid
 
-    def chromophore(
-        name: str, values: Float32, stderr: Float32, without_model_error: Float32
-    ) -> dict[str, SkinMap]:
-        good = detectable(values, stderr, usable & np.isfinite(without_model_error))
+    def chromophore(name: str) -> dict[str, SkinMap]:
+        values, stderr = (getattr(found, key) for key in (name, f"stderr_{name}"))
+        without_model_error = getattr(noise_alone, f"stderr_{name}")
+        # spots are wide on purpose; they say nothing of what is known of the skin around them
+        good = detectable(
+            getattr(by_face, name), getattr(by_face, f"stderr_{name}"),
+            usable & np.isfinite(without_model_error),
+        )  # fmt: skip
         why = "invalid where noise and model error leave it unknown"
         return {
             name: SkinMap(
@@ -352,12 +362,8 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
         }  # fmt: skip
 
     return {
-        **chromophore(
-            "melanin", found.melanin, found.stderr_melanin, noise_alone.stderr_melanin
-        ),
-        **chromophore(
-            "hemoglobin", found.hemoglobin, found.stderr_hemoglobin, noise_alone.stderr_hemoglobin
-        ),
+        **chromophore("melanin"),
+        **chromophore("hemoglobin"),
         "shading": SkinMap(np.where(usable, found.shading, 0.0), "1", valid=usable),
         "residual": SkinMap(np.where(usable, found.residual, 0.0), "1", valid=usable),
         "gamut_distance": SkinMap(

@@ -20,7 +20,9 @@ from model import (
 from reconstruction import (
     brdf_basis,
     brdf_space,
+    chromophore_posterior,
     chromophore_start,
+    dark_spots,
     face_distribution,
     mesh_repair,
 )
@@ -271,3 +273,53 @@ def test_errors_that_all_pixels_share_add_in_squares_in_either_sense(steps):
     )
     turned = face_distribution.with_common_errors(usual, [pair[::-1] for pair in moved])
     assert turned.melanin.stderr == pytest.approx(found.melanin.stderr)
+
+
+@CHEAP
+@given(
+    seed=SEED,
+    size=st.tuples(*[st.integers(0, 40)] * 2),
+    unit=st.floats(-300, 300),
+    bad=st.sampled_from([np.nan, np.inf, -np.inf, -1.0, 0.0, 5e-324]),
+)
+def test_spots_are_those_of_any_unit_and_nothing_else_than_skin(seed, size, unit, bad):
+    rng = np.random.default_rng(seed)
+    light = 10.0**unit * np.exp(0.3 * rng.standard_normal((*size, 3)))
+    dropped = rng.random(size) < 0.1
+    light[dropped] = bad
+    kept = light.copy()
+    valid = rng.random(size) < 0.9
+    found = dark_spots.darker_than_around(light, valid=valid)
+    np.testing.assert_array_equal(light, kept)
+    assert found.shape == size
+    assert not found[~valid].any()
+    if bad != 5e-324:
+        assert not found[dropped].any()
+        again = dark_spots.darker_than_around(light / 10.0**unit, valid=valid)
+        assert np.sum(again != found) <= 2  # ties that rounding decides
+    assert not dark_spots.darker_than_around(light, variance=np.inf, valid=valid).any()
+
+
+@CHEAP
+@given(
+    pair=st.tuples(*[st.floats(0.0, 0.5, width=32)] * 2),
+    errors=st.tuples(*[st.floats(0.0, 1e3, width=32)] * 2),
+    where=st.booleans(),
+)
+def test_a_mixture_lies_halfway_and_holds_both(pair, errors, where):
+    def weighed(value, error):
+        each = np.full(1, value, np.float32), np.full(1, error, np.float32)
+        one, yes = np.ones(1, np.float32), np.ones(1, bool)
+        return chromophore_posterior.WeighedChromophores(
+            each[0], each[0], one, each[1], each[1], one, one, ~yes, yes
+        )
+
+    face, alone = (weighed(*each) for each in zip(pair, errors, strict=True))
+    found = dark_spots.either(face, alone, [where])
+    if not where:
+        assert (found.melanin[0], found.stderr_hemoglobin[0]) == (pair[0], errors[0])
+        return
+    assert min(pair) <= found.melanin[0] <= max(pair)
+    least = max(abs(pair[0] - pair[1]) / 2, max(errors) / np.sqrt(2))
+    assert found.stderr_melanin[0] >= least * (1 - 1e-5)
+    assert found.stderr_melanin[0] <= sum(errors) + abs(pair[0] - pair[1]) + 1e-30

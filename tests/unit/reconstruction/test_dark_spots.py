@@ -1,0 +1,157 @@
+"""Moles and shadows on a face whose pixels are weighed together."""
+
+import numpy as np
+import pytest
+
+from model import color_table
+from model.tissue_optics import ANISOTROPY_SKIN
+from reconstruction import shading_prior
+from reconstruction.chromophore_posterior import weigh
+from reconstruction.chromophores import ChromophoreError
+from reconstruction.dark_spots import darker_than_around, either
+from reconstruction.face_chromophores import of_colors
+
+NOISE = 0.004
+SIDE = 90
+
+
+@pytest.fixture(scope="module")
+def table():
+    return color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+
+
+def smooth(rng, shape, length):
+    """Draw a field of mean 0 and standard deviation 1 that changes over `length` pixels."""
+    waves = [np.fft.fftfreq(size)[:, None] if k == 0 else np.fft.fftfreq(size)[None, :]
+             for k, size in enumerate(shape)]  # fmt: skip
+    low = np.exp(-2 * (np.pi * length) ** 2 * (waves[0] ** 2 + waves[1] ** 2))
+    field = np.fft.ifft2(np.fft.fft2(rng.standard_normal(shape)) * low).real
+    return (field - field.mean()) / field.std()
+
+
+def as_on_faces(field):
+    """Return light that is distributed as on faces, in the order of a field."""
+    prior = shading_prior.of_faces(softness=shading_prior.SHARPEST)
+    below = np.concatenate([[0.0], np.cumsum(prior.density)])
+    edges = prior.low + prior.step * (np.arange(below.size) - 0.5)
+    ranks = (field.ravel().argsort().argsort() + 0.5) / field.size
+    return np.exp(np.interp(ranks * below[-1], below, edges)).reshape(field.shape)
+
+
+def spotted(table, melanin, mole_melanin, rng):
+    """Draw a face of uneven light with moles and small shadows; return it with its truth."""
+    shape = SIDE, SIDE
+    c_m = melanin * np.exp(0.12 * smooth(rng, shape, 4.0))
+    c_hd = table.c_hd_max * (0.4 + 0.03 * smooth(rng, shape, 4.0)) ** 3
+    light = as_on_faces(smooth(rng, shape, 15.0))
+    row, column = np.mgrid[:SIDE, :SIDE]
+    moles, shades = np.zeros(shape, bool), np.zeros(shape, bool)
+    for k, (r, c) in enumerate(np.argwhere(np.ones((4, 4))) * 22 + 11):
+        here = (row - r) ** 2 + (column - c) ** 2 <= 2
+        (moles if k % 2 else shades)[here] = True
+    c_m[moles] = mole_melanin
+    light[shades] *= 0.55
+    clean = light[..., None] * table.lookup(c_m, c_hd)
+    return c_m, moles, shades, clean * (1 + NOISE * rng.standard_normal(clean.shape))
+
+
+@pytest.mark.parametrize(
+    ("melanin", "mole_melanin", "explained_away"),
+    [(0.05, 0.1, True), (0.05, 0.12, True), (0.05, 0.2, True), (0.09, 0.15, True),
+     (0.09, 0.22, False), (0.02, 0.04, False)],
+)  # fmt: skip
+def test_a_mole_is_not_explained_away_by_shade(table, melanin, mole_melanin, explained_away, rng):
+    """A face by itself does not hold some of the moles within 2.4 standard errors."""
+    truth, moles, shades, rgb = spotted(table, melanin, mole_melanin, rng)
+    variance, error = np.square(NOISE * rgb), 5e-5 * np.eye(3)
+    face = of_colors(
+        rgb, table, prior=shading_prior.of_faces(softness=shading_prior.SHARPEST),
+        common_light=0.1, variance=variance, model_error=error,
+    )  # fmt: skip
+    prior = shading_prior.of_faces()
+    by_face = weigh(rgb, table, prior=prior, face=face, variance=variance, model_error=error)
+    spots = darker_than_around(rgb, variance=variance)
+    alone = weigh(rgb, table, prior=prior, variance=variance, model_error=error, valid=spots)
+    found = either(by_face, alone, spots)
+
+    def held(estimate, where):
+        away = np.abs(estimate.melanin - truth) / estimate.stderr_melanin
+        return np.mean(away[where & found.valid] < 2.4)
+
+    assert (held(by_face, moles) < 0.5) == explained_away
+    assert held(found, moles) > 0.9
+    assert held(by_face, shades) > 0.9
+    assert held(found, shades) > 0.9
+    assert found.valid[moles].mean() > 0.8
+    same = ~spots
+    np.testing.assert_array_equal(found.melanin[same], by_face.melanin[same])
+    np.testing.assert_array_equal(found.stderr_hemoglobin[same], by_face.stderr_hemoglobin[same])
+
+
+def test_a_mixture_has_the_moments_of_draws_from_both(table, rng):
+    rgb = 0.7 * table.lookup(np.full((1, 8), 0.05), np.full((1, 8), 0.02))
+    first = weigh(rgb, table, prior=shading_prior.of_faces(), variance=np.square(0.01 * rgb))
+    second = weigh(0.5 * rgb, table, prior=shading_prior.of_faces(), variance=np.square(0.01 * rgb))
+    found = either(first, second, np.ones((1, 8), bool))
+    draws = np.concatenate([
+        rng.normal(each.melanin[0, 0], each.stderr_melanin[0, 0], 100_000)
+        for each in (first, second)
+    ])  # fmt: skip
+    np.testing.assert_allclose(found.melanin[0, 0], draws.mean(), rtol=0.02)
+    np.testing.assert_allclose(found.stderr_melanin[0, 0], draws.std(), rtol=0.02)
+
+
+def test_slopes_of_light_and_noise_are_no_spots(rng):
+    """One square holds a slope alike on both sides; 3 deviations leave 1 pixel in 700 by chance."""
+    slope = np.exp(np.linspace(0, 1.2, 120))[None, :, None] * np.ones((120, 120, 3))
+    assert not darker_than_around(slope).any()
+    noisy = 1 + 0.15 * rng.standard_normal((120, 120, 3))
+    assert np.mean(darker_than_around(noisy)) > 0.02
+    told = darker_than_around(noisy, variance=np.full(3, 0.15**2))
+    assert np.mean(told) < 0.01
+
+
+@pytest.mark.parametrize("size", [40, 400, 900])
+def test_blocks_find_what_every_pixel_by_itself_finds(size, rng):
+    """A mole of a face's hundredth is found in pictures of any size, and little else."""
+    light = np.exp(0.3 * smooth(rng, (size, size), size / 5))[..., None] * np.ones(3)
+    row, column = np.mgrid[:size, :size]
+    mole = np.hypot(row - size / 2, column - size / 3) <= max(size / 100, 1)
+    light[mole] *= 0.6
+    found = darker_than_around(light.astype(np.float32))
+    assert found[mole].all()
+    assert found[~mole].mean() < 0.01
+
+
+def test_what_is_no_skin_is_no_spot_and_takes_no_part():
+    light = np.ones((30, 30, 3))
+    light[10, 10] = 0.5
+    light[20, :5] = np.nan, -1.0, np.inf
+    valid = np.ones((30, 30), bool)
+    light[:, 25:] = 100.0
+    valid[:, 25:] = False
+    found = darker_than_around(light, valid=valid)
+    assert np.argwhere(found).tolist() == [[10, 10]]
+    assert not darker_than_around(light, valid=np.zeros((30, 30), bool)).any()
+    assert darker_than_around(np.ones((0, 5, 3))).shape == (0, 5)
+    assert not darker_than_around(light, variance=np.nan, valid=valid).any()
+
+
+@pytest.mark.parametrize(
+    ("call", "what"),
+    [
+        (lambda: darker_than_around(np.ones((3, 3))), "colors"),
+        (lambda: darker_than_around(np.ones((3, 3, 3)), valid=np.ones(3)), "valid"),
+        (lambda: darker_than_around(np.ones((3, 3, 3)), variance=np.ones(4)), "variance"),
+    ],
+)
+def test_shapes_that_do_not_fit_are_named(call, what):
+    with pytest.raises(ChromophoreError, match=what):
+        call()
+
+
+def test_estimates_of_other_pixels_are_refused(table):
+    rgb = table.lookup(np.full((2, 3), 0.05), np.full((2, 3), 0.02))
+    found = weigh(rgb, table, prior=shading_prior.of_faces())
+    with pytest.raises(ChromophoreError, match="where"):
+        either(found, found, np.ones((3, 2), bool))
