@@ -49,6 +49,10 @@ class FacialColorFitError(ValueError):
     """Sessions that no hemoglobin rig can be fitted to."""
 
 
+class UnknownBloodError(FacialColorFitError):
+    """Skin whose colors nowhere tell its blood at rest."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class AlignedImage:
     """One image laid over the neutral one.
@@ -187,6 +191,12 @@ def fit(
         shading_window_px=shared_melanin.SHADING_WINDOW_PX,
     )
     blood = {state: _blood(shared, k) for k, state in enumerate(kept)}
+    if not _valid(blood[NEUTRAL]).any():
+        raise UnknownBloodError(
+            "blood at rest: expected pixels that tell it, got a standard error of more than half "
+            "of it all over the face, as of very dark skin or little light; take more light, or "
+            "melanin alone: skinrig reconstruct --want melanin"
+        )
     tell("scale and bias maps")
     rig = HemoglobinRig.from_maps(
         np.where(_valid(blood[NEUTRAL]), blood[NEUTRAL].values, np.nan),

@@ -10,6 +10,7 @@ import numpy as np
 
 from model import store
 from reconstruction import pipeline
+from reconstruction.facial_color_fit import UnknownBloodError
 from skinrig.benchmarks.interval_coverage import Trial
 from skinrig.benchmarks.interval_trials import (
     band_of,
@@ -82,7 +83,10 @@ def _of_rig(
     from skinrig.fitting.facial_color import fit_facial_color
     from skinrig.simulating.simulation import truth_folder
 
-    fit_facial_color([done.session], out=folder / "moving", calibration=folder / "calibration")
+    try:
+        fit_facial_color([done.session], out=folder / "moving", calibration=folder / "calibration")
+    except UnknownBloodError:
+        return  # of the darkest skin: it states no interval
     maps = store.read(folder / "moving").maps
     blood, found = maps.get(f"hemoglobin_{state}"), maps.get(f"change_{state}")
     neutral = truth_folder(done.session)

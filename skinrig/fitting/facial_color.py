@@ -14,7 +14,7 @@ from model import facial_color_document, store
 from model.facial_color import FacialColorError
 from model.skin import SkinMap
 from reconstruction import facial_color_fit, landmark_table, state_images
-from reconstruction.facial_color_fit import FacialColorFit
+from reconstruction.facial_color_fit import FacialColorFit, UnknownBloodError
 from reconstruction.state_images import Landmarks, Subject
 from skinrig import dynamic_appearance
 from skinrig.dynamic_appearance import FACIAL_COLOR, Part
@@ -72,7 +72,7 @@ def fit_facial_color(
             subject, radius_px=radius_px, landmarks=marks, stored_size=stored_size,
             progress=progress,
         )  # fmt: skip
-    except FacialColorError as error:
+    except (FacialColorError, UnknownBloodError) as error:
         if subject.has_white:
             raise
         raise FacialColorInputError(

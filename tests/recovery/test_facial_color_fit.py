@@ -8,7 +8,9 @@ import pytest
 from model import color_table, store
 from model.tissue_optics import ANISOTROPY_SKIN
 from reconstruction import chromophore_posterior, pipeline, shading_prior
+from reconstruction.facial_color_fit import UnknownBloodError
 from skinrig.applying.expression import hemoglobin_rig
+from skinrig.benchmarks import interval_trials_flash
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating.facial_color import WAYS, compare, true_blood
 from skinrig.fitting.facial_color import fit_facial_color
@@ -101,6 +103,22 @@ def test_a_face_without_any_expression_is_refused(folder, tmp_path):
     with pytest.raises(ValueError, match="neutral state alone"):
         fit_facial_color([tmp_path / "session-one"], out=tmp_path / "moving")
     assert not (tmp_path / "moving").exists()
+
+
+def test_skin_whose_blood_no_color_tells_is_refused_with_what_can_be_had(folder, tmp_path):
+    """Such a face states no interval of blood either: the trial of intervals goes on."""
+    done = simulate_session(
+        "flash", tmp_path / "session-dark", subject="darkest", width_px=WIDTH_PX, seed=4,
+        states=("neutral", "smile"),
+    )  # fmt: skip
+    with pytest.raises(UnknownBloodError, match="melanin alone"):
+        fit_facial_color(
+            [done.session], out=tmp_path / "moving", calibration=folder / "calibration"
+        )
+    assert not (tmp_path / "moving").exists()
+    (tmp_path / "calibration").symlink_to(folder / "calibration")
+    trials = interval_trials_flash._of_rig(done, tmp_path, "smile", subject="a", band="b")
+    assert not list(trials)
 
 
 def test_features_stand_in_for_landmarks_and_say_so(folder, tmp_path):
