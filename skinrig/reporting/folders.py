@@ -143,8 +143,9 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_page(path: Path, text: str) -> None:
-    """Write a page that is there whole or not at all."""
+    """Write a page that is there whole or not at all; its folder is made."""
     part = path.with_name(f".{path.name}.part")
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
         part.write_text(text, encoding="utf-8")
         os.replace(part, path)

@@ -46,6 +46,12 @@ def test_one_run_is_reported_and_two_are_compared_and_it_is_said_which(maps, cap
     assert [p.name for p in maps.iterdir() if p.name.startswith(".")] == []
 
 
+def test_the_folder_of_a_page_is_made_as_those_of_maps_are(maps):
+    out = maps / "reports" / "today" / "page.html"
+    assert main(["report", str(maps / "monday"), "-o", str(out)]) == 0
+    assert [p.name for p in out.parent.iterdir()] == ["page.html"]
+
+
 def test_what_cannot_be_compared_is_refused_and_nothing_is_written(maps, capsys):
     out = maps / "page.html"
     assert main(["report", str(maps / "monday"), "--compare", "-o", str(out)]) == 3
