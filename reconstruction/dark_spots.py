@@ -23,8 +23,8 @@ from reconstruction.chromophores import ChromophoreError
 Floats = NDArray[np.float32]
 
 DARKER: Final = 0.1
-"""Least difference of log light from the surroundings: 12 % more melanin on skin of 5 %, 31 % more on
-skin of 1 %, which is within or near a face's own spread. Darker by less needs no second look."""
+"""Least difference of log light from the surroundings: 12 % more melanin on skin of 5 %, 31 % more
+on skin of 1 %, which is within or near a face's own spread. Less needs no second look."""
 NOISES: Final = 3.0
 """The same, in standard deviations of a pixel's noise."""
 PART: Final = 20
