@@ -14,7 +14,7 @@ range misses one with a chance of 5 % at most (Bonferroni).
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -51,8 +51,14 @@ DOME: Final = ("I", "III", "V", "II", "IV", "VI")
 Trials = Iterable[Trial]
 
 
-def intervals(*, toy: bool) -> StageBenchmark:
-    """Count how often 68 and 95 % intervals of every rig's maps hold the truth."""
+def intervals(*, toy: bool) -> Iterator[StageBenchmark]:
+    """Count how often 68 and 95 % intervals of every rig's maps hold the truth.
+
+    Yields
+    ------
+    StageBenchmark
+        After each kind of trial that of all so far: the last is the whole one.
+    """
     trials: list[Trial] = []
     spent: dict[str, Timing] = {}
     for make in (_small() if toy else _full()).values():
@@ -61,6 +67,10 @@ def intervals(*, toy: bool) -> StageBenchmark:
             timing, made = once(lambda make=make, folder=folder: list(make(folder)))  # type: ignore[misc]
         trials += made
         spent |= dict.fromkeys((trial.quantity for trial in made), timing)
+        yield _judged(trials, spent, toy=toy)
+
+
+def _judged(trials: Sequence[Trial], spent: Mapping[str, Timing], *, toy: bool) -> StageBenchmark:
     told = [trial for trial in trials if trial.deviation.size]
     counted = len(by_band(told, level=68, confidence=0.95))
     # one-sided at each end of the range, of two levels

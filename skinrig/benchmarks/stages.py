@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -73,7 +73,7 @@ STAGES = {
 """Module and function of each; a module is imported, and its kernels compiled, when it is run."""
 
 
-INTERRUPTED = "the run ended before it was measured"
+INTERRUPTED = "the run ended before all of it was measured"
 """Of a stage in a document that a run left which was interrupted."""
 
 
@@ -81,12 +81,14 @@ class BenchError(ValueError):
     """A stage that cannot be measured."""
 
 
-def _function(name: str) -> Callable[..., StageBenchmark]:
+def _measured(name: str, *, toy: bool) -> Iterator[StageBenchmark]:
+    """Yield what a stage has measured: once, or of a long one ever more until it is whole."""
     module, function = STAGES[name].split(".")
-    found: Callable[..., StageBenchmark] = getattr(
-        import_module(f"skinrig.benchmarks.{module}"), function
-    )
-    return found
+    made = getattr(import_module(f"skinrig.benchmarks.{module}"), function)(toy=toy)
+    if isinstance(made, StageBenchmark):
+        yield made
+    else:
+        yield from made
 
 
 def run_stages(
@@ -185,17 +187,24 @@ class _Run:
             return
         self.console.progress(f"bench {name}, {size} size")
         try:
-            made = _function(name)(toy=size == "small")
+            for made in _measured(name, toy=size == "small"):
+                if name in self.to_do:
+                    self._take(name, made, size)
+                    self.keep()
         except ImportError as error:
             if self.asked or exit_code(error) != EXTRA_MISSING:
                 raise
             self.left_out.append((name, sentence(error)))
             return
-        # the first time that its kernels are called; later ones find them compiled
-        self.compile_s.setdefault(
-            name, sum(max(p.timing.cold_s - p.timing.seconds, 0.0) for p in made.points)
-        )
+        self._take(name, made, size)
+
+    def _take(self, name: str, made: StageBenchmark, size: Size) -> None:
         self.done[name], self.size[name] = made, size
+        if name in self.to_do:
+            # the first time that its kernels are called; later ones find them compiled
+            self.compile_s[name] = sum(
+                max(p.timing.cold_s - p.timing.seconds, 0.0) for p in made.points
+            )
 
     def enlarge(self) -> None:
         """Measure again at full size what fits into the rest of the budget."""

@@ -21,13 +21,17 @@ MARGIN_S = 0.25
 HOST = """
 import sys
 from capture.devices.flash import FlashBox
-from capture.devices.port import Port
+from capture.devices.port import CommandRefused, Port
 
 box = FlashBox(Port(sys.argv[1]))
 box.set_lease(float(sys.argv[2]))
 box.arm()
 while True:
-    box.lamp_on(0.5)
+    try:
+        box.lamp_on(0.5)
+    except CommandRefused:  # a busy machine held this host up for longer than the lease
+        box.arm()
+        continue
     print("lit", flush=True)
     box.port.listen(0.02)
 """
@@ -60,7 +64,9 @@ def test_a_host_that_dies_leaves_the_box_dark_within_the_lease(lamp_keeper, tran
     with serve(load_rig("flash").resized(16), pty=transport == "pty") as served:
         host = lamp_keeper(served.addresses["flash"])
         world, box = served.world, served.world.box("flash")
-        assert box.device.lit
+        while not box.device.lit:
+            assert world.now < 30.0
+            served.wait(0.001)
         host.send_signal(blow)
         struck_s = world.now
         while box.device.lit and world.now < struck_s + 5.0:

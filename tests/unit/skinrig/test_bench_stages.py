@@ -1,6 +1,7 @@
 """How a run spends its budget, on stages that take no time."""
 
 import csv
+import dataclasses
 import json
 from types import SimpleNamespace
 
@@ -42,8 +43,12 @@ def calls(monkeypatch):
     functions = {name: stage(name, made, costs[name]) for name in NAMES}
     clock.now = 0.0
     monkeypatch.setattr(bench_stages.time, "perf_counter", lambda: clock.now)
-    monkeypatch.setattr(bench_stages, "STAGES", dict.fromkeys(NAMES, "x.y"))
-    monkeypatch.setattr(bench_stages, "_function", functions.__getitem__)
+    monkeypatch.setattr(bench_stages, "STAGES", {n: f"x.{n}" for n in NAMES})
+    monkeypatch.setattr(
+        bench_stages,
+        "import_module",
+        lambda _: SimpleNamespace(**{n: lambda n=n, **how: functions[n](**how) for n in NAMES}),
+    )
     monkeypatch.setattr(bench_plan, "FULL_S", costs)
     made.append(functions)
     return made
@@ -114,6 +119,28 @@ def test_a_run_that_is_interrupted_leaves_what_it_measured(calls, tmp_path, caps
     whole = json.loads((tmp_path / "bench.json").read_text())
     assert set(whole["stages"]) == set(NAMES)
     assert whole["left_out"] == []
+
+
+def test_a_long_stage_that_is_interrupted_leaves_what_it_measured_of_it(calls, tmp_path, capsys):
+    whole = stage("b", calls)
+
+    def in_parts(*, toy):
+        made = whole(toy=toy)
+        yield dataclasses.replace(made, points=made.points[:2])
+        if stopped:
+            raise KeyboardInterrupt
+        yield made
+
+    calls[0]["b"], stopped = in_parts, True
+    with pytest.raises(KeyboardInterrupt):
+        run(600.0, ["a", "b"], out=tmp_path)
+    kept = json.loads((tmp_path / "bench.json").read_text())
+    assert [len(kept["stages"][name]["points"]) for name in ("a", "b")] == [4, 2]
+    assert kept["left_out"] == [["b", bench_stages.INTERRUPTED]]
+    stopped = False
+    document = run(600.0, ["a", "b"], out=tmp_path)
+    assert [len(document["stages"][name]["points"]) for name in ("a", "b")] == [4, 4]
+    assert document["left_out"] == []
 
 
 def test_a_folder_that_cannot_be_made_is_told_before_anything_is_measured(calls, tmp_path):
