@@ -142,7 +142,10 @@ def main(argv: list[str] | None = None) -> int:
 def _failed(error: BaseException, code: int, given: Sequence[str], *, say: bool = True) -> int:
     """Tell people, and programs that asked for JSON, why a command ended; return its code."""
     format_message = getattr(error, "format_message", None)
-    told = errors.sentence(error) if say or format_message is None else str(format_message())
+    if isinstance(error, KeyboardInterrupt):
+        told = errors.interruption(given)
+    else:
+        told = errors.sentence(error) if say or format_message is None else str(format_message())
     if say:
         print(f"skinrig: {told}", file=sys.stderr)
     # none of a command's own came before: it is the last that a command prints

@@ -19,6 +19,7 @@ from skinrig.console import Console, plain
 from skinrig.demo_rigs import RIGS, Findings
 from skinrig.next_steps import look, suggest
 from skinrig.simulating.simulation import truth_folder
+from skinrig.waiting_threads import WAITING_ASLEEP
 
 MOST_AT_ONCE = 2
 """Rigs that run side by side: much of each is the work of one core, or waits for a compiler."""
@@ -30,9 +31,8 @@ BENCHED = (
 take about a second; `skinrig bench` measures all."""
 BENCH_BUDGET_S = 8.0
 LONGEST_FIRST = ("gradient", "dome", "flash", "probe")
-SLEEPING_THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}
-"""Environment of rigs side by side, where the user has not set it. Threads that spin as they wait
-take the core of the other rig; libraries read it when they are loaded."""
+SLEEPING_THREADS = {**WAITING_ASLEEP, "OPENBLAS_NUM_THREADS": "1"}
+"""Environment of rigs side by side, where the user has not set it: the cores are shared."""
 Shares = dict[str, float]
 
 

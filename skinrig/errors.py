@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Sequence
 
 DONE = 0
 LIMIT_MISSED = 1
@@ -67,10 +68,38 @@ _ADVICE = {
 _OWN = ("capture", "reconstruction", "model", "rigsim", "skinrig")
 
 
+RESUMED = ("capture", "serve", "simulate")
+"""Commands that have --resume."""
+
+
+def interruption(given: Sequence[str]) -> str:
+    """Return what to print of a command that was interrupted.
+
+    Parameters
+    ----------
+    given
+        Its name and arguments.
+
+    Examples
+    --------
+    >>> interruption(["simulate", "flash"])
+    'interrupted; the same command with --resume goes on'
+    >>> interruption(["bench", "--out", "bench"])
+    'interrupted; bench.json in --out keeps what was measured'
+    """
+    command = next((word for word in given if not word.startswith("-")), "")
+    if command in RESUMED:
+        return "interrupted; the same command with --resume goes on"
+    kept = any(word == "--out" or word.startswith("--out=") for word in given)
+    if command == "bench" and kept and "--extremes" not in given:
+        return "interrupted; bench.json in --out keeps what was measured"
+    return "interrupted; run the same command again"
+
+
 def sentence(error: BaseException) -> str:
     """Return what to print for ``error``, without a traceback."""
     if isinstance(error, KeyboardInterrupt):
-        return "interrupted; a capture or simulation goes on with --resume"
+        return "interrupted"
     if isinstance(error, OSError) and error.strerror and error.errno in _ADVICE:
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}{error.strerror}; {_ADVICE[error.errno]}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +14,7 @@ from skinrig.commands.options import (
     Json,
 )
 from skinrig.console import Console
+from skinrig.waiting_threads import wait_asleep
 
 BUDGET_S = 600.0
 """Seconds of a benchmark that names none."""
@@ -56,6 +58,7 @@ def bench(
         raise errors.UsageError(f"--budget: got {budget:g}, expected seconds above 0")
     if out is not None and out.exists() and not out.is_dir():
         raise errors.UsageError(f"--out: {out} is a file, expected a folder, new or to be replaced")
+    wait_asleep(os.environ)  # before numerical libraries are loaded: one stage runs at a time
     if extremes:
         from skinrig.reporting.extremes import run_extremes
 

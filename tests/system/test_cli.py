@@ -1,11 +1,16 @@
 """The command line as a user meets it: exit codes, one JSON document, no traceback."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
+from skinrig import errors
 from skinrig.cli import app, main
 
 
@@ -149,8 +154,84 @@ def test_an_interrupted_command_says_so(monkeypatch, capsys):
     monkeypatch.setattr("capture.session.verify", interrupted)
     assert main(["verify", "session", "--json"]) == 130
     out, err = capsys.readouterr()
-    assert "skinrig: interrupted; a capture or simulation goes on with --resume" in err
+    assert "skinrig: interrupted; run the same command again" in err
     assert json.loads(out)["exit_code"] == 130
+
+
+def test_an_interrupted_command_is_told_of_resuming_where_it_can():
+    """Those with the option, and no others, are told of it."""
+    commands = get_command(app).commands
+    resumable = {
+        name
+        for name, command in commands.items()
+        if any("--resume" in option.opts for option in command.params)
+    }
+    assert resumable == set(errors.RESUMED)
+    told = {name: errors.interruption([name, "--json"]) for name in commands}
+    assert {name for name, text in told.items() if "--resume" in text} == resumable
+
+
+@pytest.mark.parametrize(
+    ("argv", "kept"),
+    [(["--out", "b"], True), (["--out=b", "--toy"], True), ([], False),
+     (["--extremes", "--out", "b"], False)],
+)  # fmt: skip
+def test_an_interrupted_benchmark_is_told_where_its_measurements_are(
+    argv, kept, capsys, tmp_path, monkeypatch
+):
+    """Extremes write theirs at the end alone."""
+
+    def interrupted(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("skinrig.benchmarks.stages.run_stages", interrupted)
+    monkeypatch.setattr("skinrig.reporting.extremes.run_extremes", interrupted)
+    assert main(["bench", *argv]) == 130
+    assert ("bench.json in --out keeps" in capsys.readouterr().err) == kept
+
+
+@pytest.mark.parametrize(("own", "expected"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
+def test_threads_of_a_benchmark_wait_asleep_but_as_the_user_has_set(own, expected, monkeypatch):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    if own is not None:
+        monkeypatch.setenv("OMP_WAIT_POLICY", own)
+    found = []
+
+    def look(*args, **kwargs):
+        found.append(os.environ.get("OMP_WAIT_POLICY"))
+        return {"schema": "skinrig.bench/2", "passed": True}
+
+    monkeypatch.setattr("skinrig.benchmarks.stages.run_stages", look)
+    assert main(["bench", "--toy"]) == 0
+    assert found == [expected]
+
+
+def test_a_benchmark_sets_how_threads_wait_before_the_library_is_loaded():
+    """OpenMP reads its environment once: a fresh process has not loaded it by then."""
+    code = (
+        "import sys\n"
+        "def look(environment):\n"
+        "    print([m for m in ('numba', 'numpy', 'scipy', 'cv2') if m in sys.modules])\n"
+        "    raise SystemExit\n"
+        "import skinrig.commands.measuring as measuring\n"
+        "measuring.wait_asleep = look\n"
+        "from skinrig.cli import main\n"
+        "main(['bench', '--toy'])"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert run.stdout.strip() == "[]", run.stderr
+
+
+def test_the_package_runs_as_the_script_does(tmp_path):
+    """`python -m skinrig` ends as `skinrig` does, with its output and its exit code."""
+    for argv, code in ((["--version"], 0), (["verify", "no-such-session"], 3)):
+        run = subprocess.run(
+            [sys.executable, "-m", "skinrig", *argv], capture_output=True, text=True, cwd=tmp_path
+        )
+        assert run.returncode == code, run.stderr
+        assert "Traceback" not in run.stderr
+        assert ("skinrig " in run.stdout) == (code == 0)
 
 
 def test_no_argument_shows_where_to_begin(capsys, tmp_path, monkeypatch):
