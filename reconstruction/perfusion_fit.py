@@ -1,9 +1,7 @@
 """Levels, delay and time constant of blood that relaxes, with what the samples can tell of them.
 
-Levels enter a curve linearly: for each delay and time constant they are solved for, and what
-remains is a landscape of two numbers, looked at as a whole. So a time constant far below the
-sampling interval is no failure of a search: the landscape is flat there, and what is told is the
-bound. The noise is that of what the best curve leaves.
+The curves of a prompted cycle and of an event are here, and what a fit tells; how likely each delay
+and time constant is, and the intervals of that, are of `reconstruction.perfusion_likelihood`.
 
 Where the face moves, what is found of the blood of one pose is off that of the other by an unknown
 step, the same in all samples of a pose. It comes as promptly as the movement and would be taken
@@ -12,15 +10,16 @@ for quick blood; so it is one more level of each curve, with its standard error 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import optimize, stats
+from scipy import stats
 
 from reconstruction.perfusion_curves import CurveError
+from reconstruction.perfusion_likelihood import Landscape, Shape
 from reconstruction.perfusion_samples import PoseStep, Samples
 
 Floats = NDArray[np.float64]
@@ -28,6 +27,8 @@ Known = Literal["estimated", "only below", "only above", "unknown"]
 
 BOUND_LEVEL = 0.95
 """Confidence of bounds."""
+ONE_SIGMA_LEVEL = 0.6827
+"""Confidence of the interval whose half a standard error is."""
 GAUSSIAN_95 = 1.959964
 """Half width of a 95 % interval in standard errors."""
 LEVEL_TEST = 0.001
@@ -35,12 +36,6 @@ LEVEL_TEST = 0.001
 _GRID = 97
 _DELAYS = 81
 _DELAYS_OF_POSE = 41
-_SLOPE = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5])
-"""Time constants since the beginning of a change at which samples are tried."""
-_COARSE = 3.0
-"""Constants below so many steps of the delay need delays between them."""
-Shape = Callable[[Floats, Floats], Floats]
-"""Delays and constants of shape (..., 1) to the part of the way, (..., N)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -336,73 +331,27 @@ def _fit(
 def _fit_once(
     data: Samples, curve: Shape, delays: Floats, constants: Floats, at: Floats
 ) -> RelaxationFit:
-    def residuals(delay: Floats, constant: Floats) -> Floats:
-        """(..., P) square sums for delays and constants that broadcast to (...)."""
-        return data.residual(curve(delay[..., None], constant[..., None]))
-
-    # by constant: the common delays, and where those are too coarse some that put a sample on a
-    # slope
-    quick = constants < _COARSE * (delays[1] - delays[0]) if delays.size > 1 else constants < 0.0
-    near = np.array([_near(at, constant, delays) for constant in constants[quick]])
-    by_curve = np.full(
-        (constants.size, delays.size + (near.shape[1] if quick.any() else 0), len(data.values)),
-        np.inf,
-    )
-    # one constant after the other: all at once would take hundreds of megabytes
-    for row, constant in enumerate(constants):
-        by_curve[row, : delays.size] = residuals(delays, np.full(delays.size, constant))
-    for place, some in zip(np.flatnonzero(quick), near, strict=True):
-        by_curve[place, delays.size :] = residuals(some, np.full(some.size, constants[place]))
-    curves = len(data.values)
-    samples = (data.weights > 0).sum(axis=1)
-    # each curve by its own noise, which the best common curve leaves
-    freedom = np.maximum(samples - 2.0 - (1.0 + (delays.size > 1)) / curves, 1.0)
-    noise2 = np.full(curves, 1.0)
-    tiny = np.finfo(float).eps * np.maximum((data.weights * data.values**2).sum(axis=1), 1e-300)
-    for _ in range(2):
-        total = (by_curve / noise2).sum(axis=-1)
-        best = np.unravel_index(int(np.argmin(total)), total.shape)
-        noise2 = np.maximum(by_curve[best] / freedom, tiny)
-    total = (by_curve / noise2).sum(axis=-1)
-
-    def landscape(delay: float, log_constant: float) -> float:
-        sums = residuals(np.array([delay]), np.exp(np.array([log_constant])))
-        return float((sums[0] / noise2).sum())
-
-    common = best[1] < delays.size
-    begin = delays[best[1]] if common else near[int(quick[: best[0]].sum()), best[1] - delays.size]
-    start = np.array([begin, np.log(constants[best[0]])])
-    found = _refined(landscape, start, delays, np.log(constants), float(total[best]))
-    delay, constant, least = float(found[0]), float(np.exp(found[1])), found[2]
-    nu = float(freedom.sum())
-    excess_68 = float(stats.f.ppf(0.6827, 1, nu))
-    excess_95 = float(stats.f.ppf(BOUND_LEVEL, 1, nu))
-    least = min(least, float(total.min()))
-
-    profile = total.min(axis=1) - least
-    low, high = _crossings(np.log(constants), profile, float(np.log(constant)), excess_95)
-    interval = (float(np.exp(low)) if low is not None else 0.0,
-                float(np.exp(high)) if high is not None else np.inf)  # fmt: skip
-    inner = _crossings(np.log(constants), profile, float(np.log(constant)), excess_68)
+    landscape = Landscape.of(data, curve, delays, constants, at)
+    delay, constant, noise2 = landscape.delay_s, landscape.time_constant_s, landscape.noise2
+    low, high = landscape.constant_interval(BOUND_LEVEL)
+    interval = (low if low is not None else 0.0, high if high is not None else np.inf)
+    inner = landscape.constant_interval(ONE_SIGMA_LEVEL)
     stderr_constant = np.nan
     if inner[0] is not None and inner[1] is not None:
-        stderr_constant = 0.5 * float(np.exp(inner[1]) - np.exp(inner[0]))
+        stderr_constant = 0.5 * (inner[1] - inner[0])
 
     delay_interval, stderr_delay = (0.0, 0.0), 0.0
     if delays.size > 1:
-        along = total[:, : delays.size].min(axis=0) - least
-        ends = _crossings(delays, along, delay, excess_95)
-        delay_interval = (ends[0] if ends[0] is not None else float(delays[0]),
-                          ends[1] if ends[1] is not None else float(delays[-1]))  # fmt: skip
-        ends = _crossings(delays, along, delay, excess_68)
-        stderr_delay = 0.5 * ((ends[1] if ends[1] is not None else float(delays[-1]))
-                              - (ends[0] if ends[0] is not None else float(delays[0])))  # fmt: skip
+        delay_interval = landscape.delay_interval(BOUND_LEVEL)
+        first, last = landscape.delay_interval(ONE_SIGMA_LEVEL)
+        stderr_delay = 0.5 * (last - first)
 
+    curves = len(data.values)
     found_shape = curve(np.array([[delay]]), np.array([[constant]]))
     level, gap = (part[0] for part in data.levels(found_shape))
     flat = (data.residual(np.zeros_like(found_shape))[0] / noise2).sum()
-    differ = (flat - least) / curves / max(least / nu, 1e-300)
-    changes = stats.f.sf(differ, curves, nu) < LEVEL_TEST
+    differ = (flat - landscape.least) / curves / max(landscape.least / landscape.freedom, 1e-300)
+    changes = stats.f.sf(differ, curves, landscape.freedom) < LEVEL_TEST
     known: Known = "estimated"
     if not changes:
         known, interval = "unknown", (0.0, float("inf"))
@@ -411,14 +360,15 @@ def _fit_once(
     elif np.isinf(interval[1]):
         known = "only above"
     step = data.step(found_shape)[0]
-    errors = _level_errors(data, curve, delay, constant, gap, noise2, known == "estimated",
-                           delays.size > 1 and not data.stepped)  # fmt: skip
+    errors = landscape.level_errors(
+        gap,
+        with_constant=known == "estimated",
+        with_delay=delays.size > 1 and not data.stepped,
+    )
     if data.stepped:
         # beside a step the delay trades with levels, and its end is as likely as its middle
-        weights = np.exp(-0.5 * along)
-        weights /= weights.sum()
-        best_constants = constants[np.argmin(total[:, : delays.size], axis=0)]
-        shapes = curve(delays[:, None], best_constants[:, None])
+        weights = landscape.delay_weights()
+        shapes = curve(delays[:, None], landscape.constant_at_delays()[:, None])
         levels, gaps = data.levels(shapes)
         away = (levels - level, levels + gaps - level - gap, gaps - gap, data.step(shapes) - step)
         errors = tuple(
@@ -426,8 +376,6 @@ def _fit_once(
         )
         delay = float(weights @ delays)
         stderr_delay = float(np.sqrt(weights @ (delays - delay) ** 2))
-    usual = data.variance
-    chi2 = float((by_curve[best] / usual).sum() / nu) if np.isfinite(usual).all() else float("nan")
     return RelaxationFit(
         start=level,
         end=level + gap,
@@ -444,119 +392,5 @@ def _fit_once(
         stderr_delay_s=stderr_delay,
         delay_interval_s=delay_interval,
         noise=np.sqrt(noise2),
-        chi2=chi2,
-    )
-
-
-def _near(since: Floats, constant: float, delays: Floats) -> Floats:
-    """Return delays that leave a sample, so long after a prompt, on the slope of the change, s.
-
-    Their number is the same for each constant; those beyond the range are put into it.
-    """
-    late = since[np.isfinite(since) & (since <= 2 * delays[-1])]
-    return np.clip((late[:, None] - constant * _SLOPE).ravel(), delays[0], delays[-1])
-
-
-def _refined(
-    landscape: Callable[[float, float], float],
-    start: Floats,
-    delays: Floats,
-    logs: Floats,
-    at_start: float,
-) -> tuple[float, float, float]:
-    """Return delay, logarithm of the constant, and height of the lowest point near the start."""
-    step = float(logs[1] - logs[0])
-    if delays.size == 1:
-        found = optimize.minimize_scalar(
-            lambda log: landscape(float(delays[0]), log),
-            bounds=(max(logs[0], start[1] - step), min(logs[-1], start[1] + step)),
-            method="bounded",
-        )
-        point, height = (float(delays[0]), float(found.x)), float(found.fun)
-    else:
-        width = float(delays[1] - delays[0])
-        bounds = [
-            (max(delays[0], start[0] - width), min(delays[-1], start[0] + width)),
-            (max(logs[0], start[1] - step), min(logs[-1], start[1] + step)),
-        ]
-        simplex = optimize.minimize(
-            lambda v: landscape(v[0], v[1]), start, method="Nelder-Mead", bounds=bounds,
-            options={"xatol": 1e-5, "fatol": 1e-9},
-        )  # fmt: skip
-        point, height = (float(simplex.x[0]), float(simplex.x[1])), float(simplex.fun)
-    if height < at_start:
-        return (*point, height)
-    return float(start[0]), float(start[1]), at_start
-
-
-def _crossings(
-    grid: Floats, profile: Floats, best: float, excess: float
-) -> tuple[float | None, float | None]:
-    """Return where a profile first rises by ``excess`` on both sides of its best; None: nowhere."""
-    ends: list[float | None] = []
-    for sign in (-1, 1):
-        side = grid[sign * (grid - best) > 0][::sign]
-        height = profile[sign * (grid - best) > 0][::sign]
-        above = np.flatnonzero(height > excess)
-        if above.size == 0:
-            ends.append(None)
-            continue
-        k = int(above[0])
-        inner, level = (best, 0.0) if k == 0 else (float(side[k - 1]), float(height[k - 1]))
-        # square roots of a parabola's heights are straight
-        a, b, c = (np.sqrt(max(v, 0.0)) for v in (level, float(height[k]), excess))
-        ends.append(inner + (float(side[k]) - inner) * float((c - a) / max(b - a, 1e-12)))
-    return ends[0], ends[1]
-
-
-def _level_errors(
-    data: Samples,
-    curve: Shape,
-    delay: float,
-    constant: float,
-    gap: Floats,
-    noise2: Floats,
-    with_constant: bool,
-    with_delay: bool,
-) -> tuple[Floats, ...]:
-    """Return standard errors of start, end, their difference, and the step of a pose.
-
-    With what delay and constant add where they are known.
-    """
-
-    def at(d: float, c: float) -> Floats:
-        return np.asarray(curve(np.array([[d]]), np.array([[c]]))[0], np.float64)
-
-    base = at(delay, constant)
-    slopes = []
-    if with_constant:
-        h = 1e-3 * constant
-        slopes.append((at(delay, constant + h) - at(delay, constant - h)) / (2 * h))
-        if with_delay and delay > 1e-3 * constant:
-            slopes.append((at(delay + h, constant) - at(delay - h, constant)) / (2 * h))
-    curves = len(gap)
-    size = 3 * curves + len(slopes)
-    normal = np.zeros((size, size))
-    for p in range(curves):
-        rows = np.zeros((size, base.size))
-        rows[2 * p], rows[2 * p + 1] = 1.0 - base, base  # start and end
-        rows[2 * curves + p] = data.moved
-        for k, slope in enumerate(slopes):
-            rows[3 * curves + k] = gap[p] * slope
-        normal += (rows * data.weights[p] / noise2[p]) @ rows.T
-        step = 2 * curves + p
-        if data.stderr_of_pose[p] > 0 and normal[step, step] > 0:
-            normal[step, step] += 1.0 / data.stderr_of_pose[p] ** 2
-        else:  # no step: not a number of this fit
-            normal[step, :] = normal[:, step] = 0.0
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    covariance = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
-    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    start, end = np.arange(0, 2 * curves, 2), np.arange(1, 2 * curves, 2)
-    change2 = errors[start] ** 2 + errors[end] ** 2 - 2.0 * covariance[start, end]
-    return (
-        errors[start],
-        errors[end],
-        np.asarray(np.sqrt(np.maximum(change2, 0.0))),
-        errors[2 * curves : 3 * curves],
+        chi2=landscape.chi2,
     )
