@@ -1,26 +1,22 @@
 """Plans of the fibre probe: which exposures, placements and sites sigma_tr needs.
 
-The forecast puts simulated skin under the fibres, tells how much light each of them gives to the
-camera in each exposure, and asks the inversion itself what such readings are worth: Fisher's
-information by the derivatives of the photon table, the misfit of layers, and the certificate of the
-phantom, which no exposure removes.
+What readings of a plan are worth is forecast in `skinrig.planning.probe_forecast`.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.plan import Plan, PlanError
-from capture.plan.probe import BRACKETS, LONGEST_S, SITES, exposure_series_s, probe_plan
-from capture.plan.suction import Placement, placement_of
+from capture.plan.probe import BRACKETS, LONGEST_S, exposure_series_s, probe_plan
+from capture.plan.suction import placement_of
 from capture.rig import Rig
 from skinrig.planning.plans import (
     Choice,
@@ -29,8 +25,14 @@ from skinrig.planning.plans import (
     light_of,
     median_of_normals,
 )
+from skinrig.planning.probe_forecast import Memory, Prediction, Setting, predict
+from skinrig.planning.probe_sight import Sight, sight
 
-Floats = NDArray[np.float64]
+__all__ = [
+    "Memory", "Prediction", "Setting", "Sight", "candidates", "choose", "confirm", "foresee",
+    "predict", "setting_of", "sight", "without_sites",
+]  # fmt: skip
+
 
 SHORTEST_S = exposure_series_s()[0]
 """Of the rig's own series: the nearest fibre must not saturate in it."""
@@ -40,244 +42,6 @@ LONGEST = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0, LONGEST_S)
 """Its longest one, s."""
 REPEATS = (1, 2, 4)
 DARKS = (1, 2)
-SATURATED = 0.95
-CROSSTALK_ERROR = (0.0, 8.5e-6, 6.3e-6, 9.3e-7, 2.5e-7)
-"""Standard error of the share of a fibre's light in a spot so many places away, the last of all
-farther ones: medians of twenty simulated calibrations of the shipped rig, seeds 0 to 19."""
-FORECAST_SPREAD = 0.2
-"""Relative deviation of standard errors that sessions state from those that were forecast: those
-of three sessions were 0.7 to 1.5 times as large, about two of it either way."""
-DRAWS = 40_000
-"""Of calibrations and readings, for the interval of a median."""
-MAP_PX = 32
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sight:
-    """What the fibres take from simulated skin, and what the camera makes of it."""
-
-    sites: tuple[str, ...]
-    reflectance: Floats
-    """(S, F, 3) in 1/mm^2."""
-    phantom: Floats
-    """(F, 3) of the block that the probe is calibrated with."""
-    phantom_error: Floats
-    """(F, 3) relative error of what the block is expected to give, each fibre's own: the photon
-    table's."""
-    common: Floats
-    """(T, F, 3) relative errors of all gains together, by the certificate."""
-    unit: Floats
-    """(3,) full scales per second in the middle of a spot, for 1/mm^2."""
-    pixels: Floats
-    """(3,) of each color in a spot."""
-    chip: Any
-    """The sensor, see `rigsim.sensor.Sensor`."""
-    probe: Any
-
-
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """What of a plan sigma_tr hangs on."""
-
-    sites: tuple[str, ...]
-    exposures_s: tuple[float, ...]
-    repeats: int
-    darks: int
-    """Frames without light of each exposure time that has some."""
-    level: float = 1.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
-    """Relative errors of sigma_tr by site and color."""
-
-    sites: tuple[str, ...]
-    sigma: Floats
-    """(S, 3) standard error: readings, misfit, certificate; of sites that are not measured what
-    the others and people in general leave open. What a fit without noise is off on this skin is
-    one draw of the misfit that this states, and not counted beside it."""
-    shared: Floats
-    """(T, S, 3) the calibration's part, certificate and far cross-talk: what each of its errors
-    does to all sites and colors together, which no median averages out."""
-    misfit: Floats
-    """(S, 3) what stays without any noise."""
-    valid: NDArray[np.bool_]
-    """(S, 3)."""
-    measured: NDArray[np.bool_]
-    """(S,)."""
-
-    @property
-    def total(self) -> Floats:
-        """Standard deviation of the error of what is measured and valid."""
-        return np.asarray(self.sigma[self.valid & self.measured[:, None]])
-
-    @property
-    def median(self) -> float:
-        """Predicted median relative error over measured sites and colors."""
-        return median_of_normals(self.total)
-
-    @property
-    def common(self) -> Floats:
-        """Standard error of the calibration's part, (S, 3)."""
-        return np.asarray(np.sqrt(np.square(self.shared).sum(axis=0)))
-
-    def interval(self) -> tuple[float, float]:
-        """Return the interval that holds 68 % of the medians of a session's errors.
-
-        Errors that all fits share move the median as a whole: nine fits of one calibration are
-        hardly more than one.
-        """
-        good = self.valid & self.measured[:, None]
-        if not good.any():
-            return math.inf, math.inf
-        shared = self.shared[:, good]
-        own = np.sqrt(np.maximum(self.sigma[good] ** 2 - np.square(shared).sum(axis=0), 0.0))
-        rng = np.random.default_rng(0)
-        off = rng.standard_normal((DRAWS, len(shared))) @ shared
-        off += own * rng.standard_normal((DRAWS, own.size))
-        ends = np.quantile(np.median(np.abs(off), axis=1), (0.16, 0.84))
-        # that, and how well a session's standard errors are known beforehand, as logarithms
-        low, high = np.hypot(np.log(ends / self.median), math.log(1.0 + FORECAST_SPREAD))
-        return self.median * math.exp(-low), self.median * math.exp(high)
-
-    @property
-    def valid_share(self) -> float:
-        """Share of the fits at measured sites that will be valid."""
-        return float(self.valid[self.measured].mean()) if self.measured.any() else 0.0
-
-
-def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES) -> Sight:
-    """Look at simulated skin through the fibres.
-
-    Parameters
-    ----------
-    rig
-        The probe's.
-    subject, seed
-        The tissue, see `rigsim.probe_tissue.parse_subject`.
-    sites
-        Where the head may be placed.
-    """
-    from rigsim.probe_build import SPOT_RADIUS_PX
-    from rigsim.probe_profile import Profiles
-    from rigsim.probe_tissue import parse_subject
-    from rigsim.scenes.probe import DARK_E_PER_S, METER_RATE_PER_S, VIGNETTING
-    from rigsim.sensor import sensor_of
-    from skinrig.phantom_reflectance import expected_reflectance, packaged_certificate
-    from skinrig.simulating.probe import PHOTONS
-
-    if rig.probe is None:
-        raise PlanningError(f"rig: got {rig.name!r} without a probe, expected one with fibres")
-    tissue = parse_subject(subject, seed=seed)
-    profiles = Profiles(rig, tissue, photons=PHOTONS["small"], seed=seed)
-    made = [profiles.profile(site, 0.0, rig.probe.suction_mbar) for site in sites]
-    reflectance = np.stack([one.reflectance_per_mm2 for one in made])
-    block = expected_reflectance(packaged_certificate(), rig)
-    view = rig.views[0]
-    from model import spectra
-
-    white = spectra.camera_white(view.spectral_sensitivity, rig.lights[0].illuminant)
-    area = math.pi * SPOT_RADIUS_PX**2
-    return Sight(
-        tuple(sites), reflectance, block.per_mm2, block.stderr / block.per_mm2, block.common,
-        METER_RATE_PER_S * np.asarray(white, np.float64), area * np.array([0.25, 0.5, 0.25]),
-        sensor_of(view, dark_e_per_s=DARK_E_PER_S, vignetting=VIGNETTING), rig.probe,
-    )  # fmt: skip
-
-
-Memory = dict[tuple[Any, ...], Sequence[Any]]
-"""Fits of one `Sight` by what they hang on: plans that differ in placements alone share them, and
-without noise nearly all do."""
-
-
-def predict(look: Sight, setting: Setting, *, memory: Memory | None = None) -> Prediction:
-    """Return the errors that a plan leaves.
-
-    Placements lower what the readings' noise leaves, and neither the misfit of layers nor what the
-    calibration leaves open.
-
-    Parameters
-    ----------
-    look
-        See `sight`.
-    setting
-        Sites, exposures, placements and darks.
-    memory
-        Fits of earlier plans of the same sight, which is added to; None: none are kept.
-    """
-    memory = {} if memory is None else memory
-    shape = (len(look.sites), 3)
-    sigma, shared = np.full(shape, np.inf), np.zeros((0, *shape))
-    still, found = np.full(shape, np.inf), np.ones(shape)
-    valid = np.zeros(shape, np.bool_)
-    measured = np.zeros(len(look.sites), np.bool_)
-    places = [k for k, site in enumerate(look.sites) if site in setting.sites]
-    with_noise, without = (
-        _fits(look, setting, places, noise=noise, memory=memory) for noise in (True, False)
-    )
-    for k, fit, quiet in zip(places, with_noise, without, strict=True):
-        measured[k] = True
-        valid[k] = fit.fit.valid
-        found[k] = fit.fit.sigma_tr_per_mm
-        if not len(shared):
-            shared = np.zeros((len(fit.log_common), *shape))
-        shared[:, k] = fit.log_common
-        common = np.sqrt(np.square(fit.log_common).sum(axis=0))
-        stays = np.minimum(quiet.log_stderr, fit.log_stderr)
-        noise = np.where(np.isfinite(stays), fit.log_stderr**2, np.inf) / setting.repeats
-        noise -= np.where(np.isfinite(stays), stays**2, 0.0) / setting.repeats
-        still[k] = np.hypot(stays, common)
-        sigma[k] = np.sqrt(still[k] ** 2 + noise)
-    rest = _between(look, found, sigma, valid & measured[:, None])
-    sigma[~measured] = rest[~measured]
-    return Prediction(look.sites, sigma, shared, still, valid, measured)
-
-
-def _fits(
-    look: Sight, setting: Setting, places: Sequence[int], *, noise: bool, memory: Memory
-) -> Sequence[Any]:
-    """Return the fits of each site's profile as a plan would read it, or without its noise."""
-    read = [
-        _variance(look, look.reflectance[k], setting.exposures_s, setting.darks, setting.level)
-        for k in places
-    ]
-    # of the readings' noise a fit without it asks only which fibres are read at all
-    told = np.array(read) if noise else np.isfinite(read)
-    count = len(setting.exposures_s)
-    key = (noise, tuple(places), count, told.tobytes())
-    if key not in memory:
-        memory[key] = _fitted(look, read, places, count, noise=noise)
-    return memory[key]
-
-
-def _fitted(
-    look: Sight, read: Sequence[Floats], places: Sequence[int], exposures: int, *, noise: bool
-) -> Sequence[Any]:
-    """Return the fits of profiles with these variances of their readings."""
-    from capture.calibration.fibre import FibreReflectance
-    from reconstruction.probe_images import Measurement
-    from reconstruction.probe_stages import Profile, fit_profiles
-
-    names = tuple(fibre.name for fibre in look.probe.fibres)
-    radius = np.array(look.probe.radius_mm)
-    # gains are known from a series of all exposures on the phantom, as far as its light is known
-    gain = _variance(look, look.phantom, exposure_series_s(), 4, 1.0) / look.phantom**2
-    gain += look.phantom_error**2
-    mixed = _crosstalk(len(radius))
-    profiles = []
-    for k, own in zip(places, read, strict=True):
-        value = look.reflectance[k]
-        valid = np.isfinite(own)
-        variance = np.where(valid, own, 0.0) if noise else np.zeros_like(own)
-        told = (value, look.phantom, value / look.phantom)
-        doubt, shared = mixed.matrix_variance(*told), mixed.shared_changes(*told)
-        reflectance = FibreReflectance(
-            names, radius, value, variance + gain * value**2 + doubt,
-            np.concatenate([value * look.common, shared]), valid, ~valid,
-        )  # fmt: skip
-        head = Measurement(Placement(look.sites[k], 0.0, 0), exposures, 1.0, math.nan, 5.0)
-        profiles.append(Profile(head, reflectance))
-    return fit_profiles(profiles, look.probe) if profiles else []
 
 
 def choose(
@@ -459,59 +223,6 @@ def setting_of(plan: Plan) -> Setting:
         max(1, len(placements) // len(sites)), max(1, len(darks) // max(len(times), 1)),
         float(first[0].settings.get("level", 1.0)),
     )  # fmt: skip
-
-
-def _variance(
-    look: Sight, value: Floats, exposures_s: Sequence[float], darks: int, level: float
-) -> Floats:
-    """Return the variance of readings in 1/mm^4, (F, 3); infinite where all are saturated."""
-    rate = level * look.unit * value  # full scales per second
-    told = np.zeros(rate.shape)
-    for seconds in exposures_s:
-        gain, floor = look.chip.noise_profile(seconds)
-        light = rate * seconds
-        spread = gain * np.maximum(light, 0.0) + floor * (1.0 + 1.0 / darks)
-        told += np.where(light < SATURATED, seconds**2 / spread, 0.0)
-    with np.errstate(divide="ignore"):
-        return np.asarray(1.0 / (told * look.pixels * np.square(level * look.unit)))
-
-
-def _crosstalk(count: int) -> Any:
-    """Return cross-talk of none, known as well as a calibration leaves it.
-
-    The nearest fibres are brighter than the farthest by a million times on skin and by a thousand
-    on the phantom; what a calibration has wrong of their light in far spots cancels only as far as
-    the two are alike.
-    """
-    from capture.calibration.fibre_crosstalk import CrossTalk
-
-    place = np.arange(count)
-    apart = np.minimum(np.abs(place[:, None] - place), len(CROSSTALK_ERROR) - 1)
-    nothing = np.zeros((count, 3))
-    error = np.array(CROSSTALK_ERROR)[apart]
-    return CrossTalk(np.eye(count), error, nothing, nothing, nothing, True)
-
-
-def _between(look: Sight, found: Floats, sigma: Floats, good: NDArray[np.bool_]) -> Floats:
-    """Return the relative error of sigma_tr at each site by the map between the others, (S, 3)."""
-    from reconstruction import translucency
-
-    known = [k for k, site in enumerate(look.sites) if site in translucency.SITE_UV]
-    measured = [k for k in known if good[k].any()]
-    out = np.full(found.shape, np.inf)
-    if not measured:
-        return out
-    made = translucency.interpolate(
-        [translucency.SITE_UV[look.sites[k]] for k in measured],
-        np.where(good[measured], found[measured], 1.0),
-        np.where(good[measured], sigma[measured] * found[measured], np.inf),
-        (MAP_PX, MAP_PX), valid=good[measured],
-    )  # fmt: skip
-    for k in known:
-        u, v = translucency.SITE_UV[look.sites[k]]
-        at = min(int((1.0 - v) * MAP_PX), MAP_PX - 1), min(int(u * MAP_PX), MAP_PX - 1)
-        out[k] = np.where(made.valid[at], made.log_stderr[at], np.inf)
-    return out
 
 
 def _choice(

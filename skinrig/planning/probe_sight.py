@@ -1,0 +1,111 @@
+"""What the fibres of the probe take from simulated skin, and how noisily the camera reads it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.plan.probe import SITES
+from capture.rig import Rig
+from skinrig.planning.plans import PlanningError
+
+Floats = NDArray[np.float64]
+
+SATURATED = 0.95
+"""Of the full scale: what is above it is not read."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What the fibres take from simulated skin, and what the camera makes of it."""
+
+    sites: tuple[str, ...]
+    reflectance: Floats
+    """(S, F, 3) in 1/mm^2."""
+    phantom: Floats
+    """(F, 3) of the block that the probe is calibrated with."""
+    phantom_error: Floats
+    """(F, 3) relative error of what the block is expected to give, each fibre's own: the photon
+    table's."""
+    common: Floats
+    """(T, F, 3) relative errors of all gains together, by the certificate."""
+    unit: Floats
+    """(3,) full scales per second in the middle of a spot, for 1/mm^2."""
+    pixels: Floats
+    """(3,) of each color in a spot."""
+    chip: Any
+    """The sensor, see `rigsim.sensor.Sensor`."""
+    probe: Any
+
+
+def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES) -> Sight:
+    """Look at simulated skin through the fibres.
+
+    Parameters
+    ----------
+    rig
+        The probe's.
+    subject, seed
+        The tissue, see `rigsim.probe_tissue.parse_subject`.
+    sites
+        Where the head may be placed.
+    """
+    from rigsim.probe_build import SPOT_RADIUS_PX
+    from rigsim.probe_profile import Profiles
+    from rigsim.probe_tissue import parse_subject
+    from rigsim.scenes.probe import DARK_E_PER_S, METER_RATE_PER_S, VIGNETTING
+    from rigsim.sensor import sensor_of
+    from skinrig.phantom_reflectance import expected_reflectance, packaged_certificate
+    from skinrig.simulating.probe import PHOTONS
+
+    if rig.probe is None:
+        raise PlanningError(f"rig: got {rig.name!r} without a probe, expected one with fibres")
+    tissue = parse_subject(subject, seed=seed)
+    profiles = Profiles(rig, tissue, photons=PHOTONS["small"], seed=seed)
+    made = [profiles.profile(site, 0.0, rig.probe.suction_mbar) for site in sites]
+    reflectance = np.stack([one.reflectance_per_mm2 for one in made])
+    block = expected_reflectance(packaged_certificate(), rig)
+    view = rig.views[0]
+    from model import spectra
+
+    white = spectra.camera_white(view.spectral_sensitivity, rig.lights[0].illuminant)
+    area = math.pi * SPOT_RADIUS_PX**2
+    return Sight(
+        tuple(sites), reflectance, block.per_mm2, block.stderr / block.per_mm2, block.common,
+        METER_RATE_PER_S * np.asarray(white, np.float64), area * np.array([0.25, 0.5, 0.25]),
+        sensor_of(view, dark_e_per_s=DARK_E_PER_S, vignetting=VIGNETTING), rig.probe,
+    )  # fmt: skip
+
+
+def reading_variance(
+    look: Sight, value: Floats, exposures_s: Sequence[float], darks: int, level: float
+) -> Floats:
+    """Return the variance of readings in 1/mm^4, (F, 3); infinite where all are saturated.
+
+    Parameters
+    ----------
+    look
+        The skin's or the phantom's, see `sight`.
+    value
+        Reflectance in the fibres, 1/mm^2, (F, 3).
+    exposures_s
+        Of a series, s.
+    darks
+        Frames without light of each exposure time.
+    level
+        Of the light source, 0 to 1.
+    """
+    rate = level * look.unit * value  # full scales per second
+    told = np.zeros(rate.shape)
+    for seconds in exposures_s:
+        gain, floor = look.chip.noise_profile(seconds)
+        light = rate * seconds
+        spread = gain * np.maximum(light, 0.0) + floor * (1.0 + 1.0 / darks)
+        told += np.where(light < SATURATED, seconds**2 / spread, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / (told * look.pixels * np.square(level * look.unit)))
