@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +46,11 @@ class Atlas:
             np.linalg.norm(self.dp_du_mm, axis=-1) * scale,
             np.linalg.norm(self.dp_dv_mm, axis=-1) * scale,
         )
+
+    def moved_by(self, way_mm: Float32Array) -> Atlas:
+        """Return the atlas of the surface moved as a whole by (3,) mm, rig frame."""
+        there = np.where(self.covered[..., None], self.position_mm + way_mm, self.position_mm)
+        return dataclasses.replace(self, position_mm=there)
 
 
 def unwrap(mesh: Mesh, size: int) -> Atlas:

@@ -84,6 +84,8 @@ class Subject:
     """How much stubble lies below the surface, shape (N, N), 0 to 1; ``None``: none."""
     oiliness: float = 1.0
     """Factor of the share of the surface that oil covers."""
+    offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """How far the whole face was moved from where it was made, rig frame, see `moved_by`."""
 
     @property
     def size(self) -> int:
@@ -143,6 +145,37 @@ class Subject:
             rest=rest,
         )
 
+    def moved_by(self, offset_mm: tuple[float, float, float]) -> Subject:
+        """Return this face standing elsewhere, as a whole.
+
+        Parameters
+        ----------
+        offset_mm
+            How far it moves, mm, rig frame; without any the same object is returned.
+
+        Returns
+        -------
+        Subject
+            The same person, in the same pose, with another mesh and atlas; all else stays.
+
+        Raises
+        ------
+        SubjectError
+            The offset is not three finite numbers.
+        """
+        x, y, z = _three(offset_mm)
+        if (x, y, z) == (0.0, 0.0, 0.0):
+            return self
+        rest = self if self.rest is None else self.rest
+        way = np.array([x, y, z], np.float32)
+        there = dataclasses.replace(
+            rest,
+            mesh=dataclasses.replace(rest.mesh, vertices_mm=rest.mesh.vertices_mm + way),
+            atlas=rest.atlas.moved_by(way),
+            offset_mm=(rest.offset_mm[0] + x, rest.offset_mm[1] + y, rest.offset_mm[2] + z),
+        )
+        return there if self.pose is None else there.posed(self.pose.state, self.pose.amount)
+
     def blend_shapes(self) -> dict[str, Float32Array]:
         """Return how each expression moves the vertices, {state: (V, 3) in mm}, rig frame."""
         rest = self if self.rest is None else self.rest
@@ -177,6 +210,13 @@ class Subject:
     def surface_landmarks(self) -> landmarks.SurfacePoints:
         """Return named points of the skin itself; ``.on(mesh)`` says where they are."""
         return landmarks.find(self.mesh if self.rest is None else self.rest.mesh)
+
+
+def _three(offset_mm: tuple[float, float, float]) -> tuple[float, float, float]:
+    given = np.asarray(offset_mm, np.float64)
+    if given.shape != (3,) or not np.isfinite(given).all():
+        raise SubjectError(f"offset_mm: got {offset_mm!r}, expected three finite numbers")
+    return float(given[0]), float(given[1]), float(given[2])
 
 
 _poses: WeakValueDictionary[tuple[int, int, int, str, float], Pose] = WeakValueDictionary()

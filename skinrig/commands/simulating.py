@@ -124,6 +124,14 @@ def simulate(
             autocompletion=completion.conditions,
         ),
     ] = None,
+    nearer: Annotated[
+        float,
+        typer.Option(
+            metavar="MM",
+            help="How much nearer to the flash rig's camera than the white tile the face stands, "
+            "mm; below 0 farther.",
+        ),
+    ] = 0.0,
     plan: Annotated[
         Path | None,
         typer.Option(help="Of the dome: the lights and cameras of a plan by `skinrig plan`."),
@@ -173,6 +181,7 @@ def simulate(
         relaxation_s=relaxation, subsurface=subsurface, interreflections=interreflections,
         conditions=amounts_of(condition, "--condition"),
         plan=None if plan is None else read_plan(plan), leave_out=names_of(leave_out) or (),
+        nearer_mm=nearer,
     )  # fmt: skip
     console.say(
         f"{done.session}: {counted(done.frames, 'frame')}"

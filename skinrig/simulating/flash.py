@@ -54,6 +54,7 @@ def simulate_flash(order: Order) -> Simulated:
         "movement": order.movement,
         **({} if order.plan is None else {"plan": order.plan.to_json()}),
         **({"leave_out": list(order.leave_out)} if order.leave_out else {}),
+        **({"nearer_mm": order.nearer_mm} if order.nearer_mm else {}),
     }  # fmt: skip
     # what cannot be built must fail before a folder is made
     plan = order.plan or _plan(rig, target, states, order.repeats)
@@ -100,6 +101,7 @@ def _scenes(rig: Rig, order: Order, plan: Plan) -> dict[str, Any]:
         state = "white" if order.target == "white" else ""
         return {state: FlashScene(rig, targets.make_target(order.target), seed=seed, power=power)}
     person = make_subject(order.subject, seed=seed, mesh=order.mesh)
+    person = person.moved_by(_stance_mm(rig, order.nearer_mm))
     return {
         state: FlashScene(
             rig, person, state=state, movement=order.movement, seed=seed, power=power,
@@ -107,6 +109,29 @@ def _scenes(rig: Rig, order: Order, plan: Plan) -> dict[str, Any]:
         )
         for state in order.states
     }  # fmt: skip
+
+
+NEAREST_SHARE = 0.5
+"""Of the camera's distance: how far off the tile's place a face may stand, either way. Far beyond
+what a lens of f/11 shows with any sharpness."""
+
+
+def _stance_mm(rig: Rig, nearer_mm: float) -> tuple[float, float, float]:
+    """Return how far a face is off the tile's place that stands so much nearer to the camera."""
+    view = rig.views[0]
+    most = NEAREST_SHARE * view.distance_mm
+    if not abs(nearer_mm) < most:
+        raise SimulationError(
+            f"nearer: got {nearer_mm:g} mm, expected between {-most:g} and {most:g} mm: the camera "
+            f"is {view.distance_mm:g} mm from the tile's place"
+        )
+    x, y, z = (nearer_mm * axis for axis in view.axes[2])
+    return x, y, z
+
+
+def _nearer_mm(scene: Any) -> float:
+    """Return how much nearer to its first camera than the tile's place a scene's face stands."""
+    return float(np.dot(scene.subject.offset_mm, scene.rig.views[0].axes[2]))
 
 
 def to_superpixels(values: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> NDArray[Any]:
@@ -193,6 +218,7 @@ def truth_of(scene: Any, seed: int, session: str, state: str) -> SkinAppearance:
             "kind": "truth",
             "state": state,
             "movement": scene.movement,
+            "nearer_mm": _nearer_mm(scene),
             "landmarks_px": landmarks_at_superpixels(scene.landmarks_px()),
         },
         inputs={"session": session},

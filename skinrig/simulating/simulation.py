@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -132,6 +133,7 @@ class Order:
     conditions: Mapping[str, float] = field(default_factory=dict)
     plan: Plan | None = None
     leave_out: tuple[str, ...] = ()
+    nearer_mm: float = 0.0
 
     def __post_init__(self) -> None:
         if self.size not in SIZES:
@@ -164,6 +166,18 @@ class Order:
             return left_out_of(rig, self.leave_out)
         except ValueError as exc:
             raise SimulationError(str(exc)) from exc
+
+    def check_stance(self, rig: str) -> None:
+        """Raise where a face stands off the tile's place that the rig cannot place."""
+        if self.nearer_mm == 0.0:
+            return
+        if not math.isfinite(self.nearer_mm):
+            raise SimulationError(f"nearer: got {self.nearer_mm}, expected finite millimetres")
+        if rig != "flash":
+            raise SimulationError(f"nearer: the {rig} rig knows nothing of it; leave it out")
+        if self.target is not None or self.sequence is not None:
+            what = "a sequence" if self.target is None else "a target"
+            raise SimulationError(f"nearer: is of a face at rest or in a state, not of {what}")
 
     def check_plan(self, rig: str) -> None:
         """Raise where a plan was handed over that is another rig's, or a target's or sequence's."""
@@ -208,6 +222,7 @@ def simulate_session(
     conditions: Mapping[str, float] | None = None,
     plan: Plan | None = None,
     leave_out: Sequence[str] = (),
+    nearer_mm: float = 0.0,
 ) -> Simulated:
     """Simulate a capture into SESSION/, and write its truth beside it.
 
@@ -284,6 +299,9 @@ def simulate_session(
     leave_out
         What is not built of skin although it changes pixels, by the switches of
         `skinrig.simulating.leaving_out`.
+    nearer_mm
+        How much nearer to the flash rig's camera than the white tile's place the face stands, mm;
+        below 0 farther. The flashes are then as much nearer, and the lens is focused on the tile.
 
     Raises
     ------
@@ -303,8 +321,9 @@ def simulate_session(
         movement=movement, wrapped=wrapped, created=created, person=person, progress=progress,
         sequence=sequence, relaxation_s=relaxation_s, subsurface=subsurface,
         interreflections=interreflections, conditions=dict(conditions or {}),
-        plan=plan, leave_out=tuple(leave_out),
+        plan=plan, leave_out=tuple(leave_out), nearer_mm=float(nearer_mm),
     )  # fmt: skip
+    order.check_stance(rig_name)
     if rig_name != "dome":
         order.refuse(rig_name, subsurface=False, interreflections=False, conditions={})
         order.check_plan(rig_name)

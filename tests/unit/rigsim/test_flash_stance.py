@@ -1,0 +1,129 @@
+"""A face off the white tile's place: light, view, focus and truth move with it."""
+
+import numpy as np
+import pytest
+
+from capture.rig import Rig, load_rig
+from rigsim import landmarks
+from rigsim.depth_of_field import facing_depths
+from rigsim.films import IDEAL
+from rigsim.scenes.flash import FlashScene
+from rigsim.subject import Subject, SubjectError, make_subject
+from rigsim.variant import VariantChoice
+
+EMBREE = VariantChoice("scalar_rgb", "asked for by the test", "")
+WIDTH = 192
+NEARER_MM = 50.0
+PLAIN = {"choice": EMBREE, "lateral": False, "interreflections": False, "films": IDEAL}
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig("flash").resized(WIDTH)
+
+
+@pytest.fixture(scope="module")
+def face() -> Subject:
+    return make_subject("II", seed=4, size=160)
+
+
+@pytest.fixture(scope="module")
+def nearer(face: Subject) -> Subject:
+    return face.moved_by((0.0, 0.0, NEARER_MM))
+
+
+@pytest.fixture(scope="module")
+def places(rig: Rig, face: Subject, nearer: Subject) -> tuple[FlashScene, FlashScene]:
+    here, there = (FlashScene(rig, one, optics=False, **PLAIN) for one in (face, nearer))
+    return here, there
+
+
+def test_a_face_that_moves_nowhere_is_the_same_object(face):
+    assert face.moved_by((0.0, 0.0, 0.0)) is face
+
+
+def test_only_the_place_of_a_moved_face_is_another(face, nearer):
+    covered = face.atlas.covered
+    for way in (
+        nearer.mesh.vertices_mm - face.mesh.vertices_mm,
+        (nearer.atlas.position_mm - face.atlas.position_mm)[covered],
+    ):
+        np.testing.assert_allclose(way, np.broadcast_to([0, 0, NEARER_MM], way.shape), atol=1e-4)
+    for name in ("melanin", "normal", "roughness", "hair", "height_um"):
+        assert getattr(nearer, name) is getattr(face, name)
+    assert nearer.offset_mm == (0.0, 0.0, NEARER_MM)
+    assert nearer.moved_by((0.0, 0.0, -NEARER_MM)).offset_mm == face.offset_mm
+
+
+def test_moving_and_making_a_face_are_done_in_any_order(face, nearer):
+    first, last = face.posed("smile").moved_by((0.0, 0.0, NEARER_MM)), nearer.posed("smile")
+    np.testing.assert_allclose(first.mesh.vertices_mm, last.mesh.vertices_mm, atol=1e-3)
+    way = last.mesh.vertices_mm - face.posed("smile").mesh.vertices_mm
+    np.testing.assert_allclose(way, np.broadcast_to([0, 0, NEARER_MM], way.shape), atol=1e-3)
+    assert last.offset_mm == first.offset_mm == nearer.offset_mm
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.0, 0.0, np.nan), (0.0, np.inf, 0.0)])
+def test_an_offset_that_is_no_place_is_refused_by_name(face, offset):
+    with pytest.raises(SubjectError, match="offset_mm"):
+        face.moved_by(offset)
+
+
+def test_light_on_a_moved_face_is_that_of_its_place(rig, places):
+    """Rationale: cosine and inverse square from each flash's place, over those on the tile.
+
+    Expected: the closed form where skin faces both flashes. Tolerance 2 %: relief bends normals
+    within a pixel, whose truth is a mean.
+    """
+    for scene in places:
+        truth = scene.truth()
+        open_skin = truth["mask"] & (truth["normals"][..., 2] > 0.9)
+        place, normal = truth["position_mm"][open_skin], truth["normals"][open_skin]
+        light, tile = np.zeros(len(place)), 0.0
+        for flash in rig.lights:
+            way = np.asarray(flash.position_mm) - place
+            far = np.linalg.norm(way, axis=-1)
+            light += (way * normal).sum(axis=-1) / far**3
+            own = np.asarray(flash.position_mm)
+            tile += own[2] / np.linalg.norm(own) ** 3
+        ratio = truth["irradiance"][open_skin] / (light / tile)
+        assert np.median(np.abs(ratio - 1.0)) < 0.02
+    here, there = (np.median(one["shading"][one["mask"]]) for one in map(FlashScene.truth, places))
+    # 5 % nearer to both flashes: some 10 % more light
+    assert 1.05 < there / here < 1.15
+
+
+def test_pictures_and_landmarks_show_a_moved_face_where_its_truth_says(rig, places):
+    view = rig.views[0]
+    for scene in places:
+        truth = scene.truth()
+        rows, columns = np.nonzero(truth["mask"])
+        seen = landmarks.project(truth["position_mm"][rows, columns].astype(float), view)
+        off = np.hypot(seen[:, 0] - columns, seen[:, 1] - rows)
+        assert np.quantile(off, 0.95) < 0.5
+        assert not (scene.radiance()[rows, columns] <= 0.0).any()
+    here, there = (scene.landmarks_px() for scene in places)
+    middle = 0.5 * np.array([view.width_px - 1, view.height_px - 1])
+    points = places[0].subject.surface_landmarks()
+    for name, place in zip(points.names, points.on(places[0].subject.mesh), strict=True):
+        if name in here and name in there:
+            larger = (view.distance_mm - place[2]) / (view.distance_mm - place[2] - NEARER_MM)
+            np.testing.assert_allclose(
+                there[name] - middle, larger * (here[name] - middle), atol=0.02
+            )
+
+
+def test_the_lens_blurs_a_face_that_stands_out_of_focus(rig, face):
+    """The lens stays focused on the tile's place: slopes of the picture lose energy with depth."""
+    view = rig.views[0]
+    kept = []
+    for nearer_mm in (0.0, 200.0):
+        moved = face.moved_by((0.0, 0.0, nearer_mm))
+        depths = np.array(facing_depths(view, moved.mesh)) - facing_depths(view, face.mesh)
+        assert depths[1] == pytest.approx(nearer_mm, abs=1e-2)
+        sharp, blurred = (
+            FlashScene(rig, moved, optics=optics, **PLAIN).radiance() for optics in (False, True)
+        )
+        energy = [np.square(np.diff(image, axis=1)).sum() for image in (sharp, blurred)]
+        kept.append(energy[1] / energy[0])
+    assert kept[1] < kept[0] - 0.05
