@@ -139,7 +139,8 @@ def test_a_killed_writer_loses_nothing_it_acknowledged(nursery, tmp_path, rng, k
     acknowledged: set[str] = set()
     path = tmp_path / "s0"
     span_s = 0.05
-    while tally["kills"] < kills:
+    # a machine may be so busy that the first few writers die before they have committed a frame
+    while tally["kills"] < kills or not tally["acknowledged"]:
         started_s = time.monotonic()
         said, status = nursery.write(path, killed_after_s=rng.uniform(0, span_s))
         took_s = time.monotonic() - started_s
@@ -149,7 +150,7 @@ def test_a_killed_writer_loses_nothing_it_acknowledged(nursery, tmp_path, rng, k
         if len(fresh) >= 3:  # follow the speed of the machine
             span_s = 15 * took_s / len(fresh)
         elif not fresh:
-            span_s *= 1.2
+            span_s *= 1.5
         acknowledged |= fresh
         if not (path / "session.json").exists():
             assert not said
@@ -170,7 +171,6 @@ def test_a_killed_writer_loses_nothing_it_acknowledged(nursery, tmp_path, rng, k
         tally["acknowledged"] += len(fresh)
     print(dict(tally))
     assert (tally["lost"], tally["corrupt"], tally["damaged"]) == (0, 0, 0)
-    assert tally["acknowledged"] > 0
     if (path / "session.json").exists():
         # the last one is left in peace: it completes
         said, status = nursery.write(path)

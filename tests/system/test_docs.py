@@ -6,6 +6,7 @@ import re
 import shlex
 import shutil
 import subprocess
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -205,8 +206,14 @@ def inline_commands(page):
     return found
 
 
+@cache
+def command_line():
+    """The tree of commands: made for each use it would take most of these tests' time."""
+    return typer.main.get_command(app)
+
+
 def resolve(argv):
-    command = typer.main.get_command(app)
+    command = command_line()
     words = list(argv)
     while hasattr(command, "commands"):
         assert words, f"skinrig {' '.join(argv)}: names no command"
@@ -233,7 +240,7 @@ def test_commands_in_the_text_exist_and_have_the_options_named(page):
 
 def test_the_pages_name_every_command_of_a_user():
     argvs = [argv for page in GUIDES for argv in (*shell_commands(page), *inline_commands(page))]
-    commands = set(typer.main.get_command(app).commands)
+    commands = set(command_line().commands)
     assert {argv[0] for argv in argvs} == commands
 
 
