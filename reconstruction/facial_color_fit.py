@@ -363,7 +363,10 @@ def _own_error(images: list[AlignedImage]) -> Floats:
     for one in images:
         count += one.valid
         if one.alignment is not None:
-            total += misplacement.own_error(one.rgb, one.variance, one.valid, one.alignment)
+            total += misplacement.own_error(
+                one.rgb, one.variance, one.valid, one.alignment,
+                light_window_px=shared_melanin.SHADING_WINDOW_PX,
+            )  # fmt: skip
     return np.asarray(total / np.maximum(count, 1.0)[..., None, None])
 
 

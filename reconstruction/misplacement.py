@@ -3,6 +3,10 @@
 A picture of an expression is laid over the neutral one with an error of place
 (`reconstruction.expression_alignment`), so that a pixel shows the color of skin beside it. That is
 the picture's own error, where a face that holds still has errors that its pictures share.
+
+Light that slopes evenly makes a misplaced picture brighter or darker all around alike. Who follows
+how the light changes from picture to picture (`reconstruction.light_change`) has taken that off:
+what is left is the slopes that are finer than the window in which it is followed.
 """
 
 from __future__ import annotations
@@ -32,7 +36,12 @@ WITHOUT_BRIGHTNESS: Final = np.eye(3) - 1.0 / 3.0
 
 
 def own_error(
-    rgb: Image, variance: Image, valid: NDArray[np.bool_], alignment: Alignment
+    rgb: Image,
+    variance: Image,
+    valid: NDArray[np.bool_],
+    alignment: Alignment,
+    *,
+    light_window_px: float | None = None,
 ) -> Floats:
     """Return the covariance of each pixel's relative error by its place, (H, W, 3, 3).
 
@@ -45,11 +54,15 @@ def own_error(
         (H, W): where it means something; 0 elsewhere.
     alignment
         How it was laid over.
+    light_window_px
+        Standard deviation of the window, px, in which changes of light are followed and so are no
+        error, above 0. None: they are not followed.
 
     Returns
     -------
     ndarray of float64
-        With the brightness that skin and its shading have beside the pixel.
+        With the brightness that skin and its shading have beside the pixel, but for what changes
+        as slowly as the window.
 
     Notes
     -----
@@ -69,16 +82,20 @@ def own_error(
     >>> float(own_error(skin, 0.0 * skin, np.ones((40, 40), bool), still).max())
     0.0
     """
+    if light_window_px is not None and not 0.0 < light_window_px < np.inf:
+        raise ValueError(f"light_window_px: got {light_window_px}, expected above 0, or None")
     good = model_error.usable_pixels(rgb, valid, variance)
     safe = np.where(good[..., None], rgb, 1.0).astype(np.float64)
     noise = np.where(good[..., None], variance / safe**2, 0.0)
     place = np.square(alignment.error_px.astype(np.float64))
-    covariance = 0.5 * place[..., None, None] * _slopes(np.log(safe), noise, good)
+    covariance = 0.5 * place[..., None, None] * _slopes(np.log(safe), noise, good, light_window_px)
     covariance += (SCALE - 1.0) * (WITHOUT_BRIGHTNESS @ covariance @ WITHOUT_BRIGHTNESS)
     return np.where(good[..., None, None], covariance, 0.0)
 
 
-def _slopes(log_rgb: Floats, noise: Floats, good: NDArray[np.bool_]) -> Floats:
+def _slopes(
+    log_rgb: Floats, noise: Floats, good: NDArray[np.bool_], window_px: float | None
+) -> Floats:
     """Return the sum over both axes of the slopes' outer products, per px^2, (H, W, 3, 3)."""
     outer = np.zeros((*good.shape, 3, 3))
     count = np.zeros(good.shape)
@@ -90,6 +107,8 @@ def _slopes(log_rgb: Floats, noise: Floats, good: NDArray[np.bool_]) -> Floats:
         )
         whole = good[here] & good[after]
         slope = np.where(whole[..., None], log_rgb[after] - log_rgb[here], 0.0)
+        if window_px is not None:
+            slope = np.where(whole[..., None], slope - _even(slope, whole, window_px), 0.0)
         products = slope[..., :, None] * slope[..., None, :]
         by_noise = np.where(whole[..., None], noise[after] + noise[here], 0.0)
         products -= by_noise[..., :, None] * np.eye(3)
@@ -104,3 +123,10 @@ def _slopes(log_rgb: Floats, noise: Floats, good: NDArray[np.bool_]) -> Floats:
     # slopes that noise hides are 0, in each direction of color
     values, vectors = np.linalg.eigh(outer)
     return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ vectors.swapaxes(-1, -2))
+
+
+def _even(slope: Floats, known: NDArray[np.bool_], window_px: float) -> Floats:
+    """Return the slope of brightness averaged over a window, (..., 1), for all channels alike."""
+    weight = gaussian_filter(known.astype(np.float64), window_px, mode="constant")
+    total = gaussian_filter(slope.mean(axis=-1), window_px, mode="constant")
+    return np.asarray(total / np.maximum(weight, 1e-6))[..., None]

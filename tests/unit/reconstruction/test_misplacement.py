@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, shift
+from scipy.ndimage import gaussian_filter, map_coordinates, shift
 
 from model import color_table
 from model.tissue_optics import ANISOTROPY_SKIN
@@ -35,6 +35,66 @@ def test_brightness_errs_by_the_slope_times_the_error_of_the_place(rng):
     found = misplacement.own_error(rgb, 0.0 * rgb, np.ones((SIZE, SIZE), bool), laid_over(0.4))
     # at borders pixels have fewer neighbors along one axis than along the other
     np.testing.assert_allclose(found[8:-8, 8:-8], 0.02**2 * 0.4**2 / 2, rtol=1e-4)
+
+
+def test_an_even_slope_of_light_is_no_error_where_changes_of_light_are_followed(rng):
+    """A ramp with texture on it: with the window of `light_change` texture alone errs.
+
+    The texture is finer than 3 px; of a Gaussian of 1 px slopes less their mean over 3 px keep
+    more than 90 % of their square.
+    """
+    columns = np.indices((SIZE, SIZE))[1]
+    texture = 0.01 * gaussian_filter(rng.standard_normal((SIZE, SIZE)), 1.0)
+    everywhere, inside = np.ones((SIZE, SIZE), bool), slice(12, -12)
+
+    def error(log_light, window_px):
+        rgb = np.exp(log_light)[..., None] * np.array([0.3, 0.2, 0.1])
+        found = misplacement.own_error(
+            rgb, 0.0 * rgb, everywhere, laid_over(0.4), light_window_px=window_px
+        )
+        return found[inside, inside].mean()
+
+    ramp, fine = error(0.02 * columns, None), error(texture, None)
+    assert error(0.02 * columns, 3.0) < 1e-6 * ramp
+    assert 0.9 * fine < error(texture + 0.02 * columns, 3.0) < 1.01 * fine
+
+
+@pytest.mark.parametrize("window_px", [0.0, -1.0, np.nan, np.inf])
+def test_a_window_that_is_none_is_refused_by_name(window_px):
+    rgb = np.ones((SIZE, SIZE, 3))
+    with pytest.raises(ValueError, match="light_window_px"):
+        misplacement.own_error(
+            rgb, 0.0 * rgb, np.ones((SIZE, SIZE), bool), laid_over(0.4), light_window_px=window_px
+        )
+
+
+def test_brightness_of_light_that_is_followed_is_left_over_by_so_much(rng):
+    """Truth: one smooth misplacement of a shaded, textured skin, whose light `light_change` would
+    average over 3 px. What is left of the difference is the stated covariance, to 30 % for the
+    bends of the texture between pixels and of the place within the window."""
+    texture = gaussian_filter(rng.standard_normal((SIZE, SIZE)), 1.2, mode="wrap")
+    texture *= 0.03 / texture.std()
+    rows, columns = np.indices((SIZE, SIZE))
+    log_light = texture + 0.6 * np.sin(2 * np.pi * columns / SIZE)
+    stated, squares = 0.3, []
+    for _ in range(40):
+        field = gaussian_filter(rng.standard_normal((2, SIZE, SIZE)), (0, 8, 8), mode="wrap")
+        field *= stated / np.sqrt(2.0) / field.std(axis=(1, 2), keepdims=True)
+        moved = map_coordinates(
+            log_light, [rows + field[0], columns + field[1]], order=3, mode="grid-wrap"
+        )
+        off = moved - log_light
+        squares.append(np.square(off - gaussian_filter(off, 3.0, mode="wrap")))
+    rgb = np.exp(log_light)[..., None] * np.ones(3)
+    told, denied = (
+        misplacement.own_error(
+            rgb, 0.0 * rgb, np.ones((SIZE, SIZE), bool), laid_over(stated), light_window_px=window
+        )[12:-12, 12:-12, 0, 0].mean()
+        for window in (3.0, None)
+    )
+    seen = np.mean(squares, axis=0)[12:-12, 12:-12].mean()
+    assert told == pytest.approx(seen, rel=0.3)
+    assert denied > 1.5 * seen
 
 
 def test_what_a_shifted_picture_differs_by_is_the_stated_covariance(rng):
