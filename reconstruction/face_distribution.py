@@ -9,7 +9,9 @@ their estimates, whose errors would widen it.
 
 What all pixels err by alike does not average out: light (the face may stand off the white tile's
 place) and the layered model. The distribution is fitted again with each of these moved by its
-standard error to both sides; half of what its means move by is their standard error.
+standard error to both sides; half of what its means move by is their standard error. A mean at the
+end of what there may be cannot move beyond it, which says nothing of how well it is known: there
+the error is what it moves to the other side.
 """
 
 from __future__ import annotations
@@ -40,6 +42,9 @@ _BEGIN_SPREAD: Final = (0.3, 0.1)
 _SCALE: Final = np.array([0.1, 0.3, 0.5, 0.03, 0.3, 0.5])
 """Of means, logs of spreads and of parts: what the search takes for one."""
 _DIFFERENCE: Final = 1e-5
+AT_END: Final = 0.02
+"""Distance from an end, of log melanin and of blood's axis, within which a mean is held by it: the
+last place that a mean may have lies up to 0.016 before the end."""
 _ROUNDS: Final = 60
 
 
@@ -257,12 +262,27 @@ def with_common_errors(
     (0.5, 0.0)
     """
     errors = [
-        math.sqrt(sum((0.5 * (pick(plus).mean - pick(minus).mean)) ** 2 for minus, plus in moved))
+        math.sqrt(
+            sum(
+                _moves_by(pick(usual), pick(minus).mean, pick(plus).mean) ** 2
+                for minus, plus in moved
+            )
+        )
         for pick in (_melanin_of, _blood_of)
     ]
     return FaceDistribution(
         replace(usual.melanin, stderr=errors[0]), replace(usual.blood, stderr=errors[1])
     )
+
+
+def _moves_by(usual: Bell, minus: float, plus: float) -> float:
+    """Return by how much a mean moves with one standard error of what moved it to both sides."""
+    held = any(
+        min(mean - usual.low, usual.high - mean) < AT_END for mean in (minus, usual.mean, plus)
+    )
+    if held:
+        return max(abs(usual.mean - minus), abs(plus - usual.mean))
+    return 0.5 * (plus - minus)
 
 
 def _melanin_of(face: FaceDistribution) -> Bell:

@@ -100,6 +100,19 @@ def test_common_errors_widen_by_their_root_sum_of_squares():
     assert known.melanin.width == pytest.approx(np.hypot(0.3, 0.5))
 
 
+def test_a_mean_at_the_end_is_known_as_badly_as_it_moves_away_from_it():
+    """A mean that moves by 0.08 to each side, as far as the end at -0.69 lets it."""
+
+    def face(melanin):
+        held = min(melanin, MELANIN_ENDS[1] - 0.01)
+        bell = Bell(held, 0.02, 0.01, *MELANIN_ENDS)
+        return FaceDistribution(bell, Bell(0.4, 0.05, 0.01, *BLOOD_ENDS))
+
+    for mean in (-1.0, -0.75, -0.70):
+        known = with_common_errors(face(mean), [(face(mean - 0.08), face(mean + 0.08))])
+        assert known.melanin.stderr == pytest.approx(0.08), mean
+
+
 def test_what_is_no_probability_or_no_bell_is_refused():
     with pytest.raises(ValueError, match="shape"):
         fitted(np.ones((3, 5, 2)))
