@@ -1,4 +1,8 @@
-"""Trials of the flash rig's intervals: chromophores, and how blood changes with a state."""
+"""Trials of the flash rig's intervals: chromophores, and how blood changes with a state.
+
+Stated errors are of people who do not stand exactly where the white tile stood
+(`reconstruction.shading_prior.SOFTNESS`), and so each subject is drawn a place off it.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +12,9 @@ from typing import Final
 
 import numpy as np
 
+from capture.rig import load_rig
 from model import store
-from reconstruction import pipeline
+from reconstruction import pipeline, shading_prior
 from reconstruction.facial_color_fit import UnknownBloodError
 from skinrig.benchmarks.interval_coverage import Trial
 from skinrig.benchmarks.interval_trials import (
@@ -26,6 +31,24 @@ BLOOD_STATES: Final = ("smile", "anger", "fear", "exercise")
 FACTOR_95: Final = 2.4
 """Half width of a 95 % interval of a chromophore over that of the 68 % one, to 0.1, set on the
 subjects of seeds 0 to 15 at 384 and 768 px: tails are heavier than a Gaussian's."""
+
+STANCE_SHARE: Final = 0.5 * shading_prior.SOFTNESS
+"""Standard deviation of how far subjects stand off the tile's place, over the camera's distance:
+what the stated errors take it for. Light goes with the square of the distance."""
+_STANCE: Final = 1
+"""Beside a subject's seed: of the draw of its place."""
+
+
+def nearer_mm(seed: int) -> float:
+    """Return how much nearer to the camera than the tile's place the subject of a seed stands.
+
+    Examples
+    --------
+    >>> round(nearer_mm(520), 1) == round(nearer_mm(520), 1) != round(nearer_mm(521), 1)
+    True
+    """
+    drawn = np.random.default_rng([seed, _STANCE]).standard_normal()
+    return float(STANCE_SHARE * load_rig("flash").views[0].distance_mm * drawn)
 
 
 def flash(
@@ -58,7 +81,7 @@ def flash(
         name = f"{preset} {seed}"
         done = simulate_session(
             "flash", folder / "session-subject", subject=preset, seed=seed, width_px=width_px,
-            states=("neutral", state) if moving else ("neutral",),
+            states=("neutral", state) if moving else ("neutral",), nearer_mm=nearer_mm(seed),
         )  # fmt: skip
         pipeline.reconstruct(
             done.session, want=["melanin", "hemoglobin"], out=folder / "maps",

@@ -1,0 +1,34 @@
+"""Trials of the flash rig: its subjects stand off the white tile's place as stated errors say."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from reconstruction import shading_prior
+from skinrig.benchmarks import interval_trials_flash as trials
+
+
+def test_subjects_stand_off_the_tiles_place_by_what_the_stated_error_of_light_is_of():
+    """Light goes with the square of the distance; chi-square of 400 draws, 1 % false alarms."""
+    distance_mm = 1000.0
+    nearer = np.array([trials.nearer_mm(seed) for seed in range(400)])
+    light = -2.0 * np.log1p(-nearer / distance_mm)
+    low, high = stats.chi2.ppf([0.005, 0.995], nearer.size - 1) / (nearer.size - 1)
+    assert low < light.var(ddof=1) / shading_prior.SOFTNESS**2 < high * 1.02  # for its bend
+    assert abs(nearer.mean()) < 2.6 * nearer.std() / np.sqrt(nearer.size)
+
+
+def test_each_subject_is_simulated_where_it_was_drawn_to_stand(tmp_path, monkeypatch):
+    class Asked(Exception):
+        """Stops before anything is rendered."""
+
+    def simulate(rig, out, **given):
+        raise Asked(given["seed"], given["nearer_mm"])
+
+    monkeypatch.setattr(trials, "calibrated", lambda *_, **__: None)
+    monkeypatch.setattr(trials, "simulate_session", simulate)
+    for seed in (520, 521):
+        with pytest.raises(Asked) as asked:
+            next(trials.flash(tmp_path, {seed: "III"}, width_px=64))
+        assert asked.value.args == (seed, trials.nearer_mm(seed))
+    assert trials.nearer_mm(520) != trials.nearer_mm(521)
