@@ -56,6 +56,9 @@ class RelaxationFit:
     """Half of its 68 % interval, s; NaN where it is only bounded."""
     interval_s: tuple[float, float]
     """95 % interval of the time constant, s; 0 or inf where there is no such end."""
+    interval_68_s: tuple[float, float]
+    """68 % interval of the time constant, s, within the 95 % one: its ends lie as far from the best
+    as the likelihood says of each side, not a standard error to both."""
     known: Known
     """Whether the time constant is estimated, or "only below" the interval's upper end, or "only
     above" its lower one, or the levels do not differ."""
@@ -263,19 +266,23 @@ def _with_bends(straight: RelaxationFit, bent: Sequence[RelaxationFit]) -> Relax
         return straight
     constants = [fit.time_constant_s for fit in bent]
     middle = straight.time_constant_s
-    low, high = (
-        middle * np.exp(sign * np.hypot(np.log(end / middle), GAUSSIAN_95 * np.log(moved / middle)))
-        if 0.0 < end < np.inf
-        else end
-        for sign, end, moved in (
-            (-1.0, straight.interval_s[0], min(constants)),
-            (1.0, straight.interval_s[1], max(constants)),
+    moved = (min(constants), max(constants))
+
+    def widened(interval: tuple[float, float], sigmas: float) -> tuple[float, float]:
+        """Return an interval of so many standard errors with what bends add to it."""
+        low, high = (
+            middle * np.exp(sign * np.hypot(np.log(end / middle), sigmas * np.log(by / middle)))
+            if 0.0 < end < np.inf
+            else end
+            for sign, end, by in zip((-1.0, 1.0), interval, moved, strict=True)
         )
-    )
+        return float(low), float(high)
+
     half = 0.5 * (max(constants) - min(constants))
     return replace(
         straight,
-        interval_s=(float(low), float(high)),
+        interval_s=widened(straight.interval_s, GAUSSIAN_95),
+        interval_68_s=widened(straight.interval_68_s, 1.0),
         stderr_time_constant_s=float(np.hypot(straight.stderr_time_constant_s, half)),
     )
 
@@ -333,12 +340,10 @@ def _fit_once(
 ) -> RelaxationFit:
     landscape = Landscape.of(data, curve, delays, constants, at)
     delay, constant, noise2 = landscape.delay_s, landscape.time_constant_s, landscape.noise2
-    low, high = landscape.constant_interval(BOUND_LEVEL)
-    interval = (low if low is not None else 0.0, high if high is not None else np.inf)
-    inner = landscape.constant_interval(ONE_SIGMA_LEVEL)
-    stderr_constant = np.nan
-    if inner[0] is not None and inner[1] is not None:
-        stderr_constant = 0.5 * (inner[1] - inner[0])
+    interval, inner = (
+        (low if low is not None else 0.0, high if high is not None else np.inf)
+        for low, high in map(landscape.constant_interval, (BOUND_LEVEL, ONE_SIGMA_LEVEL))
+    )
 
     delay_interval, stderr_delay = (0.0, 0.0), 0.0
     if delays.size > 1:
@@ -354,7 +359,7 @@ def _fit_once(
     changes = stats.f.sf(differ, curves, landscape.freedom) < LEVEL_TEST
     known: Known = "estimated"
     if not changes:
-        known, interval = "unknown", (0.0, float("inf"))
+        known, interval, inner = "unknown", (0.0, float("inf")), (0.0, float("inf"))
     elif interval[0] == 0.0:
         known = "only below"
     elif np.isinf(interval[1]):
@@ -385,8 +390,11 @@ def _fit_once(
         step=step,
         stderr_step=errors[3],
         time_constant_s=constant,
-        stderr_time_constant_s=stderr_constant if known == "estimated" else float("nan"),
+        stderr_time_constant_s=(
+            0.5 * (inner[1] - inner[0]) if known == "estimated" else float("nan")
+        ),
         interval_s=interval,
+        interval_68_s=inner,
         known=known,
         delay_s=delay,
         stderr_delay_s=stderr_delay,

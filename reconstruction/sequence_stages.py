@@ -29,7 +29,7 @@ from reconstruction import (
 from reconstruction.evidence import Evidence, EvidenceError
 from reconstruction.perfusion_samples import PoseStep
 
-REVISION = 5
+REVISION = 6
 CURVES = "perfusion_curves"
 CURVES_FILE = "perfusion_curves.json"
 MAPS = (*flash_stages.MAPS, CURVES)
@@ -353,6 +353,7 @@ def _of_fit(fit: perfusion_fit.RelaxationFit, curve: int | None) -> dict[str, An
         "time_constant_s": fit.time_constant_s,
         "stderr_time_constant_s": fit.stderr_time_constant_s,
         "interval_s": list(fit.interval_s),
+        "interval_68_s": list(fit.interval_68_s),
         "known": fit.known,
         "delay_s": fit.delay_s,
         "stderr_delay_s": fit.stderr_delay_s,

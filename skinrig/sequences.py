@@ -31,6 +31,9 @@ class SequenceOrder:
     """Shots of a prompted sequence; None: every phase, a tenth of them twice."""
     duration_s: str | None = None
     """How long an event is followed, s; None: as :data:`DURATIONS_S`."""
+    reaction_s: float | None = None
+    """Mean time from prompt to movement of the person that is simulated, s; None: the simulator's
+    usual one. A real person has their own."""
 
     @property
     def prompted(self) -> bool:
@@ -39,13 +42,14 @@ class SequenceOrder:
 
     def document(self) -> dict[str, Any]:
         """Return this as JSON values."""
-        return {
+        told: dict[str, Any] = {
             "state": self.state,
             "prompt_period_s": self.prompt_period_s if self.prompted else None,
             "shot_period_s": self.shot_period_s,
             "captures": self.captures,
             "duration_s": self.duration_s,
         }
+        return told if self.reaction_s is None else told | {"reaction_s": self.reaction_s}
 
 
 def sequence_plan(rig: Rig, order: SequenceOrder, *, darks: int = 4) -> Plan:

@@ -7,6 +7,7 @@ A subject is a person with a time constant of their own; the places of the face 
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -28,6 +29,9 @@ CONSTANTS_S: Final[Mapping[str, Sequence[float]]] = {
     "smile": (1.0, 2.0, 4.0),
 }
 """Time constants that are simulated, s, of an event and of prompts."""
+REACTIONS_S: Final = (0.1, 0.4)
+"""Between which mean times from a prompt to the movement a person's own is drawn, s: from that of
+one who knows the rhythm to that of one who is slow."""
 
 
 def sequences(
@@ -51,7 +55,7 @@ def sequences(
         constant_s = CONSTANTS_S[state][seed % len(CONSTANTS_S[state])]
         done = simulate_session(
             "flash", folder / "session-subject", subject=preset, seed=seed, width_px=width_px,
-            sequence=SequenceOrder(state=state), relaxation_s=constant_s,
+            sequence=order_of(state, seed), relaxation_s=constant_s,
         )  # fmt: skip
         truth = truth_of(done)
         pipeline.reconstruct(
@@ -71,6 +75,23 @@ def sequences(
         forget(folder, done)
 
 
+def order_of(state: str, seed: int) -> SequenceOrder:
+    """Return the sequence of a subject, of prompts with a reaction time of their own.
+
+    Parameters
+    ----------
+    state
+        One of `CONSTANTS_S`.
+    seed
+        Of the subject.
+    """
+    order = SequenceOrder(state=state)
+    if not order.prompted:
+        return order
+    reaction_s = float(np.random.default_rng([seed, 16]).uniform(*REACTIONS_S))
+    return dataclasses.replace(order, reaction_s=reaction_s)
+
+
 def of_fits(
     quantity: str,
     fits: Iterable[Mapping[str, Any]],
@@ -82,8 +103,11 @@ def of_fits(
 ) -> Trial:
     """Compare fits with the true time constant, or the true delay.
 
-    Fits that tell a bound alone, or nothing, have no standard error and are left out; of delays as
-    well, which mean nothing where blood does not change.
+    A time constant counts by its own two intervals, which differ in length to both sides, and a
+    delay by its standard error and its 95 % interval. Bounds of a time constant are intervals that
+    are open to one side: to leave them out would leave out the large ones of those that are
+    estimated. Fits that tell nothing are left out; of delays as well those that tell a bound alone,
+    as delays mean little where blood hardly changes.
 
     Parameters
     ----------
@@ -96,20 +120,54 @@ def of_fits(
     delay
         Whether it is the delay.
     """
-    name, ends = ("delay", "delay_interval_s") if delay else ("time_constant", "interval_s")
     off, widths = [], []
     for fit in fits:
-        if fit["known"] != "estimated":
+        if fit["known"] == "unknown" or (delay and fit["known"] != "estimated"):
             continue
-        stderr = float(fit[f"stderr_{name}_s"])
-        low, high = (math.inf if end is None else float(end) for end in fit[ends])
-        away = abs(float(fit[f"{name}_s"]) - true_s) / max(stderr, 1e-300)
-        # the 95 % interval is no multiple of the standard error: it says itself what is inside
-        inside = low <= true_s <= high
-        off.append(min(away, GAUSSIAN_95) if inside else max(away, 1.001 * GAUSSIAN_95))
-        widths.append(100.0 * stderr / true_s)
+        if delay:
+            half = float(fit["stderr_delay_s"])
+            best = float(fit["delay_s"])
+            inner, outer = (best - half, best + half), _ends(fit["delay_interval_s"])
+        else:
+            best = float(fit["time_constant_s"])
+            inner, outer = _ends(fit["interval_68_s"]), _ends(fit["interval_s"])
+        off.append(deviation(best, true_s, inner, outer))
+        if fit["known"] == "estimated":
+            widths.append(100.0 * 0.5 * (inner[1] - inner[0]) / true_s)
     width = float(np.median(widths)) if widths else float("nan")
     return Trial(quantity, subject, band, np.array(off), width, "%", GAUSSIAN_95)
+
+
+def deviation(
+    best: float, true: float, inner: tuple[float, float], outer: tuple[float, float]
+) -> float:
+    """Return how far off an estimate is in half widths of its 68 % interval to that side.
+
+    Up to 1 just where that holds the truth, and up to `GAUSSIAN_95` just where the 95 % one does.
+
+    Parameters
+    ----------
+    best
+        The estimate.
+    true
+        The truth.
+    inner, outer
+        The 68 % and 95 % interval, the one within the other; infinite where an end is open.
+    """
+    if inner[0] <= true <= inner[1]:
+        end = inner[0] if true < best else inner[1]
+        # a best beyond the tried constants may lie outside the interval
+        share = abs(true - best) / max(abs(end - best), 1e-300) if math.isfinite(end) else 0.0
+        return min(share, 1.0)
+    if outer[0] <= true <= outer[1]:
+        return GAUSSIAN_95
+    return 2.0 * GAUSSIAN_95
+
+
+def _ends(interval: Sequence[float | None]) -> tuple[float, float]:
+    """Return an interval as written, where null stands for an open upper end."""
+    low, high = interval
+    return 0.0 if low is None else float(low), math.inf if high is None else float(high)
 
 
 def _band(truth: Path) -> str:

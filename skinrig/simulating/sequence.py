@@ -77,12 +77,17 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
         "mesh": str(order.mesh or ""), "sequence": sequence.document(),
         "relaxation_s": constant_s, "movement": order.movement,
     }  # fmt: skip
-    if not sequence.prompted:
-        course: Any = EventCourse(sequence.state, constant_s)
-    elif constant_s is None:
-        course = PromptedCourse(sequence.state, seed=seed)
+    reaction_s = sequence.reaction_s
+    if reaction_s is not None and not 0 <= reaction_s < np.inf:
+        raise SimulationError(f"reaction: got {reaction_s}, expected seconds >= 0")
+    if reaction_s is not None and not sequence.prompted:
+        raise SimulationError(f"reaction: is for prompts, and {sequence.state} follows an event")
+    if sequence.prompted:
+        own = {"rise_s": constant_s, "fall_s": constant_s, "reaction_s": reaction_s}
+        told: dict[str, Any] = {name: v for name, v in own.items() if v is not None}
+        course: Any = PromptedCourse(sequence.state, seed=seed, **told)
     else:
-        course = PromptedCourse(sequence.state, rise_s=constant_s, fall_s=constant_s, seed=seed)
+        course = EventCourse(sequence.state, constant_s)
     texels = TEXELS[0] if width <= COARSE_PX else TEXELS[1]
     person = make_subject(order.subject, seed=seed, size=texels, mesh=order.mesh)
     plan = sequence_plan(rig, sequence)

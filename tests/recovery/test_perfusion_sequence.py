@@ -106,15 +106,17 @@ def test_a_course_of_two_seconds_is_recovered_within_its_errors(tmp_path, calibr
 @pytest.mark.render
 def test_a_smile_that_moves_the_face_has_its_own_time_constant(tmp_path, calibration):
     """Whose cheek seemed to follow in half the time when its pose's step passed for blood."""
-    order = SequenceOrder(state="smile")
+    order = SequenceOrder(state="smile", reaction_s=0.3)
     session = simulate(tmp_path, order, subject="I", seed=1, relaxation_s=2.0)
     found, _ = curves(session, calibration, tmp_path / "a")
+    course = json.loads((tmp_path / "truth-s" / "perfusion_course.json").read_text())
+    assert course["constants_s"]["reaction_s"] == 0.3
     cheek = found["fits"]["cheek"]
     assert cheek["known"] == "estimated"
     assert cheek["interval_s"][0] <= 2.0 <= cheek["interval_s"][1]
     assert cheek["stderr_time_constant_s"] < 0.5
     low, high = cheek["delay_interval_s"]
-    assert low <= 0.16 <= high < 0.6
+    assert low <= 0.3 <= high < 0.6
 
 
 @pytest.mark.long
@@ -161,7 +163,12 @@ def test_what_is_no_sequence_has_no_curves(tmp_path):
 
 
 def test_sequences_that_cannot_be_are_refused_before_a_folder_is_made(tmp_path):
-    for order in (SequenceOrder(state="bliss"), SequenceOrder(state="smile", shot_period_s="5.25")):
+    for order in (
+        SequenceOrder(state="bliss"),
+        SequenceOrder(state="smile", shot_period_s="5.25"),
+        SequenceOrder(state="smile", reaction_s=-0.1),
+        SequenceOrder(state="exercise", reaction_s=0.2),
+    ):
         with pytest.raises((SimulationError, EvidenceError, ValueError)):
             simulate(tmp_path, order)
     with pytest.raises(SimulationError, match="knows nothing"):

@@ -46,6 +46,24 @@ def test_a_time_constant_is_recovered_within_its_errors(phase, constant_s):
     assert abs(np.mean(pulls)) < 4.0 / np.sqrt(runs) * max(1.0, np.std(pulls))
 
 
+def test_intervals_of_68_percent_hold_as_often_and_are_longer_above():
+    """Where noise is large, a constant is better bounded below: its two sides differ."""
+    rng, noise = np.random.default_rng(21), 1e-3
+    clean, runs, held, longer = relaxing(PHASE, 1.0), 40, 0, []
+    for _ in range(runs):
+        found = fit_cycle(PHASE, 0.03 + 0.01 * clean + noise * rng.standard_normal(22),
+                          cycle_s=CYCLE_S)  # fmt: skip
+        low, high = found.interval_68_s
+        assert found.interval_s[0] <= low <= found.time_constant_s <= high <= found.interval_s[1]
+        if found.known == "estimated":
+            assert found.stderr_time_constant_s == pytest.approx(0.5 * (high - low))
+        held += low <= 1.0 <= high
+        longer.append((high - found.time_constant_s) / (found.time_constant_s - low))
+    # both ends, each by one chance in a thousand, of the nominal share
+    assert stats.binom.ppf(0.001, runs, 0.6827) <= held <= stats.binom.ppf(0.999, runs, 0.6827)
+    assert np.median(longer) > 1.0
+
+
 def test_planned_times_instead_of_true_ones_miss_the_time_constant():
     rng = np.random.default_rng(1)
     late = PHASE + np.where(np.arange(22) % 3 == 0, 1.1, 0.0)
@@ -114,6 +132,7 @@ def test_even_blood_leaves_the_constant_unknown():
     found = fit_cycle(PHASE, 0.03 + 1e-3 * rng.standard_normal(22), cycle_s=CYCLE_S)
     assert found.known == "unknown"
     assert "do not differ" in str(found)
+    assert found.interval_s == found.interval_68_s == (0.0, np.inf)
     assert fit_cycle(PHASE, np.full(22, 0.03), cycle_s=CYCLE_S).known == "unknown"
 
 
@@ -208,9 +227,11 @@ def test_a_bend_adds_to_an_interval_in_squares():
     rng = np.random.default_rng(6)
     seen = 0.044 - 0.015 * (1.0 - np.exp(-time / 20.0)) + 1e-4 * rng.standard_normal(time.size)
     plain, bent, twice = (fit_course(time, seen, bend=bend) for bend in (0.0, 0.05, 0.1))
-    for end in (0, 1):
+    for name, end in (("interval_s", 0), ("interval_s", 1), ("interval_68_s", 0),
+                      ("interval_68_s", 1)):  # fmt: skip
         shares = [
-            np.log(fit.interval_s[end] / fit.time_constant_s) ** 2 for fit in (plain, bent, twice)
+            np.log(getattr(fit, name)[end] / fit.time_constant_s) ** 2
+            for fit in (plain, bent, twice)
         ]
         # twice the bend moves constants by twice, but for curvature
         assert shares[2] - shares[0] == pytest.approx(4 * (shares[1] - shares[0]), rel=0.25)

@@ -5,7 +5,7 @@ import pytest
 
 from reconstruction.perfusion_fit import fit_course
 from skinrig.benchmarks.interval_coverage import pooled
-from skinrig.benchmarks.interval_trials_sequence import of_fits
+from skinrig.benchmarks.interval_trials_sequence import REACTIONS_S, of_fits, order_of
 
 CONSTANT_S = 20.0
 
@@ -22,6 +22,7 @@ def fit_of(rng, *, noise, too_sure=1.0):
         "time_constant_s": middle,
         "stderr_time_constant_s": fit.stderr_time_constant_s / too_sure,
         "interval_s": [middle + (end - middle) / too_sure for end in fit.interval_s],
+        "interval_68_s": [middle + (end - middle) / too_sure for end in fit.interval_68_s],
     }
 
 
@@ -47,24 +48,57 @@ def test_intervals_half_as_wide_are_found_out(rng):
     assert pooled(made, level=95, confidence=0.999).verdict == "missed"
 
 
-@pytest.mark.parametrize(("low", "high", "held"), [(10.0, None, 1.0), (30.0, 40.0, 0.0)])
-def test_an_interval_counts_at_95_percent_as_it_stands(low, high, held):
-    fit = {
-        "known": "estimated", "time_constant_s": 35.0, "stderr_time_constant_s": 2.0,
-        "interval_s": [low, high],
+def told(known, best, inner, outer):
+    return {
+        "known": known, "time_constant_s": best, "interval_68_s": inner, "interval_s": outer,
+        "stderr_time_constant_s": None,
     }  # fmt: skip
-    one = of_fits("x", [fit], CONSTANT_S, subject="a", band="any")
-    assert one.share(68) == 0.0
-    assert one.share(95) == held
 
 
-def test_bounds_alone_are_left_out():
-    fit = {
-        "known": "only below", "time_constant_s": 0.1, "stderr_time_constant_s": None,
-        "interval_s": [0.0, 1.0],
-    }  # fmt: skip
+@pytest.mark.parametrize(
+    ("inner", "outer", "held_68", "held_95"),
+    [
+        ([33.0, 37.0], [10.0, None], 0.0, 1.0),
+        ([33.0, 37.0], [30.0, 40.0], 0.0, 0.0),
+        ([19.0, 36.0], [10.0, 37.0], 1.0, 1.0),
+        # as far off as the longer side reaches, but to the shorter one
+        ([33.0, 60.0], [30.0, 90.0], 0.0, 0.0),
+    ],
+)
+def test_each_interval_counts_as_it_stands(inner, outer, held_68, held_95):
+    fit = told("estimated", 35.0, inner, outer)
     one = of_fits("x", [fit], CONSTANT_S, subject="a", band="any")
-    assert one.deviation.size == 0
+    assert one.share(68) == held_68
+    assert one.share(95) == held_95
+
+
+@pytest.mark.parametrize(
+    ("known", "inner", "outer", "held"),
+    [
+        ("only above", [18.0, None], [15.0, None], (1, 1)),
+        ("only above", [28.0, None], [25.0, None], (0, 0)),
+        ("only below", [0.0, 5.0], [0.0, 25.0], (0, 1)),
+        ("only below", [0.0, 5.0], [0.0, 8.0], (0, 0)),
+    ],
+)
+def test_bounds_are_intervals_that_are_open_to_one_side(known, inner, outer, held):
+    one = of_fits("x", [told(known, 4.0 if known == "only below" else 90.0, inner, outer)],
+                  CONSTANT_S, subject="a", band="any")  # fmt: skip
+    assert (one.share(68), one.share(95)) == held
+    assert np.isnan(one.width)
+
+
+def test_what_tells_nothing_is_left_out():
+    fit = told("unknown", 0.1, [0.0, None], [0.0, None])
+    assert of_fits("x", [fit], CONSTANT_S, subject="a", band="any").deviation.size == 0
+
+
+def test_each_person_reacts_in_a_time_of_their_own():
+    own = [order_of("smile", seed).reaction_s for seed in range(200)]
+    assert order_of("smile", 3).reaction_s == own[3]
+    low, high = REACTIONS_S
+    assert low <= min(own) < low + 0.05 < high - 0.05 < max(own) <= high
+    assert order_of("exercise", 3).reaction_s is None
 
 
 @pytest.mark.parametrize(
