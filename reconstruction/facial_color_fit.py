@@ -189,6 +189,7 @@ def fit(
         own_error=np.stack([_own_error(images) for images in of_states]),
         valid=np.stack([average[2] for average in averages]),
         shading_window_px=shared_melanin.SHADING_WINDOW_PX,
+        one_face=subject.has_white,
     )
     blood = {state: _blood(shared, k) for k, state in enumerate(kept)}
     if not _valid(blood[NEUTRAL]).any():

@@ -22,13 +22,14 @@ Jimenez et al. 2010, doi:10.1145/1866158.1866167, section 3.1
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.color_table import ColorTable
-from reconstruction import chromophore_posterior, light_change
-from reconstruction.chromophore_posterior import FINEST
+from reconstruction import chromophore_posterior, dark_spots, face_chromophores, light_change
+from reconstruction.chromophore_posterior import FINEST, WeighedChromophores
 from reconstruction.chromophore_start import LOWEST
 from reconstruction.chromophores import (
     RELATIVE_NOISE,
@@ -104,6 +105,7 @@ def weigh(
     shading_window_px: float | None = None,
     own_share: float = OWN_SHARE,
     own_error: ArrayLike | None = None,
+    one_face: bool = False,
 ) -> SharedMelanin:
     """Estimate one melanin and the blood of every state, pixel by pixel.
 
@@ -135,6 +137,10 @@ def weigh(
     own_error : array_like, shape (S, ..., 3, 3), optional
         Covariance of what each state's relative color errs by beside all that, such as where it
         was misplaced (`reconstruction.misplacement`). None: nothing.
+    one_face : bool
+        Whether the pixels are one person's skin whose light a white tile told, but for where the
+        face stands: each is then weighed by what all of them tell together of its melanin and
+        blood (`reconstruction.face_chromophores`).
 
     Returns
     -------
@@ -183,13 +189,11 @@ def weigh(
     cells = np.ascontiguousarray(table.cells, np.float64)
     mean, mean_variance = _mean_color(log_rgb, relative, usable, table, cells, owns)
     mean_rgb = np.exp(mean)
-    found = chromophore_posterior.weigh(
-        mean_rgb,
-        table,
-        prior=prior,
-        variance=mean_variance * mean_rgb**2,
-        model_error=_with_mean_of(owns, relative, usable, common),
-    )
+    mean_error = _with_mean_of(owns, relative, usable, common)
+    found = _weighed(
+        mean_rgb, table, prior, mean_variance * mean_rgb**2, mean_error,
+        shape if one_face else None,
+    )  # fmt: skip
     ends = np.array([table.c_m_max, table.c_hd_max])
     begin = _fractions(np.stack([found.melanin, found.hemoglobin], axis=-1), ends)
     # dm = 3 end a^2 da
@@ -234,6 +238,30 @@ def weigh(
         valid_states=each.reshape(states, *shape),
         reference=reference % states,
     )
+
+
+def _weighed(
+    rgb: Map,
+    table: ColorTable,
+    prior: ShadingPrior,
+    variance: Map,
+    model_error: NDArray[np.float64],
+    face_shape: tuple[int, ...] | None,
+) -> WeighedChromophores:
+    """Weigh all solutions of colors (n, 3); those of one face, of such a shape, by it."""
+    known = partial(chromophore_posterior.weigh, rgb, table, prior=prior, variance=variance,
+                    model_error=model_error)  # fmt: skip
+    face = None
+    if face_shape is not None:
+        face = face_chromophores.in_known_light(
+            rgb, table, variance=variance, model_error=model_error
+        )
+    found = known(face=face)
+    if face is None or face_shape is None or len(face_shape) != 2:
+        return found
+    picture = (*face_shape, 3)
+    spots = dark_spots.darker_than_around(rgb.reshape(picture), variance=variance.reshape(picture))
+    return dark_spots.either(found, known(valid=spots.reshape(-1)), spots.reshape(-1))
 
 
 def _model_errors(

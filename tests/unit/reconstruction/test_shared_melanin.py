@@ -339,3 +339,37 @@ def test_an_own_error_that_does_not_fit_is_refused(table, prior, rng):
     for wrong in (np.zeros((4, 3, 3)), np.full((len(rgb), 4, 3, 3), np.nan)):
         with pytest.raises(ChromophoreError, match="own_error"):
             shared_melanin.weigh(rgb, table, prior=prior, variance=variance, own_error=wrong)
+
+
+def test_pixels_of_one_face_tell_each_others_melanin_and_moles_stay_moles(table, prior, rng):
+    """Truth: type V, 9 % melanin with 15 % scatter, in light drawn from the prior, two states.
+
+    Expected: by the face melanin errs by less than 0.7 of what it does alone, and its interval
+    holds 60 % at least; a mole of four times as much is in 2.4 standard errors, and is far out of
+    what the face's other skin has.
+    """
+    side, mole = 48, (slice(20, 24), slice(20, 24))
+    melanin = 0.09 * np.exp(0.15 * rng.standard_normal((side, side)))
+    melanin[mole] = 0.36
+    blood = np.stack([np.full((side, side), 0.02), np.full((side, side), 0.03)])
+    chance = np.cumsum(prior.density) / np.sum(prior.density)
+    light = np.exp(np.interp(rng.random((side, side)), chance, prior.nodes))
+    light[14:30, 14:30] = 0.6  # even around the mole, as light is
+    clean = light[..., None] * table.lookup(np.broadcast_to(melanin, blood.shape), blood)
+    seen = clean * (1.0 + 3e-3 * rng.standard_normal(clean.shape))
+    errors = {}
+    for one_face in (False, True):
+        found = shared_melanin.weigh(
+            seen, table, prior=prior, variance=(3e-3 * clean) ** 2, one_face=one_face,
+            model_error=model_error.color_errors().transport,
+        )  # fmt: skip
+        usual = found.valid.copy()
+        usual[mole] = False
+        off = np.abs(found.melanin - melanin)
+        errors[one_face] = np.median(off[usual] / melanin[usual])
+        if one_face:
+            assert np.mean(off[usual] < found.stderr_melanin[usual]) > 0.6
+            assert np.mean(off[mole] < 2.4 * found.stderr_melanin[mole]) > 0.9
+            assert np.median(found.melanin[mole]) > 1.5 * np.median(found.melanin[usual])
+            assert np.isfinite(found.stderr_hemoglobin[:, usual]).all()
+    assert errors[True] < 0.7 * errors[False]
