@@ -2,6 +2,12 @@
 
 Blocks of the map tell how its histogram scatters, neighboring buckets and neighboring blocks
 together; histograms drawn with that scatter tell how far the best kernel moves.
+
+Where both histograms are of one piece of skin, as neutral and strained maps of a session are, they
+scatter together: a furrow more than usual is in both, and moves the kernel by little. Then both
+are drawn with the same factor on each piece of skin, pieces matched by the place on the skin, and
+each kernel with the scatter of its own histogram: a kernel that deepens furrows scatters more than
+one that does not. Else the target is drawn as of other skin.
 """
 
 from __future__ import annotations
@@ -14,6 +20,7 @@ from numpy.typing import NDArray
 
 from reconstruction import kernel_fit_kernels as kernels
 from reconstruction import normal_histogram
+from reconstruction.block_errors import LEAST_BLOCKS
 from reconstruction.kernel_search import Buckets, Found, Relief
 
 Floats = NDArray[np.float64]
@@ -24,8 +31,14 @@ MOST_DRAWN = 64
 """Nearly-as-good kernels among which each draw finds its best."""
 DRAWN_WITHIN = 3.0
 """They are taken from within so many standard errors of the distance."""
-WITHIN = 0.6827
-"""Share of draws within a standard error of the best."""
+MOST_PAIRED = 140
+"""The same of histograms of one piece of skin."""
+PAIRED_WITHIN = 4.0
+"""The same of histograms of one piece of skin, whose valley is wider than their scatter."""
+WITHIN = 0.6827, 0.95
+"""Shares of draws within the half widths of intervals that are told."""
+GAUSSIAN_95 = 1.959964
+"""Half width of a Gaussian's interval of the second share over that of the first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +78,9 @@ class BlockCounts:
         other patches of the same skin, neighboring buckets together.
         """
         sizes = self.counts.sum(axis=1)
-        counts, sizes = self.counts[sizes > 0], sizes[sizes > 0]
-        n = len(sizes)
-        p = counts.sum(axis=0) / sizes.sum()
-        apart = (counts - sizes[:, None] * p) / sizes.sum()
-        return np.asarray(apart * math.sqrt(n / max(n - 1, 1) * self.growth))
+        counts = self.counts[sizes > 0]
+        n = len(counts)
+        return np.asarray(_apart(counts) * math.sqrt(n / max(n - 1, 1) * self.growth))
 
     def noise(self, target: Floats, target_samples: float) -> float:
         """Return the standard error of the distance to a target of so many effective samples."""
@@ -131,7 +142,21 @@ def nearly_as_good(
     return np.stack([i, j], axis=1)[order]
 
 
-def stderr_of_best(
+@dataclass(frozen=True, slots=True)
+class HalfWidths:
+    """Half widths of intervals about the best kernel.
+
+    Attributes
+    ----------
+    alpha, sigma_um : tuple of float
+        Of 68.27 and 95 %; the second is at least a Gaussian's.
+    """
+
+    alpha: tuple[float, float]
+    sigma_um: tuple[float, float]
+
+
+def widths_of_best(
     relief: Relief,
     buckets: Buckets,
     found: Found,
@@ -141,8 +166,8 @@ def stderr_of_best(
     noise: float,
     scatter: Floats,
     rng: np.random.Generator,
-) -> tuple[float, float]:
-    """Return ways of the best kernel that 68 % of drawn histograms stay within.
+) -> HalfWidths:
+    """Return ways of the best kernel that most drawn histograms of other skin stay within.
 
     Not their root mean square: a long valley leads few of them far away.
 
@@ -156,11 +181,6 @@ def stderr_of_best(
         Of `BlockCounts.scatter`.
     rng
         Draws the histograms.
-
-    Returns
-    -------
-    tuple of float
-        Of alpha, and of sigma in um.
     """
     near = nearly_as_good(found, alphas, sigmas_um, DRAWN_WITHIN * noise)
     some = near[np.unique(np.linspace(0, len(near) - 1, MOST_DRAWN).round().astype(int))]
@@ -171,7 +191,94 @@ def stderr_of_best(
     for draw in range(DRAWS):
         moved = rng.standard_normal(len(scatter)) @ scatter
         best[draw] = int(np.argmin(np.abs(gap + moved).sum(axis=1)))
+    return _widths(alphas, sigmas_um, some, best)
+
+
+def widths_of_pair(
+    relief: Relief,
+    buckets: Buckets,
+    found: Found,
+    alphas: Floats,
+    sigmas_um: Floats,
+    *,
+    noise: float,
+    target_blocks: Floats,
+    growth: float,
+    rng: np.random.Generator,
+) -> HalfWidths | None:
+    """Return ways of the best kernel that most drawn pairs of histograms of one skin stay within.
+
+    Parameters
+    ----------
+    relief, buckets, found, alphas, sigmas_um, noise, rng
+        As of `widths_of_best`.
+    target_blocks : ndarray, shape (blocks, buckets)
+        Counts behind the target in the skin of each block of the relief, of `of_kernel`.
+    growth : float
+        Of `BlockCounts`. Of the relief's roughness, not of its difference from the target's: how
+        many furrows a patch has is what the next patch differs by.
+
+    Returns
+    -------
+    HalfWidths or None
+        None where fewer than `block_errors.LEAST_BLOCKS` blocks are in both maps.
+    """
+    shape = (relief.code.shape[0], relief.code.shape[1])
+    group, groups = normal_histogram.block_of(relief.places, shape, normal_histogram.BLOCKS)
+    ours = np.bincount(group, minlength=groups)
+    both = np.flatnonzero((ours > 0) & (target_blocks.sum(axis=1) > 0))
+    if len(both) < LEAST_BLOCKS:
+        return None
+    theirs = _apart(target_blocks[both])
+    factors = rng.standard_normal((DRAWS, len(both)))
+    factors = np.float32(math.sqrt(len(both) / (len(both) - 1) * growth)) * factors
+    factors = factors.astype(np.float32)
+    near = nearly_as_good(found, alphas, sigmas_um, PAIRED_WITHIN * noise)
+    # dense about the best, sparse where hardly a draw comes
+    steps = np.linspace(0.0, 1.0, MOST_PAIRED) ** 1.5 * (len(near) - 1)
+    some = near[np.unique(steps.round().astype(int))]
+    distance = np.empty((DRAWS, len(some)), np.float32)
+    for i in np.unique(some[:, 0]).tolist():
+        da, db = relief.change(float(sigmas_um[i]))
+        for column in np.flatnonzero(some[:, 0] == i).tolist():
+            alpha = np.float32(alphas[some[column, 1]])
+            counts = kernels.count_in_groups(
+                -(relief.along + alpha * da), -(relief.across + alpha * db),
+                group, groups, buckets.bins, buckets.limit,
+            )  # fmt: skip
+            gap = counts.sum(axis=0) / relief.places.size - buckets.target
+            apart = _apart(np.asarray(counts[both], np.float64)) - theirs
+            used = np.flatnonzero((gap != 0.0) | apart.any(axis=0))
+            moved = factors @ apart[:, used].astype(np.float32)
+            distance[:, column] = np.abs(gap[used].astype(np.float32) + moved).sum(axis=1)
+    return _widths(alphas, sigmas_um, some, distance.argmin(axis=1))
+
+
+def of_grid(widths: HalfWidths, alphas: Floats, sigmas_um: Floats) -> HalfWidths:
+    """Return half widths with the grid's own: a step over sqrt(12), as of an even error."""
+    step = [float(np.diff(g).min()) if g.size > 1 else 0.0 for g in (alphas, sigmas_um)]
+    (alpha, alpha_95), (sigma, sigma_95) = (
+        tuple(math.hypot(w, factor * s / math.sqrt(12.0)) for w, factor in zip(
+            told, (1.0, GAUSSIAN_95), strict=True))
+        for told, s in zip((widths.alpha, widths.sigma_um), step, strict=True)
+    )  # fmt: skip
+    return HalfWidths((alpha, alpha_95), (sigma, sigma_95))
+
+
+def _apart(counts: Floats) -> Floats:
+    """Return what each block adds to the error of the common shares, (blocks, buckets)."""
+    sizes = counts.sum(axis=1)
+    common = counts.sum(axis=0) / sizes.sum()
+    return np.asarray((counts - sizes[:, None] * common) / sizes.sum())
+
+
+def _widths(
+    alphas: Floats, sigmas_um: Floats, some: NDArray[np.int64], best: NDArray[np.intp]
+) -> HalfWidths:
+    """Return quantiles of how far draws' best kernels are from the best, which is the first."""
     i, j = some[best].T
     ways = np.abs([alphas[j] - alphas[some[0, 1]], sigmas_um[i] - sigmas_um[some[0, 0]]])
-    alpha, sigma = np.quantile(ways, WITHIN, axis=1)
-    return float(alpha), float(sigma)
+    (alpha, sigma), (alpha_95, sigma_95) = np.quantile(ways, WITHIN, axis=1).tolist()
+    return HalfWidths(
+        (alpha, max(alpha_95, GAUSSIAN_95 * alpha)), (sigma, max(sigma_95, GAUSSIAN_95 * sigma))
+    )

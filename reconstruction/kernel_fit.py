@@ -82,7 +82,12 @@ class KernelFit:
         How far the best moves in 68 % of cases when both histograms are drawn anew, with the
         scatter that blocks of the map show, neighbors together: what another patch of the same
         skin and size would change; at least a grid step over sqrt(12). Infinite where not `valid`.
-        alpha and sigma make up for one another, so that their errors are not Gaussian.
+        With `target_blocks` both are drawn together, as of one piece of skin; else as if the
+        target were of other skin. alpha and sigma make up for one another, so that their errors
+        are not Gaussian.
+    alpha_95, sigma_95_um : float
+        Half widths of 95 % intervals, of the same draws; at least 1.96 standard errors. More where
+        a long valley leads some draws far away.
     alpha_interval, sigma_interval_um : tuple of float
         Least and largest of `near_best`.
     at_edge : bool
@@ -116,6 +121,8 @@ class KernelFit:
     distance_refined: float
     alpha_stderr: float
     sigma_stderr_um: float
+    alpha_95: float
+    sigma_95_um: float
     alpha_interval: tuple[float, float]
     sigma_interval_um: tuple[float, float]
     at_edge: bool
@@ -228,6 +235,7 @@ def fit_kernel(
     valid: ArrayLike | None = None,
     y_up: bool = True,
     target_samples: float | None = None,
+    target_blocks: NDArray[np.integer] | None = None,
     alphas: ArrayLike | None = None,
     sigmas_um: ArrayLike | None = None,
     first_sample: int = kernel_search.FIRST_SAMPLE,
@@ -262,6 +270,10 @@ def fit_kernel(
     target_samples : float, optional
         Effective number of samples behind the target (`NormalStatistics.effective_samples`); as
         many as behind the neutral relief by default. For `noise` and standard errors only.
+    target_blocks : ndarray of int, shape (rows, columns, bins, bins), optional
+        Where the target is of the same piece of skin: its counts in the skin of each block of the
+        neutral map (`normal_histogram.grid_of`, `normal_histogram.block_counts`), for standard
+        errors only.
     alphas, sigmas_um : array_like, optional
         Another grid than the paper's, increasing; alphas within [-2, 1], sigmas > 0.
     first_sample : int
@@ -289,6 +301,7 @@ def fit_kernel(
         relief, Buckets(target, bins, float(limit)), ALPHAS if alphas is None else alphas,
         SIGMAS_UM if sigmas_um is None else sigmas_um, search=search,
         target_samples=target_samples, first_sample=first_sample, seed=seed,
+        target_blocks=_blocks(target_blocks, relief, bins, transposed=axis in ("y", 0)),
     )  # fmt: skip
 
 
@@ -418,6 +431,26 @@ def _target(histogram: NDArray[np.floating], bins: int, *, transposed: bool) -> 
     return np.append(shares.reshape(-1), max(1.0 - total, 0.0) if total < 1 - 1e-6 else 0.0)
 
 
+def _blocks(
+    counts: NDArray[np.integer] | None, relief: Relief, bins: int, *, transposed: bool
+) -> Floats | None:
+    """Return counts of the target by blocks of the relief, (blocks, bins ** 2 + 1)."""
+    if counts is None:
+        return None
+    parts = np.asarray(counts, np.float64)
+    shape = (relief.code.shape[0], relief.code.shape[1])
+    expected = (*normal_histogram.grid_of(shape, normal_histogram.BLOCKS), bins, bins)
+    if transposed and parts.ndim == 4:
+        parts = parts.transpose(1, 0, 3, 2)
+    if parts.shape != expected:
+        raise KernelFitError(f"target_blocks: got shape {np.shape(counts)}, expected {expected}")
+    if not np.isfinite(parts).all() or (parts < 0).any():
+        raise KernelFitError("target_blocks: got counts that are not finite or below 0")
+    flat = parts.reshape(expected[0] * expected[1], bins * bins)
+    # beyond the limit nothing is in the target, either
+    return np.append(flat, np.zeros((len(flat), 1)), axis=1)
+
+
 def fit_relief(
     relief: Relief,
     buckets: Buckets,
@@ -428,8 +461,12 @@ def fit_relief(
     target_samples: float | None,
     first_sample: int,
     seed: int,
+    target_blocks: Floats | None = None,
 ) -> KernelFit:
-    """Fit the kernel of a prepared relief; parameters and errors as of :func:`fit_kernel`."""
+    """Fit the kernel of a prepared relief; parameters and errors as of :func:`fit_kernel`.
+
+    The counts of `target_blocks` have the shape (blocks, bins ** 2 + 1), axes as of the relief.
+    """
     strengths = _grid("alphas", alphas, *ALPHA_LIMITS)
     widths = _grid("sigmas_um", sigmas_um, 1e-9, math.inf)
     if search not in ("hierarchical", "exhaustive"):
@@ -446,12 +483,14 @@ def fit_relief(
             relief, buckets, strengths, widths, first_sample=first_sample, rng=rng
         )
     with kernels.threads_for(500 * relief.places.size):
-        return _described(relief, buckets, strengths, widths, found, search, target_samples, rng)
+        return _described(
+            relief, buckets, strengths, widths, found, search, target_samples, target_blocks, rng
+        )
 
 
 def _described(
     relief: Relief, buckets: Buckets, alphas: Floats, sigmas_um: Floats, found: Found, search: str,
-    target_samples: float | None, rng: np.random.Generator,
+    target_samples: float | None, target_blocks: Floats | None, rng: np.random.Generator,
 ) -> KernelFit:  # fmt: skip
     """Return what a search found, with its noise, its valley and a finer minimum."""
     start = relief.along, relief.across
@@ -475,16 +514,20 @@ def _described(
     elif float(found.distance.max()) - distance <= noise:
         reason = "the distance does not depend on the kernel beyond its noise"
     refined = (alpha, sigma, distance)
-    stderr = (math.inf, math.inf)
+    told = kernel_errors.HalfWidths((math.inf, math.inf), (math.inf, math.inf))
     if not reason:
         refined = _refined(relief, buckets, alphas, sigmas_um, (i, j), distance)
-        stderr = kernel_errors.stderr_of_best(
+        pair = None
+        if target_blocks is not None:
+            pair = kernel_errors.widths_of_pair(
+                relief, buckets, found, alphas, sigmas_um,
+                noise=noise, target_blocks=target_blocks, growth=blocks.growth, rng=rng,
+            )  # fmt: skip
+        told = pair or kernel_errors.widths_of_best(
             relief, buckets, found, alphas, sigmas_um,
             noise=noise, scatter=blocks.scatter(theirs), rng=rng,
         )  # fmt: skip
-        least = [float(np.diff(g).min()) / math.sqrt(12) if g.size > 1 else 0.0
-                 for g in (alphas, sigmas_um)]  # fmt: skip
-        stderr = (math.hypot(stderr[0], least[0]), math.hypot(stderr[1], least[1]))
+        told = kernel_errors.of_grid(told, alphas, sigmas_um)
     return KernelFit(
         alpha=alpha if not reason else 0.0,
         sigma_um=sigma,
@@ -497,8 +540,10 @@ def _described(
         alpha_refined=refined[0] if not reason else 0.0,
         sigma_refined_um=refined[1],
         distance_refined=refined[2] if not reason else before,
-        alpha_stderr=stderr[0],
-        sigma_stderr_um=stderr[1],
+        alpha_stderr=told.alpha[0],
+        sigma_stderr_um=told.sigma_um[0],
+        alpha_95=told.alpha[1],
+        sigma_95_um=told.sigma_um[1],
         alpha_interval=(float(near[:, 0].min()), float(near[:, 0].max())),
         sigma_interval_um=(float(near[:, 1].min()), float(near[:, 1].max())),
         at_edge=i in (0, sigmas_um.size - 1) or j in (0, alphas.size - 1),

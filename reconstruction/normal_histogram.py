@@ -321,6 +321,58 @@ class NormalStatistics:
     stderr_y: float
 
 
+def grid_of(shape: tuple[int, int], blocks: int) -> tuple[int, int]:
+    """Return into how many rows and columns of blocks `block_of` cuts a map."""
+    return max(1, min(blocks, shape[0] // 4)), max(1, min(blocks, shape[1] // 4))
+
+
+def block_counts(
+    height: NDArray[np.floating],
+    block: NDArray[np.int64],
+    blocks: int,
+    *,
+    pixel: float | tuple[float, float],
+    bins: int = 64,
+    limit: float = 1.0,
+    y_up: bool = True,
+    valid: ArrayLike | None = None,
+    angle_rad: float = 0.0,
+) -> NDArray[np.int64]:
+    """Count a relief's normals by blocks of any shape, as of another map of the same skin.
+
+    Parameters
+    ----------
+    height, pixel, bins, limit, y_up, valid, angle_rad
+        As of :func:`histogram`.
+    block : ndarray of int, shape (H, W)
+        Of each pixel, 0 to `blocks` - 1; pixels with another number are left out.
+    blocks : int
+        At least 1.
+
+    Returns
+    -------
+    ndarray of int64, shape (blocks, bins, bins)
+        Axes (n_y, n_x) of each; normals beyond the limit are left out.
+
+    Raises
+    ------
+    HistogramError
+        For a map of blocks of another shape, and as of :func:`histogram`.
+    """
+    check_buckets(bins, limit)
+    if block.shape != np.shape(height) or blocks < 1:
+        raise HistogramError(
+            f"block: got shape {block.shape} and {blocks} blocks, expected {np.shape(height)} and "
+            "at least 1"
+        )
+    a, b, known = slopes(height, pixel=pixel, y_up=y_up, valid=valid)
+    known = known & (block >= 0) & (block < blocks)
+    a, b = turned(a[known], b[known], angle_rad)
+    group = np.asarray(block[known], np.int64)
+    counts = kernels.count_in_groups(a, b, group, blocks, bins, float(limit))
+    return np.asarray(counts[:, :-1], np.int64).reshape(blocks, bins, bins)
+
+
 def block_of(
     places: NDArray[np.int64], shape: tuple[int, int], blocks: int
 ) -> tuple[NDArray[np.int64], int]:
@@ -328,7 +380,7 @@ def block_of(
 
     A map is cut into ``blocks`` along each axis, fewer where they would be below 4 pixels.
     """
-    across = [max(1, min(blocks, side // 4)) for side in shape]
+    across = grid_of(shape, blocks)
     y, x = np.divmod(places, shape[1])
     return y * across[0] // shape[0] * across[1] + x * across[1] // shape[1], across[0] * across[1]
 

@@ -14,7 +14,13 @@ from model.microstructure import KernelTableError
 from model.skin import SkinMap
 from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, KernelFit, fit_kernel
 from reconstruction.kernel_table import KernelTableFitError, direction_dependence, fit_table
-from reconstruction.normal_histogram import NormalStatistics, measure
+from reconstruction.normal_histogram import (
+    BLOCKS,
+    NormalStatistics,
+    block_counts,
+    grid_of,
+    measure,
+)
 from reconstruction.skin_strain import StateStrain
 
 LEAST_SAMPLES = 1000
@@ -100,10 +106,54 @@ def _common(
     affine = each.strain.affine_px((shape[0], shape[1]))
     # a pixel of the state shows what the neutral picture has where the map leads back to
     back = affine if not there else _inverse(affine)
+    return ndimage.map_coordinates(seen, _moved(back, shape), order=0, cval=0) > 0
+
+
+def _moved(affine: NDArray[np.float64], shape: tuple[int, ...]) -> list[NDArray[np.float64]]:
+    """Return the rows and columns that a map of pixels (column, row) takes each pixel to."""
     columns, rows = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
-    places = [back[1, 0] * columns + back[1, 1] * rows + back[1, 2],
-              back[0, 0] * columns + back[0, 1] * rows + back[0, 2]]  # fmt: skip
-    return ndimage.map_coordinates(seen, places, order=0, cval=0) > 0
+    return [affine[1, 0] * columns + affine[1, 1] * rows + affine[1, 2],
+            affine[0, 0] * columns + affine[0, 1] * rows + affine[0, 2]]  # fmt: skip
+
+
+def _skin_blocks(
+    each: StateStrain, height: SkinMap, *, pixel_um: float, there: Bools
+) -> NDArray[np.int64]:
+    """Count a state's normals in the skin of each block of the neutral map turned to its jaws.
+
+    Parameters
+    ----------
+    each, height
+        The state.
+    pixel_um
+        Size of a pixel.
+    there
+        (H, W): pixels of the state to count.
+
+    Returns
+    -------
+    ndarray, shape (rows, columns, bins, bins)
+        As `fit_kernel` takes them.
+    """
+    shape = (there.shape[0], there.shape[1])
+    row, column = _moved(_inverse(each.strain.affine_px(shape)), shape)
+    # from the neutral map to the one that `_along_x` has turned
+    c, s = math.cos(each.state.angle_rad), math.sin(each.state.angle_rad)
+    middle = (shape[1] - 1) / 2, (shape[0] - 1) / 2
+    x, y = column - middle[0], middle[1] - row
+    row, column = middle[1] - (c * y - s * x), middle[0] + (c * x + s * y)
+    grid = grid_of(shape, BLOCKS)
+    down, right = (
+        np.floor((place + 0.5) * parts / side).astype(np.int64)
+        for place, parts, side in zip((row, column), grid, shape, strict=True)
+    )
+    inside = (down >= 0) & (down < grid[0]) & (right >= 0) & (right < grid[1])
+    block = np.where(inside, down * grid[1] + right, -1)
+    counts = block_counts(
+        height.values, block, grid[0] * grid[1], pixel=pixel_um, valid=there,
+        angle_rad=each.state.angle_rad,
+    )  # fmt: skip
+    return counts.reshape(*grid, *counts.shape[1:])
 
 
 def _inverse(affine: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -166,12 +216,14 @@ def fit_kernels(
         turned, inside = _along_x(height.values, seen, each.state.angle_rad)
         if np.count_nonzero(inside) < LEAST_SAMPLES:
             continue
-        target = statistics[each.state.name]
+        target, strained = statistics[each.state.name], heights[each.state.name]
+        there = _valid(strained) & _common(each, neutral, heights, there=True)
         every = 1 if np.count_nonzero(inside) >= FULL_GRID_PX else COARSER
         fit = fit_kernel(
             turned, target.histogram, stretch=each.stretch_s[0], axis="x", pixel_um=pixel_um,
             valid=inside, stretch_across=each.stretch_t[0], alphas=ALPHAS[::every],
             sigmas_um=SIGMAS_UM[::every], target_samples=target.effective_samples,
+            target_blocks=_skin_blocks(each, strained, pixel_um=pixel_um, there=there),
         )  # fmt: skip
         fits.append(_entry(each, fit))
     angles = sorted({fit["angle_deg"] for fit in fits})
@@ -191,6 +243,7 @@ def _entry(each: StateStrain, fit: KernelFit) -> dict[str, Any]:
         "stretch_t": each.stretch_t[0],
         "alpha": fit.alpha, "alpha_stderr": fit.alpha_stderr,
         "sigma_um": fit.sigma_um, "sigma_stderr_um": fit.sigma_stderr_um,
+        "alpha_95": fit.alpha_95, "sigma_95_um": fit.sigma_95_um,
         "alpha_interval": fit.alpha_interval, "sigma_interval_um": fit.sigma_interval_um,
         "alpha_refined": fit.alpha_refined, "sigma_refined_um": fit.sigma_refined_um,
         "distance": fit.distance, "distance_before": fit.distance_before,

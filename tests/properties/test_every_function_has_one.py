@@ -105,7 +105,9 @@ NOT_DRIVEN = {
                 "model.rgl": "of_brdf",
                 "reconstruction.brdf_space": "curve",
                 "reconstruction.chromophore_reference": "fit weigh",
-                "reconstruction.kernel_errors": "nearly_as_good of_kernel stderr_of_best",
+                "reconstruction.kernel_errors": (
+                    "nearly_as_good of_grid of_kernel widths_of_best widths_of_pair"
+                ),
                 "reconstruction.face_chromophores": "in_known_light of_colors",
                 "reconstruction.face_distribution": "fit",
                 "reconstruction.kernel_fit": (

@@ -149,6 +149,25 @@ def test_histograms_of_a_relief_and_of_its_normals_agree(seed, bins, angle):
 def test_every_pixel_is_in_one_block(rows, columns, blocks):
     number, count = normal_histogram.block_of(np.arange(rows * columns), (rows, columns), blocks)
     assert set(number.tolist()) == set(range(count))
+    down, right = normal_histogram.grid_of((rows, columns), blocks)
+    assert down * right == count
+
+
+@CHEAP
+@given(seed=SEED, bins=st.integers(1, 20), angle=st.floats(-3.2, 3.2), sides=SIDES)
+def test_counts_of_blocks_are_those_of_the_whole(seed, bins, angle, sides):
+    rng = np.random.default_rng(seed)
+    height, valid = rng.standard_normal(sides), masked(rng, sides)
+    told = {"pixel": 1.5, "bins": bins, "limit": 0.7, "valid": valid, "angle_rad": angle}
+    parts = normal_histogram.block_counts(height, rng.integers(0, 5, sides), 5, **told)
+    assert parts.shape == (5, bins, bins)
+    if parts.any():
+        whole = normal_histogram.histogram(height, **told)
+        np.testing.assert_allclose(parts.sum(axis=0) / parts.sum(), whole, atol=1e-12)
+    none = normal_histogram.block_counts(height, np.full(sides, -1), 5, **told)
+    assert not none.any()
+    with pytest.raises(normal_histogram.HistogramError, match="block"):
+        normal_histogram.block_counts(height, np.zeros((1, 1, 1), int), 5, **told)
 
 
 @CHEAP

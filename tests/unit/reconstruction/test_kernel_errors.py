@@ -47,15 +47,15 @@ def test_errors_are_the_same_from_kept_counts_and_from_new_ones(rng):
     blocks = kernel_errors.of_kernel(relief, buckets, float(ALPHAS[j]), float(SIGMAS_UM[i]))
     noise, scatter = blocks.noise(buckets.target, 1e4), blocks.scatter(1e4)
     told = {"noise": noise, "scatter": scatter}
-    with_counts = kernel_errors.stderr_of_best(
+    with_counts = kernel_errors.widths_of_best(
         relief, buckets, found, ALPHAS, SIGMAS_UM, **told, rng=np.random.default_rng(5)
     )
     found.counts.clear()
-    without = kernel_errors.stderr_of_best(
+    without = kernel_errors.widths_of_best(
         relief, buckets, found, ALPHAS, SIGMAS_UM, **told, rng=np.random.default_rng(5)
     )
     assert with_counts == without
-    assert with_counts[0] > 0.0
+    assert with_counts.alpha[0] > 0.0
 
 
 def test_no_more_counts_are_kept_than_memory_is_granted(rng, monkeypatch):
@@ -90,3 +90,89 @@ def test_bounds_are_the_sums_of_plain_numpy(rng):
         lows = [np.sum(np.sign(target - x / before) * gap, axis=1), *(gap @ signs.T).T]
         sampled = np.abs(target - (x + y) / (before + fresh)).sum(axis=1)
         np.testing.assert_allclose(found, np.stack([sampled, np.max(lows, axis=0)], 1), rtol=1e-12)
+
+
+def paired(height, strained, blocks=normal_histogram.BLOCKS):
+    """Return counts of a strained map in the blocks of the neutral one, pixel by pixel."""
+    rows, columns = normal_histogram.grid_of(height.shape, blocks)
+    group, groups = normal_histogram.block_of(np.arange(height.size), height.shape, blocks)
+    counts = normal_histogram.block_counts(
+        strained, group.reshape(height.shape), groups, pixel=6.0, bins=64
+    )
+    return counts.reshape(rows, columns, 64, 64)
+
+
+def strained_pair(rng, side=96):
+    """Return a relief and what a kernel and a little of something else make of it."""
+    height = 8.0 * gaussian_filter(rng.standard_normal((side, side)), 2.0)
+    deeper = kernel_fit.convolved(height, -0.4, 15.0, axis="x", pixel_um=6.0)
+    return height, deeper + 0.3 * gaussian_filter(rng.standard_normal((side, side)), 1.0)
+
+
+TOLD = {
+    "stretch": 1.0, "pixel_um": 6.0, "alphas": ALPHAS, "sigmas_um": SIGMAS_UM,
+    "search": "exhaustive",
+}  # fmt: skip
+
+
+def test_one_piece_of_skin_tells_a_kernel_better_than_two(rng):
+    height, strained = strained_pair(rng)
+    target = normal_histogram.histogram(strained, pixel=6.0)
+    alone = kernel_fit.fit_kernel(height, target, axis="x", **TOLD)
+    same = kernel_fit.fit_kernel(
+        height, target, axis="x", target_blocks=paired(height, strained), **TOLD
+    )
+    assert (same.alpha, same.sigma_um, same.distance) == (
+        alone.alpha,
+        alone.sigma_um,
+        alone.distance,
+    )
+    assert same.alpha_stderr < alone.alpha_stderr
+    # blocks of the map turned about are those of other skin: then nothing is in common
+    other = kernel_fit.fit_kernel(
+        height, target, axis="x", target_blocks=paired(height, strained)[::-1, ::-1], **TOLD
+    )
+    assert other.alpha_stderr > same.alpha_stderr
+    for fit in (alone, same, other):
+        assert fit.alpha_95 >= 1.959 * fit.alpha_stderr
+        assert fit.sigma_95_um >= 1.959 * fit.sigma_stderr_um
+
+
+def test_errors_of_a_map_on_its_side_are_the_same(rng):
+    """Rows for columns, in the map, its target and its blocks: y up turns into x to the right."""
+    height, strained = strained_pair(rng, side=64)
+    fits = []
+    for axis, a, b in (
+        ("x", height, strained),
+        ("y", height.T[::-1, ::-1], strained.T[::-1, ::-1]),
+    ):
+        target = normal_histogram.histogram(b, pixel=6.0)
+        fits.append(kernel_fit.fit_kernel(a, target, axis=axis, target_blocks=paired(a, b), **TOLD))
+    first, second = fits
+    assert (first.alpha, first.sigma_um) == (second.alpha, second.sigma_um)
+    assert second.alpha_stderr == pytest.approx(first.alpha_stderr, rel=0.3)
+
+
+def test_pairs_that_nothing_can_be_drawn_of_are_refused_or_left(rng):
+    height, strained = strained_pair(rng, side=48)
+    target, blocks = normal_histogram.histogram(strained, pixel=6.0), paired(height, strained)
+    alone = kernel_fit.fit_kernel(height, target, axis="x", **TOLD)
+    few = np.where(np.arange(64).reshape(8, 8, 1, 1) < 4, blocks, 0)
+    fit = kernel_fit.fit_kernel(height, target, axis="x", target_blocks=few, **TOLD)
+    assert fit.alpha_stderr == alone.alpha_stderr  # of four blocks no scatter: as of other skin
+    for wrong in (blocks[:7], blocks[..., :32], -blocks):
+        with pytest.raises(kernel_fit.KernelFitError, match="target_blocks"):
+            kernel_fit.fit_kernel(height, target, axis="x", target_blocks=wrong, **TOLD)
+
+
+def test_normals_are_counted_in_blocks_of_any_shape(rng):
+    height = 5.0 * gaussian_filter(rng.standard_normal((40, 50)), 2.0)
+    block = rng.integers(-1, 3, height.shape)
+    counts = normal_histogram.block_counts(height, block, 3, pixel=6.0, angle_rad=0.3)
+    for k in range(3):
+        a, b, _ = normal_histogram.slopes(height, pixel=6.0)
+        x, y = normal_histogram.turned(a[block == k], b[block == k], 0.3)
+        np.testing.assert_allclose(
+            counts[k] / counts[k].sum(), normal_histogram.from_slopes(x, y), atol=1e-12
+        )
+    assert counts.sum() == np.count_nonzero(block >= 0)
