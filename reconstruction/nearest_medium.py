@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from reconstruction.profile_batch import LEAST_DEVIATION, START_ERROR, ProfileBatch
+from reconstruction.profile_batch import LEAST_DEVIATION, START_ERROR, ProfileBatch, fits_from
 from reconstruction.smooth_misfit import smooth_misfit
 from reconstruction.subsurface_models import LEAST_LOG, ProfileModel
 
@@ -171,10 +171,8 @@ def _nearest_of(
     """
     square, theta, offs = [], [], []
     for number, start in enumerate(starts):
-        batch.run(model, chosen, logs, wide, start.copy(), better=number > 0, logarithmic=True)
-        alone = ProfileBatch.of(batch.y[chosen], batch.variance[chosen], batch.used[chosen],
-                                batch.prior)  # fmt: skip
-        alone.run(model, np.arange(len(chosen)), logs, wide, start.copy(), logarithmic=True)
+        alone = fits_from(model, logs, wide, start.copy(), batch.prior, logarithmic=True)
+        batch.keep(chosen, alone, better=number > 0)
         known: Bools = np.isfinite(wide)
         off = np.where(known, logs - np.log(np.maximum(alone.predicted, 1e-290)), 0.0)
         prior = (START_ERROR * alone.theta[:, 2] / DIMMING) ** 2

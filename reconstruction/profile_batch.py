@@ -220,21 +220,55 @@ class ProfileBatch:
     ) -> None:
         """Fit from `theta` on and keep the results; with `better` only the likelier ones."""
         by_logs = self.logarithmic if logarithmic is None else logarithmic
-        n = y.shape[0]
-        covariance, chi2 = np.empty((n, 4, 4)), np.empty(n)
-        predicted, total, steps = np.empty(y.shape), np.empty(y.shape), np.empty(n, np.int64)
-        parts = min(get_num_threads(), max(1, n // 64))
-        levenberg_marquardt.fit(
-            model.kind, model.radius_mm, model.constants, model.axes, model.grid, y, variance,
-            model.error, by_logs, self.prior, model.bounds, theta, ROUNDS, STEPS, parts,
-            covariance, chi2, predicted, total, steps,
-        )  # fmt: skip
+        self.keep(chosen, fits_from(model, y, variance, theta, self.prior, by_logs), better=better)
+
+    def keep(self, chosen: NDArray[np.intp], fits: Fits, *, better: bool = False) -> None:
+        """Take results of some profiles; with `better` only the likelier ones."""
+        won = np.ones(len(chosen), np.bool_)
         if better:
-            won = chi2 + _log_volume(total) < self.chi2[chosen] + _log_volume(self.total[chosen])
-            chosen, theta, covariance, chi2 = chosen[won], theta[won], covariance[won], chi2[won]
-            predicted, total, steps = predicted[won], total[won], steps[won]
-        self.theta[chosen], self.covariance[chosen], self.chi2[chosen] = theta, covariance, chi2
-        self.predicted[chosen], self.total[chosen], self.steps[chosen] = predicted, total, steps
+            own = self.chi2[chosen] + _log_volume(self.total[chosen])
+            won = fits.chi2 + _log_volume(fits.total) < own
+        chosen = chosen[won]
+        self.theta[chosen], self.covariance[chosen] = fits.theta[won], fits.covariance[won]
+        self.chi2[chosen], self.predicted[chosen] = fits.chi2[won], fits.predicted[won]
+        self.total[chosen], self.steps[chosen] = fits.total[won], fits.steps[won]
+
+
+@dataclass(frozen=True, slots=True)
+class Fits:
+    """What the kernel makes of profiles from one start of each."""
+
+    theta: Floats
+    """(N, 4)."""
+    covariance: Floats
+    """(N, 4, 4)."""
+    chi2: Floats
+    """(N,)."""
+    predicted: Floats
+    """(N, F)."""
+    total: Floats
+    """(N, F) variance with the model's error."""
+    steps: NDArray[np.int64]
+    """(N,) evaluations, negative where it did not converge."""
+
+
+def fits_from(
+    model: ProfileModel, y: Floats, variance: Floats, theta: Floats, prior: Floats,
+    logarithmic: bool,
+) -> Fits:  # fmt: skip
+    """Fit profiles from `theta` on, see `levenberg_marquardt.fit`; `theta` becomes the result."""
+    n = y.shape[0]
+    fits = Fits(
+        theta, np.empty((n, 4, 4)), np.empty(n), np.empty(y.shape), np.empty(y.shape),
+        np.empty(n, np.int64),
+    )  # fmt: skip
+    parts = min(get_num_threads(), max(1, n // 64))
+    levenberg_marquardt.fit(
+        model.kind, model.radius_mm, model.constants, model.axes, model.grid, y, variance,
+        model.error, logarithmic, prior, model.bounds, theta, ROUNDS, STEPS, parts,
+        fits.covariance, fits.chi2, fits.predicted, fits.total, fits.steps,
+    )  # fmt: skip
+    return fits
 
 
 def _sum_over(kept: Bools, squares: Floats, variance: Floats) -> Floats:

@@ -59,22 +59,63 @@ def smooth_misfit(radius_mm: Floats, value: Floats, variance: Floats) -> tuple[F
     True
     """
     order = np.argsort(radius_mm)
-    penalty = np.empty((order.size, order.size))
-    penalty[np.ix_(order, order)] = _penalty(np.sqrt(radius_mm[order]))
+    bend, mass = _bends(np.sqrt(radius_mm[order]))
     weight = np.full(variance.shape, WEAKEST)
     np.divide(1.0, variance, out=weight, where=variance < 1.0 / WEAKEST)
-    weighed = np.where(weight > WEAKEST, weight * value, 0.0)
-    best = np.full(len(value), -np.inf)
-    strength = np.full(len(value), STRENGTHS[0])
-    for each in STRENGTHS:
-        whole = _whole(weight, penalty, np.full(len(value), each))
-        curve = np.linalg.solve(whole, weighed[..., None])[..., 0]
-        likely = (weighed * curve).sum(axis=1) - np.linalg.slogdet(whole)[1]
-        likely -= (order.size - 2) * np.log(each) + (np.log(each / USUAL) / SPREAD) ** 2
-        strength = np.where(likely > best, each, strength)
-        best = np.maximum(likely, best)
+    told = np.where(weight > WEAKEST, value, 0.0)
+    strength = STRENGTHS[log_posterior(bend, mass, told[:, order], weight[:, order]).argmax(axis=1)]
+    penalty = np.empty((order.size, order.size))
+    penalty[np.ix_(order, order)] = bend @ np.linalg.solve(mass, bend.T)
     covariance = np.linalg.inv(_whole(weight, penalty, strength))
-    return np.asarray((covariance @ weighed[..., None])[..., 0]), np.asarray(covariance)
+    return np.asarray((covariance @ (weight * told)[..., None])[..., 0]), np.asarray(covariance)
+
+
+def log_posterior(bend: Floats, mass: Floats, value: Floats, weight: Floats) -> Floats:
+    """Return twice the logarithm of how likely each of `STRENGTHS` is, up to a constant.
+
+    With Q and R of the penalty Q R^-1 Q' and W the weights, what is left after level and slope is
+    Q' y, of covariance s R + Q' W^-1 Q: five diagonals, so that all strengths take as many steps as
+    there are fibres.
+
+    Parameters
+    ----------
+    bend, mass
+        Q, (F, F - 2), and R, (F - 2, F - 2); of fibres in the order of their places.
+    value, weight
+        Readings, and one over their variances, > 0, (N, F).
+
+    Returns
+    -------
+    ndarray, shape (N, S)
+    """
+    left = (value @ bend).T[..., None]
+    # of s R + Q' W^-1 Q the diagonal and the two below it, each (F - 2, N, S)
+    whole = [_below(bend, mass, 1.0 / weight, k) for k in range(3)]
+    # Green and Silverman 1994, section 2.6.2: it is L D L', L with ones and two diagonals below
+    pivot, lower, lowest, rest = (np.zeros_like(whole[0]) for _ in range(4))
+    for k in range(mass.shape[0]):
+        pivot[k], rest[k] = whole[0][k], left[k]
+        if k > 0:
+            pivot[k] -= lower[k - 1] ** 2 * pivot[k - 1]
+            rest[k] -= lower[k - 1] * rest[k - 1]
+            whole[1][k] -= lowest[k - 1] * lower[k - 1] * pivot[k - 1]
+        if k > 1:
+            pivot[k] -= lowest[k - 2] ** 2 * pivot[k - 2]
+            rest[k] -= lowest[k - 2] * rest[k - 2]
+        lower[k] = whole[1][k] / pivot[k]
+        lowest[k] = whole[2][k] / pivot[k]
+    usual = (np.log(STRENGTHS / USUAL) / SPREAD) ** 2
+    return np.asarray(-(rest**2 / pivot + np.log(pivot)).sum(axis=0) - usual)
+
+
+def _below(bend: Floats, mass: Floats, variance: Floats, by: int) -> Floats:
+    """Return a diagonal of s R + Q' V Q for each of `STRENGTHS`, (F - 2, N, S); 0 past its end."""
+    inner = np.arange(mass.shape[0] - by)
+    pairs = bend[:, inner] * bend[:, inner + by]
+    out = np.zeros((mass.shape[0], len(variance), STRENGTHS.size))
+    out[: inner.size] = (variance @ pairs).T[..., None]
+    out[: inner.size] += (mass[inner, inner + by])[:, None, None] * STRENGTHS
+    return out
 
 
 def _whole(weight: Floats, penalty: Floats, strength: Floats) -> Floats:
@@ -85,8 +126,12 @@ def _whole(weight: Floats, penalty: Floats, strength: Floats) -> Floats:
     return np.asarray(whole)
 
 
-def _penalty(place: Floats) -> Floats:
-    """Return the integral of the squared second derivative of natural cubic splines, (F, F)."""
+def _bends(place: Floats) -> tuple[Floats, Floats]:
+    """Return Q, (F, F - 2), and R, (F - 2, F - 2).
+
+    The integral of the squared second derivative of the natural cubic spline through y is
+    y' Q R^-1 Q' y.
+    """
     step = np.diff(place)
     inner = np.arange(place.size - 2)
     bend = np.zeros((place.size, place.size - 2))
@@ -95,4 +140,4 @@ def _penalty(place: Floats) -> Floats:
     bend[inner + 2, inner] = 1.0 / step[1:]
     mass = np.diag((step[:-1] + step[1:]) / 3.0)
     mass[inner[:-1], inner[1:]] = mass[inner[1:], inner[:-1]] = step[1:-1] / 6.0
-    return np.asarray(bend @ np.linalg.solve(mass, bend.T))
+    return bend, mass

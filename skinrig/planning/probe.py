@@ -65,7 +65,7 @@ def choose(
     look = sight(rig, subject, seed=seed)
     own = probe_plan(rig)
     if not wants:
-        return _choice(rig, look, own, setting_of(own), wants)
+        return _choice(rig, look, own, setting_of(own), predict(look, setting_of(own)), wants)
     target = wants.get("sigma_tr", math.inf) / 100.0
     memory: Memory = {}
     whole = predict(look, setting_of(own), memory=memory)
@@ -95,7 +95,7 @@ def choose(
     setting, plan, found = tried[-1]
     reasons: tuple[str, ...] = ()
     if good(found):
-        setting, plan = without_sites(look, setting, plan, good)
+        setting, plan = without_sites(look, setting, plan, good, memory=memory)
     else:
         reasons = (_why(look, whole, target),)
         least = valid_share * whole.valid_share
@@ -103,7 +103,8 @@ def choose(
         setting, plan, _ = next(
             one for one in tried if one[2].median <= 1.05 * best and one[2].valid_share >= least
         )
-    return _choice(rig, look, plan, setting, wants, path=path, reasons=reasons)
+    found = predict(look, setting, memory=memory)
+    return _choice(rig, look, plan, setting, found, wants, path=path, reasons=reasons)
 
 
 def foresee(
@@ -112,7 +113,7 @@ def foresee(
     """Return what a plan of the probe will give at its sites."""
     setting = setting_of(plan)
     look = sight(rig, subject, seed=seed, sites=setting.sites)
-    return _choice(rig, look, plan, setting, wants)
+    return _choice(rig, look, plan, setting, predict(look, setting), wants)
 
 
 def confirm(
@@ -175,8 +176,9 @@ def candidates(rig: Rig, look: Sight) -> Iterator[tuple[Setting, Plan]]:
 
 
 def without_sites(
-    look: Sight, setting: Setting, plan: Plan, good: Callable[[Prediction], bool]
-) -> tuple[Setting, Plan]:
+    look: Sight, setting: Setting, plan: Plan, good: Callable[[Prediction], bool], *,
+    memory: Memory | None = None,
+) -> tuple[Setting, Plan]:  # fmt: skip
     """Take off sites that the others, and people in general, tell of as well as is wanted.
 
     Parameters
@@ -187,11 +189,13 @@ def without_sites(
         That reach what is wanted.
     good
         Whether errors keep to what is wanted.
+    memory
+        See `predict`.
     """
     while len(setting.sites) > 1:
         for site in setting.sites:
             rest = tuple(other for other in setting.sites if other != site)
-            if good(predict(look, replace(setting, sites=rest))):
+            if good(predict(look, replace(setting, sites=rest), memory=memory)):
                 kept = tuple(s for s in plan.steps if s.index.get("site") != site)
                 setting, plan = replace(setting, sites=rest), replace(plan, steps=kept)
                 break
@@ -226,10 +230,10 @@ def setting_of(plan: Plan) -> Setting:
 
 
 def _choice(
-    rig: Rig, look: Sight, plan: Plan, setting: Setting, wants: Mapping[str, float], *,
-    path: tuple[Mapping[str, float], ...] = (), reasons: tuple[str, ...] = (),
+    rig: Rig, look: Sight, plan: Plan, setting: Setting, found: Prediction,
+    wants: Mapping[str, float], *, path: tuple[Mapping[str, float], ...] = (),
+    reasons: tuple[str, ...] = (),
 ) -> Choice:  # fmt: skip
-    found = predict(look, setting)
     full = probe_plan(rig, repeats=setting.repeats)
     value = 100.0 * found.median
     low, high = found.interval()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
 
+from reconstruction import smooth_misfit as module
 from reconstruction.smooth_misfit import SPREAD, STRENGTHS, USUAL, smooth_misfit
 
 RADIUS = 0.3 + 0.25 * np.arange(28)
@@ -42,6 +43,33 @@ def test_curve_and_errors_are_those_of_kriging_at_the_likeliest_strength(noise):
     np.testing.assert_allclose(covariance[0], each[best][2], atol=1e-3 * noise**2)
     spline = make_smoothing_spline(PLACE, value, w=spread**-2.0, lam=1.0 / STRENGTHS[best])
     np.testing.assert_allclose(curve[0], spline(PLACE), atol=1e-4 * noise)
+
+
+@pytest.mark.parametrize("unread", [0.0, 0.3, 0.9])
+def test_strengths_are_as_likely_as_the_whole_matrix_says(unread):
+    """Five diagonals against determinant and solution of the full matrix, up to a constant.
+
+    Readings of next to no weight have a hundredth here, not `WEAKEST`: the full matrix would lose
+    ten digits to it. Tolerance: rounding of the full matrix, conditions to 1e9.
+    """
+    rng = np.random.default_rng(5)
+    bend, mass = module._bends(PLACE)
+    value = CURVE + 0.03 * rng.standard_normal((6, 28))
+    gone = rng.random((6, 28)) < unread
+    weight = np.where(gone, 0.01, 0.03**-2.0 * np.exp(-0.4 * RADIUS))
+    value = np.where(gone, 0.0, value)
+    whole = bend @ np.linalg.solve(mass, bend.T) / STRENGTHS[:, None, None]
+    whole = whole + (weight[:, None, :, None] * np.eye(28))
+    told = (weight * value)[:, None]
+    curve = np.linalg.solve(whole, np.broadcast_to(told, whole.shape[:-1])[..., None])[..., 0]
+    square = (told * curve).sum(axis=-1)
+    expected = square - np.linalg.slogdet(whole)[1]
+    expected -= 26 * np.log(STRENGTHS) + (np.log(STRENGTHS / USUAL) / SPREAD) ** 2
+    found = module.log_posterior(bend, mass, value, weight)
+    assert np.ptp(found, axis=1).min() > 3.0  # some are unlikely
+    np.testing.assert_allclose(
+        found - found[:, :1], expected - expected[:, :1], atol=1e-5, rtol=1e-7
+    )
 
 
 def test_fibres_that_read_nothing_go_straight_on_with_growing_errors():
