@@ -1,7 +1,10 @@
-"""A ledger of pops: what the host believes against what the flash box did."""
+"""A ledger of pops: what the host believes against what the flash box did; hosts to be struck."""
 
 import itertools
+import subprocess
+import sys
 from collections import Counter
+from contextlib import ExitStack
 
 import pytest
 
@@ -15,6 +18,8 @@ from capture.devices.port import (
     PortTimeout,
 )
 from capture.devices.wire import Code
+from rigsim.boxes.controller import Controller
+from rigsim.serve import serve
 
 # pops of a low power: the tube recovers in 12 ms, so that a second pop would not be refused
 POWER = 0.008
@@ -100,3 +105,56 @@ def ledger():
     for one in made:
         if one.box is not None:
             one.box.port.close()
+
+
+def end(host):
+    host.kill()
+    host.wait()
+    host.stdout.close()
+
+
+@pytest.fixture
+def host_at_work():
+    """Start a process that keeps served boxes at work; it is gone when the test ends.
+
+    ``host_at_work(script, rig, boxes, *arguments, pty=, word=, at_work=)`` runs the script with the
+    boxes' addresses and the arguments, and returns the served rig and the process when it has said
+    ``word`` twice and ``at_work(world)`` holds. A busy machine may hold a host up for longer than
+    its lease before anybody strikes it, which says nothing of a blow: then another is started, on
+    boxes of its own.
+    """
+    with ExitStack() as started:
+
+        def host_at_work(script, rig, boxes, *arguments, pty, word, at_work):
+            for _ in range(8):
+                served = started.enter_context(serve(rig, pty=pty))
+                given = [served.addresses[name] for name in boxes] + [str(a) for a in arguments]
+                host = subprocess.Popen(
+                    [sys.executable, "-c", script, *given], stdout=subprocess.PIPE, text=True
+                )
+                started.callback(end, host)
+                said = [host.stdout.readline() for _ in range(2)]
+                if said == [f"{word}\n"] * 2 and at_work(served.world):
+                    return served, host
+            return pytest.fail("eight hosts in turn did not get to work")
+
+        yield host_at_work
+
+
+@pytest.fixture
+def last_heard(monkeypatch):
+    """Tell when a box was last given bytes, s on its world's clock: ``last_heard(box)``.
+
+    What a host sent before it was struck may be under way for as long as a busy machine likes;
+    from the last byte on, the box alone keeps the time.
+    """
+    heard = {}
+    honest = Controller.feed
+
+    def feed(box, data, now):
+        if data:
+            heard[id(box)] = now
+        return honest(box, data, now)
+
+    monkeypatch.setattr(Controller, "feed", feed)
+    return lambda box: heard[id(box)]

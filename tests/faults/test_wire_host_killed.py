@@ -15,8 +15,7 @@ from rigsim.serve import serve
 from skinrig.cli import main
 
 LEASE_S = 0.3
-# the operating system's scheduling on a busy machine; the box itself is exact to a millisecond
-MARGIN_S = 0.25
+EXACT_S = 0.001  # the box keeps its own time
 
 HOST = """
 import sys
@@ -60,7 +59,9 @@ def lamp_keeper():
 
 @pytest.mark.parametrize("transport", ["pty", "tcp"])
 @pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])
-def test_a_host_that_dies_leaves_the_box_dark_within_the_lease(lamp_keeper, transport, blow):
+def test_a_host_that_dies_leaves_the_box_dark_within_the_lease(
+    lamp_keeper, last_heard, transport, blow
+):
     with serve(load_rig("flash").resized(16), pty=transport == "pty") as served:
         host = lamp_keeper(served.addresses["flash"])
         world, box = served.world, served.world.box("flash")
@@ -69,14 +70,14 @@ def test_a_host_that_dies_leaves_the_box_dark_within_the_lease(lamp_keeper, tran
             served.wait(0.001)
         host.send_signal(blow)
         struck_s = world.now
-        while box.device.lit and world.now < struck_s + 5.0:
+        while box.device.lit:
+            assert world.now < struck_s + 60.0
             served.wait(0.01)
-        assert not box.device.lit
         assert not box.armed
         dark_s = box.device.lamp_times[-1][1]
         print(f"dark {1e3 * (dark_s - struck_s):.0f} ms after the host fell silent")
-        assert dark_s - struck_s <= LEASE_S + MARGIN_S
         assert box.tripped
+        assert dark_s - last_heard(box) <= LEASE_S + EXACT_S
 
 
 @pytest.mark.parametrize("transport", ["pty", "tcp"])
