@@ -86,15 +86,23 @@ def encode(normals: ArrayLike, *, limit: float | None = LIMIT) -> Floating:
         +X right, +Y up, +Z outward, of any positive length.
     limit : float, optional
         Derivatives are clamped to [-limit, limit]; None keeps them as they are. How many were
-        clamped says :func:`encoding_report`, which returns the same derivatives.
+        clamped says :func:`encoding_report`, which has masks, and 0 in place of NaN.
 
     Returns
     -------
     ndarray, shape (..., 2)
-        Dimensionless; float32 for float32 and float16 normals, float64 otherwise. 0 where a
-        normal is not finite, zero, or does not point outward: nothing represents it.
+        Dimensionless; float32 for float32 and float16 normals, float64 otherwise. NaN where a
+        normal is not finite, zero, or does not point outward: nothing represents it, and 0
+        would be a flat surface. :func:`decode` gives (0, 0, 0) there.
+
+    Examples
+    --------
+    >>> encode([[0.6, 0.0, 0.8], [0.0, 0.0, -1.0]]).round(9).tolist()
+    [[0.75, 0.0], [nan, nan]]
     """
-    return encoding_report(normals, limit=limit).derivatives
+    report = encoding_report(normals, limit=limit)
+    report.derivatives[~report.valid] = np.nan
+    return report.derivatives
 
 
 def encoding_report(normals: ArrayLike, *, limit: float | None = LIMIT) -> Encoding:
@@ -272,13 +280,14 @@ def combine(
 
     Parameters
     ----------
-    base : array_like, shape (H, W, 2)
-        Derivatives of the neutral face.
-    wrinkle : array_like, shape (h, w, 2)
-        Derivatives to add, at any resolution over the same square; read bilinearly, averaged
-        first where finer than the base.
+    base : array_like, shape (..., H, W, 2) or (..., H, W, 3)
+        Derivatives of the neutral face, or its normals, which are encoded without a limit.
+    wrinkle : array_like, shape (..., h, w, 2) or (..., h, w, 3)
+        Derivatives to add, or normals of which they are, at any resolution over the same square;
+        read bilinearly, averaged first where finer than the base. Leading axes broadcast with
+        those of the base.
     masks : array_like, shape (8, h, w), or two RGBA textures (h, w, 4)
-        In the order of `ZONES`, at any resolution.
+        In the order of `ZONES`, at any resolution; the same for all leading axes.
     weights : mapping of str to float, or array_like, shape (8,)
         Any number of blend shapes by name, or the zones' sums.
     clamp : {"unit", "signed"}
@@ -288,9 +297,14 @@ def combine(
 
     Returns
     -------
-    ndarray, shape (H, W, 3)
+    ndarray, shape (..., H, W, 3)
         Unit tangent-space normals of the base's type; (0, 0, 0) where the base is not finite
-        (or beyond 1e18, whose square float32 does not hold).
+        (or beyond 1e18, whose square float32 does not hold) or a normal of it points inward.
+
+    Raises
+    ------
+    WrinkleError
+        For shapes that fit nothing, and for wrinkles or masks that are not finite.
 
     Examples
     --------
@@ -300,7 +314,23 @@ def combine(
     >>> encode(n)[0, 0].round(9).tolist()
     [0.1, 0.1]
     """
-    return combine_layers(base, [Layer(wrinkle, masks, table)], weights, clamp=clamp)  # type: ignore[arg-type]
+    below, above = _derivatives("base", base), _derivatives("wrinkle", wrinkle)
+    try:
+        lead = np.broadcast_shapes(below.shape[:-3], above.shape[:-3])
+    except ValueError:
+        raise WrinkleError(
+            f"base, wrinkle: got leading axes {below.shape[:-3]} and {above.shape[:-3]}, "
+            f"expected ones that broadcast"
+        ) from None
+    if not lead:
+        return combine_layers(below, [Layer(above, masks, table)], weights, clamp=clamp)
+    below = np.broadcast_to(below, (*lead, *below.shape[-3:]))
+    above = np.broadcast_to(above, (*lead, *above.shape[-3:]))
+    out = np.empty((*below.shape[:-1], 3), below.dtype)
+    for at in np.ndindex(lead):
+        layer = Layer(above[at], masks, table)
+        out[at] = combine_layers(below[at], [layer], weights, clamp=clamp)
+    return out
 
 
 def combine_layers(
@@ -315,6 +345,7 @@ def combine_layers(
     Parameters
     ----------
     base : array_like, shape (H, W, 2)
+        Derivatives.
     layers : sequence of Layer
         Any number, none included.
     weights : mapping of str to float, or array_like (Z,)
@@ -354,8 +385,11 @@ def zone_strength(masks: Floating, sums: Floating) -> Floating:
     Bilinear reading is linear, so that one map is read instead of as many as there are zones.
     """
     if sums.shape[0] != masks.shape[0]:
+        last = masks.shape[2] == sums.shape[0]
+        hint = "; zones come first: numpy.moveaxis(masks, -1, 0)" if last else ""
         raise WrinkleError(
-            f"weights: got {sums.shape[0]} zones, expected the {masks.shape[0]} of the masks"
+            f"masks: got shape {masks.shape}, expected ({sums.shape[0]}, h, w), one for each of "
+            f"the {sums.shape[0]} zones' weights{hint}"
         )
     return np.tensordot(sums, masks.astype(np.float64, copy=False), axes=1)
 
@@ -381,13 +415,25 @@ def widened(planes: Floating, shape: tuple[int, int], dtype: Any) -> tuple[Any, 
     return (*np.ascontiguousarray(wide, dtype), first, part.astype(dtype))
 
 
+def _derivatives(name: str, values: ArrayLike) -> Floating:
+    """Return maps of derivatives as they are, and those of normals encoded."""
+    d = _real(values)
+    if d.ndim < 3 or d.shape[-1] not in (2, 3) or 0 in d.shape[-3:]:
+        raise WrinkleError(
+            f"{name}: got shape {d.shape}, expected (..., H, W, 2) or normals (..., H, W, 3)"
+        )
+    return encode(d, limit=None) if d.shape[-1] == 3 else d
+
+
 def _derivative_map(name: str, values: ArrayLike, *, finite: bool) -> Floating:
     d = _real(values)
     if d.ndim != 3 or d.shape[2] != 2 or 0 in d.shape:
         hint = "; encode normals first" if d.ndim == 3 and d.shape[2] == 3 else ""
         raise WrinkleError(f"{name}: got shape {d.shape}, expected (H, W, 2){hint}")
     if finite and not np.isfinite(d).all():
-        raise WrinkleError(f"{name}: got NaN or infinity, expected finite derivatives")
+        raise WrinkleError(
+            f"{name}: got NaN or infinity, expected finite derivatives, or normals with n_z > 0"
+        )
     return np.ascontiguousarray(d)
 
 

@@ -104,8 +104,12 @@ def test_derivatives_whose_squares_overflow_still_decode(dtype):
 
 
 @pytest.mark.parametrize("limit", [1.0, None])
-def test_normals_that_nothing_represents_are_masked_and_never_nan(limit):
+def test_normals_that_nothing_represents_are_masked_and_never_flat(limit):
     lost = [[0, 0, 0], [0.6, 0, -0.8], [1, 0, 0], [np.nan, 0, 1], [0, np.inf, 1], [0, 0, -1]]
+    bare = wrinkles.encode(np.array([*lost, [0.0, 0.6, 0.8]]), limit=limit)
+    assert np.isnan(bare[:6]).all()
+    np.testing.assert_allclose(bare[6], [0.0, 0.75])
+    assert not wrinkles.decode(bare[:6]).any()
     report = wrinkles.encoding_report(np.array([*lost, [0.0, 0.6, 0.8]]), limit=limit)
     np.testing.assert_array_equal(report.valid, [False] * 6 + [True])
     assert not report.derivatives[:6].any()
@@ -305,12 +309,16 @@ def test_a_hole_in_the_base_is_a_zero_normal_and_its_neighbours_are_whole(rng):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"base": np.zeros((4, 4, 3))}, "encode normals first"),
+        ({"base": np.zeros((4, 4, 4))}, r"base: got shape \(4, 4, 4\), expected \(..., H, W, 2\)"),
+        ({"base": np.zeros((4, 2))}, "base: got shape"),
+        ({"base": np.zeros((3, 4, 4, 2)), "wrinkle": np.zeros((2, 2, 2, 2))}, "leading axes"),
+        ({"wrinkle": -np.ones((2, 2, 3))}, "wrinkle: got NaN.*n_z > 0"),
         ({"wrinkle": np.full((2, 2, 2), np.nan)}, "wrinkle: got NaN"),
         ({"masks": np.full((8, 2, 2), np.nan)}, "masks: got NaN"),
-        ({"masks": np.ones((7, 2, 2))}, "got 8 zones, expected the 7"),
+        ({"masks": np.ones((7, 2, 2))}, r"masks: got shape \(7, 2, 2\), expected \(8, h, w\)"),
+        ({"masks": np.ones((9, 7, 8))}, r"\(9, 7, 8\), expected \(8, h, w\).*zones come first"),
         ({"masks": np.ones((2, 2))}, "masks: got shape"),
-        ({"weights": np.ones(7)}, "got 7 zones"),
+        ({"weights": np.ones(7)}, "of the 7 zones"),
         ({"weights": np.ones((8, 2))}, "a finite number a zone"),
         ({"clamp": "tight"}, "clamp: got 'tight'"),
     ],
@@ -322,6 +330,34 @@ def test_what_does_not_fit_is_refused(change, says):
     }  # fmt: skip
     with pytest.raises(WrinkleError, match=says):
         wrinkles.combine(**(given | change))
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_normals_are_combined_as_the_derivatives_that_they_hold(rng, kind):
+    base, fold = tilted(rng, (6, 5)).astype(kind), tilted(rng, (4, 4)).astype(kind)
+    base[1, 2] = (0.0, 0.0, -1.0)
+    masks, weights = rng.random((8, 3, 3)), {"joy": 0.4, "anger": 0.9}
+    wanted = wrinkles.combine(
+        wrinkles.encode(base, limit=None), wrinkles.encode(fold, limit=None), masks, weights
+    )
+    found = wrinkles.combine(base, fold, masks, weights)
+    assert found.dtype == kind
+    np.testing.assert_array_equal(found, wanted)
+    lengths = np.linalg.norm(found, axis=-1)
+    assert lengths[1, 2] == 0.0
+    lengths[1, 2] = 1.0
+    np.testing.assert_allclose(lengths, 1.0, rtol=1e-6)
+
+
+def test_leading_axes_of_base_and_wrinkle_broadcast(rng):
+    base, fold = rng.uniform(-0.5, 0.5, (2, 1, 6, 5, 2)), rng.uniform(-0.5, 0.5, (3, 4, 4, 2))
+    masks, weights = rng.random((8, 3, 3)), {"joy": 0.4, "anger": 0.9}
+    found = wrinkles.combine(base, fold, masks, weights)
+    assert found.shape == (2, 3, 6, 5, 3)
+    for i, j in np.ndindex(2, 3):
+        one = wrinkles.combine(base[i, 0], fold[j], masks, weights)
+        np.testing.assert_array_equal(found[i, j], one)
+    assert wrinkles.combine(base[:0], fold, masks, weights).shape == (0, 3, 6, 5, 3)
 
 
 def test_averaging_and_reading_keep_the_mean_of_a_texture(rng):
