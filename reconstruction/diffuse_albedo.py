@@ -13,7 +13,7 @@ Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 6.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,10 +38,10 @@ class DiffuseAlbedo:
 
     Attributes
     ----------
-    r_d : ndarray of float64, shape (..., C)
+    r_d : ndarray of float64, shape (..., C), or (...) of samples without channels
         R_d of each channel, absolute. Not clamped: a black surface gives small values of either
         sign, an overexposed calibration values above 1. NaN where not `valid`.
-    stderr : ndarray of float64, shape (..., C)
+    stderr : ndarray of float64, shape of `r_d`
         Standard error of `r_d`; NaN where not `valid`, and where it cannot be known (a minimum; up
         to 3 samples of unknown variance).
     valid : ndarray of bool, shape (...)
@@ -100,11 +100,12 @@ def estimate(
     ----------
     brdf_samples
         f_r = L / (E cos), 1/sr, (..., M, C), of a white-balanced camera: a white surface has 1/pi
-        in all channels, and highlights the same value in all.
+        in all channels, and highlights the same value in all. Or (..., M), of one channel; the
+        normals' shape tells which.
     light_dirs, view_dirs
         Unit vectors (..., M, 3) or broadcast, away from the surface.
     normals
-        Unit normals (..., 3), outward.
+        Unit normals (..., 3), outward; those of samples with channels may be broadcast.
     eta
         Relative refractive index (the paper: about 1.3).
     variance
@@ -121,6 +122,7 @@ def estimate(
     Returns
     -------
     DiffuseAlbedo
+        Without the channels' axis where the samples have none.
 
     Raises
     ------
@@ -130,14 +132,26 @@ def estimate(
     Notes
     -----
     Samples with light or view below 0.05 (cosine) are not used.
+
+    Examples
+    --------
+    >>> up, f = np.array([0.0, 0.0, 1.0]), np.full(8, 0.2)
+    >>> found = estimate(f, up, up, up, eta=1.0)
+    >>> found.r_d.shape, round(float(found.r_d), 4)
+    ((), 0.6283)
     """
-    f = np.ascontiguousarray(brdf_samples, dtype=np.float32)
+    f = np.asarray(brdf_samples, dtype=np.float32)
+    n = np.asarray(normals, dtype=np.float32)
+    gray = f.ndim > 0 and n.shape == (*f.shape[:-1], 3)
+    f = f[..., None] if gray else f
     if f.ndim < 2:
-        raise ValueError(f"brdf_samples: got shape {f.shape}, expected (..., M, C)")
+        raise ValueError(
+            f"brdf_samples: got shape {f.shape}, expected (..., M, C), or (..., M) with "
+            f"normals (..., 3)"
+        )
     lead, (samples, channels) = f.shape[:-2], f.shape[-2:]
-    n = np.ascontiguousarray(normals, dtype=np.float32)
-    if n.shape != (*lead, 3):
-        raise ValueError(f"normals: got shape {n.shape}, expected {(*lead, 3)}")
+    n = np.ascontiguousarray(_spread("normals", n, (*lead, 3)))
+    f = np.ascontiguousarray(f)
     if discard is not None and discard < 0:
         raise ValueError(f"discard: got {discard}, expected at least 0 or None")
     if method not in ("envelope", "stable_minimum", "minimum"):
@@ -145,21 +159,23 @@ def estimate(
     f = f.reshape(-1, samples, channels)
     n = n.reshape(-1, 3)
     light, view = (
-        np.ascontiguousarray(
-            np.broadcast_to(np.asarray(v, dtype=np.float32), (*lead, samples, 3))
-        ).reshape(-1, samples, 3)
-        for v in (light_dirs, view_dirs)
+        np.ascontiguousarray(_spread(name, np.asarray(v, np.float32), (*lead, samples, 3))).reshape(
+            -1, samples, 3
+        )
+        for name, v in (("light_dirs", light_dirs), ("view_dirs", view_dirs))
     )
     usable: NDArray[np.bool_] = np.asarray(np.isfinite(f))
     if valid is not None:
         given = np.asarray(valid, dtype=bool)
         given = given[..., None] if given.ndim == len(lead) + 1 else given
-        usable &= np.broadcast_to(given, (*lead, samples, channels)).reshape(f.shape)
+        usable &= _spread("valid", given, (*lead, samples, channels)).reshape(f.shape)
     usable &= np.asarray(np.isfinite(n).all(axis=-1))[:, None, None]
     if variance is None:
         var = np.ones_like(f)
     else:
-        var = np.broadcast_to(np.asarray(variance, np.float32), (*lead, samples, channels))
+        told = np.asarray(variance, np.float32)
+        told = told[..., None] if gray and told.ndim else told
+        var = _spread("variance", told, (*lead, samples, channels))
         var = np.ascontiguousarray(var).reshape(f.shape)
         usable &= (var > 0.0) & np.isfinite(var)
     ratio, cos_l, cos_v = _ratios(f, light, view, n, usable, eta)
@@ -181,9 +197,10 @@ def estimate(
         stderr = np.full(r_d.shape, np.nan)
     found: NDArray[np.bool_] = np.asarray(np.isfinite(r_d).all(axis=-1))
     r_d = np.where(found[:, None], r_d, np.nan)
+    shape = lead if gray else (*lead, channels)
     return DiffuseAlbedo(
-        r_d.reshape(*lead, channels),
-        np.where(found[:, None], stderr, np.nan).reshape(*lead, channels),
+        r_d.reshape(shape),
+        np.where(found[:, None], stderr, np.nan).reshape(shape),
         found.reshape(lead),
         np.asarray(dropped, dtype=np.int64).reshape(lead),
     )
@@ -209,6 +226,14 @@ def reduced_albedo(albedo: DiffuseAlbedo, *, eta: float) -> ReducedAlbedo:
     stderr = dipole.albedo_slope(deficit, eta) * albedo.stderr
     alpha, deficit, stderr = (np.where(usable, v, np.nan) for v in (alpha, deficit, stderr))
     return ReducedAlbedo(alpha, deficit, stderr, usable, outlier)
+
+
+def _spread(name: str, values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return an array broadcast to a shape, or refuse it by its name."""
+    try:
+        return np.broadcast_to(values, shape)
+    except ValueError:
+        raise ValueError(f"{name}: got shape {values.shape}, expected {shape}") from None
 
 
 def _ratios(

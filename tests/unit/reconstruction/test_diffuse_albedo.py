@@ -180,8 +180,49 @@ def test_leading_axes_broadcast_and_inputs_stay():
     )  # fmt: skip
     np.testing.assert_array_equal(folded.r_d.reshape(6, 3), flat.r_d)
     np.testing.assert_array_equal(p.f, before)
-    with pytest.raises(ValueError, match="normals"):
-        estimate(p.f, p.light, p.view, p.normals[0], eta=1.3)
+    one = estimate(p.f, p.light, p.view, p.normals[0], eta=1.3)
+    same = np.broadcast_to(p.normals[0], p.normals.shape)
+    np.testing.assert_array_equal(one.r_d, estimate(p.f, p.light, p.view, same, eta=1.3).r_d)
+
+
+@pytest.mark.parametrize("method", ["envelope", "stable_minimum"])
+def test_samples_of_one_channel_need_no_axis_for_it(method):
+    p = scene("light", points=6, samples=50)
+    told = {"variance": p.variance[..., 1], "valid": p.valid}
+    wanted = estimate(
+        p.f[..., 1:2], p.light, p.view, p.normals, eta=1.3, method=method,
+        variance=p.variance[..., 1:2], valid=p.valid,
+    )  # fmt: skip
+    gray = estimate(p.f[..., 1], p.light, p.view, p.normals, eta=1.3, method=method, **told)
+    np.testing.assert_array_equal(gray.r_d, wanted.r_d[:, 0])
+    np.testing.assert_array_equal(gray.stderr, wanted.stderr[:, 0])
+    np.testing.assert_array_equal(gray.valid, wanted.valid)
+    point = estimate(
+        p.f[4, :, 1], p.light[4], p.view[4], p.normals[4], eta=1.3, method=method,
+        variance=p.variance[4, :, 1], valid=p.valid[4],
+    )  # fmt: skip
+    assert point.r_d.shape == point.stderr.shape == point.valid.shape == ()
+    assert point.r_d == gray.r_d[4]
+    assert np.isfinite(reduced_albedo(point, eta=1.3).albedo_prime)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"normals": np.ones((2, 3))}, r"normals: got shape \(2, 3\), expected \(6, 3\)"),
+        ({"brdf_samples": np.ones(5)}, r"brdf_samples: got shape \(5,\), expected \(..., M, C\)"),
+        ({"light_dirs": np.ones((7, 3))}, r"light_dirs: got shape \(7, 3\), expected \(6, 50, 3\)"),
+        ({"variance": np.ones((7, 3))}, r"variance: got shape \(7, 3\)"),
+        ({"valid": np.ones((6, 49), bool)}, r"valid: got shape"),
+    ],
+)
+def test_shapes_that_fit_nothing_are_named(change, says):
+    p = scene("light", points=6, samples=50)
+    given = {
+        "brdf_samples": p.f, "light_dirs": p.light, "view_dirs": p.view, "normals": p.normals,
+    }  # fmt: skip
+    with pytest.raises(ValueError, match=says):
+        estimate(**(given | change), eta=1.3)
 
 
 def test_the_reduced_albedo_carries_errors_and_flags_outliers():
