@@ -33,6 +33,9 @@ _SMALL: Final = 1 << 17  # pixels
 """Tiles that a thread takes at a time, so that one on a busy core holds up no other."""
 _FAST: Final = {"nsz", "arcp", "contract", "reassoc"}
 
+_EXACT: Final = 2.0**53
+"""Whole numbers below it are exact in float64."""
+
 _LEVELS: Final = 256
 _GROUPS: Final = 8
 
@@ -161,7 +164,7 @@ def recover_response(
 
 
 def merge(
-    frames: Sequence[NDArray[np.integer]] | NDArray[np.integer],
+    frames: Sequence[NDArray[np.integer | np.floating]] | NDArray[np.integer | np.floating],
     exposures_s: ArrayLike,
     *,
     gain: float,
@@ -173,10 +176,11 @@ def merge(
 
     Parameters
     ----------
-    frames : sequence of N arrays of integers, shape (H, W) or (H, W, C)
-        Raw DN of one camera, nothing subtracted; the scene and the light do not change.
+    frames : sequence of N arrays of whole numbers, shape (..., H, W) or (..., H, W, C)
+        Raw DN of one camera, nothing subtracted; the scene and the light do not change. Of any
+        type, floating ones included, as long as every value is whole.
     exposures_s : array_like, shape (N,)
-        Exposure times, s.
+        Exposure times, s; one time as often as there are frames of it.
     gain : float
         Electrons per DN.
     read_noise : float
@@ -187,7 +191,8 @@ def merge(
     Returns
     -------
     radiance : ndarray of float32, shape (H, W[, C])
-        DN above black per second; negative values are kept; NaN where not valid.
+        DN above black per second, of the frames' shape; negative values are kept; NaN
+        where not valid.
     variance : ndarray of float32, shape (H, W[, C])
         Of `radiance`; NaN where not valid.
     valid : ndarray of bool, shape (H, W[, C])
@@ -196,10 +201,15 @@ def merge(
     Raises
     ------
     BracketError
-        Where shapes, times or levels do not fit.
+        Where shapes, times or levels do not fit, or a value is not whole.
 
     Notes
     -----
+    Frames that were averaged have less noise than one frame, and may hide pixels that were
+    saturated in some of them; of those with a dark frame subtracted, neither the saturation nor
+    the noise is known any more. Both are refused, since their variance would be wrong: give the
+    single frames, each with its time (the merge averages them), and the dark level as `black`.
+
     The estimate of largest likelihood for shot and read noise: each frame weighs by
     ``t^2 / (radiance t / gain + (read_noise / gain)^2 + 1/12)``, the radiance in it being the
     estimate itself, not the noisy value of the frame, which would favor low readings
@@ -217,6 +227,7 @@ def merge(
     stack = [np.asarray(frame) for frame in frames]
     times = np.asarray(exposures_s, np.float64)
     _check(stack, times, gain=gain, read_noise=read_noise, black=black, white=white)
+    stack = [frame if np.issubdtype(frame.dtype, np.integer) else _whole(frame) for frame in stack]
     if any(frame.dtype != np.uint16 for frame in stack):
         return merge_reference(
             stack, times, gain=gain, read_noise=read_noise, black=black, white=white
@@ -304,6 +315,16 @@ def _starters(times: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.array(chosen, np.int64)
 
 
+def _floating(frame: NDArray[Any]) -> bool:
+    return bool(np.issubdtype(frame.dtype, np.floating))
+
+
+def _whole(frame: NDArray[Any]) -> NDArray[np.integer]:
+    """Return whole numbers of a floating type as uint16 where that holds them, else as int64."""
+    held = not frame.size or (float(frame.min()) >= 0 and float(frame.max()) <= 65535)
+    return frame.astype(np.uint16 if held else np.int64)
+
+
 def _check(
     stack: Sequence[NDArray[np.integer]],
     times: NDArray[np.float64],
@@ -317,8 +338,20 @@ def _check(
     checks.that("frames", len(stack), len(stack) > 0, "at least one frame")
     shapes = sorted({frame.shape for frame in stack})
     checks.that("frames", shapes, len(shapes) <= 1, "frames of one shape")
-    whole = all(np.issubdtype(frame.dtype, np.integer) for frame in stack)
-    checks.that("frames", [str(f.dtype) for f in stack][:3], whole, "raw DN, whole numbers")
+    numbers = all(np.issubdtype(f.dtype, np.integer) or _floating(f) for f in stack)
+    checks.that("frames", [str(f.dtype) for f in stack][:3], numbers, "raw DN, whole numbers")
+    for k, frame in enumerate(stack):
+        if not _floating(frame):
+            continue
+        values = frame.astype(np.float64, copy=False)
+        part = (values == np.rint(values)) & (np.abs(values) < _EXACT)  # NaN is not whole
+        if not part.all():
+            checks.that(
+                f"frames[{k}]", float(values[~part].flat[0]), False,
+                "raw DN, whole numbers; in place of averaged frames give the single ones, each "
+                "with its time, and in place of subtracting a dark frame its level as black",
+            )  # fmt: skip
+            break
     one_each = times.shape == (len(stack),)
     checks.that("exposures_s", times.shape, one_each, f"{len(stack)} times")
     positive = bool(np.isfinite(times).all() and (times > 0).all())

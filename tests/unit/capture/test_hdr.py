@@ -71,7 +71,10 @@ def test_values_below_black_stay_negative_and_inputs_unchanged():
         ([], (), {}, "at least one"),
         ([np.zeros((2, 2), int)], (1.0, 2.0), {}, "1 times"),
         ([np.zeros((2, 2), int), np.zeros((2, 3), int)], (1.0, 2.0), {}, "one shape"),
-        ([np.zeros((2, 2))], (1.0,), {}, "whole numbers"),
+        ([np.zeros((2, 2), bool)], (1.0,), {}, "whole numbers"),
+        ([np.full((2, 2), 800.5)], (1.0,), {}, r"frames\[0\]: got 800.5.*the single ones"),
+        ([np.zeros((2, 2)), np.full((2, 2), np.nan)], (1.0, 2.0), {}, r"frames\[1\]: got nan"),
+        ([np.full((2, 2), np.inf, np.float32)], (1.0,), {}, r"frames\[0\]: got inf"),
         ([np.zeros((2, 2), int)], (0.0,), {}, "seconds > 0"),
         ([np.zeros((2, 2), int)], (1.0,), {"gain": 0.0}, "gain"),
         ([np.zeros((2, 2), int)], (1.0,), {"white": 100}, "white"),
@@ -111,6 +114,32 @@ def test_frames_that_are_views_or_other_integers_give_the_same(rng):
     first, second, third = (merge(f, TIMES, **SENSOR) for f in (cut, whole, longer))
     np.testing.assert_array_equal(first[0], second[0])
     np.testing.assert_allclose(first[0], third[0], rtol=1e-3)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
+def test_whole_numbers_of_a_floating_type_are_raw_frames_too(rng, kind):
+    frames = rng.integers(400, 2000, (2, 5, 6)).astype(np.uint16)
+    frames[:, 0, 0] = 2048  # exact in half precision, saturated below
+    sensor = {**SENSOR, "white": 2048}
+    wanted = merge(frames, (0.1, 1.0), **sensor)
+    for found in (
+        merge(frames.astype(kind), (0.1, 1.0), **sensor),
+        merge([frames[0], frames[1].astype(kind)], (0.1, 1.0), **sensor),
+    ):
+        for one, other in zip(found, wanted, strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert not wanted[2][0, 0]
+    below = merge(np.full((1, 2, 2), -3.0), (1.0,), **sensor)[0]
+    np.testing.assert_allclose(below, -3.0 - SENSOR["black"])
+
+
+def test_single_frames_of_one_time_merge_as_their_average_would(rng):
+    frames = rng.integers(900, 1100, (4, 50, 50)).astype(np.uint16)
+    radiance, variance, _ = merge(frames, [0.5] * 4, **SENSOR)
+    mean = frames.mean(axis=0) - SENSOR["black"]
+    np.testing.assert_allclose(radiance, mean / 0.5, rtol=1e-5)
+    _, alone, _ = merge(frames[:1], [0.5], **SENSOR)
+    assert np.median(variance / alone) == pytest.approx(0.25, rel=0.01)
 
 
 def test_the_variance_is_that_of_the_best_unbiased_estimate(scene):
