@@ -42,6 +42,9 @@ LONGEST_FIRST = (
     "tests/faults/test_caliper_stateful.py",
     "tests/faults/test_dome_stateful.py",
     "tests/faults/test_wire_stateful.py",
+    "tests/recovery/test_head_motion.py",
+    "tests/faults/test_power_cut.py",
+    "tests/unit/skinrig/exporting/test_consent_on_its_way.py",
     "tests/unit/rigsim/test_tissue_mc_skin_table.py",
     "tests/unit/reconstruction/test_kernel_fit.py",
 )

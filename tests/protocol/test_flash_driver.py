@@ -134,9 +134,12 @@ def test_refusals_are_queued_read_and_cleared(bench):
 
 def test_the_analyser_turns_and_settles(bench):
     box = bench.box()
-    box.set_polarizer("crossed")
-    turning = not box.settled()
-    box.port.listen(0.15)
+    for way in ("crossed", "parallel") * 8:  # on a real line a busy machine may ask when it is over
+        box.set_polarizer(way)
+        turning = not box.settled()
+        box.port.listen(0.15)
+        if turning:
+            break
     assert turning
     assert box.settled()
     assert not box.status().turning
