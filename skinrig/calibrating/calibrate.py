@@ -16,7 +16,7 @@ from capture.calibration import chart, color, colorimetry, polarization, sensor,
 from capture.calibration.phantom import read_certificate
 from capture.calibration.photon_transfer import FlatPair
 from capture.session import FrameRecord, Session
-from skinrig.calibrating import dome, gradient, probe
+from skinrig.calibrating import dome, gradient, probe, white_tile
 
 KINDS = (
     "sensor", "color", "polarization", "white", *dome.KINDS, probe.KIND
@@ -91,8 +91,9 @@ def calibrate(
         made = dome.calibrate_dome(kind, opened, out, made_on, targets=targets)
         calibration, summary, findings = made.calibration, made.summary, made.findings
     else:
-        calibration = _MAKERS[kind](_Frames(opened), made_on)
-        summary = tuple(_summary(calibration))
+        frames = _Frames(opened)
+        calibration = _MAKERS[kind](frames, made_on)
+        summary, findings = tuple(_summary(calibration)), tuple(frames.findings)
     drift: tuple[store.Drift, ...] = ()
     try:
         drift = store.drift(store.load(out, kind), calibration)
@@ -120,6 +121,7 @@ class _Frames:
         self.serial = serials.pop()
         self.source = sessions[0].source
         self.inputs = {session.id: session.content_hash for session in sessions}
+        self.findings: list[str] = []
 
     def of(self, kind: str, **index: str | int | float) -> list[tuple[FrameRecord, raw.RawFrame]]:
         """Return records with their frames; an empty list when there are none."""
@@ -139,6 +141,17 @@ class _Frames:
             )
         return found
 
+    def setting(self, record: FrameRecord, name: str) -> float:
+        """Return a number that a frame was taken with."""
+        try:
+            return float(record.settings[name])
+        except KeyError:
+            raise CalibratingError(
+                f"sessions: frame {record.step_id} of rig {self.rig.name!r} lacks its {name};"
+                " photographs that were imported never do: capture the target with the rig"
+                " (`skinrig capture flash --target ...`)"
+            ) from None
+
     def dark_level(self) -> NDArray[np.float32] | float:
         """Return what a frame without light shows above its black level, (h, w, 3)."""
         darks = [raw.linear_rgb(frame, demosaic="centered").rgb for _, frame in self.of("dark")]
@@ -149,7 +162,7 @@ def _sensor(frames: _Frames, created: date) -> store.Calibration:
     by_power = defaultdict(list)
     first = frames.need("flat")[0][1]
     for record, frame in frames.of("flat"):
-        by_power[float(record.settings["power"])].append(frame.cfa)
+        by_power[frames.setting(record, "power")].append(frame.cfa)
     pairs = [
         FlatPair(cfas[k], cfas[k + 1], light)
         for light, cfas in sorted(by_power.items())
@@ -161,7 +174,7 @@ def _sensor(frames: _Frames, created: date) -> store.Calibration:
         [frame.cfa for _, frame in darks],
         white_dn=first.white,
         pattern=first.pattern,
-        dark_exposures_s=[float(record.settings["exposure_s"]) for record, _ in darks],
+        dark_exposures_s=[frames.setting(record, "exposure_s") for record, _ in darks],
         block=max(4, min(16, min(first.cfa.shape) // 32)),
     )
     return result.to_calibration(
@@ -176,13 +189,17 @@ def _sensor(frames: _Frames, created: date) -> store.Calibration:
 def _white(frames: _Frames, created: date) -> store.Calibration:
     dark = frames.dark_level()
     shots = frames.need("subject", polarizer="crossed")
+    powers = [frames.setting(record, "power") for record, _ in shots]
     linear = [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
+    for (record, _), image in zip(shots, linear, strict=True):
+        what = f"frame {record.step_id} of state {record.index.get('state')!r}"
+        frames.findings += white_tile.examine(image.rgb - dark, image.valid, what)
     # the tile depolarizes: crossed filters pass half of its light, the diffuse total is twice that
     reference = white.white_reference(
         [2.0 * (image.rgb - dark) for image in linear],
         variances=[4.0 * image.variance for image in linear],
         valid=[image.valid for image in linear],
-        lights=[float(record.settings["power"]) for record, _ in shots],
+        lights=powers,
         reflectance=WHITE_TILE_REFLECTANCE,
         # every pixel by itself: what the pixels' own gains differ by must cancel in the ratio
         degree=None,
@@ -231,7 +248,7 @@ def _color(frames: _Frames, created: date) -> store.Calibration:
 def _polarization(frames: _Frames, created: date) -> store.Calibration:
     dark = frames.dark_level()
     shots = frames.need("malus")
-    angles = np.deg2rad([float(record.settings["analyser_deg"]) for record, _ in shots])
+    angles = np.deg2rad([frames.setting(record, "analyser_deg") for record, _ in shots])
     linear = [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
     images = [picture.rgb - dark for picture in linear]
     valid = np.logical_and.reduce([picture.valid for picture in linear])

@@ -1,0 +1,50 @@
+"""A white reference is of a white tile: other sessions are refused, with one clear error."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from skinrig.calibrating import white_tile
+from skinrig.cli import main
+from skinrig.simulating.simulation import simulate_session
+
+pytestmark = pytest.mark.render
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("subject", ["palest", "IV"])
+def test_a_face_makes_no_white_reference(subject, tmp_path, capsys):
+    simulate_session("flash", tmp_path / "face", subject=subject, width_px=96)
+    calibration = tmp_path / "calibration"
+    assert main(["calibrate", "white", str(tmp_path / "face"), "--out", str(calibration)]) == 3
+    said = capsys.readouterr().err
+    assert "frame S001 of state 'neutral' shows no white tile" in said
+    assert not calibration.exists()
+
+
+def test_a_small_simulated_tile_is_taken_and_a_part_of_one_told(tmp_path, capsys, monkeypatch):
+    simulate_session("flash", tmp_path / "tile", target="white", width_px=96)
+    calibration = tmp_path / "calibration"
+    command = ["calibrate", "white", str(tmp_path / "tile"), "--out", str(calibration)]
+    assert main(command) == 0
+    assert "found:" not in capsys.readouterr().out
+    assert (calibration / "white.json").exists()
+    monkeypatch.setattr(white_tile, "evenness", lambda rgb, valid: 0.8)
+    assert main(command) == 0
+    assert (
+        "found: frame S001 of state 'white': 80 % of the picture is even" in capsys.readouterr().out
+    )
+    monkeypatch.setattr(white_tile, "evenness", lambda rgb, valid: 0.3)
+    assert main(command) == 3
+    assert "shows no white tile: 30 %" in capsys.readouterr().err
+
+
+def test_imported_photographs_lack_the_power_that_a_white_reference_needs(tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    Image.fromarray(np.full((32, 48, 3), 128, np.uint8)).save(tmp_path / "photos" / "tile.jpg")
+    session, calibration = tmp_path / "session", tmp_path / "calibration"
+    assert main(["import", "photos", str(tmp_path / "photos"), "--out", str(session)]) == 0
+    assert main(["calibrate", "white", str(session), "--out", str(calibration)]) == 3
+    said = capsys.readouterr().err
+    assert "frame P000 of rig 'imported' lacks its power" in said
+    assert "fault of skinrig" not in said

@@ -1,0 +1,65 @@
+"""A white tile is told from other pictures by what lamps and lenses can do to it."""
+
+import numpy as np
+import pytest
+
+from skinrig.calibrating.white_tile import LEAST_EVEN, evenness
+
+
+def field(height=256, width=384):
+    y, x = np.mgrid[:height, :width]
+    return (y - height / 2) / (width / 2), (x - width / 2) / (width / 2)
+
+
+def tile(rng, *, fall=1.0, tint=0.0, noise=0.02):
+    """Return a tile behind a lens of 30 degrees, a lamp beside it, corners that are tinted."""
+    y, x = field()
+    lens = np.cos(np.arctan(np.hypot(x, y) * np.tan(np.deg2rad(30.0)))) ** 4
+    lamp = np.exp(-fall * (x + 0.5 * y))
+    color = np.stack([1 + tint * (x**2 + y**2), np.ones_like(x), 1 - tint * x**2], axis=-1)
+    light = (lens * lamp)[..., None] * color * (0.6, 1.0, 0.7)
+    return light * (1 + noise * rng.standard_normal(light.shape))
+
+
+@pytest.mark.parametrize("fall", [0.0, 1.0])
+@pytest.mark.parametrize("tint", [0.0, 0.05])
+@pytest.mark.parametrize("brightness", [1e-4, 1.0, 1e4])
+def test_a_tile_under_slanted_light_and_a_wide_lens_is_even(fall, tint, brightness, rng):
+    picture = brightness * tile(rng, fall=fall, tint=tint)
+    assert evenness(picture, np.ones(picture.shape[:2], bool)) > 0.99
+
+
+def test_a_speck_of_dust_and_saturated_pixels_do_not_matter(rng):
+    picture, valid = tile(rng), np.ones((256, 384), bool)
+    picture[100:108, 200:208] = 0.05
+    picture[:60, :90], valid[:60, :90] = 50.0, False
+    assert evenness(picture, valid) > 0.95
+
+
+def test_a_margin_beside_the_tile_is_counted_as_not_even(rng):
+    picture = tile(rng)
+    picture[:, 288:] = 0.001 * rng.random((256, 96, 3))
+    share = evenness(picture, np.ones((256, 384), bool))
+    assert share == pytest.approx(0.75, abs=0.04)
+
+
+def test_a_lit_ball_before_darkness_is_no_tile(rng):
+    y, x = field()
+    depth = np.sqrt(np.clip(0.36 - x**2 - y**2, 0, None))
+    picture = depth[..., None] * (0.9, 0.6, 0.4) + 1e-4 * rng.standard_normal((256, 384, 3))
+    assert evenness(picture, np.ones((256, 384), bool)) < LEAST_EVEN
+
+
+def test_an_evenly_lit_chart_of_colors_is_no_tile(rng):
+    patches = rng.uniform(0.05, 0.9, (8, 12, 3))
+    picture = patches.repeat(32, axis=0).repeat(32, axis=1)
+    assert evenness(picture, np.ones((256, 384), bool)) < LEAST_EVEN
+
+
+def test_nothing_is_said_of_a_picture_that_is_saturated_all_over():
+    assert evenness(np.ones((96, 96, 3)), np.zeros((96, 96), bool)) == 1.0
+
+
+def test_pictures_of_a_few_pixels_are_judged(rng):
+    assert evenness(np.ones((8, 8, 3)), np.ones((8, 8), bool)) == 1.0
+    assert evenness(rng.random((8, 8, 3)), np.ones((8, 8), bool)) < LEAST_EVEN
