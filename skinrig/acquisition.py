@@ -29,6 +29,7 @@ from skinrig.addresses import addresses, patiently, require_addresses
 from skinrig.console import Console
 from skinrig.errors import UsageError
 from skinrig.light_safety import light_figures, light_lines
+from skinrig.next_steps import named
 from skinrig.sequences import SequenceOrder, sequence_lines, sequence_plan
 
 CALIBRATION_TARGETS = ("dark", "flat", "chart", "malus")
@@ -478,7 +479,7 @@ def _run(
     for reason in dict.fromkeys(left_out.values()):
         console.say(f"left out: {reason}")
     console.say(f"{out}: {done.frames} frames in {done.steps} steps, {done.retakes} retaken")
-    console.say(f"next: skinrig verify {out}")
+    console.say(f"next: skinrig verify {named(out)}")
     return {
         "session": out, "captured": done.frames, "retakes": done.retakes,
         "stale_frames": done.stale, "steps": len(plan.steps), "dead_lights": done.dead_lights,

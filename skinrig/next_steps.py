@@ -7,6 +7,7 @@ answers at once.
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -72,6 +73,17 @@ class Surroundings:
         return ", ".join(f"{n} {noun}{'s' if n > 1 else ''}" for n, noun in counts if n)
 
 
+def named(path: str | Path) -> str:
+    """Return a path as a shell takes it: in quotes where it holds a space or the like.
+
+    Examples
+    --------
+    >>> named("session"), named("my session")
+    ('session', "'my session'")
+    """
+    return shlex.quote(str(path))
+
+
 def after_session(
     rig: str, session: str | Path, target: str | None, *, calibration: str | Path = "calibration"
 ) -> str:
@@ -95,19 +107,20 @@ def after_session(
     >>> after_session("probe", "session-phantom", "phantom")
     'skinrig calibrate fibre session-phantom --out calibration'
     """
+    place, store = named(session), named(calibration)
     if target == "sequence":
-        return f"skinrig reconstruct {session} --want perfusion_curves --out appearance"
+        return f"skinrig reconstruct {place} --want perfusion_curves --out appearance"
     if not target:
-        needs = "" if rig not in WANTS or rig in UNCALIBRATED else f" --calibration {calibration}"
+        needs = "" if rig not in WANTS or rig in UNCALIBRATED else f" --calibration {store}"
         want = WANTS.get(rig, WANTS["photographs"])
-        return f"skinrig reconstruct {session} --want {want}{needs} --out appearance"
+        return f"skinrig reconstruct {place} --want {want}{needs} --out appearance"
     kind = CALIBRATIONS.get(rig, {}).get(target)
     if kind is None:
-        return f"skinrig verify {session}"
-    named = f"{session}"
+        return f"skinrig verify {place}"
+    given = place
     if rig == "dome" and kind == "lights":  # one calibration of both
-        named = f"{session} SESSION-WHITE" if target == "mirror" else f"SESSION-MIRROR {session}"
-    return f"skinrig calibrate {kind} {named} --out {calibration}"
+        given = f"{place} SESSION-WHITE" if target == "mirror" else f"SESSION-MIRROR {place}"
+    return f"skinrig calibrate {kind} {given} --out {store}"
 
 
 def look(folder: Path) -> Surroundings:
@@ -154,10 +167,13 @@ def suggest(found: Surroundings, folder: Path) -> tuple[Step, ...]:
     steps: list[Step] = []
     if found.reports:
         steps.append(
-            Step(f"{OPENER} {found.reports[0]}", "the report in a browser: maps, errors, checks")
+            Step(
+                f"{OPENER} {named(found.reports[0])}",
+                "the report in a browser: maps, errors, checks",
+            )
         )
     elif found.appearances:
-        steps.append(Step(f"skinrig report {folder}", "one page of all that lies here"))
+        steps.append(Step(f"skinrig report {named(folder)}", "one page of all that lies here"))
     used = {d.get("parameters", {}).get("session") for d in found.appearances.values()}
     fresh = [(p, d) for p, d in found.sessions.items() if p.name not in used and not _target(d)]
     if fresh:
@@ -170,14 +186,21 @@ def suggest(found: Surroundings, folder: Path) -> tuple[Step, ...]:
         )
     if found.appearances:
         seen = _most_whole(found.appearances, ("facial_color.json", "mesh.obj"))
-        steps.append(Step(f"skinrig view {seen}", "a page that shows the skin moving, under light"))
+        steps.append(
+            Step(f"skinrig view {named(seen)}", "a page that shows the skin moving, under light")
+        )
         given = _most_whole(found.appearances, ("mesh.obj",))
         measured = found.appearances[given].get("source") == "measured"
         use = " --use research" if measured else ""
-        steps.append(Step(f"skinrig export {given} --to maps{use} --out export", "other programs"))
+        steps.append(
+            Step(f"skinrig export {named(given)} --to maps{use} --out export", "other programs")
+        )
     if found.photographs and not found.sessions:
         steps.append(
-            Step(f"skinrig import photos {folder} --out session", "photographs become a session")
+            Step(
+                f"skinrig import photos {named(folder)} --out session",
+                "photographs become a session",
+            )
         )
     if not steps:
         steps = [
@@ -237,11 +260,17 @@ def _is_report(path: Path) -> bool:
 
 def _target(session: Mapping[str, Any]) -> str:
     """Return the calibration target of a session, as far as its documents say one."""
-    named = session.get("extra", {}).get("simulation", {}).get("target")
-    if named:
-        return str(named)
-    kinds = {step.get("kind") for step in session.get("plan", {}).get("steps", ())}
-    targets = CALIBRATIONS.get(session.get("rig", {}).get("name", ""), {})
+    simulated = session.get("extra", {}).get("simulation", {}).get("target")
+    if simulated:
+        return str(simulated)
+    steps = session.get("plan", {}).get("steps", ())
+    kinds = {step.get("kind") for step in steps}
+    rig = session.get("rig", {}).get("name", "")
+    # the flash rig takes its white tile as it takes a face, as a state of that name
+    states = {step.get("index", {}).get("state") for step in steps if step.get("kind") == "subject"}
+    if rig == "flash" and states == {"white"}:
+        return "white"
+    targets = CALIBRATIONS.get(rig, {})
     return next((target for target in targets if target in kinds - {"dark"}), "")
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from capture.rig import Probe, Rig, load_rig
 from capture.session import Session
+from skinrig.next_steps import named
 from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
 from skinrig.simulating.shot_numbers import shots_made
@@ -96,10 +97,12 @@ def serve_rig(
     ) as served:
         for name, url in served.addresses.items():
             print(f"{name} {url}", flush=True)
-        boxes = " ".join(f"--port {n}={served.addresses[n]}" for n in rig.boxes)
-        cameras = " ".join(f"--camera {v.name}={served.addresses[v.name]}" for v in rig.views)
+        boxes = " ".join("--port " + named(f"{n}={served.addresses[n]}") for n in rig.boxes)
+        cameras = " ".join(
+            "--camera " + named(f"{v.name}={served.addresses[v.name]}") for v in rig.views
+        )
         more = "" if rig.caliper is None else " --force-limit 2 --eyes closed"
-        out = "session" if resume is None else f"{resume} --resume"
+        out = "session" if resume is None else f"{named(resume)} --resume"
         print(
             f"next: skinrig capture {rig_name} {boxes} {cameras}{more} --out {out}\nCtrl-C ends it",
             file=sys.stderr,

@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import os
+import shlex
 from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
@@ -175,7 +176,7 @@ def load(directory: str | Path, kind: str) -> Calibration:
     except OSError as exc:
         raise CalibrationMissing(
             f"{path}: no {kind} calibration there ({exc.strerror}); make one with"
-            f" `skinrig calibrate {kind} SESSION --out {folder}`"
+            f" `skinrig calibrate {kind} SESSION --out {shlex.quote(str(folder))}`"
         ) from exc
     document = _parse(path, raw)
     if document.kind != kind:

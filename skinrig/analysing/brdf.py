@@ -24,6 +24,7 @@ from skinrig import consent
 from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf_space_datasets import Dataset
 from skinrig.errors import UsageError
+from skinrig.next_steps import named
 from skinrig.traits import labels as trait_labels
 
 FloatArray = NDArray[np.float64]
@@ -285,7 +286,7 @@ def _measured(
     weights: list[SkinMap] = []
     while (name := f"basis_weight_{len(weights)}") in appearance.maps:
         weights.append(appearance.maps[name])
-    how = f"skinrig reconstruct SESSION --want r_d,basis_weight_0 --rank 24 --out {folder}"
+    how = f"skinrig reconstruct SESSION --want r_d,basis_weight_0 --rank 24 --out {named(folder)}"
     if not weights or BASIS_FILE not in appearance.files:
         raise AnalysisError(f"{folder}: holds no lobes; make them by `{how}`")
     try:

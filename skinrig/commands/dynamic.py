@@ -11,6 +11,7 @@ import typer
 from skinrig.commands.help import Subcommands
 from skinrig.commands.options import Json, NewMaps
 from skinrig.console import Console
+from skinrig.next_steps import named
 
 Weights = Annotated[
     str, typer.Option(help="States and their weights: smile=0.7,anger=0.3; they sum to one.")
@@ -70,7 +71,7 @@ def fit_facial_color(
     states = ",".join(found.hemoglobin)
     console.say(f"{out}: hemoglobin rig of {states}")
     last = list(found.changes)[-1]
-    console.say(f"next: skinrig apply expression {out} --weights {last}=1 --out {last}")
+    console.say(f"next: skinrig apply expression {named(out)} --weights {last}=1 --out {last}")
     console.document(
         "skinrig.fit/1",
         {"model": "facial_color", "out": out, "states": list(found.hemoglobin),
@@ -130,7 +131,9 @@ def fit_microstructure(
 
     console = Console(json)
     found = fit(appearances, out=out, paper_table=paper_table, on_message=console.say)
-    console.say(f"next: skinrig apply microstructure {out} --mesh MESH --weights SHAPE=1 --out DIR")
+    console.say(
+        f"next: skinrig apply microstructure {named(out)} --mesh MESH --weights SHAPE=1 --out DIR"
+    )
     console.document(
         "skinrig.fit/1",
         {"model": "microstructure", "out": out,

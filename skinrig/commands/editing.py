@@ -10,6 +10,7 @@ import typer
 from skinrig.commands.options import Json, NewMaps, Seed
 from skinrig.console import Console
 from skinrig.errors import UsageError
+from skinrig.next_steps import named
 
 
 def edit(
@@ -85,7 +86,7 @@ def edit(
     for text in done.warnings:
         console.say(f"warning: {text}")
     console.say(f"{out}: {', '.join(done.changed) or 'nothing'} changed")
-    console.say(f"next: skinrig render {out} --out pictures")
+    console.say(f"next: skinrig render {named(out)} --out pictures")
     console.document("skinrig.edit/1", {"out": out, **done.record})
 
 
@@ -142,7 +143,9 @@ def fit_traits(
     names = found.library.names
     console.say(f"{out}: {len(names)} traits of {len(found.faces)} faces")
     first = names[0]
-    console.say(f"next: skinrig edit APPEARANCE --space {out} --trait {first}=1 --out edited")
+    console.say(
+        f"next: skinrig edit APPEARANCE --space {named(out)} --trait {first}=1 --out edited"
+    )
     console.document(
         "skinrig.fit/1",
         {"model": "traits", "out": out, "faces": found.faces, "traits": names,

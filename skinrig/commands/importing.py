@@ -10,6 +10,7 @@ import typer
 from skinrig.commands.help import Subcommands
 from skinrig.commands.options import Consent, ConsentExpires, Json, Out
 from skinrig.console import Console, counted
+from skinrig.next_steps import named
 
 import_app = typer.Typer(
     cls=Subcommands, help="Bring in what other devices made.", no_args_is_help=True
@@ -85,8 +86,8 @@ def import_mesh(
         f"{done.path}: {done.vertices} vertices, {done.faces} triangles, {size} mm, "
         f"{'with' if done.has_uv else 'without'} texture coordinates"
     )
-    after = f"reconstruct {done.path} --want normals --out appearance"
-    console.say(f"next: skinrig {after if done.reopened else f'verify {done.path}'}")
+    after = f"reconstruct {named(done.path)} --want normals --out appearance"
+    console.say(f"next: skinrig {after if done.reopened else f'verify {named(done.path)}'}")
     console.document(
         "skinrig.import/1",
         {"path": done.path, "vertices": done.vertices, "faces": done.faces,
@@ -125,7 +126,7 @@ def import_lp(
     for text in done.assumed:
         console.say(f"assumed: {text}")
     console.say(f"{done.path}: {counted(done.frames, 'picture')}, lights of {done.lights}")
-    console.say(f"next: skinrig reconstruct {out} --want normals,albedo --out appearance")
+    console.say(f"next: skinrig reconstruct {named(out)} --want normals,albedo --out appearance")
     console.document(
         "skinrig.import/1",
         {

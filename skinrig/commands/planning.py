@@ -11,6 +11,7 @@ import typer
 from skinrig import errors
 from skinrig.commands.options import Json, Rig, file_to_write
 from skinrig.console import Console
+from skinrig.next_steps import named
 
 
 def plan(
@@ -83,7 +84,7 @@ def plan(
         part = out.with_name(f".{out.name}.part")
         part.write_text(json_text.dumps(choice.plan.to_json(), indent=1) + "\n", encoding="utf-8")
         part.replace(out)
-        console.say(f"next: skinrig capture {rig} --plan {out} --out session")
+        console.say(f"next: skinrig capture {rig} --plan {named(out)} --out session")
     console.document(document.pop("schema"), document)
     if not reached:
         raise typer.Exit(errors.LIMIT_MISSED)

@@ -14,6 +14,7 @@ from skinrig.commands.options import (
 )
 from skinrig.console import Console, counted
 from skinrig.errors import UsageError
+from skinrig.next_steps import named
 
 
 def calibrate(
@@ -144,7 +145,7 @@ def reconstruct(
     console.say(f"reused: {', '.join(done.reused) or 'nothing'}")
     for what, why in done.left_out:
         console.say(f"left out: {what} ({why})")
-    console.say(f"next: skinrig report {out}")
+    console.say(f"next: skinrig report {named(out)}")
     console.document(
         "skinrig.reconstruct/1",
         {"path": out, "ran": done.ran, "reused": done.reused, "left_out": done.left_out,

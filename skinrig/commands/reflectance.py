@@ -9,6 +9,7 @@ import typer
 
 from skinrig.commands.options import Json, NewMaps
 from skinrig.console import Console
+from skinrig.next_steps import named
 
 
 def fit_reflectance(
@@ -45,7 +46,7 @@ def fit_reflectance(
         console.say(f"left out: {what}: {why}")
     valid = float(found.model.valid.mean())
     console.say(f"{out}: reflectance model, {100 * valid:.0f} % of its texels valid")
-    console.say(f"next: skinrig render {out} --light 1,1,2 --out picture")
+    console.say(f"next: skinrig render {named(out)} --light 1,1,2 --out picture")
     console.document(
         "skinrig.fit/1",
         {"model": "reflectance", "out": out, "assumed": list(found.assumed),

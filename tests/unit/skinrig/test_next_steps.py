@@ -1,6 +1,7 @@
 """What a plain ``skinrig`` tells people to do next, from what lies in a folder."""
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -129,3 +130,29 @@ def test_each_target_leads_to_a_calibration_that_exists(rig, target, capsys):
 def test_nothing_typed_prints_the_next_steps(capsys):
     assert main([]) == 0
     assert "skinrig demo" in capsys.readouterr().out
+
+
+def test_a_path_with_spaces_is_quoted_so_that_the_command_can_be_pasted():
+    folder = Path("an o'clock")
+    folder.mkdir()
+    session(folder / "my face")
+    appearance(folder / "my maps", files=("mesh.obj",))
+    (folder / "anna.NEF").touch()
+    for command in [
+        *commands(folder),
+        after_session("flash", "my tile", "white", calibration="my rig"),
+        after_session("dome", "my ball", "mirror"),
+        after_session("gradient", "my skin", None, calibration="my rig"),
+        after_session("flash", "my smiles", "sequence"),
+    ]:
+        words = shlex.split(command)
+        assert words[0] in ("skinrig", OPENER)
+        assert not {"my", "o'clock"} & set(words), command
+
+
+def test_a_photograph_of_a_captured_tile_is_no_skin():
+    session(Path("session-tile"))
+    document = json.loads(Path("session-tile/session.json").read_text())
+    document["plan"]["steps"] = [{"kind": "subject", "index": {"state": "white"}}]
+    Path("session-tile/session.json").write_text(json.dumps(document))
+    assert not any("reconstruct" in command for command in commands())
