@@ -35,7 +35,7 @@ class DiscStatisticsError(ValueError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscStatistics:
-    """What lies in a disc about each pixel, arrays of shape (H, W)."""
+    """What lies in a disc about each pixel, arrays of shape (..., H, W)."""
 
     mean: Floats
     """Mean of the valid pixels; NaN where the disc holds none."""
@@ -90,13 +90,15 @@ def measure(
     Parameters
     ----------
     h
-        Shape (H, W), any unit. float32 is summed in float32 about a value of its neighbourhood,
-        which leaves the deviation a relative error below 1e-4; anything else, or in a disc of
-        less than 6 px, in float64, with 1e-7. What is not finite counts as missing.
+        Shape (..., H, W), any unit: each map by itself. float32 is summed in float32 about a
+        value of its neighbourhood, which leaves the deviation a relative error below 1e-4;
+        anything else, or in a disc of less than 6 px, in float64, with 1e-7. What is not finite
+        counts as missing.
     radius_px
         Radius of the disc, px; 0 is the pixel alone, and a disc may be larger than the map.
     valid
-        Shape (H, W), bool: pixels that count; None: all that are finite.
+        Shape of the map, or one that broadcasts to it, bool: pixels that count; None: all that
+        are finite.
 
     Returns
     -------
@@ -106,7 +108,7 @@ def measure(
     Raises
     ------
     DiscStatisticsError
-        When the map is not (H, W), the mask does not fit, or the radius is no radius.
+        When the map is not (..., H, W), the mask does not fit, or the radius is no radius.
 
     Examples
     --------
@@ -115,27 +117,35 @@ def measure(
     ([3, 4, 3], [0.333, 0.5, 0.0])
     """
     h = np.asarray(h)
-    if h.ndim != 2 or not h.size:
-        raise DiscStatisticsError(f"h: got shape {h.shape}, expected (H, W) with pixels")
+    if h.ndim < 2 or 0 in h.shape[-2:]:
+        raise DiscStatisticsError(f"h: got shape {h.shape}, expected (..., H, W) with pixels")
     if h.dtype != np.float32 or radius_px < _SMALL_PX:
         h = np.asarray(h, np.float64)
     if valid is not None:
         valid = np.asarray(valid)
-        if valid.dtype != np.bool_ or valid.shape != h.shape:
+        try:
+            fits = valid.shape[-2:] == h.shape[-2:]
+            fits = fits and np.broadcast_shapes(valid.shape, h.shape) == h.shape
+        except ValueError:
+            fits = False
+        if valid.dtype != np.bool_ or not fits:
             raise DiscStatisticsError(
                 f"valid: got {valid.dtype} {valid.shape}, expected bool {h.shape}"
             )
-    rows, columns = h.shape
+        valid = np.broadcast_to(valid, h.shape)
+    rows, columns = h.shape[-2:]
     half = half_widths(radius_px, rows - 1, columns - 1)
     high = half_widths(radius_px, columns - 1, rows - 1)
     reach = min(float(radius_px), math.hypot(rows, columns))
     inner = min(math.isqrt(math.floor(reach**2 / 2.0)), int(high[0]), int(half[0]))
     mean, deviation = np.empty(h.shape), np.empty(h.shape)
     count = np.empty(h.shape, np.int32)
-    mask = np.zeros((1, 1), np.uint8) if valid is None else np.ascontiguousarray(valid)
-    disc_kernels.disc_moments(
-        np.ascontiguousarray(h), mask.view(np.uint8), valid is not None, half, high, inner,
-        64 if radius_px <= 32.0 else 128, _WIDE, 4 * get_num_threads(), TRUSTED[h.dtype],
-        mean, deviation, count,
-    )  # fmt: skip
+    nothing = np.zeros((1, 1), np.bool_)
+    for at in np.ndindex(h.shape[:-2]):
+        mask = nothing if valid is None else np.ascontiguousarray(valid[at])
+        disc_kernels.disc_moments(
+            np.ascontiguousarray(h[at]), mask.view(np.uint8), valid is not None, half, high, inner,
+            64 if radius_px <= 32.0 else 128, _WIDE, 4 * get_num_threads(), TRUSTED[h.dtype],
+            mean[at], deviation[at], count[at],
+        )  # fmt: skip
     return DiscStatistics(mean, deviation, count)

@@ -52,23 +52,25 @@ class FacialColorError(ValueError):
 
 def local_statistics(
     h: ArrayLike, radius_px: float, *, valid: Mask | None = None
-) -> tuple[Floats, Floats]:
+) -> tuple[Image, Image]:
     """Return mean and deviation of a map in a disc about each pixel, eq. (1).
 
     Parameters
     ----------
     h
-        Shape (H, W); what is not finite counts as missing.
+        Shape (..., H, W); what is not finite counts as missing.
     radius_px
         Radius of the disc, px, >= 0, need not be whole.
     valid
-        Shape (H, W), bool: pixels that count; None: all that are finite.
+        Shape of the map, or one that broadcasts to it, bool: pixels that count; None: all that
+        are finite.
 
     Returns
     -------
-    mu, sigma : ndarray of float64
-        Shape (H, W), over the valid pixels of each disc within the map; NaN where it holds none.
-        `model.disc_statistics.measure` tells how many they are.
+    mu, sigma : ndarray
+        Shape of the map, over the valid pixels of each disc within the map; NaN where it holds
+        none. float32 for float32 and float16 maps, float64 otherwise.
+        `model.disc_statistics.measure` tells how many pixels they are of, and gives float64.
 
     Raises
     ------
@@ -81,8 +83,10 @@ def local_statistics(
     >>> round(float(mu[0, 0]), 6), round(float(sigma[0, 0]), 6)
     (0.2, 0.1)
     """
-    found = disc_statistics.measure(h, radius_px, valid=valid)
-    return found.mean, found.deviation
+    image = np.asarray(h)
+    kind = np.float32 if image.dtype in (np.float16, np.float32) else np.float64
+    found = disc_statistics.measure(image, radius_px, valid=valid)
+    return found.mean.astype(kind, copy=False), found.deviation.astype(kind, copy=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

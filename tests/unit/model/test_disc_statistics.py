@@ -154,11 +154,44 @@ def test_map_is_not_modified_and_may_be_a_view(rng):
     np.testing.assert_array_equal(found.mean, measure(h[::2, ::3].copy(), 3.0).mean)
 
 
+def test_maps_of_a_stack_are_measured_each_by_itself(rng):
+    h, valid = rng.random((2, 3, 9, 11)), rng.random((3, 9, 11)) > 0.3
+    whole, masked = measure(h, 2.5), measure(h, 2.5, valid=valid)
+    for i, j in np.ndindex(2, 3):
+        for found, one in (
+            (whole, measure(h[i, j], 2.5)),
+            (masked, measure(h[i, j], 2.5, valid=valid[j])),
+        ):
+            np.testing.assert_array_equal(found.mean[i, j], one.mean)
+            np.testing.assert_array_equal(found.deviation[i, j], one.deviation)
+            np.testing.assert_array_equal(found.count[i, j], one.count)
+    assert measure(h[:0], 2.5, valid=valid).mean.shape == (0, 3, 9, 11)
+
+
+@pytest.mark.parametrize("radius_px", [2.0, 8.0])
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [(np.float16, np.float32), (np.float32, np.float32), (np.float64, np.float64)],
+)
+def test_local_statistics_have_the_precision_of_their_map(given, told, radius_px, rng):
+    h = rng.uniform(0.1, 0.2, (3, 20, 20)).astype(given)
+    mu, sigma = facial_color.local_statistics(h, radius_px)
+    exact = measure(h.astype(np.float64), radius_px)
+    assert mu.dtype == sigma.dtype == told
+    np.testing.assert_allclose(mu, exact.mean, rtol=2e-6)
+    np.testing.assert_allclose(sigma, exact.deviation, rtol=2e-4)
+
+
 def test_wrong_maps_masks_and_radii_are_named():
     with pytest.raises(DiscStatisticsError, match=r"h: got shape \(3,\)"):
         measure(np.zeros(3), 1.0)
     with pytest.raises(DiscStatisticsError, match="valid: got float64"):
         measure(np.zeros((3, 3)), 1.0, valid=np.ones((3, 3)))
+    for shape in ((1, 3), (2, 3, 3), (1, 3, 3)):
+        with pytest.raises(DiscStatisticsError, match=r"expected bool \(3, 3\)"):
+            measure(np.zeros((3, 3)), 1.0, valid=np.ones(shape, bool))
+    with pytest.raises(DiscStatisticsError, match=r"h: got shape \(2, 0, 3\)"):
+        measure(np.zeros((2, 0, 3)), 1.0)
     for radius in (-1.0, np.nan, np.inf):
         with pytest.raises(DiscStatisticsError, match="radius_px: got"):
             measure(np.zeros((3, 3)), radius)
