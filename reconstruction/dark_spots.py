@@ -1,4 +1,4 @@
-"""Pixels that are darker than what is around them: by a mole's melanin, or by shade.
+"""Pixels that may be no skin of the face's usual kind: moles and shade, lips and eyelids.
 
 One person's skin tells which of both a dark color is where pigment changes slowly
 (`reconstruction.face_chromophores`). A mole is not of that skin, and shade is so much more frequent
@@ -6,6 +6,11 @@ that a face's distribution explains a mole away: as usual skin in little light, 
 standard error. But light changes slowly, too, beside an edge of shadow. So a pixel that is darker
 than its surroundings is one of both, and neither is the more probable: the estimate lies halfway
 between that of the face and that of the pixel alone, and its standard error holds both.
+
+Lips and eyelids have less melanin than the rest of a face, and the face explains that away
+likewise: as usual skin with less blood. Shade makes a pixel by itself look like darker skin, never
+like lighter, and so one that by itself has less melanin than by its face, by more than its standard
+error, is one of both, too.
 """
 
 from __future__ import annotations
@@ -101,6 +106,35 @@ def darker_than_around(
             least[band][good[band]] = np.maximum(DARKER, NOISES * noise)
     with np.errstate(invalid="ignore"):
         return np.asarray(_median_around(log_light, good) - log_light > least)
+
+
+def lighter_by_itself(
+    by_face: WeighedChromophores, alone: WeighedChromophores
+) -> NDArray[np.bool_]:
+    """Return where a pixel alone has less melanin than by its face, outside its 68 % interval.
+
+    Parameters
+    ----------
+    by_face, alone
+        Estimates of the same pixels, with and without what the face tells.
+
+    Returns
+    -------
+    ndarray of bool
+        Of the pixels' shape; False where either is unknown.
+
+    Raises
+    ------
+    reconstruction.chromophores.ChromophoreError
+        When shapes differ.
+    """
+    if by_face.melanin.shape != alone.melanin.shape:
+        raise ChromophoreError(
+            f"alone: expected the shape {by_face.melanin.shape} of by_face, got "
+            f"{alone.melanin.shape}"
+        )
+    with np.errstate(invalid="ignore"):
+        return np.asarray(by_face.melanin - alone.melanin > alone.stderr_melanin)
 
 
 def either(

@@ -335,11 +335,12 @@ def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     known = partial(chromophore_posterior.weigh, rgb, table, prior=prior)
     found = by_face = known(face=face, variance=variance, model_error=errors)
     noise_alone = known(face=face, variance=variance)
-    if face is not None:  # what is darker than its surroundings may be no skin of that face
+    if face is not None:  # moles, lips and lids may be no skin of that face's usual kind
+        alone = known(variance=variance, model_error=errors)
         spots = dark_spots.darker_than_around(rgb, variance=variance)
-        alone = partial(known, variance=variance, valid=spots)
-        found = dark_spots.either(found, alone(model_error=errors), spots)
-        noise_alone = dark_spots.either(noise_alone, alone(), spots)
+        spots |= dark_spots.lighter_by_itself(by_face, alone)
+        found = dark_spots.either(by_face, alone, spots)
+        noise_alone = dark_spots.either(noise_alone, known(variance=variance, valid=spots), spots)
     usable = found.valid
 
     def chromophore(name: str) -> dict[str, SkinMap]:

@@ -256,12 +256,17 @@ def _weighed(
         face = face_chromophores.in_known_light(
             rgb, table, variance=variance, model_error=model_error
         )
-    found = known(face=face)
-    if face is None or face_shape is None or len(face_shape) != 2:
-        return found
-    picture = (*face_shape, 3)
-    spots = dark_spots.darker_than_around(rgb.reshape(picture), variance=variance.reshape(picture))
-    return dark_spots.either(found, known(valid=spots.reshape(-1)), spots.reshape(-1))
+    by_face = known(face=face)
+    if face is None or face_shape is None:
+        return by_face
+    alone = known()
+    spots = dark_spots.lighter_by_itself(by_face, alone)
+    if len(face_shape) == 2:
+        dark = dark_spots.darker_than_around(
+            rgb.reshape(*face_shape, 3), variance=variance.reshape(*face_shape, 3)
+        )
+        spots |= dark.reshape(-1)
+    return dark_spots.either(by_face, alone, spots)
 
 
 def _model_errors(
