@@ -30,7 +30,7 @@ from reconstruction.skin_strain import StateStrain, measure_states, skin_mask
 from reconstruction.slope_fields import Perspective
 from reconstruction.strain_kernels import count_normals, fit_kernels, histogram_document
 
-REVISION = 6
+REVISION = 7
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
 MAPS = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")

@@ -8,9 +8,17 @@ from scipy import ndimage
 
 from model.skin import SkinMap
 from reconstruction.gradient_images import SkinState, state_name
+from reconstruction.normal_histogram import BLOCKS, block_counts, block_of, grid_of
 from reconstruction.skin_strain import StateStrain, skin_mask
 from reconstruction.strain import Strain
-from reconstruction.strain_kernels import count_normals, fit_kernels, histogram_document
+from reconstruction.strain_kernels import (
+    HIDDEN,
+    _along_x,
+    _skin_blocks,
+    count_normals,
+    fit_kernels,
+    histogram_document,
+)
 
 SIDE, PIXEL_UM = 240, 6.0
 
@@ -90,6 +98,60 @@ def test_variances_change_more_along_the_jaws_than_across(fitted):
         along = [rows[f"{angle}_{step}"]["variance_s"] for step in ("m1", "p1")]
         across = [rows[f"{angle}_{step}"]["variance_t"] for step in ("m1", "p1")]
         assert along[0] / along[1] > 1.5 * max(across[0] / across[1], 1.0)
+
+
+def test_errors_of_variances_hold_what_pictures_hide(fitted):
+    """As a share of the variance beside the scatter over patches, which large patches outgrow."""
+    strains, counted, _, _ = fitted
+    for row in histogram_document(strains, counted)["states"]:
+        one = counted[row["name"]]
+        for axis, value, scatter in (
+            ("s", one.variance_x, one.stderr_x), ("t", one.variance_y, one.stderr_y),
+        ):  # fmt: skip
+            assert row[f"variance_{axis}_stderr"] > HIDDEN * value
+            assert row[f"variance_{axis}_stderr"] ** 2 == pytest.approx(
+                scatter**2 + (HIDDEN * value) ** 2
+            )
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 35.0, 90.0])
+def test_a_state_is_counted_in_the_blocks_that_show_its_skin(relief, angle_deg):
+    """Skin moved and stretched, counted in the neutral map's blocks, against counting it there.
+
+    Rationale: the state's height at F X + shift is the neutral one's at X, so that its slopes times
+    F transposed, counted where the turned neutral map has X, are the neutral ones. With F a mere
+    shift the histograms are alike to interpolation; those of other blocks are not.
+    """
+    shift = np.array([14.0, -9.0])
+    each = state(angle_deg, 1, 1.0)
+    moved = Strain(np.eye(2), shift, 1e-8 * np.eye(6), 0.05, 100, True)
+    each = StateStrain(each.state, 1.0, moved)
+    whole, edge = relief, SIDE // 2
+    # x to the right, y up: what was at X is at X + shift
+    top, left = edge + round(shift[1]), edge - round(shift[0])
+    there = np.ones((SIDE, SIDE), bool)
+    found = _skin_blocks(
+        each, as_map(whole[top : top + SIDE, left : left + SIDE]), pixel_um=PIXEL_UM, there=there
+    )
+    turned, inside = _along_x(middle(whole).astype(np.float32), there, each.state.angle_rad)
+    group, groups = block_of(np.arange(SIDE**2), (SIDE, SIDE), BLOCKS)
+    expected = block_counts(turned, group.reshape(SIDE, SIDE), groups, pixel=PIXEL_UM, valid=inside)
+    assert found.shape == (*grid_of((SIDE, SIDE), BLOCKS), 64, 64)
+
+    def shares(counts):
+        coarse = counts.reshape(-1, 16, 4, 16, 4).sum(axis=(2, 4)).reshape(len(counts), -1)
+        return coarse / np.maximum(coarse.sum(axis=1, keepdims=True), 1)
+
+    both = found.reshape(groups, 64, 64)
+    whole_blocks = np.flatnonzero(
+        (both.sum(axis=(1, 2)) > 0.95 * SIDE**2 / groups)
+        & (expected.sum(axis=(1, 2)) > 0.95 * SIDE**2 / groups)
+    )
+    assert len(whole_blocks) > 0.3 * groups
+    ours, theirs = shares(both)[whole_blocks], shares(expected)[whole_blocks]
+    own = np.abs(ours - theirs).sum(axis=1)
+    other = np.abs(ours - theirs[::-1]).sum(axis=1)
+    assert np.median(own) < 0.5 * np.median(other)
 
 
 def test_progress_is_told_and_the_direction_does_not_matter_here(fitted):
