@@ -33,7 +33,7 @@ from reconstruction import (
 from reconstruction.detectability import detectable
 from reconstruction.evidence import Evidence, EvidenceError
 
-REVISION = 6
+REVISION = 7
 """Grows when the code of a stage changes its result, so that older maps are computed again."""
 
 MAPS = (
