@@ -14,8 +14,12 @@ def test_a_page_draws_a_face_without_errors_or_requests(viewer):
     assert viewer.problems == []
 
 
-def test_the_first_picture_is_the_one_that_is_drawn_again(viewer):
-    """Textures reach the device while the first frame is drawn, and keep their own places."""
+def test_the_first_picture_is_the_one_that_is_drawn_again(open_page, procedural_html):
+    """Textures reach the device while the first frame is drawn, and keep their own places.
+
+    Others have drawn on the page that all share.
+    """
+    viewer = open_page(procedural_html)
     first = viewer.read("albedo")
     assert first[first[..., 3] > 0, 0].std() > 0.005
     viewer.bench(1)
