@@ -1,0 +1,258 @@
+"""GenTL producers, the makers' libraries behind GenICam cameras, and the cameras they find.
+
+A producer is a file ``*.cti`` that comes with a camera maker's software. One process can open a
+producer once only, so cameras of one producer share it; it is closed with the last of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from capture.devices.camera import CameraBusy, CameraError, CameraUrlError
+from capture.devices.port import LinkLost
+
+SEARCH_PATH = "GENICAM_GENTL64_PATH"
+"""Variable that lists the folders of producers (GenTL 1.6, section 3.3)."""
+
+# what a camera answers to a wrong request; anything else means that it does not answer
+_REFUSALS = (
+    "AccessException", "OutOfRangeException", "InvalidArgumentException", "LogicalErrorException",
+    "PropertyException", "InvalidParameterException", "InvalidValueException",
+    "NotImplementedException", "NotAvailableException",
+)  # fmt: skip
+_BUSY = ("AccessDeniedException", "ResourceInUseException", "BusyException")
+
+# the library logs what it then raises, with a traceback; the error says it once
+_quiet = logging.getLogger("capture.genicam_library")
+_quiet.setLevel(logging.CRITICAL + 1)
+
+
+class MissingHarvesters(CameraError, ImportError):
+    """The optional library is not installed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """What is used of the packages ``harvesters`` and ``genicam``."""
+
+    core: Any
+    """``harvesters.core``."""
+    errors: tuple[type[Exception], ...]
+    """What GenApi (features) and GenTL (transport) raise."""
+
+    @contextlib.contextmanager
+    def translated(self, doing: str) -> Iterator[None]:
+        """Raise the library's errors as those of a camera, with what was being done."""
+        try:
+            yield
+        except self.errors as error:
+            kind = type(error).__name__
+            text = f"{doing}: {' '.join(str(error).split()) or kind}"
+            if kind in _BUSY:
+                raise CameraBusy(f"{text}; close the other program that has the camera") from error
+            if kind in _REFUSALS:
+                raise CameraError(text) from error
+            raise LinkLost(
+                f"{text}; the camera does not answer: look at its cable and power, then open it "
+                "again"
+            ) from error
+
+
+def load_library(url: str) -> Library:
+    """Import the optional packages.
+
+    Raises
+    ------
+    MissingHarvesters
+    """
+    try:
+        from genicam import genapi, gentl
+        from harvesters import core
+    except ImportError as error:
+        raise MissingHarvesters(
+            f"{url}: needs the optional part 'genicam': pip install 'skinrig[genicam]'"
+        ) from error
+    return Library(core, (genapi.GenericException, gentl.GenericException))
+
+
+def producer_files(url: str, given: str) -> tuple[Path, ...]:
+    """Return the producers to look into.
+
+    Parameters
+    ----------
+    url
+        Of the camera, for messages.
+    given
+        A file ``*.cti`` or a folder of such; empty: the folders of the environment variable
+        ``GENICAM_GENTL64_PATH``, which the makers' installers set.
+
+    Raises
+    ------
+    CameraUrlError
+        When there is none.
+    """
+    places = [given] if given else os.environ.get(SEARCH_PATH, "").split(os.pathsep)
+    folders = [Path(place) for place in places if place]
+    files: dict[Path, None] = {}
+    for folder in folders:
+        for file in sorted(folder.glob("*.cti")) if folder.is_dir() else [folder]:
+            if file.is_file():
+                files[file.resolve()] = None
+    if not files:
+        where = f"in {', '.join(map(str, folders))}" if folders else f"as {SEARCH_PATH} is not set"
+        raise CameraUrlError(
+            f"{url}: found no GenTL producer (*.cti) {where}; install the camera maker's software, "
+            f"then set {SEARCH_PATH} to the folder of its .cti file or add ?producer=FILE.cti"
+        )
+    return tuple(files)
+
+
+@dataclass(slots=True)
+class _Opened:
+    harvester: Any
+    users: int = 0
+
+
+_opened: dict[Path, _Opened] = {}
+
+
+class Connection:
+    """A camera that this process has for itself.
+
+    Parameters
+    ----------
+    acquirer
+        Of the library.
+    file
+        The producer behind it.
+    model, identifier
+        As the producer tells them; may be empty.
+
+    Attributes
+    ----------
+    acquirer, model, identifier
+        As given.
+    """
+
+    def __init__(
+        self, library: Library, acquirer: Any, file: Path, *, model: str, identifier: str
+    ) -> None:
+        self.acquirer = acquirer
+        self.model = model
+        self.identifier = identifier
+        self._library = library
+        self._file: Path | None = file
+
+    def close(self) -> None:
+        """Let go of the camera, even of one that is gone; doing so twice is allowed."""
+        file, self._file = self._file, None
+        if file is None:
+            return
+        try:
+            with contextlib.suppress(*self._library.errors):
+                self.acquirer.destroy()
+        finally:
+            _opened[file].users -= 1
+            _close_unused(self._library, file)
+
+
+def connect(library: Library, url: str, serial: str, files: Sequence[Path]) -> Connection:
+    """Open the camera of a serial number.
+
+    Parameters
+    ----------
+    library
+        From :func:`load_library`.
+    url
+        Of the camera, for messages.
+    serial
+        Its serial number, or the producer's identifier of it, as the message for one that is not
+        there lists them.
+    files
+        Producers, the first that has the camera is taken.
+
+    Raises
+    ------
+    CameraUrlError
+        When no such camera is found; the message names those that are.
+    CameraBusy
+        When another program has it.
+    LinkLost
+        When it does not answer.
+    """
+    found: list[str] = []
+    for file in files:
+        try:
+            opened = _open(library, url, file)
+        except CameraUrlError as error:
+            if len(files) == 1:
+                raise
+            found.append(str(error).removeprefix(f"{url}: "))
+            continue
+        try:
+            for device in opened.harvester.device_info_list:
+                own, identifier = _told(library, device, "serial_number"), str(device.id_)
+                model = _told(library, device, "model")
+                if serial not in (own, identifier):
+                    found.append(f"{model} {own or identifier}".strip())
+                    continue
+                with library.translated(f"{url}: cannot be opened"):
+                    acquirer = _create(opened.harvester, device)
+                opened.users += 1
+                return Connection(library, acquirer, file, model=model, identifier=identifier)
+        finally:
+            _close_unused(library, file)
+    raise CameraUrlError(
+        f"{url}: no such camera; found {', '.join(found) or 'none'} through "
+        f"{', '.join(file.name for file in files)}. Cameras that were plugged in after another "
+        "one of that producer was opened are not seen: close all, then try again"
+    )
+
+
+def _open(library: Library, url: str, file: Path) -> _Opened:
+    if file not in _opened:
+        harvester = library.core.Harvester(logger=_quiet)
+        try:
+            harvester.add_file(str(file), check_existence=True, check_validity=True)
+            with library.translated(f"{url}: {file.name}"):
+                harvester.update()
+        except OSError as error:
+            raise CameraUrlError(
+                f"{url}: the GenTL producer {file} cannot be loaded ({error}); it must be made for "
+                "this system and processor"
+            ) from error
+        _opened[file] = _Opened(harvester)
+    return _opened[file]
+
+
+def _close_unused(library: Library, file: Path) -> None:
+    if _opened[file].users == 0:
+        with contextlib.suppress(*library.errors):
+            _opened.pop(file).harvester.reset()
+
+
+def _create(harvester: Any, device: Any) -> Any:
+    """Open a device; the library takes Ctrl-C for itself then, which is given back."""
+    if threading.current_thread() is not threading.main_thread():
+        return harvester.create(device)
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        return harvester.create(device)
+    finally:
+        if handler is not None:  # None: not set from Python
+            signal.signal(signal.SIGINT, handler)
+
+
+def _told(library: Library, device: Any, name: str) -> str:
+    try:
+        return str(getattr(device, name) or "")
+    except library.errors:  # optional in GenTL
+        return ""
