@@ -24,7 +24,7 @@ from capture.devices.camera import (
 )
 from capture.rig import RigError, View
 
-from .world import World, get
+from .world import World, get_by_name_or_box
 
 __all__ = ["CameraBody", "SimCamera", "open_camera"]
 
@@ -34,14 +34,20 @@ FOREIGN_SERIAL = "SR-9999"
 
 
 def open_camera(rest: str) -> Camera:
-    """Open ``sim://WORLD/VIEW``; the world must be registered, or its box be open."""
+    """Open ``sim://WORLD/VIEW``; the world must be registered, or its box be open.
+
+    WORLD is the name of ``sim://BOX?world=NAME``, or BOX itself where no name was given.
+    """
     name, slash, view_name = rest.partition("/")
     if not (name and slash and view_name):
         raise CameraUrlError(f"sim://{rest}: got {rest!r}, expected WORLD/VIEW")
     try:
-        return SimCamera(get(name).camera(view_name))
+        return SimCamera(get_by_name_or_box(name).camera(view_name))
     except (KeyError, RigError) as exc:
-        raise CameraUrlError(f"sim://{rest}: {exc.args[0]}; open the world's box first") from exc
+        raise CameraUrlError(
+            f"sim://{rest}: {exc.args[0]}; open its box first, by "
+            "sim://BOX?world=NAME, and its cameras by sim://NAME/VIEW"
+        ) from exc
 
 
 @dataclass(frozen=True, slots=True)

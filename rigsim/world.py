@@ -49,6 +49,7 @@ __all__ = [
     "World",
     "WorldClock",
     "get",
+    "get_by_name_or_box",
 ]
 
 TRANSCRIPT_LINES = 4096
@@ -378,6 +379,30 @@ def get(name: str) -> World:
         known = ", ".join(_BENCH) or "none"
         raise KeyError(f"world: got {name!r}, expected a registered one: {known}")
     return _BENCH[name]
+
+
+def get_by_name_or_box(name: str) -> World:
+    """Return the registered world called `name`, or the only one without a name of that box.
+
+    Parameters
+    ----------
+    name
+        As it was registered; or the box ``BOX`` of a world that ``sim://BOX`` or ``sim://BOX?...``
+        made without a name of its own.
+
+    Raises
+    ------
+    KeyError
+        When there is none, or several worlds without a name have that box.
+    """
+    unnamed = [url for url in _BENCH if url.partition("?")[0] == f"sim://{name}"]
+    if name in _BENCH or not unnamed:
+        return get(name)
+    if len(unnamed) > 1:
+        raise KeyError(
+            f"world: got {name!r}, of which there are {len(unnamed)}, expected one with a name"
+        )
+    return _BENCH[unnamed[0]]
 
 
 def _dark_frame(view: View, rng: np.random.Generator) -> NDArray[np.uint16]:

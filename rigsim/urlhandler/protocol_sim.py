@@ -1,8 +1,9 @@
 """Pyserial port on a simulated box: ``sim://BOX?seed=1&clock=virtual&drop=0.001&...``.
 
 ``sim://flash?world=NAME`` is the box of a registered world; where no world has that name, one is
-made and registered under it. Without ``world`` the whole URL is the name: the same URL is the same
-box, which keeps its state while its port is closed. ``seed``, ``clock`` (virtual or real) and the
+made and registered under it; ``name=NAME`` says the same. Without a name the whole URL is the name:
+the same URL is the same box, which keeps its state while its port is closed, and its cameras are
+``sim://flash/VIEW``. ``seed``, ``clock`` (virtual or real) and the
 switches of `rigsim.faults.Faults` say how a new world is made.
 
 The port fails as real ones do: a pulled cable is a SerialException in read and write, an OSError in
@@ -51,7 +52,9 @@ def world_of_url(url: str) -> tuple[World, str]:
     if len(settings) != len(pairs):
         raise ValueError(f"{url}: a setting stands twice")
     box = parts.netloc
-    name = settings.pop("world", url)
+    if "name" in settings and "world" in settings:
+        raise ValueError(f"{url}: got world and name, which mean the same; give one")
+    name = settings.pop("world", settings.pop("name", url))
     try:
         return _with_box(worlds.get(name), box, url), box
     except KeyError:

@@ -10,7 +10,7 @@ import pytest
 import serial
 from serial.serialutil import PortNotOpenError
 
-from capture.devices.camera import Exposure
+from capture.devices.camera import CameraUrlError, Exposure, open_camera
 from capture.devices.port import Port
 from capture.devices.wire import Request, encode
 from capture.rig import load_rig
@@ -111,13 +111,34 @@ def test_a_url_with_an_unknown_world_makes_one_under_that_name():
     made.unregister()
 
 
+def test_a_world_is_named_by_name_as_by_world():
+    made, _ = world_of_url("sim://flash?name=unit-named")
+    assert world_of_url("sim://flash?world=unit-named")[0] is made
+    made.unregister()
+
+
+@pytest.mark.parametrize("url", ["sim://probe", "sim://probe?seed=1&clock=virtual"])
+def test_cameras_of_a_world_without_a_name_are_found_by_its_box(url):
+    made, _ = world_of_url(url)
+    camera = open_camera("sim://probe/cam")
+    assert camera.info.serial == made.rig.view("cam").serial
+    camera.close()
+    other, _ = world_of_url("sim://probe?seed=2")
+    with pytest.raises(CameraUrlError, match=r"of which there are 2, .* sim://BOX.world=NAME"):
+        open_camera("sim://probe/cam")
+    made.unregister()
+    other.unregister()
+    with pytest.raises(CameraUrlError, match="expected a registered one"):
+        open_camera("sim://probe/cam")
+
+
 @pytest.mark.parametrize(
     ("url", "match"),
     [
         ("sim://toaster", "expected one of flash"), ("sim://flash?seed=-1", "seed"),
         ("sim://flash?clock=fast", "clock"), ("sim://flash?dropp=1", "did you mean drop"),
         ("sim://flash?seed=1&seed=2", "twice"), ("sim://flash?drop=2", "probability"),
-        ("sim://flash?seed", "bad query"),
+        ("sim://flash?seed", "bad query"), ("sim://flash?name=a&world=b", "world and name"),
     ],
 )  # fmt: skip
 def test_a_url_that_no_world_understands_is_named(url, match):
