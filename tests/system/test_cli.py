@@ -246,3 +246,26 @@ def test_no_argument_shows_where_to_begin(capsys, tmp_path, monkeypatch):
 )
 def test_the_readme_names_commands_that_exist(command):
     assert command in COMMANDS
+
+
+def test_a_simulated_world_is_captured_by_the_urls_of_its_box_and_camera(tmp_path, monkeypatch):
+    monkeypatch.setattr("rigsim.world._BENCH", {})
+    out = tmp_path / "session"
+    where = ["--port", "flash=sim://flash?seed=1&clock=virtual", "--camera", "cam=sim://flash/cam"]
+    assert main(["capture", "flash", *where, "--target", "dark", "--out", str(out)]) == 0
+    assert main(["verify", str(out)]) == 0
+
+
+def test_a_benchmark_takes_several_stages_after_one_option_or_many(monkeypatch):
+    asked = []
+
+    def measured(stages, **settings):
+        asked.append(stages)
+        return {"schema": "skinrig.bench/1", "passed": True}
+
+    monkeypatch.setattr("skinrig.benchmarks.stages.run_stages", measured)
+    assert main(["bench", "--stage", "chromophores", "wrinkles", "hdr", "--json"]) == 0
+    assert main(["bench", "--stage", "chromophores", "--stage", "wrinkles", "hdr"]) == 0
+    assert main(["bench", "chromophores", "wrinkles", "hdr"]) == 0
+    assert main(["bench"]) == 0
+    assert asked == [["chromophores", "wrinkles", "hdr"]] * 3 + [None]
