@@ -35,8 +35,8 @@ from capture.devices.genicam_producer import (
 )
 from capture.devices.genicam_readout import prepare
 
-BUFFER_BYTES = 2**30
-"""Most memory for frames that wait to be fetched."""
+BUFFER_BYTES = 2**32
+"""Most memory for the frames of a sequence, which are fetched when it is over."""
 MIN_BUFFERS = 3
 STAMP_TOLERANCE_S = 1e-3
 """How far a frame's stamp may be ahead of the camera's clock: ticks of either are rounded."""
@@ -166,10 +166,15 @@ class GenicamCamera:
             features.set("TriggerSource", self._readout.line)
             features.set_if_there("TriggerActivation", "RisingEdge")
         size = int(features.read("PayloadSize"))
-        most = max(BUFFER_BYTES // max(size, 1), MIN_BUFFERS)
+        if (count + 1) * size > BUFFER_BYTES and count + 1 > MIN_BUFFERS:
+            raise CameraError(
+                f"{self._url}: {count} frames of {size / 1e6:.1f} MB that wait for the end of a "
+                f"sequence: got {count * size / 1e9:.1f} GB, expected {BUFFER_BYTES / 1e9:.1f} GB "
+                "at most; use a packed format or a smaller part of the sensor"
+            )
         with self._library.translated(f"{self._url}: arming"):
             least = max(self._acquirer.min_num_buffers, MIN_BUFFERS)
-            self._acquirer.num_buffers = max(min(count + 1, most), least)
+            self._acquirer.num_buffers = max(count + 1, least)
             self._acquirer.start()
         self._trigger, self._left = trigger, count
         self._seq, self._frame_id = -1, None

@@ -7,6 +7,8 @@ tests/protocol/test_genicam_producer.py.
 
 import itertools
 import signal
+import subprocess
+import sys
 from collections import deque
 from types import SimpleNamespace
 
@@ -25,6 +27,7 @@ from capture.devices.camera import (
     Trigger,
     WrongCamera,
     next_frame,
+    open_camera,
 )
 from capture.devices.port import LinkLost
 
@@ -473,12 +476,34 @@ def test_other_triggers_are_refused(camera, trigger):
         camera.arm(0, Trigger.EDGE)
 
 
-def test_buffers_for_a_sequence_stay_within_memory(camera, body):
+def test_every_frame_of_a_sequence_has_its_buffer_or_the_sequence_is_refused(camera, body):
+    """They are fetched when the sequence is over; one without a buffer would be lost."""
     camera.arm(300, Trigger.EDGE)
     assert body.announced == 301
     body.nodes["PayloadSize"]._value = 2**26
-    camera.arm(300, Trigger.EDGE)
-    assert body.announced == 16
+    with pytest.raises(CameraError, match=r"300 frames of 67\.1 MB.*packed"):
+        camera.arm(300, Trigger.EDGE)
+    assert not body.running
+    camera.arm(40, Trigger.EDGE)
+    assert body.announced == 41
+
+
+def test_a_camera_whose_library_is_missing_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "harvesters", None)  # as if it were not installed
+    with pytest.raises(ImportError, match=r"skinrig\[genicam\]") as caught:
+        open_camera("genicam:1234")
+    assert isinstance(caught.value, CameraError)
+
+
+def test_the_library_is_imported_by_nothing_but_such_an_address():
+    code = (
+        "import sys, capture.devices.genicam\n"
+        "from capture.devices.camera import check_address\n"
+        "check_address('genicam:1')\n"
+        "print(sorted({'harvesters', 'genicam'} & set(sys.modules)))\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout == "[]\n"
 
 
 def test_a_camera_that_is_gone_is_a_lost_link_and_can_be_closed(bus, body):
@@ -584,9 +609,10 @@ def test_an_address_that_says_something_else_is_refused(rest):
 
 
 def test_a_format_or_line_that_it_lacks_is_named_with_those_it_has(bus):
-    for query, message in (("format=Mono12p", "Mono12p.*BayerRG12"), ("line=Line9", "Line1, Line2")):
-        with pytest.raises(CameraError, match=message):
-            genicam.open_camera(f"B2?{query}")
+    with pytest.raises(CameraError, match=r"Mono12p.*BayerRG12"):
+        genicam.open_camera("B2?format=Mono12p")
+    with pytest.raises(CameraUrlError, match=r"Line9.*Software, Line1, Line2"):
+        genicam.open_camera("B2?line=Line9")
 
 
 def test_every_error_of_the_library_is_one_of_a_camera():
