@@ -169,7 +169,7 @@ def fit_cycle(
     longest = 0.5 * min(middle, cycle_s - middle)
     delays = np.linspace(0.0, longest, _DELAYS)
     if data.stepped:
-        between = _moves_between(phase % cycle_s, data.moved > 0.0, middle, longest)
+        between = data.moves_between(phase % cycle_s, middle, longest)
         delays = np.linspace(*between, _DELAYS_OF_POSE)
     changes = np.concatenate([phase % cycle_s, (phase - middle) % cycle_s])
     plain, *bent = (
@@ -227,20 +227,6 @@ def fit_course(
         for amount in ((0.0, -bend, bend) if bend else (0.0,))
     )
     return _with_bends(straight, bent)
-
-
-def _moves_between(
-    phase: Floats, moved: NDArray[np.bool_], middle: float, longest: float
-) -> tuple[float, float]:
-    """Return between which delays the face moves: when it last had not, and first had."""
-    since = np.where(phase < middle, phase, phase - middle)
-    done = moved == (phase < middle)  # shows what was asked for last
-    soon = since <= longest
-    not_yet = float(since[soon & ~done].max(initial=0.0))
-    already = float(since[soon & done].min(initial=longest))
-    # reactions differ: between the earliest that has and the latest that has not, where they cross
-    low, high = min(not_yet, already), max(not_yet, already)
-    return (low, high) if high > low else (0.0, longest)
 
 
 def _check_bend(bend: float) -> None:

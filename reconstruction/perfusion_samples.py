@@ -89,6 +89,28 @@ class Samples:
         """Whether any curve has a step."""
         return bool((self.stderr_of_pose > 0).any())
 
+    def moves_between(self, phase: Floats, middle: float, longest: float) -> tuple[float, float]:
+        """Return between which delays the face moves: when it last had not, and first had.
+
+        Parameters
+        ----------
+        phase : ndarray, shape (N,)
+            Since the prompt of the expression, in [0, cycle), s.
+        middle
+            When rest is asked for, s.
+        longest
+            Longest delay that is looked at, s.
+        """
+        since = np.where(phase < middle, phase, phase - middle)
+        done = (self.moved > 0.0) == (phase < middle)  # shows what was asked for last
+        soon = since <= longest
+        not_yet = float(since[soon & ~done].max(initial=0.0))
+        already = float(since[soon & done].min(initial=longest))
+        # reactions differ: between the earliest that has and the latest that has not, where they
+        # cross
+        low, high = min(not_yet, already), max(not_yet, already)
+        return (low, high) if high > low else (0.0, longest)
+
     def with_free_step(self) -> Samples:
         """Return these with steps of which nothing is known, where there are any."""
         return replace(self, taken=np.where(self.stderr_of_pose > 0, 1.0, 0.0))
