@@ -64,6 +64,8 @@ def examine(*, probe_renderer: bool = True) -> list[Finding]:
     if probe_renderer:
         findings.append(_renderer())
     findings.extend(_serial_ports())
+    if importlib.util.find_spec("harvesters") is not None:
+        findings.append(_camera_producers())
     return findings
 
 
@@ -88,3 +90,15 @@ def _serial_ports() -> list[Finding]:
             "" if ports else "none is needed to simulate; plug the rig in and look again",
         )
     ]  # fmt: skip
+
+
+def _camera_producers() -> Finding:
+    from capture.devices.camera import CameraUrlError
+    from capture.devices.genicam_producer import SEARCH_PATH, producer_files
+
+    try:
+        state = ", ".join(file.name for file in producer_files("genicam", ""))
+    except CameraUrlError:
+        state = ""
+    mend = f"install the camera maker's software and set {SEARCH_PATH} to its folder"
+    return Finding("GenTL producers", state or "none", True, "" if state else mend)

@@ -211,7 +211,8 @@ def open_camera(url: str) -> Camera:
     Parameters
     ----------
     url
-        ``sim://WORLD/VIEW``, ``tcp://HOST:PORT/VIEW``, ``hotfolder:PATH``, ``gphoto2:SERIAL``.
+        ``sim://WORLD/VIEW``, ``tcp://HOST:PORT/VIEW``, ``hotfolder:PATH``, ``gphoto2:SERIAL``,
+        ``genicam:SERIAL``.
         The part before the colon names an entry point of the group ``capture.cameras``.
 
     Raises

@@ -212,8 +212,8 @@ def connect(library: Library, url: str, serial: str, files: Sequence[Path]) -> C
             _close_unused(library, file)
     raise CameraUrlError(
         f"{url}: no such camera; found {', '.join(found) or 'none'} through "
-        f"{', '.join(file.name for file in files)}. Cameras that were plugged in after another "
-        "one of that producer was opened are not seen: close all, then try again"
+        f"{', '.join(file.name for file in files)}; plug it in and switch it on"
+        + (", then close the other cameras, since they hide new ones" if _opened else "")
     )
 
 

@@ -1,0 +1,37 @@
+import importlib.util
+import types
+
+import pytest
+
+from skinrig import doctor
+
+
+@pytest.fixture
+def with_harvesters(monkeypatch):
+    find = importlib.util.find_spec
+    here = types.SimpleNamespace()
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: here if name == "harvesters" else find(name)
+    )
+
+
+def producers():
+    return [
+        finding
+        for finding in doctor.examine(probe_renderer=False)
+        if finding.what == "GenTL producers"
+    ]
+
+
+def test_the_producers_of_industrial_cameras_are_told(with_harvesters, tmp_path, monkeypatch):
+    (tmp_path / "maker.cti").touch()
+    monkeypatch.setenv("GENICAM_GENTL64_PATH", str(tmp_path))
+    (finding,) = producers()
+    assert (finding.state, finding.mend) == ("maker.cti", "")
+
+
+def test_where_there_are_none_it_says_what_to_set(with_harvesters, monkeypatch):
+    monkeypatch.delenv("GENICAM_GENTL64_PATH", raising=False)
+    (finding,) = producers()
+    assert finding.state == "none"
+    assert "GENICAM_GENTL64_PATH" in finding.mend
