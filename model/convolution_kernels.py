@@ -145,7 +145,8 @@ def _slow_sample(  # type: ignore[no-untyped-def]
 
     `reach` pixels to each side are weighed; a weight of 0 needs nothing.
     """
-    total = np.float32(0.0)
+    nothing = source.dtype.type(0.0)
+    total = nothing
     for l in range(1 - reach, reach + 1):  # noqa: E741
         wy = _tap(fy, l, reach)
         if wy == 0.0:
@@ -153,7 +154,7 @@ def _slow_sample(  # type: ignore[no-untyped-def]
         gy = y + l
         if gy < 0 or gy >= rows:
             if border == OPEN:
-                return np.float32(0.0), False
+                return nothing, False
             gy = _mirrored(gy, rows)
         for k in range(1 - reach, reach + 1):
             wx = _tap(fx, k, reach)
@@ -162,10 +163,10 @@ def _slow_sample(  # type: ignore[no-untyped-def]
             gx = x + k
             if gx < 0 or gx >= columns:
                 if border == OPEN:
-                    return np.float32(0.0), False
+                    return nothing, False
                 gx = _mirrored(gx, columns)
             if clear.size > 0 and clear[gy - top, gx - left] == 0:
-                return np.float32(0.0), False
+                return nothing, False
             total += wy * wx * source[gy - top, gx - left]
     return total, True
 
@@ -203,7 +204,7 @@ def along_lines(
 
     Parameters
     ----------
-    source : (h, w) float32
+    source : (h, w) float32 or float64
         A window of the map.
     clear : (h, w) uint8 or (0, 0)
         Of `distance_to_invalid` there; empty: all is valid.
@@ -215,7 +216,7 @@ def along_lines(
         Where the output is; unit vectors (right, down), strength, px.
     reach, border : int
         `LINEAR` or `CUBIC`; `MIRROR` or `OPEN`.
-    out : (m, n) float32, written
+    out : (m, n) of the source's type, written
         Pixels that are not valid keep their value.
     """
     rows, columns = size[0], size[1]
@@ -224,7 +225,8 @@ def along_lines(
     sh, sw = sigma.shape[0] > 1, sigma.shape[1] > 1
     xh, xw = axis.shape[0] > 1, axis.shape[1] > 1
     masked = clear.size > 0
-    zero, one, two = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+    kind = source.dtype.type
+    zero, one, two = kind(0.0), kind(1.0), kind(2.0)
     for row in prange(out.shape[0]):
         gy = row + out_at[0]
         y = gy - top
@@ -241,7 +243,7 @@ def along_lines(
             ax = axis[row * xh, column * xw, 0]
             ay = axis[row * xh, column * xw, 1]
             # w(i) = e^(i^2), by w(i + 1) = w(i) e^(2 i + 1)
-            e = math.exp(-0.5 / (float(s) * float(s)))
+            e = math.exp(-0.5 / (kind(s) * kind(s)))
             if e < LEAST_WEIGHT:
                 continue
             w, grow, grow_by = e, e * e * e, e * e
@@ -253,13 +255,13 @@ def along_lines(
                 quick = quick and clear[y, x] > need
             if quick and abs(ax) == one and ay == zero:
                 for i in range(1, radius + 1):
-                    total += np.float32(w) * (source[y, x + i] + source[y, x - i] - two * own)
+                    total += kind(w) * (source[y, x + i] + source[y, x - i] - two * own)
                     norm += 2.0 * w
                     w *= grow
                     grow *= grow_by
             elif quick and abs(ay) == one and ax == zero:
                 for i in range(1, radius + 1):
-                    total += np.float32(w) * (source[y + i, x] + source[y - i, x] - two * own)
+                    total += kind(w) * (source[y + i, x] + source[y - i, x] - two * own)
                     norm += 2.0 * w
                     w *= grow
                     grow *= grow_by
@@ -267,8 +269,8 @@ def along_lines(
                 for i in range(1, radius + 1):
                     dx, dy = i * ax, i * ay
                     bx, by = math.floor(dx), math.floor(dy)
-                    cx = _cubic(np.float32(dx - bx))
-                    cy = _cubic(np.float32(dy - by))
+                    cx = _cubic(kind(dx - bx))
+                    cy = _cubic(kind(dy - by))
                     jx, jy = int(bx), int(by)
                     sample = zero
                     for m in range(4):
@@ -280,7 +282,7 @@ def along_lines(
                         part += cx[2] * (above[p + 2] + below[q - 2])
                         part += cx[3] * (above[p + 3] + below[q - 3])
                         sample += cy[m] * part
-                    total += np.float32(w) * (sample - two * own)
+                    total += kind(w) * (sample - two * own)
                     norm += 2.0 * w
                     w *= grow
                     grow *= grow_by
@@ -288,7 +290,7 @@ def along_lines(
                 for i in range(1, radius + 1):
                     dx, dy = i * ax, i * ay
                     bx, by = math.floor(dx), math.floor(dy)
-                    fx, fy = np.float32(dx - bx), np.float32(dy - by)
+                    fx, fy = kind(dx - bx), kind(dy - by)
                     jx, jy = int(bx), int(by)
                     p, q = x + jx, x - jx
                     above, below = source[y + jy], source[y - jy]
@@ -299,7 +301,7 @@ def along_lines(
                     sample += fy * (
                         (one - fx) * (above[p] + below[q]) + fx * (above[p + 1] + below[q - 1])
                     )
-                    total += np.float32(w) * (sample - two * own)
+                    total += kind(w) * (sample - two * own)
                     norm += 2.0 * w
                     w *= grow
                     grow *= grow_by
@@ -316,15 +318,15 @@ def along_lines(
                             value, there = _slow_sample(
                                 source, clear, top, left, rows, columns, border,
                                 gy + int(by), gx + int(bx),
-                                np.float32(dy - by), np.float32(dx - bx), finer,
+                                kind(dy - by), kind(dx - bx), finer,
                             )  # fmt: skip
                             pair += value
                             good = good and there
                         if good:
                             break
                     if good:
-                        total += np.float32(w) * (pair - two * own)
+                        total += kind(w) * (pair - two * own)
                     norm += 2.0 * w
                     w *= grow
                     grow *= grow_by
-            out[row, column] = own + a * total / np.float32(norm)
+            out[row, column] = own + a * total / kind(norm)

@@ -36,6 +36,7 @@ from numpy.typing import ArrayLike, NDArray
 from model import convolution_kernels as kernels
 
 Float32 = NDArray[np.float32]
+Floating = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 Sampling = Literal["cubic", "linear"]
 Border = Literal["mirror", "open"]
@@ -175,7 +176,7 @@ def _settings(sampling: str, border: str) -> None:
         raise ConvolutionError(f'border: got {border!r}, expected "mirror" or "open"')
 
 
-def _usable(height: Float32, valid: ArrayLike | None) -> NDArray[np.uint8]:
+def _usable(height: Floating, valid: ArrayLike | None) -> NDArray[np.uint8]:
     """Return distances to pixels that are not valid, empty where there are none."""
     good: Bools = np.isfinite(height)
     if valid is not None:
@@ -191,7 +192,7 @@ def _usable(height: Float32, valid: ArrayLike | None) -> NDArray[np.uint8]:
 
 
 def _pass(
-    source: Float32,
+    source: Floating,
     source_window: Window,
     clear: NDArray[np.uint8],
     lines: LineKernels,
@@ -199,12 +200,12 @@ def _pass(
     shape: tuple[int, int],
     sampling: Sampling,
     border: Border,
-) -> Float32:
+) -> Floating:
     """Return one pass in a window of the map."""
     if lines.nothing:
         inner = window.within(source_window)
         return source[inner.rows, inner.columns]
-    out = np.empty(window.shape, np.float32)
+    out = np.empty(window.shape, source.dtype)
     kernels.along_lines(
         source, clear,
         np.array([source_window.top, source_window.left]), np.array(shape),
@@ -226,19 +227,21 @@ def convolve(
     valid: ArrayLike | None = None,
     sampling: Sampling = "cubic",
     border: Border = "mirror",
-) -> Float32:
+) -> Floating:
     """Convolve a map along two axes in turn, with kernels that vary from pixel to pixel.
 
     Parameters
     ----------
-    height : array_like, shape (H, W)
-        Displacement, any unit; computed in float32. Row 0 is the top.
+    height : array_like, shape (..., H, W)
+        Displacement, any unit; maps of a stack are convolved alike. float32 and float16 are
+        computed in float32, everything else in float64. Row 0 is the top.
     axis_s, axis_t : array_like, shape (H, W, 2) or (2,)
         Unit vectors (x right, y down) in pixels; the sign means nothing. Only looked at where
         the kernel does something.
     alpha_s, sigma_s, alpha_t, sigma_t : array_like, shape (H, W) or ()
-        Strengths in [-2, 1] and standard deviations along the axes, px, >= 0.
-    valid : array_like of bool, shape (H, W), optional
+        Strengths in [-2, 1] and standard deviations along the axes, px, >= 0. They and the axes
+        are taken in float32.
+    valid : array_like of bool, shape (H, W) or that of `height`, optional
         Heights to sample; heights that are not finite never are. Others keep their value.
     sampling : {"cubic", "linear"}
         How samples between pixels are taken: Keys' cubic, or bilinear, which is quicker and blurs.
@@ -247,7 +250,7 @@ def convolve(
 
     Returns
     -------
-    ndarray of float32, shape (H, W)
+    ndarray of float32 or float64, shape (..., H, W)
         A new array.
 
     Raises
@@ -259,25 +262,46 @@ def convolve(
     --------
     >>> spike = np.zeros((1, 7))
     >>> spike[0, 3] = 1.0
-    >>> convolve(spike, (1, 0), (0, 1), 0.5, 0.7, 0.0, 1.0)[0].astype(float).round(3).tolist()
+    >>> convolve(spike, (1, 0), (0, 1), 0.5, 0.7, 0.0, 1.0)[0].round(3).tolist()
     [0.0, 0.005, 0.103, 0.785, 0.103, 0.005, 0.0]
     """
     _settings(sampling, border)
     given = np.asarray(height)
-    if given.ndim != 2 or given.size == 0:
-        raise ConvolutionError(f"height: got shape {given.shape}, expected (H, W)")
-    shape = (given.shape[0], given.shape[1])
+    if given.ndim < 2 or 0 in given.shape[-2:]:
+        raise ConvolutionError(f"height: got shape {given.shape}, expected (..., H, W)")
+    shape = (given.shape[-2], given.shape[-1])
     first = LineKernels.of(axis_s, alpha_s, sigma_s, shape)
     second = LineKernels.of(axis_t, alpha_t, sigma_t, shape)
     for lines in (first, second):
         reach_of(lines, shape, sampling)
-    source = np.ascontiguousarray(given, np.float32)
+    single = given.dtype in (np.float16, np.float32)
+    source: Floating = np.ascontiguousarray(given, np.float32 if single else np.float64)
+    mask = _mask(valid, source.shape)
     if first.nothing and second.nothing:
         return source.copy()
-    clear = _usable(source, valid)
     whole = Window(0, shape[0], 0, shape[1])
-    along_s = _pass(source, whole, clear, first, whole, shape, sampling, border)
-    return _pass(along_s, whole, clear, second, whole, shape, sampling, border)
+
+    def convolved(at: tuple[int, ...]) -> Floating:
+        clear = _usable(source[at], None if mask is None else mask[at])
+        along_s = _pass(source[at], whole, clear, first, whole, shape, sampling, border)
+        return _pass(along_s, whole, clear, second, whole, shape, sampling, border)
+
+    if source.ndim == 2:
+        return convolved(())  # no copy of a large map
+    out = np.empty_like(source)
+    for at in np.ndindex(source.shape[:-2]):
+        out[at] = convolved(at)
+    return out
+
+
+def _mask(valid: ArrayLike | None, shape: tuple[int, ...]) -> Bools | None:
+    """Return the mask of a stack of maps, given for each map or for all."""
+    if valid is None:
+        return None
+    mask = np.asarray(valid)
+    if mask.dtype != np.bool_ or mask.shape not in (shape, shape[-2:]):
+        raise ConvolutionError(f"valid: got {mask.dtype} {mask.shape}, expected bool {shape}")
+    return np.broadcast_to(mask, shape)
 
 
 def tiles_of(shape: tuple[int, int], tile: int) -> list[Window]:

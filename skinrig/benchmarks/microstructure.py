@@ -385,7 +385,7 @@ def two_passes_error(
     side: int = 160,
     sampling: Sampling = "cubic",
     rng: np.random.Generator,
-) -> tuple[float, Callable[[], Float32]]:
+) -> tuple[float, Callable[[], NDArray[np.floating]]]:
     """Return how far two passes are from the true convolution whose kernel varies, and the call.
 
     The true one (eqs. 1 and 2, with the kernel of the pixel it is written to) is known exactly of
@@ -430,9 +430,10 @@ def two_passes_error(
         height += wave
         expected += response * wave
     inner = slice(margin, -margin), slice(margin, -margin)
+    stored = height.astype(np.float32)
 
-    def call() -> Float32:
-        return convolve(height, axis_s, axis_t, alpha[0], sigma, alpha[1], sigma, sampling=sampling)
+    def call() -> NDArray[np.floating]:
+        return convolve(stored, axis_s, axis_t, alpha[0], sigma, alpha[1], sigma, sampling=sampling)
 
     off = (call() - expected)[inner]
     change = (expected - height)[inner]

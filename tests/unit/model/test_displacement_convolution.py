@@ -78,6 +78,38 @@ def test_two_passes_are_eqs_4_to_6_evaluated_plainly(rng, mode):
         assert same.all()
 
 
+def test_double_heights_are_convolved_in_double_to_the_rounding_of_float32_parameters(rng):
+    shape = (61, 83)
+    height = 1e4 + relief(shape, rng)  # float32 would leave 1e-3 of it
+    asked = [np.asarray(v, np.float32) for v in fields(shape)]
+    found = convolve(height, *asked, sampling="linear")
+    assert found.dtype == np.float64
+    axis_s, axis_t, alpha_s, sigma_s, alpha_t, sigma_t = (v.astype(np.float64) for v in asked)
+    valid = np.ones(shape, bool)
+    first = numpy_pass(height, axis_s, alpha_s, sigma_s, valid)
+    expected = numpy_pass(first, axis_t, alpha_t, sigma_t, valid)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    still = convolve(height, *slanted(0.6), 0.0, 2.0, 0.5, np.where(valid & (height > 2e4), 2, 0))
+    np.testing.assert_array_equal(still, height)
+
+
+def test_heights_of_a_stack_are_convolved_each_by_itself(rng):
+    stack = rng.standard_normal((2, 3, 12, 15)).astype(np.float32)
+    valid = rng.random(stack.shape) > 0.05
+    kernel = (*slanted(0.4), 0.8, 1.2, -0.9, 1.1)
+    for mask in (valid, valid[0, 0]):
+        found = convolve(stack, *kernel, valid=mask)
+        assert found.dtype == np.float32
+        for at in np.ndindex(2, 3):
+            one = convolve(stack[at], *kernel, valid=np.broadcast_to(mask, stack.shape)[at])
+            np.testing.assert_array_equal(found[at], one)
+    assert convolve(stack[:0], *kernel).shape == (0, 3, 12, 15)
+    half = stack.astype(np.float16)
+    np.testing.assert_array_equal(
+        convolve(half, *kernel), convolve(half.astype(np.float32), *kernel)
+    )
+
+
 def test_kernels_along_rows_and_columns_are_those_of_the_fit(rng):
     height = relief((40, 50), rng)
     found = convolve(height, X, Y, 0.7, 1.7, -1.3, 2.2)
