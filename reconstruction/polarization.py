@@ -192,8 +192,9 @@ def separate(
         var_p, var_c = _variances(variance, p.shape, kind)
         var_k = np.broadcast_to(np.asarray(leak_stderr, dtype=kind) ** 2, p.shape)
         # derivatives by k: d' = -2 s / (w_c - k w_p), s' = w_p s / (w_c - k w_p)
-        var_d = 4 * (var_c + leak**2 * var_p + specular**2 * var_k) / safe**2
-        var_s = (w_c**2 * var_p + w_p**2 * var_c + (w_p * specular) ** 2 * var_k) / safe**2
+        with np.errstate(invalid="ignore"):  # 0 times a variance without bounds: not valid below
+            var_d = 4 * (var_c + leak**2 * var_p + specular**2 * var_k) / safe**2
+            var_s = (w_c**2 * var_p + w_p**2 * var_c + (w_p * specular) ** 2 * var_k) / safe**2
         known = mask & np.isfinite(var_d) & np.isfinite(var_s)
         good = good & known.all(axis=-1)
         mask = good[..., None]

@@ -114,5 +114,24 @@ def test_an_array_that_is_no_table_is_refused(rgb, message):
 
 
 def test_a_size_too_small_for_a_spline_is_refused():
-    with pytest.raises(ColorTableError, match="at least 8"):
-        color_table.build("Nikon 5100 (NPL)", "D65", size=4)
+    for size in (4, 7, 8.5, "16"):
+        with pytest.raises(ColorTableError, match=f"at least 8, got {size}"):
+            color_table.build("Nikon 5100 (NPL)", "D65", size=size)
+
+
+def test_fractions_whose_shapes_do_not_fit_are_named():
+    table = color_table.build("Nikon 5100 (NPL)", "D65", size=8)
+    for asked in (table.lookup, table.jacobian, color_table.spectral_reflectance):
+        with pytest.raises(ColorTableError, match=r"broadcast, got \(3,\) and \(4,\)"):
+            asked(np.full(3, 0.1), np.full(4, 0.1))
+
+
+@pytest.mark.parametrize(("size", "told"), [(8, 0.04), (16, 3e-3), (32, 4e-5)])
+def test_the_color_between_nodes_is_as_near_as_told(size, told, rng):
+    melanin, blood = 0.5 * rng.random(5000) ** 3, 0.32 * rng.random(5000) ** 3
+    fine, coarse = (
+        color_table.build("Nikon 5100 (NPL)", "D65", size=n).lookup(melanin, blood)
+        for n in (256, size)
+    )
+    off = np.abs(coarse / fine - 1.0).max()
+    assert 0.05 * told < off < told

@@ -259,3 +259,18 @@ def test_images_that_do_not_fit_are_refused():
         PolarizerAxes(light=(0.0, 2.0, 0.0))
     with pytest.raises(ValueError, match="same"):
         PolarizerAxes(crossed=(0.0, 1.0, 0.0))
+
+
+def test_a_variance_without_bounds_masks_its_pixel_and_warns_nobody():
+    parallel, crossed = np.full((2, 2, 3), 0.5), np.full((2, 2, 3), 0.25)
+    parallel[0, 0] = crossed[0, 0]  # no specular part
+    for bad in (np.inf, np.nan):
+        variance = np.full(parallel.shape, 1e-4)
+        variance[0, 0, 1] = bad
+        with np.errstate(all="raise"):
+            found = separate(parallel, crossed, variance=variance, extinction=1000.0)
+        assert found.valid.tolist() == [[False, True], [True, True]]
+        assert np.isfinite(found.stderr[found.valid]).all()
+        with np.errstate(all="raise"):
+            found = separate(parallel, crossed, variance=variance)
+        assert found.valid.tolist() == [[False, True], [True, True]]
