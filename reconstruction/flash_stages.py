@@ -182,9 +182,14 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
     if images["crossed"] is None:
         crossed = session.frames("subject", polarizer="crossed")
         states = sorted({str(record.index.get("state")) for record in crossed})
+        what = "photograph" if "photographs" in session.manifest.extra else "crossed frame"
         raise EvidenceError(
-            f"{session.path}: has no crossed frame of state {inputs.state!r}; it has "
-            f"{'those of ' + ', '.join(states) if states else 'none at all: is it finished?'}"
+            f"{session.path}: has no {what} of state {inputs.state!r}; it has "
+            + (
+                f"those of {', '.join(states)}: choose one of them (--state {states[0]})"
+                if states
+                else "none at all: is it finished?"
+            )
         )
     return images
 

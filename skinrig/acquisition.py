@@ -398,6 +398,7 @@ def capture_session(
         )  # fmt: skip
         return {
             "steps": len(chosen.steps), "estimated_s": seconds, "captured": 0, "light": light,
+            "plan": chosen.to_json(),
         }  # fmt: skip
     box_urls = {name: box_urls[name] for name in needed}
     return _run(

@@ -175,7 +175,11 @@ def suggest(found: Surroundings, folder: Path) -> tuple[Step, ...]:
     elif found.appearances:
         steps.append(Step(f"skinrig report {named(folder)}", "one page of all that lies here"))
     used = {d.get("parameters", {}).get("session") for d in found.appearances.values()}
-    fresh = [(p, d) for p, d in found.sessions.items() if p.name not in used and not _target(d)]
+    fresh = [
+        (path, document)
+        for path, document in found.sessions.items()
+        if path.name not in used and not _target(document) and not _is_gray(document)
+    ]
     if fresh:
         path, document = fresh[0]
         rig = document.get("rig", {}).get("name", "")
@@ -272,6 +276,13 @@ def _target(session: Mapping[str, Any]) -> str:
         return "white"
     targets = CALIBRATIONS.get(rig, {})
     return next((target for target in targets if target in kinds - {"dark"}), "")
+
+
+def _is_gray(session: Mapping[str, Any]) -> bool:
+    """Tell imported photographs without color, of which no map of skin can be made."""
+    rig = session.get("rig", {})
+    filters = {view.get("cfa") for view in rig.get("views", ())}
+    return rig.get("name") not in CALIBRATIONS and filters == {"MONO"}
 
 
 def _most_whole(appearances: Mapping[Path, Mapping[str, Any]], files: Sequence[str]) -> Path:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from capture.rig import Probe, Rig, load_rig
 from capture.session import Session
+from skinrig.console import Console
+from skinrig.errors import INTERRUPTED
 from skinrig.next_steps import named
 from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
@@ -41,6 +43,7 @@ def serve_rig(
     site: str | None = None,
     resume: Path | None = None,
     seconds: float | None = None,
+    as_json: bool = False,
 ) -> None:
     """Print the addresses of boxes and cameras, one ``NAME URL`` a line, and serve.
 
@@ -66,6 +69,8 @@ def serve_rig(
         drawn by the number of a shot, and shots are counted on from those. None: from 0 on.
     seconds
         How long; None serves until Ctrl-C.
+    as_json
+        Whether the addresses are one JSON document, with the next step.
     """
     from rigsim.serve import serve
 
@@ -95,22 +100,26 @@ def serve_rig(
     with serve(
         rig, pty=pty, tcp=tcp, allow_remote=allow_remote, seed=seed, scene=scene, shots_made=made
     ) as served:
-        for name, url in served.addresses.items():
-            print(f"{name} {url}", flush=True)
         boxes = " ".join("--port " + named(f"{n}={served.addresses[n]}") for n in rig.boxes)
         cameras = " ".join(
             "--camera " + named(f"{v.name}={served.addresses[v.name]}") for v in rig.views
         )
         more = "" if rig.caliper is None else " --force-limit 2 --eyes closed"
         out = "session" if resume is None else f"{named(resume)} --resume"
-        print(
-            f"next: skinrig capture {rig_name} {boxes} {cameras}{more} --out {out}\nCtrl-C ends it",
-            file=sys.stderr,
-        )
+        after = f"skinrig capture {named(rig_name)} {boxes} {cameras}{more} --out {out}"
+        if as_json:
+            addresses = {"addresses": dict(served.addresses), "next": after}
+            Console(as_json).document("skinrig.serve/1", addresses)
+        else:
+            for name, url in served.addresses.items():
+                print(f"{name} {url}", flush=True)
+        print(f"next: {after}\nCtrl-C ends it", file=sys.stderr)
         try:
             served.wait(seconds)
         except KeyboardInterrupt:
             print("no longer served; the lights are dark", file=sys.stderr)
+            if as_json:  # its one document stands there already
+                raise SystemExit(INTERRUPTED) from None
             raise
 
 

@@ -18,7 +18,7 @@ from capture.documents import Fault, InputError
 from capture.importers.pictures import Encoding, Photo, PhotoError, read_photo
 from capture.plan import Kind, Plan, Step, Value
 from capture.rig import Light, Rig, View
-from capture.session import Session, Subject
+from capture.session import Session, SessionDiskError, Subject
 
 logger = logging.getLogger(__name__)
 
@@ -47,6 +47,8 @@ class Imported:
     """Names of the subject's states, one per photograph or pair of photographs."""
     ignored: tuple[str, ...]
     """Files that are no photographs, left out."""
+    color_states: tuple[str, ...] = ()
+    """Those of `states` whose photographs hold color; gray ones tell nothing of chromophores."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,11 +166,22 @@ def import_photos(
         if target.exists():
             target.rmdir()
         part.rename(target)
+    except SessionDiskError as exc:
+        shutil.rmtree(part, ignore_errors=True)
+        raise SessionDiskError(
+            exc.what,
+            where=str(target),
+            advice="Free space or name another folder, then import again; nothing was kept.",
+        ) from exc
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
         raise
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
-    return Imported(str(target), len(steps), assumed, states, tuple(ignored))
+    color = {str(step.index["state"]) for step, entry in steps if entry.pattern != "MONO"}
+    return Imported(
+        str(target), len(steps), assumed, states, tuple(ignored),
+        tuple(state for state in states if state in color),
+    )  # fmt: skip
 
 
 def _files(directory: Path) -> tuple[list[Path], list[str]]:

@@ -30,6 +30,8 @@ ASSUMED_READ_NOISE_E = 10.0
 _JPEG, _PNG, _EXR = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _TIFF_SUFFIXES = (".tif", ".tiff")
+_NAMES = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG", ".exr": "OpenEXR"}
+"""What a file of that name, which is none and no raw file either, was meant to be."""
 _ADVICE = "Give the photograph as the camera or the raw converter wrote it."
 
 
@@ -160,6 +162,10 @@ def _raw(file: Path, where: str) -> Photo:
     try:
         frame = raw.read(file)
     except raw.RawError as exc:
+        if (kind := _NAMES.get(file.suffix.lower())) is not None:
+            begins = repr(file.read_bytes()[:4])
+            expected = f"those of a {kind}"
+            raise _error(f"is no {kind}", where, "first bytes", begins, expected) from exc
         raise PhotoError(exc.what, where=where, faults=exc.faults, advice=_ADVICE) from exc
     except NotImplementedError as exc:  # LibRaw's word for a filter array it cannot describe
         raise _error("has an unknown filter array", where, "cell", str(exc), "2 x 2") from exc

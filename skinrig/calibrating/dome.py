@@ -98,6 +98,10 @@ def calibrate_dome(
     rigs = {session.rig.name for session in sessions}
     if len(rigs) != 1:
         raise DomeCalibratingError(f"sessions: got rigs {sorted(rigs)}, expected one")
+    if "dome" not in sessions[0].rig.boxes:
+        raise DomeCalibratingError(
+            f"kind {kind!r}: got a session of rig {rigs.pop()!r}, expected one of a dome"
+        )
     what = targets or DomeTargets()
     if kind == "geometry":
         return _geometry(sessions, Path(folder), created, what)

@@ -103,7 +103,9 @@ def capture(
 def serve(
     rig: Rig,
     pty: Annotated[bool, typer.Option("--pty", help="Boxes on a pseudo terminal.")] = False,
-    tcp: Annotated[str, typer.Option(help="Address for boxes and cameras.")] = "127.0.0.1:0",
+    tcp: Annotated[
+        str, typer.Option(help="Address for cameras and, without --pty, boxes; port 0: a free one.")
+    ] = "127.0.0.1:0",
     anywhere: Annotated[
         bool, typer.Option("--allow-remote", help="Let other machines connect.")
     ] = False,
@@ -118,8 +120,12 @@ def serve(
             "be gone on with: noise of its shots does not come again."
         ),
     ] = None,
+    json: Json = False,
 ) -> None:
     """Serve a simulated rig to any client; the first lines are the addresses.
+
+    Boxes and cameras are on TCP, with --pty boxes on a pseudo terminal each. With --json the
+    addresses are the one document, printed as soon as they can be opened.
 
     Example: skinrig serve flash --pty
     """
@@ -127,7 +133,7 @@ def serve(
 
     serve_rig(
         rig, pty=pty, tcp=tcp, allow_remote=anywhere, subject=subject, size=size, seed=seed,
-        site=site, resume=resume,
+        site=site, resume=resume, as_json=json,
     )  # fmt: skip
 
 

@@ -47,10 +47,15 @@ def import_photos(
     console.say(
         f"{done.path}: {counted(done.frames, 'photograph')}, states {', '.join(done.states)}"
     )
-    state = "" if "neutral" in done.states else f" --state {done.states[0]}"
-    console.say(
-        f"next: skinrig reconstruct {out} --want melanin,hemoglobin --out appearance{state}"
-    )
+    place = named(out)
+    if done.color_states:
+        shown = "neutral" if "neutral" in done.color_states else done.color_states[0]
+        state = "" if shown == "neutral" else f" --state {shown}"
+        after = f"reconstruct {place} --want melanin,hemoglobin --out appearance{state}"
+    else:
+        console.say("left out: melanin and hemoglobin: gray pictures hold no color to tell them by")
+        after = f"verify {place}"
+    console.say(f"next: skinrig {after}")
     console.document(
         "skinrig.import/1",
         {

@@ -42,7 +42,16 @@ def file_to_write(context: typer.Context, out: Path | None) -> Path | None:
     return out
 
 
-Page = Annotated[Path, typer.Option("-o", "--out", callback=file_to_write, help="The page.")]
+def page_to_write(context: typer.Context, out: Path | None) -> Path | None:
+    """Refuse a folder, and the standard output, which has no name to be opened by."""
+    if out is not None and not context.resilient_parsing and str(out) == STDOUT:
+        raise UsageError("--out: got '-', expected a file to write")
+    return file_to_write(context, out)
+
+
+STDOUT = "-"
+"""The standard output where a file is named."""
+Page = Annotated[Path, typer.Option("-o", "--out", callback=page_to_write, help="The page.")]
 Site = Annotated[
     str | None,
     typer.Option(help="Where the gradient rig's skin is from: forehead (default), cheek or chin."),

@@ -7,13 +7,19 @@ from typing import Annotated
 
 import typer
 
-from skinrig.commands.options import Json, Page
+from skinrig.commands.options import STDOUT, Json, file_to_write
 from skinrig.console import Console
+from skinrig.errors import UsageError
 
 
 def report(
     paths: Annotated[list[Path], typer.Argument(help="Folders that skinrig wrote.")],
-    out: Page = Path("report.html"),
+    out: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--out", callback=file_to_write, help="The page; - is the standard output."
+        ),
+    ] = Path("report.html"),
     compare: Annotated[
         bool | None,
         typer.Option(
@@ -36,15 +42,23 @@ def report(
     from skinrig.report import make
     from skinrig.reporting.folders import write_page
 
+    piped = str(out) == STDOUT
+    if piped and json:
+        raise UsageError("--out: got '-' with --json, whose document goes there; name a file")
     console = Console(json)
+    talk = Console(json or piped)  # where the page goes nothing else does
     done = make(paths, compare=compare)
-    write_page(out, done.html)
+    if piped:
+        typer.echo(done.html, nl=False)
+    else:
+        write_page(out, done.html)
     size = len(done.html.encode())
     if done.compared is None:
-        console.say(done.verdict)
+        talk.say(done.verdict)
     else:
-        console.say(f"compared {' with '.join(done.compared)}; --no-compare shows all of both")
-    console.say(f"{out}: {size / 1e6:.2f} MB; open it in a browser")
+        talk.say(f"compared {' with '.join(done.compared)}; --no-compare shows all of both")
+    if not piped:
+        talk.say(f"{out}: {size / 1e6:.2f} MB; open it in a browser")
     missed = sum(not check.passed for check in done.checks)
     console.document(
         "skinrig.report/1",

@@ -149,6 +149,7 @@ def write_page(path: Path, text: str) -> None:
     try:
         part.write_text(text, encoding="utf-8")
         os.replace(part, path)
-    except OSError:
+    except OSError as error:
         part.unlink(missing_ok=True)
-        raise
+        # the page was asked for, of the part beside it nobody knows
+        raise type(error)(error.errno, error.strerror, str(path)) from error

@@ -313,7 +313,7 @@ def test_a_text_that_calls_itself_a_photograph_is_told_in_one_sentence(tmp_path,
     (tmp_path / "in" / "a.jpg").write_text("no photograph")
     assert main(["import", "photos", str(tmp_path / "in"), "--out", str(tmp_path / "s")]) == 3
     told = capsys.readouterr().err
-    assert "a.jpg: got one that is not a raw file (LibRaw: " in told
+    assert "a.jpg: got one that is no JPEG (first bytes: b'no p')" in told
     assert told.count("expected") == 1
 
 

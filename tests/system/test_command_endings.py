@@ -1,0 +1,155 @@
+"""What commands say when they end, well or badly: next steps, pages and plans, where they go."""
+
+import errno
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from capture.rig import load_rig
+from capture.session.disk import Disk
+from skinrig import errors
+from skinrig.cli import main
+
+
+def photograph(path, color=True, seed=0):
+    pixels = np.random.default_rng(seed).integers(40, 200, (32, 48, 3), np.uint8)
+    Image.fromarray(pixels if color else pixels[..., 0]).save(path)
+
+
+@pytest.fixture
+def photos(tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    return folder
+
+
+def bring(photos, session):
+    return main(["import", "photos", str(photos), "--out", str(session)])
+
+
+def test_a_gray_photograph_is_not_offered_for_melanin(photos, tmp_path, capsys, monkeypatch):
+    photograph(photos / "portrait.png", color=False)
+    assert bring(photos, tmp_path / "session") == 0
+    said = capsys.readouterr().out
+    assert "next: skinrig verify" in said
+    assert "reconstruct" not in said
+    monkeypatch.chdir(tmp_path)
+    assert main([]) == 0
+    assert "skinrig reconstruct" not in capsys.readouterr().out
+
+
+def test_of_gray_and_colored_photographs_a_colored_one_is_offered(photos, tmp_path, capsys):
+    photograph(photos / "a.png", color=False)
+    photograph(photos / "b.png")
+    assert bring(photos, tmp_path / "session") == 0
+    assert "--out appearance --state b" in capsys.readouterr().out
+
+
+def test_of_several_photographs_the_states_there_are_named(photos, tmp_path, capsys):
+    photograph(photos / "a.png")
+    photograph(photos / "b.png")
+    session, out = tmp_path / "session", tmp_path / "appearance"
+    assert bring(photos, session) == 0
+    assert main(["reconstruct", str(session), "--want", "melanin", "--out", str(out)]) == 3
+    said = capsys.readouterr().err
+    assert "has no photograph of state 'neutral'; it has those of a, b" in said
+    assert "--state a" in said
+    assert "crossed frame" not in said
+
+
+def test_a_full_disk_at_an_import_speaks_of_importing_again(photos, tmp_path, capsys, monkeypatch):
+    photograph(photos / "a.png")
+
+    def full(self, descriptor, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Disk, "write", full)
+    assert bring(photos, tmp_path / "session") == 3
+    said = capsys.readouterr().err
+    assert "No space left on device" in said
+    assert "then import again; nothing was kept" in said
+    assert "resume" not in said
+    assert ".part" not in said
+    assert [entry.name for entry in tmp_path.iterdir()] == ["photos"]
+
+
+@pytest.mark.parametrize(("name", "kind"), [("a.jpg", "JPEG"), ("a.PNG", "PNG")])
+def test_text_named_as_a_picture_is_told_by_the_picture_it_is_not(
+    name, kind, photos, tmp_path, capsys
+):
+    (photos / name).write_bytes(b"text")
+    assert bring(photos, tmp_path / "session") == 3
+    said = capsys.readouterr().err
+    assert f"is no {kind}" in said
+    assert "b'text'" in said
+    assert "LibRaw" not in said
+
+
+def test_a_page_that_cannot_be_written_is_called_by_its_own_name(photos, tmp_path, capsys):
+    photograph(photos / "a.png")
+    assert bring(photos, tmp_path / "session") == 0
+    capsys.readouterr()
+    code = main(["report", str(tmp_path / "session"), "-o", "/proc/page.html"])
+    said = capsys.readouterr().err
+    assert code == 3
+    assert "/proc/page.html" in said
+    assert ".part" not in said
+
+
+def test_a_report_goes_to_the_standard_output_alone(photos, tmp_path, capsys, monkeypatch):
+    photograph(photos / "a.png")
+    assert bring(photos, tmp_path / "session") == 0
+    capsys.readouterr()
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", str(tmp_path / "session"), "-o", "-"]) == 0
+    page = capsys.readouterr().out
+    assert page.startswith("<!")
+    assert page.rstrip().endswith("</html>")
+    assert not (tmp_path / "-").exists()
+    assert main(["report", str(tmp_path / "session"), "-o", "-", "--json"]) == 2
+    assert main(["view", "-o", "-"]) == 2
+    assert not (tmp_path / "-").exists()
+
+
+def test_a_script_reads_the_whole_plan_of_a_dry_run(capsys):
+    assert main(["capture", "flash", "--dry-run", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert len(told["plan"]["steps"]) == told["steps"] > 0
+    assert {step["kind"] for step in told["plan"]["steps"]} == {"dark", "subject"}
+
+
+@pytest.mark.parametrize("kind", ["lights", "geometry"])
+def test_a_dome_is_not_calibrated_by_sessions_of_another_rig(kind, photos, tmp_path, capsys):
+    photograph(photos / "a.png")
+    session = tmp_path / "session"
+    assert bring(photos, session) == 0
+    assert main(["calibrate", kind, str(session), "--out", str(tmp_path / "c")]) == 3
+    assert "session of rig 'imported', expected one of a dome" in capsys.readouterr().err
+
+
+def test_a_served_rig_prints_one_document_and_ends_without_another(monkeypatch, capsys):
+    rig = load_rig("flash")
+    addresses = {name: f"tcp://127.0.0.1:1/{name}" for name in (*rig.boxes, "cam")}
+
+    class Served(SimpleNamespace):
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            return None
+
+        def wait(self, seconds):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("rigsim.serve.serve", lambda *args, **settings: Served(addresses=addresses))
+    monkeypatch.setattr("skinrig.serving._flash_scene", lambda *args: None)
+    assert main(["serve", "flash", "--json"]) == errors.INTERRUPTED
+    told = json.loads(capsys.readouterr().out)
+    assert told["schema"] == "skinrig.serve/1"
+    assert told["addresses"] == addresses
+    assert told["next"].startswith("skinrig capture flash --port flash=tcp://127.0.0.1:1/flash")
+    assert main(["serve", "flash"]) == errors.INTERRUPTED
+    assert capsys.readouterr().out.splitlines() == [f"{n} {url}" for n, url in addresses.items()]
