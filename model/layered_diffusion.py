@@ -38,7 +38,8 @@ def reflectance(
     Raises
     ------
     ValueError
-        For coefficients or thicknesses that are negative or NaN, or an `eta` outside 1 to 100.
+        For coefficients or thicknesses that are negative or NaN, for no layers, or an `eta` outside
+        1 to 100.
 
     Notes
     -----
@@ -67,6 +68,10 @@ def reflectance(
     ):  # fmt: skip
         if not np.all((values >= 0.0) & ((values < np.inf) | endless)):
             raise ValueError(f"{name}: got negative values or NaN, expected at least 0")
+        if np.ndim(values) < 1 or np.shape(values)[-1] < 1:
+            raise ValueError(
+                f"{name}: got shape {np.shape(values)}, expected (..., layers), at least one layer"
+            )
     sigma_t = np.maximum(sigma_a_per_mm + sigma_s_prime_per_mm, _FAINT_PER_MM)
     diffusion = 1.0 / (3.0 * sigma_t)
     kappa = np.sqrt(sigma_a_per_mm / diffusion)

@@ -276,13 +276,14 @@ def mixture_coordinates(
 ) -> FloatArray:
     """Return the non-negative shares (n, K) of a basis (K, d) that come nearest to samples.
 
-    Both finite, each in any unit.
+    Both finite, each in any unit; what is narrower than double precision is widened.
 
     Raises
     ------
     TraitError
         For what is not finite, and a metric that is none of samples of this length.
     """
+    samples, basis = np.asarray(samples, np.float64), np.asarray(basis, np.float64)
     unit, own = exponent_of(samples), exponent_of(basis)
     d = basis.shape[1]
     if metric is not None:

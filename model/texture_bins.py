@@ -33,8 +33,18 @@ def principal_axes(covariance: Floats, unit: float) -> Floats:
     -------
     ndarray, shape (C, C)
         Orthonormal rows; the largest component of each is positive.
+
+    Raises
+    ------
+    ValueError
+        For a covariance that is not square, or not finite.
     """
     C = len(covariance)
+    if covariance.shape != (C, C) or C < 1 or not np.isfinite(covariance).all():
+        raise ValueError(
+            f"covariance: got shape {covariance.shape}, expected (C, C) of finite values, C at "
+            "least 1"
+        )
     preferred = OPPONENT if C == 3 else np.eye(C)
     # orders directions without variance; about that of the rounding of float32
     least = 1e-9 * np.trace(covariance) + 1e-13 * unit**2
@@ -53,7 +63,12 @@ def uneven_edges(quantiles: ArrayLike, unit: float) -> Floats:
     quantiles : array_like
         Even quantiles of the values of every image; all count the same.
     unit : float
-        Largest value of the images; a range far below it is widened.
+        Largest value of the images, above 0; a range far below it is widened.
+
+    Raises
+    ------
+    ValueError
+        For no values or some that are not finite, and for a `unit` that is not above 0.
 
     Examples
     --------
@@ -62,6 +77,13 @@ def uneven_edges(quantiles: ArrayLike, unit: float) -> Floats:
     [-0.05, 0.5, 1.05]
     """
     values = np.sort(np.asarray(quantiles, np.float64), axis=None)
+    if not (values.size and np.isfinite(values).all()):
+        raise ValueError(
+            f"quantiles: got {np.count_nonzero(~np.isfinite(values))} of {values.size} values that "
+            "are not finite, expected finite ones, at least one"
+        )
+    if not 0.0 < unit < np.inf:
+        raise ValueError(f"unit: got {unit}, expected a finite value above 0")
     low, high = values[0], values[-1]
     room = max(_MARGIN * (high - low), 0.5e-4 * unit)
     low, high = low - room, high + room

@@ -48,6 +48,8 @@ def reading_matrix(texels: int, pixels: int) -> Any:
 
 def averaging_matrix(pixels: int, texels: int) -> Any:
     """Return the sparse matrix that averages `pixels` over each of `texels`; rows sum to 1."""
+    if pixels < 1 or texels < 1:
+        raise ValueError(f"pixels, texels: got {pixels}, {texels}, expected at least 1")
     edges = np.arange(texels + 1) * (pixels / texels)
     values, rows, columns = [], [], []
     for i in range(texels):
@@ -66,7 +68,7 @@ def resampled(texture: Floats, shape: tuple[int, int]) -> Floats:
     Parameters
     ----------
     texture : ndarray, shape (..., h, w)
-        Real and finite; channels lead.
+        Floating point numbers of any precision, finite; channels lead.
     shape : (int, int)
         Rows and columns wanted.
 
@@ -75,12 +77,27 @@ def resampled(texture: Floats, shape: tuple[int, int]) -> Floats:
     ndarray, shape (..., *shape)
         Of the texture's type.
 
+    Raises
+    ------
+    ValueError
+        For a texture of other numbers, or none, and for a shape without pixels.
+
     Examples
     --------
     >>> resampled(np.arange(4.0)[None], (1, 2)).tolist()
     [[0.5, 2.5]]
     """
-    out = np.asarray(texture)
+    given = np.asarray(texture)
+    real = np.issubdtype(given.dtype, np.floating)
+    if given.ndim < 2 or min(given.shape[-2:]) < 1 or not real:
+        raise ValueError(
+            f"texture: got shape {given.shape} of {given.dtype}, expected (..., h, w) of floating "
+            "point numbers, h and w at least 1"
+        )
+    if len(shape) != 2 or min(shape) < 1:
+        raise ValueError(f"shape: got {tuple(shape)}, expected rows and columns, each at least 1")
+    # sparse matrices know no halves: those are summed in single precision
+    out = given.astype(np.promote_types(given.dtype, np.float32), copy=False)
     for axis, pixels in ((-2, shape[0]), (-1, shape[1])):
         texels = out.shape[axis]
         if texels != pixels:
@@ -89,4 +106,4 @@ def resampled(texture: Floats, shape: tuple[int, int]) -> Floats:
             moved = np.moveaxis(out, axis, 0)
             flat = matrix.astype(out.dtype) @ moved.reshape(texels, -1)
             out = np.moveaxis(flat.reshape(pixels, *moved.shape[1:]), 0, axis)
-    return out
+    return out.astype(given.dtype, copy=False)

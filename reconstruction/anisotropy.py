@@ -35,6 +35,13 @@ Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
 Errors: TypeAlias = Literal["relative", "absolute"]
 
+FAR = 300
+"""Powers of two from 1 beyond which values are brought near it: their squares keep within range."""
+LEAST_ERROR, MOST_ERROR = 1e-307, 1e150
+"""Relative standard errors of one direction: less would divide 0 by 0, more is no reading."""
+MOST_APART = 1e12
+"""Standard errors over the least: directions of greater ones are left out, since beside the best
+ones rounding hides what they tell."""
 UNKNOWN_AXIS_RAD = math.pi / math.sqrt(12.0)
 """Standard deviation of an axis that may point anywhere."""
 
@@ -158,17 +165,28 @@ def estimate(
     angle, values, stderr, good, shape = _checked(
         angle_rad, sigma_tr_per_mm, stderr_per_mm, valid, errors
     )
+    # sums and squares of values at the ends of the range would leave it
+    exponent = _far_exponent(np.where(good, values, 0.0).max(axis=0, initial=0.0))
+    with np.errstate(over="ignore"):
+        values, stderr = np.ldexp(values, -exponent), np.ldexp(stderr, -exponent)
     scale = np.where(good, values, 0.0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)
     scale = np.where(scale > 0, scale, 1.0)
     y = np.where(good, values / scale, 0.0)
-    relative = np.where(good, stderr / scale, math.inf)
+    with np.errstate(over="ignore"):
+        relative = np.clip(stderr / scale, LEAST_ERROR, MOST_ERROR)
+    relative = np.where(good, relative, math.inf)
     least = relative.min(axis=0, initial=math.inf)
     least = np.where(np.isfinite(least), least, 1.0)
     # weights of 1 at most: errors of any size keep within range
-    weight = np.where(good, (least / relative) ** 2, 0.0)
+    weight = np.where(good & (relative <= MOST_APART * least), (least / relative) ** 2, 0.0)
     outlier = np.zeros(weight.shape, bool)
     if outliers:
         weight, outlier = direction_harmonics.without_outliers(angle, y, weight)
+        # others beside one far above them were next to nothing of the mean
+        kept = np.where(weight > 0, y, 0.0)
+        closer = _far_exponent(kept.max(axis=0, initial=0.0))
+        y = np.ldexp(np.where(closer == 0, y, kept), -closer)
+        least, exponent = np.ldexp(least, -closer), exponent + closer
     linear = direction_harmonics.fit(angle, y, weight)
     p, inverse, residual = diffusion_ellipse.fit(angle, y, weight, linear)
     # what rounding leaves is neither a residual nor a harmonic
@@ -196,9 +214,11 @@ def estimate(
     h, h_stderr, h_across = _length(p[:, 1:3], covariance[:, 1:3, 1:3])
     mean, by_parameter = diffusion_ellipse.mean_over_directions(p[:, :3])
     mean_error = np.sqrt(_quadratic(by_parameter, covariance[:, :3, :3]))
+    with np.errstate(over="ignore"):
+        mean, mean_error = (np.ldexp(one * scale, exponent) for one in (mean, mean_error))
     tilt, tilt_stderr, _ = _length(p[:, 3:], covariance[:, 3:, 3:])
     ellipse = p[:, :3].copy()
-    ellipse[:, 0] += 2.0 * np.log(scale)
+    ellipse[:, 0] += 2.0 * (np.log(scale) + exponent * math.log(2.0))
     told, odd = linear.told, linear.odd
 
     def shaped(found: NDArray[Any], otherwise: float, where: Bools = told) -> NDArray[Any]:
@@ -212,8 +232,8 @@ def estimate(
         axis_stderr_rad=shaped(_axis_stderr(h, h_across), UNKNOWN_AXIS_RAD),
         p_value=shaped(np.exp(log_p), 1.0),
         log10_p=shaped(log_p / math.log(10.0), 0.0),
-        mean_per_mm=shaped(mean * scale, 0.0),
-        mean_stderr_per_mm=shaped(mean_error * scale, math.inf),
+        mean_per_mm=shaped(mean, 0.0),
+        mean_stderr_per_mm=shaped(mean_error, math.inf),
         tilt=shaped(tilt, 0.0, odd),
         tilt_stderr=shaped(tilt_stderr, math.inf, odd),
         tilt_rad=shaped(_turned(np.arctan2(p[:, 4], p[:, 3]), math.tau), 0.0, odd),
@@ -400,6 +420,12 @@ def _checked(
     if errors == "absolute" and zero.any():
         raise AnisotropyError('stderr_per_mm: got none or 0, expected above 0 for "absolute"')
     return angle, values, np.where(whole, 1.0, stderr), good, shape
+
+
+def _far_exponent(largest: Floats) -> NDArray[np.int64]:
+    """Return the power of two of values (B,) far from 1; 0 for those that are not, and for 0."""
+    exponent = np.frexp(largest)[1].astype(np.int64)
+    return np.where((largest > 0) & (np.abs(exponent) > FAR), exponent, 0)
 
 
 def _quadratic(vectors: Floats, matrices: Floats) -> Floats:

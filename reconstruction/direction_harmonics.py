@@ -149,6 +149,7 @@ def fit(angle_rad: Floats, values: Floats, weight: Floats) -> HarmonicFit:
     deleted = np.maximum(deleted, 1e-12 * residual)
     enough = told & (dof >= 3) & (residual > 0)
     per_one = np.sqrt(np.where(enough, deleted / np.maximum(dof - 1, 1), 1.0) * left)
+    per_one = np.maximum(per_one, np.finfo(np.float64).tiny)
     studentized = np.where(enough & used, error / per_one, 0.0)
     return HarmonicFit(coefficients, told, odd, residual, axial, first, dof, studentized)
 

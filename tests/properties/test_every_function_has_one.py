@@ -137,6 +137,7 @@ NOT_DRIVEN = {
                 "reconstruction.chromophore_ridge": "lines_of",
                 "reconstruction.chromophore_start": "start_for",
                 "reconstruction.nearest_medium": "fit_nearest",
+                "reconstruction.profile_batch": "fits_from",
                 "reconstruction.profile_comparison": "compare",
                 "reconstruction.subsurface_models": "profile_model",
                 "reconstruction.subsurface_outcome": "judged",

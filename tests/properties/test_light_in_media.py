@@ -456,3 +456,12 @@ def test_even_light_comes_back_as_albedo_and_sums_agree(r_d, length, level, seed
     tree = dipole_gather.SourceTree.of(points, area)
     told = dipole_gather.gather(tree, light, points[:4], r_d, length)
     np.testing.assert_array_equal(told.exitance, quick)
+
+
+@CHEAP
+@given(shape=st.sampled_from([(), (0,), (3, 0)]), which=st.integers(0, 2))
+def test_a_stack_without_layers_is_an_error(shape, which):
+    values = [np.ones((3, 1)) for _ in range(3)]
+    values[which] = np.ones(shape)
+    with pytest.raises(ValueError, match="at least one layer"):
+        layered_diffusion.reflectance(*values)

@@ -104,6 +104,19 @@ def test_mixtures_of_a_basis_are_its_own_shares(seed, unit, n, size):
 
 
 @CHEAP
+@given(seed=SEED, kind=st.sampled_from([np.float16, np.float32, np.int64]))
+def test_mixtures_of_narrow_numbers_are_those_of_wide_ones(seed, kind):
+    rng = np.random.default_rng(seed)
+    samples, basis = (rng.integers(0, 9, (n, 6)).astype(kind) for n in (4, 2))
+    found = reduced_spaces.mixture_coordinates(samples, basis, None)
+    wide = reduced_spaces.mixture_coordinates(
+        samples.astype(np.float64), basis.astype(np.float64), None
+    )
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, wide, atol=1e-12)
+
+
+@CHEAP
 @given(bad=st.sampled_from([np.nan, np.inf, -np.inf]), where=st.sampled_from(["s", "b", "m"]))
 def test_mixtures_of_what_is_not_finite_are_refused(bad, where):
     samples, basis, metric = np.ones((3, 4)), np.eye(2, 4), np.eye(4)

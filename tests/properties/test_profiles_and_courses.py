@@ -330,3 +330,19 @@ def test_what_is_straight_in_the_root_of_the_distance_is_kept_whatever_fibres_ar
     one = smooth_misfit.smooth_misfit(radius, values, variance[:1])[0]
     other = smooth_misfit.smooth_misfit(radius[order], values[:, order], variance[:1, order])[0]
     np.testing.assert_allclose(other, one[:, order], atol=1e-9)
+
+
+@CHEAP
+@given(seed=st.integers(0, 99), fibres=st.integers(3, 30), least=st.floats(1e-6, 1e6),
+       level=st.floats(-10.0, 10.0), slope=st.floats(-10.0, 10.0))  # fmt: skip
+def test_level_and_slope_tell_nothing_of_how_much_a_misfit_bends(seed, fibres, least, level, slope):
+    rng = np.random.default_rng(seed)
+    place = np.cumsum(rng.uniform(0.02, 0.3, fibres))
+    bend, mass = smooth_misfit._bends(place)
+    value = rng.standard_normal((2, fibres))
+    weight = least * 10.0 ** rng.uniform(0.0, 3.0, (2, fibres))
+    found = smooth_misfit.log_posterior(bend, mass, value, weight)
+    assert found.shape == (2, smooth_misfit.STRENGTHS.size)
+    assert np.isfinite(found).all()
+    moved = smooth_misfit.log_posterior(bend, mass, value + level + slope * place, weight)
+    np.testing.assert_allclose(moved, found, rtol=1e-7, atol=1e-6)

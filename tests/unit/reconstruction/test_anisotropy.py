@@ -431,3 +431,41 @@ def test_profiles_that_do_not_fit_are_refused():
         given = {"radius_mm": RADIUS_MM, "reflectance_per_mm2": truth} | MEDIUM | wrong
         with pytest.raises(AnisotropyError, match=match):
             estimate_from_profiles(SIXTEEN, **given)
+
+
+@pytest.mark.parametrize("unit", [1e-300, 1e-150, 1e150, 1.7e308])
+@pytest.mark.parametrize("told", [None, 0.01])
+def test_values_of_any_size_give_the_same_ratio_and_axis(unit, told):
+    shape = ellipse(SIXTEEN, 1.5, 0.3, mean=0.8)
+    shape = shape / shape.max()
+    errors = "relative" if told is None else "absolute"
+    stderr = None if told is None else np.full(16, told)
+    usual = estimate(SIXTEEN, shape, stderr, errors=errors)
+    found = estimate(SIXTEEN, unit * shape, None if told is None else unit * stderr, errors=errors)
+    assert found.valid
+    for name in ("ratio", "axis_rad", "ratio_stderr", "chi2"):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(usual, name), rtol=1e-6, atol=1e-12
+        )
+    np.testing.assert_allclose(found.mean_per_mm / unit, usual.mean_per_mm, rtol=1e-12)
+
+
+@pytest.mark.parametrize("height", [1e20, 1e150, 1e300])
+def test_a_direction_far_above_all_others_is_left_out_and_hides_none(height):
+    values = ellipse(SIXTEEN, 1.5, 0.3)
+    valid = np.arange(16) != 3
+    values[3] = height
+    found, without = estimate(SIXTEEN, values), estimate(SIXTEEN, values, valid=valid)
+    np.testing.assert_array_equal(found.outlier, ~valid)
+    for name in ("ratio", "axis_rad", "mean_per_mm"):
+        np.testing.assert_allclose(getattr(found, name), getattr(without, name), rtol=1e-9)
+
+
+def test_directions_of_hopeless_errors_are_none():
+    """Beside errors 1e12 times smaller their weights are rounding, and matrices singular."""
+    values = ellipse(SIXTEEN, 1.5, 0.3)
+    stderr = np.where(np.arange(16) < 3, 1e-3, 1e13)
+    found = estimate(SIXTEEN, values, stderr, errors="absolute")
+    assert found.used.sum() == 3
+    assert not found.valid
+    assert "3 usable directions" in str(found.reason)
