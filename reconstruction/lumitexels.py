@@ -30,7 +30,6 @@ __all__ = [
     "Surface",
     "Visibility",
     "gather",
-    "grazing_weight",
     "visibility",
 ]
 
@@ -129,30 +128,6 @@ class Visibility:
     """Shape (L, P)."""
     view: Bools
     """Shape (V, P)."""
-
-
-def grazing_weight(cos_light: ArrayLike, cos_view: ArrayLike) -> NDArray[np.float32]:
-    """Return how far a sample counts for the angles at which it was lit and seen, 0 to 1.
-
-    A smooth step of each cosine from 0 at `MIN_COSINE` to 1 at three times that: at flat angles
-    small errors of geometry and pixel become large errors of the BRDF.
-
-    Parameters
-    ----------
-    cos_light, cos_view : array_like
-        Any shapes that broadcast.
-
-    Examples
-    --------
-    >>> grazing_weight([0.05, 0.2, 0.9], 1.0).tolist()
-    [0.0, 0.5, 1.0]
-    """
-
-    def step(cosine: ArrayLike) -> Floats:
-        x = np.clip((np.asarray(cosine, np.float32) / MIN_COSINE - 1.0) / 2.0, 0.0, 1.0)
-        return np.asarray(x * x * (3.0 - 2.0 * x), np.float32)
-
-    return np.asarray(step(cos_light) * step(cos_view), np.float32)
 
 
 def visibility(

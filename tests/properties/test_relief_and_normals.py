@@ -18,7 +18,6 @@ from reconstruction import (
     kernel_table,
     landmark_field,
     light_selection,
-    lumitexels,
     mesh_repair,
     normal_histogram,
     normal_integration,
@@ -336,14 +335,6 @@ def test_more_lights_never_tell_less_of_normals(seed, noise):
     chosen = light_selection.select(found, median_rad=10.0, valid_share=0.5, least=3)
     assert len(set(chosen.lights)) == len(chosen.lights)
     assert light_selection.median_of_rayleigh([0.1, 0.1]) == pytest.approx(0.1 * 1.17741, rel=1e-3)
-
-
-@CHEAP
-@given(light=st.floats(-1.0, 1.0), view=st.floats(-1.0, 1.0))
-def test_flat_angles_count_for_less(light, view):
-    weight = lumitexels.grazing_weight([light, min(light + 0.1, 1.0)], view)
-    assert np.all((weight >= 0.0) & (weight <= 1.0))
-    assert weight[1] >= weight[0]
 
 
 @CHEAP

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from reconstruction.lumitexel_store import LumitexelStore
-from reconstruction.lumitexels import Surface, gather, grazing_weight, visibility
+from reconstruction.lumitexels import Surface, gather, visibility
 from reconstruction.ray_casting import RayCaster
 
 RADIUS = 80.0
@@ -395,14 +395,6 @@ def test_a_surface_needs_one_unit_normal_a_point():
         Surface(np.zeros((2, 3)), np.zeros((3, 3)))
     with pytest.raises(ValueError, match="finite"):
         Surface(np.full((2, 3), np.nan), np.zeros((2, 3)))
-
-
-def test_grazing_weights_rise_from_nothing_to_one():
-    cosine = np.linspace(0, 1, 50)
-    weight = grazing_weight(cosine, 1.0)
-    assert (np.diff(weight) >= 0).all()
-    np.testing.assert_array_equal(weight, grazing_weight(1.0, cosine))
-    assert (weight[0], weight[-1]) == (0.0, 1.0)
 
 
 def test_a_point_inside_the_mesh_sees_nothing():
