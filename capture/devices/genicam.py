@@ -157,7 +157,7 @@ class GenicamCamera:
             # another trigger left on would have to come first
             for other in features.choices("TriggerSelector"):
                 features.set("TriggerSelector", other)
-                features.set("TriggerMode", "Off")
+                features.set_if_there("TriggerMode", "Off")
             features.set("TriggerSelector", "FrameStart")
         features.set("TriggerMode", "On")
         if trigger is Trigger.SOFTWARE:
@@ -252,8 +252,11 @@ class GenicamCamera:
         """Return the frame in a buffer of the library."""
         with self._library.translated(f"{self._url}: a frame"):
             payload = int(buffer.payload_type)
-            number = int(buffer.pixel_format)
-            size = (int(buffer.width), int(buffer.height))
+            number = self._optional(buffer, "pixel_format", self._readout.format_number)
+            size = (
+                self._optional(buffer, "width", self._info.width_px),
+                self._optional(buffer, "height", self._info.height_px),
+            )
             data = memoryview(buffer.raw_buffer)[self._optional(buffer, "image_offset", 0) :]
             padding = self._optional(buffer, "padding_x", 0)
             big_endian = self._optional(buffer, "pixel_endianness", 1) == 2

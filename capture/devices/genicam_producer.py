@@ -205,7 +205,7 @@ def connect(library: Library, url: str, serial: str, files: Sequence[Path]) -> C
                     found.append(f"{model} {own or identifier}".strip())
                     continue
                 with library.translated(f"{url}: cannot be opened"):
-                    acquirer = _create(opened.harvester, device)
+                    acquirer = _create(library, opened.harvester, device)
                 opened.users += 1
                 return Connection(library, acquirer, file, model=model, identifier=identifier)
         finally:
@@ -239,13 +239,16 @@ def _close_unused(library: Library, file: Path) -> None:
             _opened.pop(file).harvester.reset()
 
 
-def _create(harvester: Any, device: Any) -> Any:
+def _create(library: Library, harvester: Any, device: Any) -> Any:
     """Open a device; the library takes Ctrl-C for itself then, which is given back."""
+    core = library.core
+    # chunks are not used, and one that cannot be read would cost its frame
+    config = core.ParameterSet({core.ParameterKey.ENABLE_AUTO_CHUNK_DATA_UPDATE: False})
     if threading.current_thread() is not threading.main_thread():
-        return harvester.create(device)
+        return harvester.create(device, config=config)
     handler = signal.getsignal(signal.SIGINT)
     try:
-        return harvester.create(device)
+        return harvester.create(device, config=config)
     finally:
         if handler is not None:  # None: not set from Python
             signal.signal(signal.SIGINT, handler)

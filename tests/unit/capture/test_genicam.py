@@ -235,7 +235,7 @@ def bus(clock, body, tmp_path, monkeypatch):
                 for b in producers[self.path]
             ]
 
-        def create(self, device):
+        def create(self, device, *, config):
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # as the library does
             if device.body.busy:
                 raise error("ResourceInUseException")
@@ -244,7 +244,11 @@ def bus(clock, body, tmp_path, monkeypatch):
         def reset(self):
             opened.remove(self.path)
 
-    library = genicam_producer.Library(SimpleNamespace(Harvester=Harvester), (GenericError,))
+    core = SimpleNamespace(
+        Harvester=Harvester, ParameterSet=dict,
+        ParameterKey=SimpleNamespace(ENABLE_AUTO_CHUNK_DATA_UPDATE="chunks"),
+    )  # fmt: skip
+    library = genicam_producer.Library(core, (GenericError,))
     monkeypatch.setattr(genicam, "load_library", lambda url: library)
     monkeypatch.setattr(genicam.GenicamCamera.__init__, "__kwdefaults__", {"clock": clock})
     monkeypatch.setenv("GENICAM_GENTL64_PATH", str(tmp_path))
