@@ -52,6 +52,8 @@ def fit_facial_color(
 ) -> None:
     """Fit the hemoglobin rig: blood of each state as scale and bias of the neutral.
 
+    Nothing is left to chance: there is no --seed.
+
     Example: skinrig fit facial-color session-flash --calibration calibration --out moving
     """
     from skinrig.fitting.facial_color import fit_facial_color as fit
@@ -124,6 +126,8 @@ def fit_microstructure(
     json: Json = False,
 ) -> None:
     """Fit neutral microrelief and its table of kernels, site by site.
+
+    Nothing is left to chance: there is no --seed.
 
     Example: skinrig fit microstructure forehead=appearance-gradient --out moving
     """

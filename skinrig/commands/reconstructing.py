@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -94,7 +95,7 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
 
 
 def reconstruct(
-    session: Annotated[Path, typer.Argument(help="SESSION/ folder.")],
+    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="SESSION/ folder.")],
     want: Annotated[
         str,
         typer.Option(
@@ -126,28 +127,77 @@ def reconstruct(
 ) -> None:
     """Make maps of a session; computes only what is wanted and not there yet.
 
+    Maps of several sessions, each by itself, go to folders of their names in the one of --out.
+
     Example: skinrig reconstruct session --want melanin,hemoglobin --out appearance
+
+    Example: skinrig reconstruct monday tuesday --want melanin --out appearances
     """
     from reconstruction import pipeline
     from skinrig.demo import truth_beside
 
     console = Console(json)
     check_rank(rank, basis)
-    truth = truth_beside(session)
-    done = pipeline.reconstruct(
-        session, want=[w.strip() for w in want.split(",") if w.strip()], out=out,
-        calibration=calibration, state=state, scan=scan, basis=basis, landmarks=landmarks,
-        progress=console.progress, truth=truth.name if truth else "", hold_out=hold_out, rank=rank,
-    )  # fmt: skip
-    for text in done.assumed:
-        console.say(f"assumed: {text}")
-    console.say(f"run: {', '.join(done.ran) or 'nothing'}")
-    console.say(f"reused: {', '.join(done.reused) or 'nothing'}")
-    for what, why in done.left_out:
-        console.say(f"left out: {what} ({why})")
+    wants = [name.strip() for name in want.split(",") if name.strip()]
+    made = []
+    for session, folder in zip(sessions, folders_of(sessions, out), strict=True):
+        truth = truth_beside(session)
+        if len(sessions) > 1:
+            console.say(f"{session}:")
+        done = pipeline.reconstruct(
+            session, want=wants, out=folder, calibration=calibration, state=state, scan=scan,
+            basis=basis, landmarks=landmarks, progress=console.progress,
+            truth=truth.name if truth else "", hold_out=hold_out, rank=rank,
+        )  # fmt: skip
+        for text in done.assumed:
+            console.say(f"assumed: {text}")
+        console.say(f"run: {', '.join(done.ran) or 'nothing'}")
+        console.say(f"reused: {', '.join(done.reused) or 'nothing'}")
+        for what, why in done.left_out:
+            console.say(f"left out: {what} ({why})")
+        made.append(
+            {"path": folder, "ran": done.ran, "reused": done.reused, "left_out": done.left_out,
+             "assumed": done.assumed, "work": [dict(w) for w in done.work]}
+        )  # fmt: skip
     console.say(f"next: skinrig report {named(out)}")
     console.document(
         "skinrig.reconstruct/1",
-        {"path": out, "ran": done.ran, "reused": done.reused, "left_out": done.left_out,
-         "assumed": done.assumed, "work": [dict(w) for w in done.work]},
-    )  # fmt: skip
+        made[0] if len(made) == 1 else {"path": out, "appearances": made},
+    )
+
+
+def folders_of(sessions: Sequence[Path], out: Path) -> list[Path]:
+    """Return where the maps of each session go.
+
+    Parameters
+    ----------
+    sessions
+        One or several.
+    out
+        As given: the folder of one session's maps, else the one that holds theirs.
+
+    Raises
+    ------
+    skinrig.errors.UsageError
+        Where two sessions would go to one folder, or several into a folder of maps.
+
+    Examples
+    --------
+    >>> [str(folder) for folder in folders_of([Path("a"), Path("b/c")], Path("out"))]
+    ['out/a', 'out/c']
+    """
+    if len(sessions) == 1:
+        return [out]
+    names = [session.absolute().name for session in sessions]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise UsageError(
+            f"SESSION: got two of the name {twice!r}, whose maps would go to one folder;"
+            " reconstruct them one by one"
+        )
+    if (out / "appearance.json").exists():
+        raise UsageError(
+            f"--out: {out} holds the maps of one session, expected a folder for those of"
+            f" {len(names)}; name another"
+        )
+    return [out / name for name in names]

@@ -149,7 +149,10 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
         if name not in units:
             close = difflib.get_close_matches(name, units, 1)
             hint = f"; did you mean {close[0]}?" if close else ""
-            raise PlanningError(f"--want: got {name!r}, expected {known}{hint}")
+            others = [other for other, gives in UNITS.items() if name in gives]
+            if others:
+                hint = f"; {name} is planned for {', '.join(others)}"
+            raise PlanningError(f"--want: got {name!r} of rig {rig!r}, expected {known}{hint}")
         if unit not in (None, units[name]):
             raise PlanningError(f"--want: got {name} in {unit}, expected {units[name]}")
         try:

@@ -153,3 +153,38 @@ def test_a_served_rig_prints_one_document_and_ends_without_another(monkeypatch, 
     assert told["next"].startswith("skinrig capture flash --port flash=tcp://127.0.0.1:1/flash")
     assert main(["serve", "flash"]) == errors.INTERRUPTED
     assert capsys.readouterr().out.splitlines() == [f"{n} {url}" for n, url in addresses.items()]
+
+
+def test_several_sessions_are_reconstructed_into_folders_of_their_names(
+    tmp_path, capsys, monkeypatch
+):
+    asked = []
+
+    def reconstruct(session, *, want, out, **settings):
+        asked.append((session.name, out))
+        return SimpleNamespace(ran=("a",), reused=(), left_out=(), assumed=(), work=())
+
+    monkeypatch.setattr("reconstruction.pipeline.reconstruct", reconstruct)
+    monday, tuesday, out = tmp_path / "monday", tmp_path / "tuesday", tmp_path / "maps"
+    command = ["reconstruct", "--want", "melanin", "--out", str(out), "--json"]
+    assert main([*command, str(monday), str(tuesday)]) == 0
+    assert asked == [("monday", out / "monday"), ("tuesday", out / "tuesday")]
+    told = json.loads(capsys.readouterr().out)
+    assert [row["path"] for row in told["appearances"]] == [str(path) for _, path in asked]
+    assert main([*command, str(monday)]) == 0
+    assert asked[-1] == ("monday", out)
+    assert json.loads(capsys.readouterr().out)["path"] == str(out)
+    assert main([*command, str(monday), str(tmp_path / "other" / "monday")]) == 2
+    assert "two of the name 'monday'" in capsys.readouterr().err
+    out.mkdir()
+    (out / "appearance.json").write_text("{}")
+    assert main([*command, str(monday), str(tuesday)]) == 2
+    assert "holds the maps of one session" in capsys.readouterr().err
+    assert len(asked) == 3
+
+
+def test_what_a_rig_does_not_plan_is_told_with_the_rigs_that_do(capsys):
+    assert main(["plan", "flash", "--want", "normals<=1deg,hemoglobin<=5%"]) == 3
+    said = capsys.readouterr().err
+    assert "got 'normals' of rig 'flash'" in said
+    assert "normals is planned for dome, gradient" in said
