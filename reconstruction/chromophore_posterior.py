@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.color_table import ColorTable
 from reconstruction import chromophore_ridge as ridge
+from reconstruction.chromophore_kernels import OUTSIDE_DISTANCE, OUTSIDE_SIGMAS
 from reconstruction.chromophore_start import LOWEST
 from reconstruction.chromophores import (
     RELATIVE_NOISE,
@@ -58,7 +59,8 @@ class WeighedChromophores:
     gamut_distance: Map
     """How far the nearest color of the table is: root mean square relative difference."""
     outside: Mask
-    """The color does not belong to the table, see `reconstruction.chromophores`."""
+    """The color does not belong to the table, see `reconstruction.chromophores`: by the usual model
+    error, or by the pixel's own."""
     valid: Mask
     """Usable input, and not `outside`."""
 
@@ -157,11 +159,16 @@ def weigh(
         _TASK_PIXELS,
     )
     named = {name: maps[k].reshape(shape) for k, name in enumerate(ridge.MAPS)}
+    # the rough fit knew the usual model error alone: of a picture with much else than skin it is
+    # far too large
+    outside = fitted.outside | (
+        (named["residual"] > OUTSIDE_SIGMAS) & (fitted.gamut_distance > OUTSIDE_DISTANCE)
+    )
     return WeighedChromophores(
         **named,
         gamut_distance=fitted.gamut_distance,
-        outside=fitted.outside,
-        valid=usable & ~fitted.outside,
+        outside=outside,
+        valid=usable & np.isfinite(named["melanin"]) & ~outside,
     )
 
 

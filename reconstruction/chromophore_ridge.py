@@ -190,7 +190,7 @@ def _descend(log_rgb, by_b, k, b, seen, w, of_face):  # type: ignore[no-untyped-
         if turn == NEWTON_STEPS or moved * moved * (by_color + stiff) < CLOSE * CLOSE:
             break
         b += moved
-    if of_face[3] < 1.0 and step * step * (by_color + stiff) > ROUGH * ROUGH:
+    if step * step * (by_color + stiff) > ROUGH * ROUGH:
         step = 0.0  # not found: what a parabola says of places that far off is worth nothing
     return b, step, by_color, by_color + stiff, pushed, e0, e1, e2, g0, g1, g2, j, x
 
@@ -463,7 +463,7 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                     more += _prior_cost(prior, prior_low, prior_step, t)
                     across[k, i] = width * math.exp(-0.5 * max(more, -NEGLIGIBLE))
                     deepest = min(deepest, max(more, -NEGLIGIBLE))
-                if blood_of_face[3] < 1.0 and deepest < -MISSED:
+                if deepest < -MISSED:
                     # The ridge is not where the probability is; what lines have must not differ by
                     # much more than their neighbors', or the sum between them is of neither.
                     cost[k] += deepest
@@ -523,6 +523,10 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
             for m in range(BINS):
                 edges_b[m + 1] = ends[1] * (b_low + (m + 1) / per_b) ** 3
                 total_b[m + 1] = total_b[m] + bins[m]
+            if not total_a[count] > 0.0:  # no place along the ridge has any probability
+                for m in range(6):
+                    maps[m, n] = np.nan
+                continue
             center, reach = _center_and_reach(edges_a, total_a, count)
             maps[0, n], maps[3, n] = center, reach
             center, reach = _center_and_reach(edges_b, total_b, BINS)

@@ -162,3 +162,26 @@ def test_light_far_from_what_is_expected_leaves_finite_numbers(scale, table, pri
     for values in (found.melanin, found.hemoglobin, found.stderr_melanin, found.stderr_hemoglobin):
         assert np.isfinite(values).all()
         assert (values > 0).all()
+
+
+def test_what_is_no_skin_by_its_own_errors_is_masked_among_pixels_of_large_errors(prior):
+    """White cloth in a photograph whose background is rough: the usual error passes anything."""
+    table = color_table.build("linear sRGB", "D65", anisotropy=ANISOTROPY_SKIN)
+    light = np.exp(np.linspace(np.log(0.05), np.log(2.0), 9))[:, None, None]
+    cloth = light * [[1.0, 0.96, 0.99], [1.0, 1.0, 1.0], [0.6, 0.9, 1.0], [0.9, 0.5, 0.9]]
+    face = light * table.lookup([0.01, 0.03, 0.1, 0.3], [0.03, 0.03, 0.03, 0.03])
+    rgb = np.stack([cloth, face])
+    fine, rough = 3e-5 * (3.0 * np.eye(3) - 1.0), 0.05 * (3.0 * np.eye(3) - 1.0)
+    errors = np.broadcast_to(fine, (*rgb.shape[:-1], 3, 3)).copy()
+    errors[1, ::2] = rough
+    found = weigh(rgb, table, prior=prior, variance=(0.01 * rgb) ** 2, model_error=errors)
+    assert found.outside[0].all()
+    assert not found.valid[0].any()
+    assert found.valid[1].all()
+    for values in (found.melanin, found.shading, found.stderr_melanin, found.stderr_hemoglobin):
+        assert np.isfinite(values[found.valid]).all()
+        assert (values[found.valid] > 0).all()
+    # by the mean of the pixels' errors all of this could be skin
+    assert not invert(
+        rgb, table, variance=(0.01 * rgb) ** 2, model_error=errors.mean(axis=(0, 1, 2))
+    ).outside.any()
