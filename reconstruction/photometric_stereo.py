@@ -123,7 +123,8 @@ def estimate_normals(
     variance : array_like, optional
         Of the samples: a number, (N,) or (N, ...). Where None, noise is taken to be the same
         under all lights (relative to their intensity) and its size from the residuals; of few
-        lights these tell little, see `Robustness.few`.
+        lights these tell little, see `Robustness.few`. What is expected of a sample, not what its
+        own photons tell: low draws would weigh most, see Notes.
     valid : ndarray of bool, shape (N, ...) or (...), optional
         Samples, or points, to use: not saturated, not occluded.
     robust : bool
@@ -152,6 +153,12 @@ def estimate_normals(
     normal sees lit, with the noise from the median residual. Standard errors are those of an
     M-estimate (Huber 1981, doi 10.1002/0471725250, section 7.6); a known variance is taken as
     known unless the residuals exceed it beyond chance.
+
+    A variance by a sample's own photons pulls the albedo down and the errors with it: of 24 lights,
+    3 photons a sample at normal incidence and half a photon of read noise 68 % intervals of the
+    albedo hold 27 % (``robust=False``; 10 photons: 41, 100: 63). By the photons that a fit expects,
+    the first one of equal variances and two by the fit before, they hold 70 % (68, 69); at 1 photon
+    nothing does, 43 %, as only the bright draws leave a normal.
 
     With few samples a median residual is little evidence, and matte surfaces depart from
     Lambert's law by a few percent, most where they are dark: what is rejected then may be good.

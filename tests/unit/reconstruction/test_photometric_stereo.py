@@ -394,3 +394,28 @@ def test_the_biweight_keeps_95_percent_of_the_efficiency_of_least_squares(rng):
     # 95 % for many lights, less for 60; five sigma
     assert 0.90 - 5 * spread < efficiency < 0.97 + 5 * spread
     assert spread < 0.01
+
+
+@pytest.mark.parametrize("photons", [3.0, 10.0])
+def test_errors_of_few_photons_hold_with_the_variance_that_a_fit_expects(photons):
+    """Rationale: Poisson counts, whose own variance is a draw as well. Expected: 68 % intervals
+    hold 60 to 76 %. Tolerance: that range; 2000 points tell it to a percent.
+
+    By each sample's own photons they hold fewer.
+    """
+    rng = np.random.default_rng(521)
+    lights, read = ring(24), 0.25
+    mean = np.repeat(photons * (lights @ tilted(0.2))[:, None], 2000, axis=1)
+    samples = rng.poisson(mean) + np.sqrt(read) * rng.standard_normal(mean.shape)
+
+    def held(variance):
+        found = estimate_normals(samples, lights, variance=variance, robust=False)
+        inside = np.abs(found.albedo - photons) < found.stderr_albedo
+        return found, inside[found.valid].mean()
+
+    found, _ = held(np.ones(24))
+    for _ in range(3):
+        normal = found.albedo[:, None] * found.normals
+        found, share = held(np.maximum(lights @ normal.T, 0.0) + read)
+    assert 0.60 < share < 0.76
+    assert held(np.maximum(samples, 0.0) + read)[1] < 0.60
