@@ -5,13 +5,12 @@ PYTEST := .venv/bin/python -m pytest
 # files in the order of tests/conftest.py, the longest first, not that of how many tests they have
 WORKERS := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
-.PHONY: help setup browser demo test test-long test-all lint bench clean
+.PHONY: help setup browser demo test test-long lint bench clean
 
 help:
 	@echo "make demo       simulate, capture, calibrate, reconstruct, report (leaves ./demo)"
 	@echo "make test       every test but the long ones"
 	@echo "make test-long  the long ones"
-	@echo "make test-all   both in one run, sooner than one after the other"
 	@echo "make lint       ruff, mypy and the import contracts"
 	@echo "make browser    Chromium and what else the tests in a browser need (else they skip)"
 	@echo "make bench      error against run time of each stage"
@@ -39,9 +38,6 @@ test: .venv/.ready
 
 test-long: .venv/.ready
 	@$(PYTEST) -q $(WORKERS) --durations 25 -m long tests
-
-test-all: .venv/.ready
-	@$(PYTEST) -q $(WORKERS) --durations 25
 
 bench: .venv/.ready
 	@$(SKINRIG) bench
