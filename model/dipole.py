@@ -53,23 +53,27 @@ def reflectance(
     Raises
     ------
     ValueError
-        For arguments that are negative, not finite or above 1e100.
+        For arguments that are negative, not finite or above 1e100, or whose shapes do not
+        broadcast.
 
     Examples
     --------
     >>> float(reflectance(1.0, 0.032, 0.74, 1.3).round(5))
     0.02202
     """
-    r, sigma_a, sigma_s = np.broadcast_arrays(
-        *(
-            _not_negative(name, value, most=LARGEST)
-            for name, value in (
-                ("radius_mm", radius_mm),
-                ("sigma_a_per_mm", sigma_a_per_mm),
-                ("sigma_s_prime_per_mm", sigma_s_prime_per_mm),
-            )
-        )
-    )
+    given = {
+        "radius_mm": radius_mm,
+        "sigma_a_per_mm": sigma_a_per_mm,
+        "sigma_s_prime_per_mm": sigma_s_prime_per_mm,
+    }
+    arrays = [_not_negative(name, value, most=LARGEST) for name, value in given.items()]
+    try:
+        r, sigma_a, sigma_s = np.broadcast_arrays(*arrays)
+    except ValueError:
+        raise ValueError(
+            f"{', '.join(given)}: got shapes {', '.join(str(a.shape) for a in arrays)}, "
+            f"expected ones that broadcast"
+        ) from None
     A = fresnel.boundary_factor(eta)
     scatters = sigma_s > 0.0
     sigma_t = np.where(scatters, sigma_a + sigma_s, 1.0)

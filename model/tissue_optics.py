@@ -257,10 +257,15 @@ def layer_stack_reflectance(
     """
     if tier not in TIERS:
         raise TissueError(f"tier: got {tier!r}, expected one of {', '.join(TIERS)}")
-    sigma_a, sigma_s, thickness = np.broadcast_arrays(
-        *(np.asarray(x, dtype=np.float64) for x in (sigma_a_per_mm, sigma_s_prime_per_mm)),
-        np.asarray(thickness_mm, dtype=np.float64),
-    )
+    given = (sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm)
+    arrays = [np.asarray(x, dtype=np.float64) for x in given]
+    try:
+        sigma_a, sigma_s, thickness = np.broadcast_arrays(*arrays)
+    except ValueError:
+        raise TissueError(
+            f"sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm: expected shapes that broadcast, "
+            f"got {', '.join(str(a.shape) for a in arrays)}"
+        ) from None
     if sigma_a.ndim == 0 or sigma_a.shape[-1] == 0:
         raise TissueError(f"layers: expected at least one on the last axis, got {sigma_a.shape}")
     _check_range("sigma_a_per_mm", sigma_a, 0.0, np.inf, open_end=True)

@@ -7,8 +7,9 @@ parallel rays or a pinhole camera. See `discontinuity_integration` for surfaces 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -103,16 +104,17 @@ def integrate(
 
     Parameters
     ----------
-    normals : ndarray, shape (H, W, 3), or NormalMaps
+    normals : ndarray, shape (..., H, W, 3), or NormalMaps of (H, W)
         Outward, any length but 0, z towards the camera. Of `NormalMaps`, `valid` and
-        `stderr_rad` are taken where not given here (`valid` besides).
+        `stderr_rad` are taken where not given here (`valid` besides). Maps of a stack are
+        integrated each by itself.
     pixel : float
         Size of a pixel on the surface; its unit is that of the height. Under perspective, at the
         mean height, so that the camera's distance is `pixel * focal_px`.
-    valid : ndarray of bool, shape (H, W), optional
+    valid : ndarray of bool, shape (..., H, W), optional
         Pixels to integrate. Those whose normal is 0, not finite or more than 88.8 degrees from
         the ray are left out besides.
-    stderr_rad : float or ndarray, shape (H, W), optional
+    stderr_rad : float or ndarray, shape (..., H, W), optional
         Standard error of the normals, rad (root mean square angle). Slopes then count by the
         inverse of the variance it gives them, which rises towards the horizon. A thousandth and
         a thousandfold of the median are the least and the most that count. None: all slopes alike.
@@ -129,7 +131,7 @@ def integrate(
 
     Returns
     -------
-    ndarray, shape (H, W)
+    ndarray, shape (..., H, W)
         In the unit of `pixel`, float32 for normals in float32, else float64; mean 0 over each
         connected part, 0 outside.
 
@@ -156,6 +158,18 @@ def integrate(
     >>> np.round(np.diff(height, axis=1)[0], 6), np.round(np.diff(height, axis=0)[:, 0], 6)
     (array([-0.5, -0.5, -0.5]), array([-1., -1.]))
     """
+    if not isinstance(normals, NormalMaps):
+        stack = np.asarray(normals)
+        if stack.ndim > 3:
+            masks = _for_each("valid", valid, stack.shape[:-1])
+            errors = _for_each("stderr_rad", stderr_rad, stack.shape[:-1])
+            out = np.empty(stack.shape[:-1], np.float32 if stack.dtype == np.float32 else float)
+            for at in np.ndindex(stack.shape[:-3]):
+                out[at] = integrate(
+                    stack[at], pixel=pixel, valid=masks(at), stderr_rad=errors(at), y_up=y_up,
+                    camera=camera, method=method, denoise=denoise, settings=settings,
+                )  # fmt: skip
+            return out
     found = integrate_map(
         normals, pixel=pixel, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera,
         method=method, denoise=denoise, settings=settings,
@@ -166,6 +180,22 @@ def integrate(
             f"{found.convergence.iterations}; allow more, or a larger tolerance"
         )
     return found.height
+
+
+def _for_each(
+    name: str, values: Any, shape: tuple[int, ...]
+) -> Callable[[tuple[int, ...]], NDArray[Any] | None]:
+    """Return what belongs to each map of a stack: None, a number, or a part of an array."""
+    if values is None:
+        return lambda at: None
+    given = np.asarray(values)
+    if not given.ndim:
+        return lambda at: given
+    try:
+        spread = np.broadcast_to(given, shape)
+    except ValueError:
+        raise IntegrationError(f"{name}: got shape {given.shape}, expected {shape}") from None
+    return lambda at: spread[at]
 
 
 def integrate_map(

@@ -132,3 +132,8 @@ def test_profiles_broadcast_and_refuse_negative_coefficients():
         dipole.reflectance(1.0, -0.1, 1.0, 1.3)
     with pytest.raises(ValueError, match="albedo_prime"):
         dipole.total_reflectance(1.2, 1.3)
+
+
+def test_shapes_that_do_not_broadcast_are_named():
+    with pytest.raises(ValueError, match=r"radius_mm, .*got shapes \(4,\), \(3,\), \(\), expected"):
+        dipole.reflectance(np.ones(4), np.ones(3), 1.0, 1.4)

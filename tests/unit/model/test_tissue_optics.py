@@ -10,6 +10,7 @@ from model.tissue_optics import (
     C_M_MAX,
     TissueError,
     blood_absorption,
+    layer_stack_reflectance,
     skin_layers,
     two_layer_reflectance,
 )
@@ -95,3 +96,8 @@ def test_shapes_are_fractions_then_wavelengths():
 def test_impossible_fractions_are_refused_by_name(arguments, message):
     with pytest.raises(TissueError, match=message):
         two_layer_reflectance(*arguments)
+
+
+def test_layers_whose_shapes_do_not_broadcast_are_named():
+    with pytest.raises(TissueError, match=r"thickness_mm: .* got \(3,\), \(2,\), \(2,\)"):
+        layer_stack_reflectance(np.ones(3), np.ones(2), np.ones(2))

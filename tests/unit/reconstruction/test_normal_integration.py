@@ -358,6 +358,27 @@ def test_what_cannot_be_integrated_is_named(change, message):
         integrate(given.pop("normals"), **given)
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_normals_of_a_stack_are_integrated_each_by_itself(rng, kind):
+    n = (rng.normal(size=(2, 3, 9, 10, 3)) * 0.2 + [0.0, 0.0, 1.0]).astype(kind)
+    valid = rng.random((9, 10)) > 0.1
+    errors = rng.uniform(0.01, 0.02, (3, 9, 10))
+    for given in (
+        {},
+        {"valid": valid},
+        {"stderr_rad": errors, "valid": valid},
+        {"stderr_rad": 0.1},
+    ):
+        found = integrate(n, pixel=2.0, **given)
+        assert found.dtype == kind
+        for i, j in np.ndindex(2, 3):
+            own = {k: v[j] if np.ndim(v) == 3 else v for k, v in given.items()}
+            np.testing.assert_array_equal(found[i, j], integrate(n[i, j], pixel=2.0, **own))
+    assert integrate(n[:0]).shape == (0, 3, 9, 10)
+    with pytest.raises(IntegrationError, match=r"valid: got shape \(4, 9, 10\)"):
+        integrate(n, valid=np.ones((4, 9, 10), bool))
+
+
 def test_settings_and_cameras_out_of_range_are_named():
     for make in (
         lambda: Settings(tolerance=0.0),
