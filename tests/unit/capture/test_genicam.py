@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from capture.acquire.frame_stream import FrameStream, compare_clocks
 from capture.devices import genicam, genicam_producer
 from capture.devices.camera import (
     CameraBusy,
@@ -311,6 +312,7 @@ def test_edges_are_those_of_the_line_that_was_asked_for(bus, body):
     camera.arm(2, Trigger.EDGE)
     assert body.nodes["TriggerActivation"].value == "RisingEdge"
     body.released_by("Line2")
+    assert body.shots == 0
     body.released_by("Line1")
     assert (camera.frame(1.0).image == 65).all()
     with pytest.raises(FrameTimeout, match="plugged into the camera's Line1"):
@@ -348,6 +350,15 @@ def test_settings_are_the_nearest_the_camera_has_and_said_so(camera, body):
     assert camera.configure(Exposure(60.0, 50)) == Exposure(1.0, 100)
     got = camera.configure(Exposure(1e-7, 10**6))
     assert (got.exposure_s, got.iso) == (pytest.approx(20e-6), 1585)  # 24 dB
+
+
+def test_a_gain_of_0_db_is_called_what_the_address_says(bus, body):
+    camera = genicam.open_camera("B2?iso=160")
+    assert camera.configure(Exposure(0.008, 160)).iso == 160
+    assert body.nodes["Gain"].value == 0.0
+    assert camera.configure(Exposure(0.008, 1600)).iso == 1600
+    assert body.nodes["Gain"].value == pytest.approx(20.0)
+    camera.close()
 
 
 def test_a_gain_of_another_unit_is_left_at_its_least(bus, body):
@@ -396,6 +407,29 @@ def test_frames_are_counted_from_arming_and_lost_ones_with_them(camera, body):
             body.released_by("Line2")
         del body.buffers[1]  # of which bytes were lost
         assert [camera.frame(1.0).seq for _ in range(3)] == [0, 2, 3]
+
+
+def test_frames_of_a_sequence_find_their_rows_of_light_by_the_cameras_clock(camera, body, clock):
+    """Twelve releases a second, as a light dome gives them; one frame is lost on its way."""
+    camera.configure(WANT)
+    offset = compare_clocks(camera, lambda: clock.now)
+    assert offset.offset_s == pytest.approx(5000.0, abs=offset.uncertainty_s)
+    camera.arm(6, Trigger.EDGE)
+    times = {}
+    for row in range(6):
+        clock.now += 1.0 / 12.0
+        times[row] = clock.now
+        body.released_by("Line2")
+    del body.buffers[2]
+    stream = FrameStream(
+        "cam", camera, row_times_s=times, dwell_s=1.0 / 12.0, clock=offset, want=WANT, lag_s=0.0,
+        timeout_s=1.0,
+    )  # fmt: skip
+    frames = stream.until(5)
+    assert {row: int(frame.image[0, 0]) for row, frame in frames.items()} == {
+        row: 65 + row for row in (0, 1, 3, 4, 5)
+    }
+    assert (stream.stale, stream.refused) == (0, [])
 
 
 def test_frames_of_before_arming_are_dropped(camera, body, clock):
