@@ -182,15 +182,13 @@ def _frames(inputs: Inputs) -> Mapping[str, Any]:
     if images["crossed"] is None:
         crossed = session.frames("subject", polarizer="crossed")
         states = sorted({str(record.index.get("state")) for record in crossed})
-        what = "photograph" if "photographs" in session.manifest.extra else "crossed frame"
-        raise EvidenceError(
-            f"{session.path}: has no {what} of state {inputs.state!r}; it has "
-            + (
-                f"those of {', '.join(states)}: choose one of them (--state {states[0]})"
-                if states
-                else "none at all: is it finished?"
-            )
-        )
+        lacking = f"has no crossed frame of state {inputs.state!r}"
+        if "photographs" in session.manifest.extra:  # whose polarizers nobody was asked for
+            lacking = f"has no photograph of state {inputs.state!r}"
+        there = "none at all: is it finished?"
+        if states:
+            there = f"those of {', '.join(states)}: choose one of them (--state {states[0]})"
+        raise EvidenceError(f"{session.path}: {lacking}; it has {there}")
     return images
 
 

@@ -389,7 +389,9 @@ def capture_session(
             console.say(line)
     if plan_out is not None:
         write_plan(chosen, plan_out)
-        console.say(f"{plan_out}: the plan; change it and hand it over with --plan {plan_out}")
+        console.say(
+            f"{plan_out}: the plan; change it and hand it over with --plan {named(plan_out)}"
+        )
     if out is None or dry_run:
         console.rows(
             ("step", "kind", "settings"),

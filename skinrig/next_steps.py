@@ -185,9 +185,10 @@ def suggest(found: Surroundings, folder: Path) -> tuple[Step, ...]:
         rig = document.get("rig", {}).get("name", "")
         where = next((c for c in found.calibrations if rig in c.name), None)
         where = where or next(iter(found.calibrations), Path("calibration"))
-        steps.append(
-            Step(after_session(rig, path, None, calibration=where), "maps with standard errors")
-        )
+        command = after_session(rig, path, None, calibration=where)
+        if rig not in CALIBRATIONS:
+            command += _state_option(document)
+        steps.append(Step(command, "maps with standard errors"))
     if found.appearances:
         seen = _most_whole(found.appearances, ("facial_color.json", "mesh.obj"))
         steps.append(
@@ -276,6 +277,18 @@ def _target(session: Mapping[str, Any]) -> str:
         return "white"
     targets = CALIBRATIONS.get(rig, {})
     return next((target for target in targets if target in kinds - {"dark"}), "")
+
+
+def _state_option(session: Mapping[str, Any]) -> str:
+    """Return the option that chooses a photograph; empty where the usual state is there."""
+    views = session.get("rig", {}).get("views", ())
+    colored = {view.get("name") for view in views if view.get("cfa") != "MONO"}
+    states = [
+        str(step.get("index", {}).get("state", "neutral"))
+        for step in session.get("plan", {}).get("steps", ())
+        if step.get("kind") == "subject" and colored & set(step.get("cameras", ()))
+    ]
+    return "" if not states or "neutral" in states else f" --state {named(states[0])}"
 
 
 def _is_gray(session: Mapping[str, Any]) -> bool:

@@ -41,10 +41,15 @@ def test_a_gray_photograph_is_not_offered_for_melanin(photos, tmp_path, capsys, 
     assert "skinrig reconstruct" not in capsys.readouterr().out
 
 
-def test_of_gray_and_colored_photographs_a_colored_one_is_offered(photos, tmp_path, capsys):
+def test_of_gray_and_colored_photographs_a_colored_one_is_offered(
+    photos, tmp_path, capsys, monkeypatch
+):
     photograph(photos / "a.png", color=False)
     photograph(photos / "b.png")
     assert bring(photos, tmp_path / "session") == 0
+    assert "--out appearance --state b" in capsys.readouterr().out
+    monkeypatch.chdir(tmp_path)
+    assert main([]) == 0
     assert "--out appearance --state b" in capsys.readouterr().out
 
 
