@@ -315,6 +315,12 @@ def test_a_mixture_lies_halfway_and_holds_both(pair, errors, where):
         )
 
     face, alone = (weighed(*each) for each in zip(pair, errors, strict=True))
+    lighter = dark_spots.lighter_by_itself(face, alone)
+    assert not (lighter & dark_spots.lighter_by_itself(alone, face)).any()
+    assert not lighter.any() or pair[1] < pair[0]
+    unknown = weighed(np.nan, np.nan)
+    assert not dark_spots.lighter_by_itself(face, unknown).any()
+    assert not dark_spots.lighter_by_itself(unknown, alone).any()
     found = dark_spots.either(face, alone, [where])
     if not where:
         assert (found.melanin[0], found.stderr_hemoglobin[0]) == (pair[0], errors[0])
