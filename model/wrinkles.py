@@ -20,7 +20,6 @@ GPU Pro 2, chapter 1. ISBN 978-1-56881-718-7. Listing 1.1 lost an operator in pr
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -40,17 +39,17 @@ from model.wrinkle_expressions import (
     clamped,
     zone_sums,
 )
+from model.wrinkle_masks import Masks, mask_stack, mask_textures, real_array, zone_strength
 
 Floating: TypeAlias = NDArray[np.floating]
-Masks: TypeAlias = Floating | Sequence[Floating]
 
 ZONES = JIMENEZ2011.zones
 LIMIT = 1.0
 """Largest derivative that a texture of [0, 1] holds: slopes of 45 degrees along x and y."""
 
 __all__ = [
-    "CLAMPS", "JIMENEZ2011", "LIMIT", "ZONES", "Encoding", "Layer", "WrinkleError", "combine",
-    "combine_layers", "decode", "encode", "encoding_report", "from_unit", "mask_stack",
+    "CLAMPS", "JIMENEZ2011", "LIMIT", "ZONES", "Encoding", "Layer", "Masks", "WrinkleError",
+    "combine", "combine_layers", "decode", "encode", "encoding_report", "from_unit", "mask_stack",
     "mask_textures", "to_unit", "widened", "zone_strength",
 ]  # fmt: skip
 
@@ -114,7 +113,7 @@ def encoding_report(normals: ArrayLike, *, limit: float | None = LIMIT) -> Encod
     >>> report.derivatives.tolist(), report.clamped_fraction, report.valid.tolist()
     ([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]], 0.5, [True, True, False])
     """
-    n = _real(normals)
+    n = real_array(normals)
     if n.ndim == 0 or n.shape[-1] != 3:
         raise WrinkleError(f"normals: got shape {n.shape}, expected (..., 3)")
     if limit is not None and not limit > 0:
@@ -147,7 +146,7 @@ def decode(derivatives: ArrayLike) -> Floating:
     ndarray, shape (..., 3)
         Unit vectors with n_z > 0; (0, 0, 0) where a derivative is not finite.
     """
-    d = _real(derivatives)
+    d = real_array(derivatives)
     if d.ndim == 0 or d.shape[-1] != 2:
         raise WrinkleError(f"derivatives: got shape {d.shape}, expected (..., 2)")
     out = np.empty((*d.shape[:-1], 3), d.dtype)
@@ -173,7 +172,7 @@ def _decoded_huge(d: Floating) -> Floating:
 
 def to_unit(derivatives: ArrayLike, *, limit: float = LIMIT) -> Floating:
     """Return derivatives in [-limit, limit] as texture values in [0, 1]; 0 becomes 0.5."""
-    d = _real(derivatives)
+    d = real_array(derivatives)
     if not np.isfinite(d).all() or (d.size and float(np.abs(d).max()) > limit):
         raise WrinkleError(
             f"derivatives: got values beyond {limit:g} or not finite, expected encode's with "
@@ -184,51 +183,8 @@ def to_unit(derivatives: ArrayLike, *, limit: float = LIMIT) -> Floating:
 
 def from_unit(values: ArrayLike, *, limit: float = LIMIT) -> Floating:
     """Return the derivatives that texture values in [0, 1] stand for (listing 1.1)."""
-    t = _real(values)
+    t = real_array(values)
     return (t * t.dtype.type(2.0) - t.dtype.type(1.0)) * t.dtype.type(limit)
-
-
-def mask_stack(masks: Masks) -> Floating:
-    """Return masks as (Z, h, w), from that or from RGBA textures (h, w, 4), four zones each.
-
-    Parameters
-    ----------
-    masks : ndarray (Z, h, w), ndarray (T, h, w, 4), or sequence of (h, w) or of (h, w, 4)
-        Finite; 1 where a zone's weight counts in full.
-
-    Raises
-    ------
-    WrinkleError
-        For other shapes, or a value that is not finite.
-    """
-    try:
-        stack = _real(np.stack([_real(one) for one in masks]))
-    except ValueError as error:
-        raise WrinkleError(f"masks: got arrays of different shapes: {error}") from error
-    if stack.ndim == 4 and stack.shape[3] == 4:
-        stack = np.moveaxis(stack, 3, 1).reshape(-1, *stack.shape[1:3])
-    if stack.ndim != 3 or 0 in stack.shape:
-        raise WrinkleError(
-            f"masks: got shape {stack.shape}, expected (zones, h, w) or textures (h, w, 4)"
-        )
-    if not np.isfinite(stack).all():
-        raise WrinkleError("masks: got NaN or infinity, expected finite values")
-    return stack
-
-
-def mask_textures(masks: Masks) -> Floating:
-    """Return masks as RGBA textures (T, h, w, 4), four zones each; unused channels are 0.
-
-    Examples
-    --------
-    >>> mask_textures(np.ones((8, 2, 3))).shape
-    (2, 2, 3, 4)
-    """
-    stack = mask_stack(masks)
-    zones, h, w = stack.shape
-    out = np.zeros((math.ceil(zones / 4), 4, h, w), stack.dtype)
-    out.reshape(-1, h, w)[:zones] = stack
-    return np.ascontiguousarray(np.moveaxis(out, 1, 3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -379,21 +335,6 @@ def combine_layers(
     raise AssertionError("a last layer returns")
 
 
-def zone_strength(masks: Floating, sums: Floating) -> Floating:
-    """Return masks (Z, h, w) summed with their zones' weights (Z,): (h, w), float64.
-
-    Bilinear reading is linear, so that one map is read instead of as many as there are zones.
-    """
-    if sums.shape[0] != masks.shape[0]:
-        last = masks.shape[2] == sums.shape[0]
-        hint = "; zones come first: numpy.moveaxis(masks, -1, 0)" if last else ""
-        raise WrinkleError(
-            f"masks: got shape {masks.shape}, expected ({sums.shape[0]}, h, w), one for each of "
-            f"the {sums.shape[0]} zones' weights{hint}"
-        )
-    return np.tensordot(sums, masks.astype(np.float64, copy=False), axes=1)
-
-
 def widened(planes: Floating, shape: tuple[int, int], dtype: Any) -> tuple[Any, ...]:
     """Return what the kernels read of a texture: planes with the base's columns, rows' taps.
 
@@ -417,7 +358,7 @@ def widened(planes: Floating, shape: tuple[int, int], dtype: Any) -> tuple[Any, 
 
 def _derivatives(name: str, values: ArrayLike) -> Floating:
     """Return maps of derivatives as they are, and those of normals encoded."""
-    d = _real(values)
+    d = real_array(values)
     if d.ndim < 3 or d.shape[-1] not in (2, 3) or 0 in d.shape[-3:]:
         raise WrinkleError(
             f"{name}: got shape {d.shape}, expected (..., H, W, 2) or normals (..., H, W, 3)"
@@ -426,7 +367,7 @@ def _derivatives(name: str, values: ArrayLike) -> Floating:
 
 
 def _derivative_map(name: str, values: ArrayLike, *, finite: bool) -> Floating:
-    d = _real(values)
+    d = real_array(values)
     if d.ndim != 3 or d.shape[2] != 2 or 0 in d.shape:
         hint = "; encode normals first" if d.ndim == 3 and d.shape[2] == 3 else ""
         raise WrinkleError(f"{name}: got shape {d.shape}, expected (H, W, 2){hint}")
@@ -435,11 +376,3 @@ def _derivative_map(name: str, values: ArrayLike, *, finite: bool) -> Floating:
             f"{name}: got NaN or infinity, expected finite derivatives, or normals with n_z > 0"
         )
     return np.ascontiguousarray(d)
-
-
-def _real(values: ArrayLike) -> Floating:
-    """Return float32 arrays as they are, half as float32, and everything else as float64."""
-    given = np.asarray(values)
-    if given.dtype in (np.float16, np.float32):
-        return given.astype(np.float32, copy=False)
-    return given.astype(np.float64, copy=False)
