@@ -13,6 +13,8 @@ __all__ = ["LEAST_EVEN", "NoTileError", "evenness", "examine"]
 
 BLOCKS: Final = 24
 """Along the shorter side of the picture; the noise of a pixel is averaged away in them."""
+LEAST_SIDE: Final = 4
+"""Pixels a side of a square, where a picture has room for three: 3 % noise becomes 0.8 %."""
 BEND: Final = 0.03
 """Most that a block may differ from its four neighbors' mean, relative. Light of a lamp a metre
 away and the shading of a lens change over much of the field: even where they fall by 6 % from block
@@ -20,9 +22,9 @@ to block they bend by 0.4 %. Cheeks, noses, hair and edges bend by tens of perce
 TINT: Final = 0.1
 """Most that red or blue over green may differ from its median over the field, relative. A tile has
 one color under one kind of light, of which a lens that tints its corners leaves a few percent."""
-LEAST_EVEN: Final = 0.5
-"""Share of the picture that must be even: of a tile that is held at a slant or leaves a margin most
-is; of a simulated face in a dark room an eighth is."""
+LEAST_EVEN: Final = 0.8
+"""Share of the picture that must be even: a tile may leave a margin, or a holder cover one. A
+face that takes a sixth of the picture before an even wall leaves less, one in a dark room an eighth."""
 FILLED: Final = 0.95
 """Share of the picture below which a tile is said not to fill it: a speck of dust, with the squares
 that border on it, is a hundredth."""
@@ -61,7 +63,8 @@ def evenness(rgb: NDArray[np.floating], valid: NDArray[np.bool_]) -> float:
     >>> evenness(tile, np.ones((96, 144), bool))
     1.0
     """
-    side = max(min(valid.shape) // BLOCKS, 1)
+    shorter = min(valid.shape)
+    side = max(shorter // BLOCKS, min(LEAST_SIDE, shorter // 3), 1)
     count = block_sums(valid.astype(np.float64), side)
     judged = count >= side * side / 2
     sums = [block_sums(np.where(valid, rgb[..., k], 0.0), side) for k in range(3)]

@@ -29,10 +29,10 @@ def test_a_small_simulated_tile_is_taken_and_a_part_of_one_told(tmp_path, capsys
     assert main(command) == 0
     assert "found:" not in capsys.readouterr().out
     assert (calibration / "white.json").exists()
-    monkeypatch.setattr(white_tile, "evenness", lambda rgb, valid: 0.8)
+    monkeypatch.setattr(white_tile, "evenness", lambda rgb, valid: 0.9)
     assert main(command) == 0
     assert (
-        "found: frame S001 of state 'white': 80 % of the picture is even" in capsys.readouterr().out
+        "found: frame S001 of state 'white': 90 % of the picture is even" in capsys.readouterr().out
     )
     monkeypatch.setattr(white_tile, "evenness", lambda rgb, valid: 0.3)
     assert main(command) == 3

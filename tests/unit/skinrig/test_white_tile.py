@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skinrig.calibrating.white_tile import LEAST_EVEN, evenness
+from skinrig.calibrating.white_tile import LEAST_EVEN, NoTileError, evenness, examine
 
 
 def field(height=256, width=384):
@@ -63,3 +63,19 @@ def test_nothing_is_said_of_a_picture_that_is_saturated_all_over():
 def test_pictures_of_a_few_pixels_are_judged(rng):
     assert evenness(np.ones((8, 8, 3)), np.ones((8, 8), bool)) == 1.0
     assert evenness(rng.random((8, 8, 3)), np.ones((8, 8), bool)) < LEAST_EVEN
+
+
+def test_noise_of_a_thumbnail_is_no_unevenness(rng):
+    picture = tile(rng, noise=0.0)[::6, ::6]
+    picture = picture * (1 + 0.03 * rng.standard_normal(picture.shape))
+    assert evenness(picture, np.ones(picture.shape[:2], bool)) > 0.99
+
+
+def test_a_face_before_an_even_wall_is_no_tile(rng):
+    picture = tile(rng)
+    y, x = field()
+    inside = x**2 / 0.3**2 + y**2 / 0.45**2 < 1  # a sixth of the picture
+    skin = np.sqrt(np.clip(1 - x**2 / 0.3**2 - y**2 / 0.45**2, 0, 1))[..., None] * (0.5, 0.4, 0.2)
+    picture = np.where(inside[..., None], skin, picture)
+    with pytest.raises(NoTileError, match="frame 1 shows no white tile"):
+        examine(picture, np.ones((256, 384), bool), "frame 1")
