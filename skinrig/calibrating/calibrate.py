@@ -72,6 +72,8 @@ def calibrate(
     ------
     CalibratingError
         When a needed kind of frame is missing, or the sessions come from several cameras.
+    NoTileError
+        When the frames for "white" show something else than a white tile.
     """
     if kind not in KINDS:
         raise CalibratingError(f"kind: got {kind!r}, expected one of {', '.join(KINDS)}")
