@@ -80,8 +80,20 @@ class MerlTable:
         -------
         ndarray, shape (..., 3)
             1/sr; negative where not measured.
+
+        Raises
+        ------
+        ValueError
+            For angles out of range or not finite, and shapes that do not broadcast.
         """
         h, d, phi = bins(theta_h, theta_d, phi_d)
+        try:
+            h, d, phi = np.broadcast_arrays(h, d, phi)
+        except ValueError:
+            raise ValueError(
+                f"theta_h, theta_d, phi_d: got shapes {h.shape}, {d.shape} and {phi.shape}, "
+                f"expected ones that broadcast"
+            ) from None
         return np.asarray(np.moveaxis(self.stored[:, h, d, phi], 0, -1) * SCALE)
 
     @property
@@ -102,12 +114,13 @@ def bins(
     """
     h = np.asarray(theta_h, dtype=np.float64)
     d = np.asarray(theta_d, dtype=np.float64)
-    phi = np.mod(np.asarray(phi_d, dtype=np.float64), np.pi)
+    azimuth = np.asarray(phi_d, dtype=np.float64)
     for name, angle in (("theta_h", h), ("theta_d", d)):
         if not np.all((angle >= 0.0) & (angle <= _HALF_PI + 1e-6)):
             raise ValueError(f"{name}: got angles outside [0, pi/2], expected rad within it")
-    if not np.all(np.isfinite(phi)):
+    if not np.all(np.isfinite(azimuth)):
         raise ValueError("phi_d: got a value that is not finite, expected rad")
+    phi = np.mod(azimuth, np.pi)
     index_h = np.minimum((SHAPE[0] * np.sqrt(h / _HALF_PI)).astype(np.intp), SHAPE[0] - 1)
     index_d = np.minimum((SHAPE[1] * d / _HALF_PI).astype(np.intp), SHAPE[1] - 1)
     index_phi = np.minimum((SHAPE[2] * phi / np.pi).astype(np.intp), SHAPE[2] - 1)

@@ -12,6 +12,7 @@ Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 6.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -150,17 +151,20 @@ def estimate(
             f"normals (..., 3)"
         )
     lead, (samples, channels) = f.shape[:-2], f.shape[-2:]
+    if not channels:
+        raise ValueError(f"brdf_samples: got shape {f.shape}, expected at least one channel")
+    points = math.prod(lead)
     n = np.ascontiguousarray(_spread("normals", n, (*lead, 3)))
     f = np.ascontiguousarray(f)
     if discard is not None and discard < 0:
         raise ValueError(f"discard: got {discard}, expected at least 0 or None")
     if method not in ("envelope", "stable_minimum", "minimum"):
         raise ValueError(f"method: got {method!r}, expected envelope, stable_minimum or minimum")
-    f = f.reshape(-1, samples, channels)
+    f = f.reshape(points, samples, channels)
     n = n.reshape(-1, 3)
     light, view = (
         np.ascontiguousarray(_spread(name, np.asarray(v, np.float32), (*lead, samples, 3))).reshape(
-            -1, samples, 3
+            points, samples, 3
         )
         for name, v in (("light_dirs", light_dirs), ("view_dirs", view_dirs))
     )
@@ -178,6 +182,11 @@ def estimate(
         var = _spread("variance", told, (*lead, samples, channels))
         var = np.ascontiguousarray(var).reshape(f.shape)
         usable &= (var > 0.0) & np.isfinite(var)
+    shape = lead if gray else (*lead, channels)
+    if not samples:
+        nothing = np.full(shape, np.nan)
+        count = np.zeros(lead, np.int64)
+        return DiffuseAlbedo(nothing, nothing.copy(), np.zeros(lead, np.bool_), count)
     ratio, cos_l, cos_v = _ratios(f, light, view, n, usable, eta)
     usable &= np.isfinite(ratio)
     if method == "envelope":
@@ -197,7 +206,6 @@ def estimate(
         stderr = np.full(r_d.shape, np.nan)
     found: NDArray[np.bool_] = np.asarray(np.isfinite(r_d).all(axis=-1))
     r_d = np.where(found[:, None], r_d, np.nan)
-    shape = lead if gray else (*lead, channels)
     return DiffuseAlbedo(
         r_d.reshape(shape),
         np.where(found[:, None], stderr, np.nan).reshape(shape),
@@ -247,10 +255,12 @@ def _ratios(
     """Return pi f / (F_t F_t), infinite where unusable, and the cosines of light and view."""
     cosines = [np.einsum("pmc,pc->pm", v, n, dtype=np.float64) for v in (light, view)]
     above = (cosines[0] >= LEAST_COSINE) & (cosines[1] >= LEAST_COSINE)
+    above &= np.isfinite(cosines[0]) & np.isfinite(cosines[1])
     cos_light, cos_view = (np.where(above, cosine, 1.0) for cosine in cosines)
     through = boundary_kernels.transmitted(cos_light, cos_view, eta)
     good = usable & above[..., None]
-    ratio = np.pi * np.where(good, f, 0.0) / through[..., None]
+    with np.errstate(divide="ignore", invalid="ignore"):  # nothing is let through below eta = 1
+        ratio = np.pi * np.where(good, f, 0.0) / through[..., None]
     return np.where(good, ratio, np.inf), cosines[0], cosines[1]
 
 
@@ -280,7 +290,8 @@ def _minimum(
     drop = np.zeros(len(ratio), dtype=np.intp)
     if method == "stable_minimum":
         grazing = np.clip(np.minimum(cos_l, cos_v) / GRAZING_COSINE, LEAST_COSINE, 1.0)
-        ratio = ratio + np.abs(ratio) * (1.0 / grazing - 1.0)[..., None]
+        with np.errstate(invalid="ignore"):  # unusable ratios are infinite; NaN sorts last too
+            ratio = ratio + np.abs(ratio) * (1.0 / grazing - 1.0)[..., None]
         count = usable.sum(axis=1).min(axis=-1)
         drop = np.ceil(DISCARD_SHARE * count).astype(np.intp) if discard is None else drop + discard
         drop = np.minimum(drop, np.maximum(count - 1, 0))

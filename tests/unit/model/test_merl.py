@@ -108,6 +108,10 @@ def test_angles_outside_the_table_are_refused(table):
         table.lookup(1.7, 0.0, 0.0)
     with pytest.raises(ValueError, match="phi_d"):
         table.lookup(0.7, 0.0, np.nan)
+    with np.errstate(all="raise"), pytest.raises(ValueError, match="phi_d"):
+        table.lookup(0.7, 0.0, np.inf)
+    with pytest.raises(ValueError, match=r"got shapes \(3,\), \(4,\) and \(\), expected"):
+        table.lookup(np.zeros(3), np.zeros(4), 0.0)
 
 
 def directions(rng, n):

@@ -206,12 +206,32 @@ def test_samples_of_one_channel_need_no_axis_for_it(method):
     assert np.isfinite(reduced_albedo(point, eta=1.3).albedo_prime)
 
 
+@pytest.mark.parametrize("method", ["envelope", "stable_minimum", "minimum"])
+def test_points_without_samples_or_with_directions_that_are_none_are_masked(method):
+    p = scene("light", points=3, samples=20)
+    given = {"eta": 1.3, "method": method}
+    none = estimate(p.f[:, :0], p.light[:, :0], p.view[:, :0], p.normals, **given)
+    assert none.r_d.shape == none.stderr.shape == (3, 3)
+    assert np.isnan(none.r_d).all()
+    assert not none.valid.any()
+    assert estimate(p.f[:0], p.light[:0], p.view[:0], p.normals[:0], **given).r_d.shape == (0, 3)
+    usable = np.ones(p.f.shape[:2], bool)
+    usable[1, 4] = False
+    wanted = estimate(p.f, p.light, p.view, p.normals, valid=usable, **given)
+    for bad in (np.nan, np.inf):
+        light = p.light.copy()
+        light[1, 4] = bad
+        found = estimate(p.f, light, p.view, p.normals, **given)
+        np.testing.assert_array_equal(found.r_d, wanted.r_d)
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
         ({"normals": np.ones((2, 3))}, r"normals: got shape \(2, 3\), expected \(6, 3\)"),
         ({"brdf_samples": np.ones(5)}, r"brdf_samples: got shape \(5,\), expected \(..., M, C\)"),
         ({"light_dirs": np.ones((7, 3))}, r"light_dirs: got shape \(7, 3\), expected \(6, 50, 3\)"),
+        ({"brdf_samples": np.ones((6, 50, 0))}, "at least one channel"),
         ({"variance": np.ones((7, 3))}, r"variance: got shape \(7, 3\)"),
         ({"valid": np.ones((6, 49), bool)}, r"valid: got shape"),
     ],
