@@ -24,7 +24,7 @@ TINT: Final = 0.1
 one color under one kind of light, of which a lens that tints its corners leaves a few percent."""
 LEAST_EVEN: Final = 0.8
 """Share of the picture that must be even: a tile may leave a margin, or a holder cover one. A
-face that takes a sixth of the picture before an even wall leaves less, one in the dark an eighth."""
+face that takes a sixth of the picture before an even wall leaves less, in the dark an eighth."""
 FILLED: Final = 0.95
 """Share of the picture below which a tile is said not to fill it: a speck of dust, with the squares
 that border on it, is a hundredth."""
