@@ -355,8 +355,13 @@ def _shading(shading: Shading, shape: tuple[int, ...]) -> tuple[bool, Map]:
             raise ChromophoreError(f'shading: expected None, "known" or an array, got {shading!r}')
         return False, np.ones(1, dtype=np.float32)
     known = np.asarray(shading, dtype=np.float32)
-    if known.shape not in ((), shape):
-        raise ChromophoreError(f"shading: expected shape {shape} or a number, got {known.shape}")
+    if known.ndim:
+        try:
+            known = np.broadcast_to(known, shape)
+        except ValueError:
+            raise ChromophoreError(
+                f"shading: expected shape {shape} or a number, got {known.shape}"
+            ) from None
     return False, np.ascontiguousarray(known).reshape(-1)
 
 

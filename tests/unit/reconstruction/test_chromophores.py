@@ -314,3 +314,11 @@ def test_the_default_noise_is_one_percent(table):
     np.testing.assert_allclose(
         invert(color, table).stderr_melanin, stated.stderr_melanin, rtol=1e-4
     )
+
+
+def test_the_shading_of_one_map_serves_a_stack_of_them(table, rng):
+    known = rng.uniform(0.5, 1.0, (3, 4)).astype(np.float32)
+    rgb = table.lookup(rng.uniform(0.01, 0.1, (2, 3, 4)), 0.05) * known[..., None]
+    found = invert(rgb, table, shading=known)
+    for one, whole in zip(rgb, found.melanin, strict=True):
+        np.testing.assert_array_equal(whole, invert(one, table, shading=known).melanin)
