@@ -84,7 +84,8 @@ def of_map(
     value = estimate.values[part].astype(np.float64)
     stderr = spread[part].astype(np.float64)
     truth = np.asarray(true, np.float64)[part]
-    width = float(100.0 * np.median(stderr / np.abs(truth))) if value.size else float("nan")
+    with np.errstate(divide="ignore"):  # what does not change has a width of infinity
+        width = float(100.0 * np.median(stderr / np.abs(truth))) if value.size else float("nan")
     return Trial(quantity, subject, band, np.abs(value - truth) / stderr, width, "%", factor_95)
 
 

@@ -30,6 +30,7 @@ from model import (
     translucency_population,
     wrinkle_differences,
     wrinkle_expressions,
+    wrinkle_masks,
     wrinkle_storage,
     wrinkles,
 )
@@ -361,9 +362,23 @@ def test_wrinkles_by_any_weights_are_unit_normals_and_none_at_rest(seed, weights
     np.testing.assert_allclose(layered, found, atol=1e-9)
     sums = wrinkle_expressions.clamped(wrinkle_expressions.zone_sums(weights), clamp)
     assert np.all((sums >= (0.0 if clamp == "unit" else -1.0)) & (sums <= 1.0))
-    strength = wrinkles.zone_strength(wrinkles.mask_stack(masks), sums)
+    strength = wrinkle_masks.zone_strength(wrinkle_masks.mask_stack(masks), sums)
     assert np.abs(strength).max() <= 8.0
-    assert wrinkles.mask_textures(masks).shape == (2, 2, 3, 4)
+
+
+@CHEAP
+@given(seed=SEED, zones=st.integers(1, 9), dtype=st.sampled_from(["f2", "f4", "f8", "u1", "?"]))
+def test_masks_are_the_same_as_planes_and_as_textures(seed, zones, dtype):
+    planes = np.random.default_rng(seed).uniform(0, 2, (zones, 2, 3)).astype(dtype)
+    stack = wrinkle_masks.mask_stack(planes)
+    np.testing.assert_array_equal(stack, planes)
+    assert stack.dtype == (np.float32 if dtype in ("f2", "f4") else np.float64)
+    assert stack.dtype == wrinkle_masks.real_array(planes).dtype
+    textures = wrinkle_masks.mask_textures(planes)
+    assert textures.shape == (-(-zones // 4), 2, 3, 4)
+    again = wrinkle_masks.mask_stack(textures)
+    np.testing.assert_array_equal(again[:zones], planes)
+    assert not again[zones:].any()
 
 
 @CHEAP
