@@ -11,7 +11,8 @@ What all pixels err by alike does not average out: light (the face may stand off
 place) and the layered model. The distribution is fitted again with each of these moved by its
 standard error to both sides; half of what its means move by is their standard error. A mean at the
 end of what there may be cannot move beyond it, which says nothing of how well it is known: there
-the error is what it moves to the other side.
+the error is what it moves to the other side. Blood that ends at next to none is not told by color
+at all, for all skin that lives has some: any is then as probable.
 """
 
 from __future__ import annotations
@@ -242,7 +243,7 @@ def fit(
 def with_common_errors(
     usual: FaceDistribution, moved: Sequence[tuple[FaceDistribution, FaceDistribution]]
 ) -> FaceDistribution:
-    """Return the distribution with its means' standard errors.
+    """Return the distribution with its means' standard errors, and any blood where none is told.
 
     Parameters
     ----------
@@ -270,9 +271,10 @@ def with_common_errors(
         )
         for pick in (_melanin_of, _blood_of)
     ]
-    return FaceDistribution(
-        replace(usual.melanin, stderr=errors[0]), replace(usual.blood, stderr=errors[1])
-    )
+    blood = replace(usual.blood, stderr=errors[1])
+    if blood.mean - blood.low < AT_END:
+        blood = replace(blood, unexpected=1.0)
+    return FaceDistribution(replace(usual.melanin, stderr=errors[0]), blood)
 
 
 def _moves_by(usual: Bell, minus: float, plus: float) -> float:

@@ -113,6 +113,17 @@ def test_a_mean_at_the_end_is_known_as_badly_as_it_moves_away_from_it():
         assert known.melanin.stderr == pytest.approx(0.08), mean
 
 
+@pytest.mark.parametrize(("mean", "told"), [(0.055, False), (0.2, True), (0.99, True)])
+def test_blood_that_ends_at_none_may_be_any(mean, told):
+    """The darkest skin has one color with any blood: its face's ended at a hundredth of it."""
+    skin = FaceDistribution(Bell(-3.0, 0.3, 0.01, -9.0, -0.7), Bell(mean, 0.05, 0.1, 0.04, 1.0))
+    known = with_common_errors(skin, [(skin, skin)])
+    density = known.blood.relative_density(np.array([0.05, 0.4, 0.9]))
+    assert (np.ptp(density) > 0.5) == told
+    assert known.blood.unexpected == (0.1 if told else 1.0)
+    assert known.melanin == skin.melanin
+
+
 def test_what_is_no_probability_or_no_bell_is_refused():
     with pytest.raises(ValueError, match="shape"):
         fitted(np.ones((3, 5, 2)))
