@@ -118,7 +118,7 @@ def test_blood_that_ends_at_none_may_be_any(mean, told):
     """The darkest skin has one color with any blood: its face's ended at a hundredth of it."""
     skin = FaceDistribution(Bell(-3.0, 0.3, 0.01, -9.0, -0.7), Bell(mean, 0.05, 0.1, 0.04, 1.0))
     known = with_common_errors(skin, [(skin, skin)])
-    density = known.blood.relative_density(np.array([0.05, 0.4, 0.9]))
+    density = known.blood.relative_density(np.array([mean, 0.5]))
     assert (np.ptp(density) > 0.5) == told
     assert known.blood.unexpected == (0.1 if told else 1.0)
     assert known.melanin == skin.melanin
