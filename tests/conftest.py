@@ -28,6 +28,7 @@ LONGEST_FIRST = (
     "tests/browser/test_accessibility.py",
     "tests/browser/test_viewer_pages.py",
     "tests/system/test_tour.py",
+    "tests/recovery/test_kernels_of_patches.py",
     "tests/benchmarks/test_benchmarks.py",
     "tests/radiometry/test_dome_session.py",
     "tests/radiometry/test_flash_lateral_reference.py",
