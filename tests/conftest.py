@@ -1,6 +1,7 @@
 """Fixtures shared by all tests."""
 
 import os
+import sys
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -103,6 +104,24 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture
 def rng():
     return np.random.default_rng(12345)
+
+
+@pytest.fixture(autouse=True)
+def worlds_of_others():
+    """Take away the worlds that a test opened and left: the next one of this process has its own.
+
+    A world stays for as long as its process, as a rig's box stays on its port; which tests share a
+    process, and in which order, is chance.
+    """
+    before = set(_worlds())
+    yield
+    for name in set(_worlds()) - before:
+        _worlds()[name].unregister()
+
+
+def _worlds():
+    world = sys.modules.get("rigsim.world")  # most tests need none, and its import takes time
+    return {} if world is None else world._BENCH
 
 
 @pytest.fixture(scope="session")
