@@ -88,7 +88,7 @@ def invert(
     rgb
         Shape (..., 3): diffuse reflectance as white-balanced linear camera RGB (radiance times pi
         over irradiance, a perfect white is 1). With the shading free any positive factor per
-        pixel may be left in. Not modified.
+        pixel may be left in. Fitted in float32, whatever its type. Not modified.
     table
         Color table of the camera and the light that took the picture.
     shading
@@ -111,7 +111,7 @@ def invert(
     Returns
     -------
     ChromophoreMaps
-        Estimates, standard errors and masks of the pixels' shape.
+        Estimates and standard errors, float32, and masks, of the pixels' shape.
 
     Raises
     ------
@@ -126,6 +126,9 @@ def invert(
     back towards the colors of lighter skin: `ambiguous` marks both, and the estimate is the
     lighter one. Errors are those of the linearised fit; at a relative error of half and above
     they are rough.
+
+    Maps are float32 for float64 input too: what rounding the colors to it changes is below 1e-4
+    of a standard error, with the shading known and with it free, where noise is 1 percent.
 
     Examples
     --------

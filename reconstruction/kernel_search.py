@@ -55,6 +55,10 @@ KEPT_BYTES = 100_000_000
 """Most memory for counts of kernels evaluated on all pixels, which standard errors need again."""
 
 
+class KernelSearchError(ValueError):
+    """A search for kernels without anything to search."""
+
+
 @dataclass(frozen=True, slots=True)
 class Relief:
     """A neutral relief with its axis of strain along the rows, and the samples of its slopes.
@@ -196,7 +200,18 @@ class Found:
 
 
 def gentlest(distance: Floats, alphas: Floats, sigmas_um: Floats) -> tuple[int, int]:
-    """Return the indices of the least distance, ties by the rule of :class:`Found`."""
+    """Return the indices of the least distance, (S, A), ties by the rule of :class:`Found`.
+
+    Raises
+    ------
+    KernelSearchError
+        Where the grid is empty, or there is not one distance a kernel.
+    """
+    if not distance.size or distance.shape != (sigmas_um.size, alphas.size):
+        raise KernelSearchError(
+            f"distance: got shape {distance.shape} for {sigmas_um.size} sigmas and {alphas.size} "
+            "alphas, expected one distance a kernel, of one kernel at least"
+        )
     i, j = np.nonzero(distance <= distance.min() + TIE)
     order = np.lexsort((-alphas[j], sigmas_um[i], np.abs(alphas[j])))
     return int(i[order[0]]), int(j[order[0]])

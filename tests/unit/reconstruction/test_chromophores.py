@@ -48,6 +48,21 @@ def test_the_round_trip_is_exact_wherever_skin_can_be_told(shading, light):
     np.testing.assert_allclose(maps.shading[told], 1.0, rtol=2e-3)
 
 
+@pytest.mark.parametrize("shading", MODES)
+def test_rounding_colors_to_single_precision_is_far_below_a_standard_error(shading, table, rng):
+    c_m, c_hd = grid_of_skin(60, lowest=0.004)
+    colors = table.lookup(c_m, c_hd)
+    half_a_step = 2.0**-24 * rng.choice([-1.0, 1.0], colors.shape)  # relative, of single precision
+    maps = invert(colors, table, shading=shading)
+    moved = invert(colors * (1.0 + half_a_step), table, shading=shading)
+    told = maps.valid & maps.identifiable & moved.identifiable
+    assert maps.melanin.dtype == maps.stderr_melanin.dtype == np.float32
+    for name in ("melanin", "hemoglobin"):
+        change = np.abs(getattr(moved, name) - getattr(maps, name))[told]
+        assert change.any()
+        assert (change / getattr(maps, f"stderr_{name}")[told]).max() < 1e-4
+
+
 def test_with_known_shading_every_color_of_the_table_finds_its_melanin(table):
     c_m, c_hd = grid_of_skin(160)
     maps = invert(table.lookup(c_m, c_hd), table, shading="known")

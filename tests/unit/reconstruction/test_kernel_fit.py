@@ -334,3 +334,11 @@ def test_settings_that_do_not_fit_are_refused(rng):
             fit_kernel(height, target, **{**good, **change})
     with pytest.raises(KernelFitError, match="target_histogram"):
         fit_kernel(height, target * np.nan, **good)
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (0, 3), (3, 0), (3, 2)])
+def test_a_grid_that_is_empty_or_of_another_shape_is_named(shape):
+    alphas, sigmas_um = np.linspace(0.0, 1.0, min(shape[1], 3)), np.arange(1.0, 1.0 + shape[0])
+    distance = np.zeros(shape if shape != (3, 2) else (2, 3))
+    with pytest.raises(ks.KernelSearchError, match=r"distance: got shape"):
+        ks.gentlest(distance, alphas, sigmas_um)
