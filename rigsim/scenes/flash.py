@@ -164,6 +164,7 @@ class FlashScene:
         self._glow: dict[str, SkinGlow] = {}
         self._pictures: dict[str, Picture] = {}
         self._blurs: dict[str, Mapping[str, Float32Array]] = {}
+        self._spreads: dict[str, Mapping[str, Float32Array]] = {}
         self.needs: SceneNeeds = strictest(
             [
                 flash_needs.flash_needs(
@@ -311,9 +312,10 @@ class FlashScene:
 
             All are of the face as it has moved. For a state other than "neutral" there are also
             ``melanin_at_rest``, ``hemoglobin_at_rest``: the fractions of this state as they would
-            be seen on the face at rest, sharp; ``mask_at_rest``: bool, for those two. Where the
-            face has moved also ``position_at_rest_mm``: where the skin in a pixel is at rest, rig
-            frame.
+            be seen on the face at rest, sharp; ``melanin_blurred_at_rest``,
+            ``hemoglobin_blurred_at_rest``: those of even skin, blurred on the face as it has moved;
+            ``mask_at_rest``: bool, for all four. Where the face has moved also
+            ``position_at_rest_mm``: where the skin in a pixel is at rest, rig frame.
 
         Raises
         ------
@@ -443,12 +445,16 @@ class FlashScene:
             return flash_truth.unblurred_maps(picture)
         if view.name not in self._blurs:
             look = Look(self.rig, view, self.films, self._weights, self.subpixels)
-            glow = self._skin_glow(view)
-            caster = self._stage.caster
-            self._blurs[view.name] = flash_truth.blurred_maps(
-                look, caster, subject, self.state, glow
-            )
+            seen = look.at_maps(self._stage.caster, subject, self._spread(view, subject))
+            self._blurs[view.name] = seen.maps
         return self._blurs[view.name]
+
+    def _spread(self, view: View, subject: Subject) -> Mapping[str, Float32Array]:
+        """Return the textures of those maps, of the face as it has moved."""
+        if view.name not in self._spreads:
+            look = Look(self.rig, view, self.films, self._weights, self.subpixels)
+            self._spreads[view.name] = look.blurred_maps(subject, self.state, self._skin_glow(view))
+        return self._spreads[view.name]
 
     def _at_rest(
         self, view: View, moved: dict[str, NDArray[np.generic]]
@@ -459,7 +465,9 @@ class FlashScene:
             return flash_truth.unmoved_maps(moved)
         rest = subject.rest
         caster = stage_of(rest, self._choice).caster
-        return flash_truth.maps_at_rest(self._look(view, rest.mesh), caster, rest, self.state)
+        spread = self._spread(view, subject) if self.lateral else None
+        look = self._look(view, rest.mesh)
+        return flash_truth.maps_at_rest(look, caster, rest, self.state, spread)
 
     def _look(self, view: View, mesh: Mesh) -> Look:
         spread = None

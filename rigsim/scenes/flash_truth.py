@@ -5,7 +5,7 @@ The maps are described at `rigsim.scenes.flash.FlashScene.truth`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from rigsim.mesh import Float32Array
 from rigsim.render import Caster
 from rigsim.scenes.picture import Look, Picture
-from rigsim.scenes.skin_glow import SkinGlow
 from rigsim.subject import Subject
 
 HAIR_LIMIT: Final = 0.02
@@ -27,6 +26,7 @@ SPREAD: Final = ("reflectance", "melanin", "hemoglobin")
 """Maps that the spreading of light in the skin blurs."""
 
 FRACTIONS: Final = ("melanin", "hemoglobin")
+SPREAD_FRACTIONS: Final = ("melanin_blurred", "hemoglobin_blurred")
 
 
 def maps_of(
@@ -43,7 +43,7 @@ def maps_of(
     picture
         The face as the camera sees it.
     blurred
-        Maps as light spreads in the skin, by name, see `blurred_maps`.
+        Maps as light spreads in the skin, by name, see `Look.blurred_maps`.
     shading
         (H, W[, 3]), the picture's shading through the crossed analyser.
     white_rgb
@@ -57,21 +57,17 @@ def maps_of(
     return maps
 
 
-def blurred_maps(
-    look: Look, caster: Caster, subject: Subject, state: str, glow: SkinGlow
-) -> Mapping[str, Float32Array]:
-    """Return the maps of `SPREAD` blurred as the light is, seen by `look` without its lens."""
-    maps = look.blurred_maps(subject, state, glow)
-    return look.at_maps(caster, subject, maps).maps
-
-
-def unblurred_maps(picture: Picture) -> dict[str, Float32Array]:
-    """Return the same maps of a face in which light does not spread."""
-    return {f"{name}_blurred": picture.maps[name] for name in SPREAD}
+def unblurred_maps(picture: Picture, names: Sequence[str] = SPREAD) -> dict[str, Float32Array]:
+    """Return maps of a face in which light does not spread, under the names of blurred ones."""
+    return {f"{name}_blurred": picture.maps[name] for name in names}
 
 
 def maps_at_rest(
-    look: Look, caster: Caster, rest: Subject, state: str
+    look: Look,
+    caster: Caster,
+    rest: Subject,
+    state: str,
+    spread: Mapping[str, Float32Array] | None = None,
 ) -> dict[str, NDArray[np.generic]]:
     """Return the fractions of a state as seen on the face at rest.
 
@@ -85,20 +81,28 @@ def maps_at_rest(
         The face as it is before it moves.
     state
         Whose blood it has.
+    spread
+        Textures of the moved face, see `Look.blurred_maps`: light spreads on that, wherever the
+        skin is then looked for. None: light does not spread.
     """
     layers = {
         "melanin": rest.melanin,
         "hemoglobin": rest.hemoglobin(state),
         "hair": rest.hair,
     }
+    if spread is not None:
+        layers |= {name: spread[name] for name in SPREAD_FRACTIONS}
     picture = look.at_maps(caster, rest, layers)
-    maps = {f"{name}_at_rest": picture.maps[name] for name in FRACTIONS}
+    seen = dict(picture.maps)
+    if spread is None:
+        seen |= unblurred_maps(picture, FRACTIONS)
+    maps = {f"{name}_at_rest": seen[name] for name in (*FRACTIONS, *SPREAD_FRACTIONS)}
     return {**maps, "mask_at_rest": whole_skin(picture)}
 
 
 def unmoved_maps(maps: Mapping[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
     """Return the same maps of a face that has not moved, from those of `maps_of`."""
-    return {f"{name}_at_rest": maps[name] for name in (*FRACTIONS, "mask")}
+    return {f"{name}_at_rest": maps[name] for name in (*FRACTIONS, *SPREAD_FRACTIONS, "mask")}
 
 
 def whole_skin(picture: Picture) -> NDArray[np.bool_]:

@@ -204,10 +204,10 @@ def truth_of(scene: Any, seed: int, session: str, state: str) -> SkinAppearance:
     for name, values in maps.items():
         if name.startswith("mask") or (np.ndim(values) == 3 and np.shape(values)[2] != 3):
             continue
-        unmoved = name in ("melanin_at_rest", "hemoglobin_at_rest")
+        unmoved = name.endswith("_at_rest")
         inside, valid = (at_rest, whole_at_rest) if unmoved else (mask, whole)
         small = to_superpixels(np.asarray(values, np.float64), inside).astype(np.float32)
-        known = name.removesuffix("_blurred").removesuffix("_at_rest")
+        known = name.removesuffix("_at_rest").removesuffix("_blurred")
         unit = "mm" if name.endswith("_mm") else UNITS.get(known, "1")
         kept[_TRUTH_NAMES.get(name, name)] = SkinMap(small, unit, valid=valid)
     kept["mask"] = SkinMap(whole.astype(np.float32), "1")
