@@ -20,6 +20,7 @@ from skinrig.demo_rigs import RIGS, Findings
 from skinrig.next_steps import look, suggest
 from skinrig.simulating.simulation import truth_folder
 from skinrig.waiting_threads import WAITING_ASLEEP
+from skinrig.written_units import unit_sign
 
 MOST_AT_ONCE = 2
 """Rigs that run side by side: much of each is the work of one core, or waits for a compiler."""
@@ -111,7 +112,8 @@ def run_demo(
         (out / "report.html").write_text(build([out], title="skinrig demo"), encoding="utf-8")
     console.say("")
     console.rows(
-        ("subject", "map", "error", "unit", "68 % interval covers %", "masked %"), found.errors
+        ("subject", "map", "error", "unit", "68 % interval covers, %", "masked, %"),
+        [[*row[:3], unit_sign(row[3]), *row[4:]] for row in found.errors],
     )
     console.say("")
     by_rig = {rig: _sum_of(shares, f"{rig}: ") for rig in asked}

@@ -148,7 +148,7 @@ def _dome(out: Path, seed: int, share: Share, width_px: int | None, found: Findi
     found.tables.append(
         {
             "title": "Luminance of photographs that no fit has seen, on lit pixels",
-            "head": ["model", "median error %", "all skin %"],
+            "head": ["model", "median error, %", "all skin, %"],
             "rows": [
                 [name, 100 * row["median"], 100 * row["total_error"]]
                 for name, row in ((FULL, compared[FULL]), *compared["ablation"].items())

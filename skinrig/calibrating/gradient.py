@@ -259,7 +259,7 @@ def _lights_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
         ("lights off their places", f"{survey.light_scatter_mm:.2f} mm"),
         (
             "standard error of a direction",
-            f"{np.median(angle):.3f} degrees, worst {angle.max():.3f}",
+            f"{np.median(angle):.3f}°, worst {angle.max():.3f}°",
         ),
         ("intensities measured", f"{int(shining.sum())}, scatter"
          f" {100 * np.std(table.intensities[shining]):.1f} %"),
@@ -272,12 +272,12 @@ def _films_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
     zero, error = np.degrees([films.misalignment_rad, films.misalignment_stderr_rad])
     leaked, glass = films.leakage, films.glass_leakage[films.valid]
     return (
-        ("analyser's misalignment", f"{zero:+.3f} ± {error:.3f} degrees"),
+        ("analyser's misalignment", f"{zero:+.3f}° ± {error:.3f}°"),
         ("extinction of the lights' films", f"{1 / films.light_leak:.0f} : 1 (leak"
          f" {films.light_leak:.2e} ± {films.light_leak_stderr:.0e})"),
         ("extinction of the analyser", f"{1 / films.analyser_leak:.0f} : 1 (leak"
          f" {films.analyser_leak:.2e} ± {films.analyser_leak_stderr:.0e})"),
-        ("lights' polarizers off their axes", f"{np.degrees(survey.turn_scatter_rad):.2f} degrees"),
+        ("lights' polarizers off their axes", f"{np.degrees(survey.turn_scatter_rad):.2f}°"),
         ("glass leaks crossed", f"median {100 * np.median(glass):.2f} %, most"
          f" {100 * glass.max():.1f} % of parallel"),
         (f"skin (eta {films.eta:g}) will leak", f"median {100 * np.median(leaked):.3f} %, 9 of 10"

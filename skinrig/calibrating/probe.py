@@ -295,7 +295,7 @@ def _summary(
     rows = [
         ("spots found", f"{int(spots.found.sum())} of {count}, {spots.shift_px[0]:+.2f},"
          f" {spots.shift_px[1]:+.2f} px off their places, row turned"
-         f" {np.degrees(spots.rotation_rad):+.2f} degrees"),
+         f" {np.degrees(spots.rotation_rad):+.2f}°"),
         ("standard error of a place", f"worst {spots.center_stderr_px[spots.found].max():.3f} px"),
         ("radius of spots, of apertures", f"{spots.radius_px[spots.found].mean():.2f},"
          f" {spots.aperture_px:.2f} px"),

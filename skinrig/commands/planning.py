@@ -12,6 +12,7 @@ from skinrig import errors
 from skinrig.commands.options import Json, Rig, file_to_write
 from skinrig.console import Console
 from skinrig.next_steps import named
+from skinrig.written_units import written
 
 
 def plan(
@@ -76,7 +77,7 @@ def plan(
         document["confirmation"] = found
         for row in found:
             console.say(
-                f"measured: {row['name']} {row['median']:.3g} {row['unit']}, "
+                f"measured: {row['name']} {written(format(row['median'], '.3g'), row['unit'])}, "
                 f"{'within' if row['within'] else 'OUTSIDE'} the forecast's interval"
             )
     if out is not None:

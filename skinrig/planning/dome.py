@@ -292,7 +292,7 @@ def _out_of_reach(best: Prediction, look: Sight, wants: Mapping[str, float]) -> 
     if normals > wants.get("normals", math.inf):
         floor = math.degrees(light_selection.median_of_rayleigh(look.systematic_rad))
         out.append(
-            f"normals: all lights and cameras leave {normals:.2f} degrees, {floor:.2f} of them by "
+            f"normals: all lights and cameras leave {normals:.2f}°, {floor:.2f}° of it by "
             f"misplaced samples and fine relief at {look.pixel_mm:.2g} mm a pixel; "
             "more pixels would help, more lights will not"
         )

@@ -389,7 +389,7 @@ def _choice(
     lost = math.degrees(look.lost_rad)
     reasons += (
         "normals are those that the lens shows; the relief's own are "
-        f"{lost:.2g} degrees off them, which no pattern brings back",
+        f"{lost:.2g}° off them, which no pattern brings back",
     )
     return Choice(
         rig, plan, (forecast,), plan.estimated_s(rig), full.estimated_s(rig),
@@ -409,9 +409,9 @@ def _choice(
 def _why(best: Prediction, look: Sight) -> str:
     floor = math.degrees(BEYOND_RAD * math.sqrt(2.0 * math.log(2.0)))
     return (
-        f"normals: the best scan leaves {math.degrees(best.median_rad):.2f} degrees; noise and "
-        f"lost detail {math.degrees(best.noise_rad):.2f}, shadows and lobes unlike the assumed one "
-        f"{floor:.2f}; "
+        f"normals: the best scan leaves {math.degrees(best.median_rad):.2f}°; noise and "
+        f"lost detail {math.degrees(best.noise_rad):.2f}°, shadows and lobes unlike the assumed "
+        f"one {floor:.2f}°; "
         + (
             "more patterns or light will not help"
             if best.noise_rad < math.radians(floor)

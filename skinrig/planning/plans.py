@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from capture.plan import Plan
 from capture.rig import Rig, load_rig
 from skinrig.light_safety import light_figures
+from skinrig.written_units import written
 
 SCHEMA = "skinrig.plan-choice/1"
 
@@ -300,7 +301,7 @@ def lines(choice: Choice) -> list[str]:
     """Return a choice as lines for people."""
     out = []
     for one in choice.forecasts:
-        asked = "" if one.wanted is None else f", wanted {one.wanted:g} {one.unit}"
+        asked = "" if one.wanted is None else f", wanted {written(f'{one.wanted:g}', one.unit)}"
         if not math.isfinite(one.value):
             out.append(
                 f"forecast: {one.name} keeps no estimate anywhere on this subject{asked}"
@@ -308,7 +309,7 @@ def lines(choice: Choice) -> list[str]:
             )
             continue
         out.append(
-            f"forecast: {one.name} {one.value:.3g} {one.unit} in the median "
+            f"forecast: {one.name} {written(f'{one.value:.3g}', one.unit)} in the median "
             f"({one.interval[0]:.3g} to {one.interval[1]:.3g}{asked}"
             f"{'' if one.reached else ': NOT REACHED'})"
         )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from skinrig.reporting import page
 from skinrig.reporting.run_comparison import Run
+from skinrig.written_units import written
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,13 +57,13 @@ def table(a: Run, b: Run, rows: Sequence[CheckRow]) -> str:
     def told(check: page.Check | None) -> str:
         if check is None:
             return "not checked"
-        return f"{page.number(check.got)} {check.unit}".rstrip() + (
+        return written(page.number(check.got), check.unit) + (
             ", kept" if check.passed else ", missed"
         )
 
     def limit(row: CheckRow) -> str:
         bounds = [
-            f"{'≤' if c.sense == '<=' else '≥'} {page.number(c.bound)} {c.unit}".rstrip()
+            f"{'≤' if c.sense == '<=' else '≥'} {written(page.number(c.bound), c.unit)}"
             for c in (row.a, row.b)
             if c is not None
         ]

@@ -92,8 +92,9 @@ def errors(
                 )
             )  # fmt: skip
     body = "<h3>Errors by melanin band</h3>" + page.table(
-        ("map", "truth", "band", "pixels", "masked %", "median |error| %", "68 % interval",
-         "bias %", "68 % coverage %", "by noise alone %", "median standard error %", "bound %"),
+        ("map", "truth", "band", "pixels", "masked, %", "median |error|, %", "68 % interval",
+         "bias, %", "68 % coverage, %", "by noise alone, %", "median standard error, %",
+         "bound, %"),
         [
             (
                 row.name, row.against, row.band_name, row.pixels, 100 * row.masked,

@@ -21,6 +21,7 @@ from skinrig.reporting import comparison_conditions as conditions
 from skinrig.reporting.map_comparison import MapDifference
 from skinrig.reporting.map_names import heading, melanin_band, words
 from skinrig.reporting.run_comparison import Pair, Run, alone
+from skinrig.written_units import written
 
 WIDTH_PX = 200
 MOST_NAMED = 10
@@ -80,8 +81,8 @@ def lead(a: Run, b: Run, found: Sequence[Pair]) -> str:
 def _in_words(one: MapDifference) -> str:
     by = page.number(one.median if one.unit == "°" else one.bias)
     return (
-        f"{words(one.name)} by {by} {one.unit}".rstrip()
-        + f" in the median, {100 * one.beyond[-1]:.3g} % of pixels"
+        f"{words(one.name)} by {written(by, one.unit)} in the median, "
+        f"{100 * one.beyond[-1]:.3g} % of pixels"
     )
 
 
@@ -115,7 +116,8 @@ def _pair(a: Run, b: Run, pair: Pair) -> str:
         )
     body += page.table(
         ("map", "verdict", "beyond 3 σ, %", "2 σ, %", "1 σ, %", "median A", "median B",
-         "median B − A", "median |B − A|", "95th %", "σ", "unit", "pixels", "only A", "only B"),
+         "median B − A", "median |B − A|", "95th percentile", "σ", "unit", "pixels",
+         "only A", "only B"),
         [_difference_row(one) for one in sorted(pair.differences, key=_farthest_first)],
         caption="Pixel by pixel; σ: the two standard errors combined, median; beyond: share of "
         "pixels that far apart, by chance 0.27, 4.6 and 31.7 %; only: pixels without a partner",

@@ -161,8 +161,8 @@ def _errors(
             )
         )  # fmt: skip
     body = "<h3>Blood of each state: error by way</h3>" + page.table(
-        ("state", "way", "median |error| %", "68 % interval", "rms, points", "bias %",
-         "68 % coverage %", "pixels"),
+        ("state", "way", "median |error|, %", "68 % interval", "rms, points", "bias, %",
+         "68 % coverage, %", "pixels"),
         [
             (row.state, row.way, 100 * row.median_relative,
              f"{100 * row.interval[0]:.2f} – {100 * row.interval[1]:.2f}", 100 * row.rms,
@@ -173,7 +173,7 @@ def _errors(
     )  # fmt: skip
     body += page.table(
         ("state", "true change, points", "found, points", "rms of the map, points",
-         "68 % coverage %"),
+         "68 % coverage, %"),
         [
             (row.state, 100 * row.true, 100 * row.found, 100 * row.rms, 100 * row.coverage)
             for row in changes
@@ -182,7 +182,7 @@ def _errors(
     )  # fmt: skip
     if banded:
         body += page.table(
-            ("state", "band", "pixels", "median |error| %", "bias %", "68 % coverage %"), banded,
+            ("state", "band", "pixels", "median |error|, %", "bias, %", "68 % coverage, %"), banded,
             caption="Blood by the rig, by band of the true melanin fraction C_m",
         )  # fmt: skip
     labels = list(dict.fromkeys(row.state for row in states))

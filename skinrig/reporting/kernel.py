@@ -12,6 +12,10 @@ from skinrig.evaluating import microrelief as evaluation
 from skinrig.reporting import figures, page
 from skinrig.reporting.map_names import state_words
 
+_ALPHA_AND_SIGMA = (
+    "alpha", "alpha_stderr", "alpha_95", "sigma_um", "sigma_stderr_um", "sigma_95_um",
+)  # fmt: skip
+
 
 def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> str:
     """Return kernels by state and direction, and judge the distances that they leave.
@@ -48,18 +52,21 @@ def section(name: str, appearance: SkinAppearance, checks: list[page.Check]) -> 
         else ""
     )
     body = "<h3>Convolution kernels</h3>" + note + page.table(
-        ("state", "r", "alpha", "sigma um", "distance before", "after", "other skin of this size",
-         "nearly as good", "fitted"),
+        ("state", "r", "alpha", "standard error", "95 % half width", "sigma, um",
+         "standard error, um", "95 % half width, um", "distance before", "after",
+         "other skin of this size", "nearly as good", "fitted"),
         [
             (
-                state_words(fit["name"]), fit["stretch_s"], _value(fit["alpha"]),
-                _value(fit["sigma_um"]), _value(fit["distance_before"]), _value(fit["distance"]),
+                state_words(fit["name"]), fit["stretch_s"],
+                *(_value(fit.get(key)) for key in _ALPHA_AND_SIGMA),
+                _value(fit["distance_before"]), _value(fit["distance"]),
                 _value(fit.get("noise_floor")), fit.get("near_best_count", 0),
                 "yes" if fit["valid"] else "no",
             )
             for fit in fits
         ],
-        caption="Kernels fitted to histograms of normals; distances before and after the kernel",
+        caption="Kernels fitted to histograms of normals; distances before and after the kernel. "
+        "Errors of kernels are not Gaussian: 95 % half widths are not 1.96 standard errors",
     )  # fmt: skip
     plots = ""
     for key, error, title in (
@@ -106,7 +113,7 @@ def _direction(found: Mapping[str, Any] | None) -> str:
     return (
         "<h3>Kernels by the direction of stretch, less one table of all</h3>"
         + page.table(
-            ("jaws at °", "alpha", "standard error", "sigma um", "standard error um"),
+            ("jaws at, °", "alpha", "standard error", "sigma, um", "standard error, um"),
             rows,
             caption="Offsets of each direction",
         )

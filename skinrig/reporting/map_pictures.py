@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from skinrig.reporting import png
 from skinrig.reporting.page import escape, number
+from skinrig.written_units import written
 
 LEVELS = 128
 """Colors of a map's picture: it tells a value to 1/128 of its scale."""
@@ -58,7 +59,8 @@ def scalar_picture(
     mask = None if valid is None else shrink(valid, width).astype(bool)
     data = png.encode_scalar(small, low, high, scale=scale, valid=mask, levels=LEVELS)
     named = f"{of}, {title}" if of else title
-    alt = f"{named}: {_told(small, mask, unit)}; color scale {number(low)} to {_with(high, unit)}"
+    scale_words = f"color scale {number(low)} to {written(number(high), unit)}"
+    alt = f"{named}: {_told(small, mask, unit)}; {scale_words}"
     of_unit = f"<span>{escape(unit)}</span>" if unit else ""
     return (
         f'<figure><img alt="{escape(alt)}" width="{small.shape[1]}" height="{small.shape[0]}" '
@@ -69,17 +71,14 @@ def scalar_picture(
     )
 
 
-def _with(value: float, unit: str) -> str:
-    return f"{number(value)} {unit}".rstrip()
-
-
 def _told(values: NDArray[np.float64], mask: NDArray[np.bool_] | None, unit: str) -> str:
     """Return a map's median, its middle 90 %, and how much of it has no value."""
     shown = np.isfinite(values) if mask is None else mask & np.isfinite(values)
     if not shown.any():
         return "no pixel has a value"
     low, median, high = np.percentile(values[shown], [5, 50, 95])
-    text = f"median {_with(median, unit)}, 90 % of pixels within {number(low)} to {number(high)}"
+    within = f"90 % of pixels within {number(low)} to {number(high)}"
+    text = f"median {written(number(median), unit)}, {within}"
     missing = 1.0 - shown.mean()
     return text + (f", {100 * missing:.0f} % without a value" if missing >= 0.005 else "")
 

@@ -158,9 +158,9 @@ def _relief_errors(
     )
     note += page.one_skin(truth.parameters)
     return "<h3>Errors of normals and height</h3>" + note + page.table(
-        ("state", "pixels", "masked %", "mean error °", "median °", "68 % interval",
-         "unblurred truth °", "median standard error °", "68 % coverage %", "height rms um",
-         "relief rms um", "of relief %"),
+        ("state", "pixels", "masked, %", "mean error, °", "median, °", "68 % interval",
+         "unblurred truth, °", "median standard error, °", "68 % coverage, %", "height rms, um",
+         "relief rms, um", "of relief, %"),
         [
             (
                 state_words(row.state), row.pixels, 100 * row.masked, row.mean_deg, row.median_deg,
@@ -214,8 +214,8 @@ def _strain(
         for state in document["states"]
     ]  # fmt: skip
     return "<h3>Strain of the skin, from its pigment</h3>" + page.table(
-        ("state", "jaws mm", "force N", "caliper's ratio", "skin's r", "standard error", "true r",
-         "slip", "r across", "shear °", "rotation °", "windows", "measured"),
+        ("state", "jaws, mm", "force, N", "caliper's ratio", "skin's r", "standard error", "true r",
+         "slip", "r across", "shear, °", "rotation, °", "windows", "measured"),
         rows,
         caption="Stretch ratio r of the skin between the jaws, and what the caliper reads",
     )  # fmt: skip

@@ -13,6 +13,8 @@ from typing import Literal
 
 import numpy as np
 
+from skinrig.written_units import written
+
 STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
 SHORT = 22
 """Characters up to which a cell's text is not broken over lines."""
@@ -97,7 +99,7 @@ def checks_table(checks: Sequence[Check]) -> str:
 
 
 def _with_unit(value: float, unit: str) -> str:
-    return f"{number(value)} {escape(unit)}".rstrip()
+    return escape(written(number(value), unit))
 
 
 def _percent(share: float) -> str:

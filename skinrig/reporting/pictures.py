@@ -85,8 +85,8 @@ def _comparison(name: str, document: Mapping[str, Any], checks: list[page.Check]
     kinds = {f"{kind} held out": row for kind, row in document["by_kind"].items()}
     rows = {FULL: full, **kinds, **document["ablation"]}
     body = page.table(
-        ("model", "photographs", "median error %", "68 % below %", "95 % below %", "bias %",
-         "all skin %", "SSIM"),
+        ("model", "photographs", "median error, %", "68 % below, %", "95 % below, %", "bias, %",
+         "all skin, %", "SSIM"),
         [
             (
                 label, row["pairs"],
@@ -101,7 +101,7 @@ def _comparison(name: str, document: Mapping[str, Any], checks: list[page.Check]
         (band, row["pixels"], 100 * row["median"]) for band, row in document["by_band"].items()
     ]
     return body + page.table(
-        ("skin", "pixels", "median error %"), bands,
+        ("skin", "pixels", "median error, %"), bands,
         caption="The full model by skin color, from the individual typology angle",
     )  # fmt: skip
 

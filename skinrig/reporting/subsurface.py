@@ -142,9 +142,9 @@ def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> str:
                 )
             )  # fmt: skip
     table = page.table(
-        ("measurement", "channel", "method", "true sigma_tr 1/mm", "sigma_tr", "68 % interval",
-         "error %", "sigma_a", "sigma_s'", "their correlation", "chi²", "degrees", "fibres",
-         "valid"),
+        ("measurement", "channel", "method", "true sigma_tr, 1/mm", "sigma_tr", "68 % interval",
+         "error, %", "sigma_a", "sigma_s'", "their correlation", "chi²", "degrees of freedom",
+         "fibres", "valid"),
         rows,
         caption="Every fit, with what it says of itself",
     )  # fmt: skip
@@ -164,7 +164,8 @@ def _errors(
         found = evaluation.by_method([row for row in rows if row.kind == kind])
         body += f"<h3>Error of sigma_tr against the truth, {page.escape(kind)} tissue</h3>"
         body += page.table(
-            ("method", "fits", "median |error| %", "worst %", "bias %", "68 % interval covers %"),
+            ("method", "fits", "median |error|, %", "worst, %", "bias, %",
+             "68 % interval covers, %"),
             [
                 (METHOD_NAMES[row.method], row.fits, 100 * row.median, 100 * row.worst,
                  100 * row.bias, 100 * row.coverage)
@@ -185,8 +186,8 @@ def _errors(
     profiles = evaluation.compare_profiles(appearance, truth)
     if profiles:
         body += "<h3>Profiles against the truth</h3>" + page.table(
-            ("measurement", "channel", "fibres", "median |error| %", "worst %",
-             "68 % interval covers %"),
+            ("measurement", "channel", "fibres", "median |error|, %", "worst, %",
+             "68 % interval covers, %"),
             [
                 (_words_of_name(row.name), row.channel, row.fibres, 100 * row.median,
                  100 * row.worst, 100 * row.coverage)
@@ -225,8 +226,8 @@ def _anisotropy(appearance: SkinAppearance) -> str:
         for entry in document["sites"]
     ]  # fmt: skip
     return "<h3>Dependence on direction</h3>" + page.table(
-        ("site", "repeat", "channel", "directions", "ratio", "standard error", "axis °",
-         "standard error °", "chance if isotropic", "one direction is off by up to %", "valid"),
+        ("site", "repeat", "channel", "directions", "ratio", "standard error", "axis, °",
+         "standard error, °", "chance if isotropic", "one direction is off by up to, %", "valid"),
         rows,
         caption="sigma_tr along the long axis over that across it",
     )  # fmt: skip
@@ -243,8 +244,8 @@ def _sites(appearance: SkinAppearance) -> str:
         for entry in fitted["sites"]
     ]  # fmt: skip
     return "<h3>Sites</h3>" + page.table(
-        ("site", "channel", "measurements", "sigma_tr 1/mm", "standard error",
-         "translucency mm", "standard error"),
+        ("site", "channel", "measurements", "sigma_tr, 1/mm", "standard error",
+         "translucency, mm", "standard error"),
         rows,
         caption="Mean of each site's measurements; translucency is 1/sigma_tr",
     )  # fmt: skip

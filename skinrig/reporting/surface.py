@@ -12,6 +12,7 @@ from skinrig.front_view import WIDTH_PX, FrontView
 from skinrig.reporting import map_pictures, page
 from skinrig.reporting.map_names import heading, words
 from skinrig.reporting.surface_bands import Banded, errors_by_band
+from skinrig.written_units import unit_sign
 
 SMALL_PX = 110
 """Of earlier normals, lobes, samples and residuals: every second pixel of the others."""
@@ -188,7 +189,7 @@ def _errors(
         if row.unit == "deg" and coarse:
             continue
         what, got, bound = row.judged
-        unit = "°" if row.unit == "deg" else row.unit
+        unit = unit_sign(row.unit)
         where, worst_got = _worst(row.name, banded)
         checks.append(
             page.Check(
@@ -205,11 +206,11 @@ def _errors(
             "</p>"
         )
     return "<h3>Errors on the surface</h3>" + note + page.table(
-        ("map", "unit", "points", "masked %", "mean |error|", "median", "68 % interval", "95th %",
-         "bias", "68 % coverage %", "median standard error"),
+        ("map", "unit", "points", "masked, %", "mean |error|", "median", "68 % interval",
+         "95th percentile", "bias", "68 % coverage, %", "median standard error"),
         [
             (
-                words(row.name), "°" if row.unit == "deg" else row.unit, row.points,
+                words(row.name), unit_sign(row.unit), row.points,
                 100 * row.masked, row.mean, row.median,
                 f"{row.interval[0]:.3g} – {row.interval[1]:.3g}", row.high, row.bias,
                 100 * row.coverage.share, row.median_stderr,
@@ -218,7 +219,7 @@ def _errors(
         ],
         caption="Texel by texel against the nearest true point; angles in degrees",
     ) + page.table(
-        ("map", "unit", "skin", "points", "masked %", "median |error|", "95th %"),
+        ("map", "unit", "skin", "points", "masked, %", "median |error|", "95th percentile"),
         [(words(row[0]), *row[1:]) for row in banded],
         caption="By skin color: the individual typology angle of the true reflectance "
         "(Chardon et al. 1991)",
@@ -253,7 +254,7 @@ def _reflection(
     )
     low, high = held_out.interval
     body = "<h3>Reflection in directions that no light of the capture had</h3>" + page.table(
-        ("points", "directions", "median error %", "68 % interval", "in highlights %"),
+        ("points", "directions", "median error, %", "68 % interval", "in highlights, %"),
         [(held_out.points, held_out.directions, 100 * held_out.median,
           f"{100 * low:.3g} – {100 * high:.3g}", 100 * held_out.highlights)],
         caption="Against the true reflection at points of the surface",

@@ -10,6 +10,7 @@ from model.skin import SkinAppearance
 from skinrig.evaluating import flash, microrelief, subsurface
 from skinrig.evaluating import surface as surface_evaluation
 from skinrig.reporting.surface_bands import errors_by_band
+from skinrig.written_units import unit_sign
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +77,7 @@ def _surface(appearance: SkinAppearance, truth: SkinAppearance) -> list[TruthErr
     found = surface_evaluation.compare(appearance, truth, rng=np.random.default_rng(0))
     rows = [
         TruthError(
-            f"{row.name}, median error", "all", "°" if row.unit == "deg" else row.unit,
+            f"{row.name}, median error", "all", unit_sign(row.unit),
             row.median, row.interval, row.coverage.share,
         )
         for row in found

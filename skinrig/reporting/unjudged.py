@@ -80,14 +80,14 @@ def section(appearance: SkinAppearance) -> str:
     )
     if spreads:
         body += page.table(
-            ("map", "unit", "with a value %", "median", "median standard error",
-             "of the value %", "95th % of standard errors"),
+            ("map", "unit", "with a value, %", "median", "median standard error",
+             "of the value, %", "95th percentile of standard errors"),
             spreads,
             caption="Standard errors, of all pixels that have a value",
         )  # fmt: skip
     if residuals:
         body += page.table(
-            ("map", "unit", "median", "68th %", "95th %"),
+            ("map", "unit", "median", "68th percentile", "95th percentile"),
             residuals,
             caption="Residuals: what models leave of the images",
         )
@@ -152,7 +152,7 @@ def _by_band(appearance: SkinAppearance) -> str:
     if not rows:
         return ""
     return page.table(
-        ("map", "band", "pixels", "median standard error %", "95th %"),
+        ("map", "band", "pixels", "median standard error, %", "95th percentile"),
         rows,
         caption="Relative standard errors by band of the estimated melanin fraction C_m",
     )

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skinrig.reporting import page
+from skinrig.written_units import written
 
 NAMED = 3
 """Checks named that come closest to their limit."""
@@ -118,11 +119,11 @@ def weaknesses(checks: Sequence[page.Check]) -> list[str]:
 
 
 def _measured(check: page.Check) -> str:
-    return f"{page.number(check.got)} {check.unit}".rstrip()
+    return written(page.number(check.got), check.unit)
 
 
 def _bound(check: page.Check) -> str:
-    return f"{page.number(check.bound)} {check.unit}".rstrip()
+    return written(page.number(check.bound), check.unit)
 
 
 def _at(check: page.Check) -> str:

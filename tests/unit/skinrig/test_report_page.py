@@ -1,10 +1,12 @@
 """The page as programs read it: landmarks, headings, captions, alt texts, and a strict policy."""
 
+import ast
 import base64
 import hashlib
 import io
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -204,3 +206,27 @@ def test_a_check_that_is_no_number_is_missed():
     assert "missed: error, – , at most 1" in " ".join(verdict.weaknesses([missed])).replace(
         "–,", "– ,"
     )
+
+
+@pytest.mark.parametrize(
+    ("unit", "shown"), [("deg", "1.5°"), ("°", "1.5°"), ("%", "1.5 %"), ("1/mm", "1.5 1/mm")]
+)
+def test_a_check_is_told_the_same_way_in_the_table_and_in_the_verdict(unit, shown):
+    check = page.Check("normals, median", 1.5, 1.0, "<=", unit)
+    assert f">{shown}</td>" in page.checks_table([check])
+    assert f" {shown}" in verdict.section([check]).split("<h2>Checks</h2>")[0]
+
+
+def test_headings_of_tables_set_units_apart_by_a_comma():
+    joined = re.compile(r"[^,0-9 ] (%|°|um|mm|1/mm|px|N)$")
+    found = [
+        f"{path.name}:{node.lineno}: {node.value}"
+        for path in sorted(Path(page.__file__).parent.glob("*.py"))
+        for row in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(row, ast.Tuple)
+        for node in row.elts
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and joined.search(node.value)
+    ]
+    assert found == []

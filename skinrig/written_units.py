@@ -1,0 +1,46 @@
+"""How people are told a number with its unit: one way for pages and for the terminal."""
+
+from __future__ import annotations
+
+from typing import Final
+
+DEGREE: Final = "°"
+_SIGNS: Final = {"deg": DEGREE, "1": ""}
+
+
+def unit_sign(unit: str) -> str:
+    """Return a unit as people read it; none where it stands for a plain number.
+
+    Parameters
+    ----------
+    unit
+        As documents and maps name it.
+
+    Examples
+    --------
+    >>> unit_sign("deg"), unit_sign("1"), unit_sign("1/mm")
+    ('°', '', '1/mm')
+    """
+    return _SIGNS.get(unit, unit)
+
+
+def written(number: str, unit: str) -> str:
+    """Return a number with its unit.
+
+    A space stands between them, and none before the sign of degrees: SI Brochure, 9th edition,
+    section 5.4.3.
+
+    Parameters
+    ----------
+    number
+        As it is to be read.
+    unit
+        As documents and maps name it.
+
+    Examples
+    --------
+    >>> written("1.5", "deg"), written("1.5", "°"), written("12", "%"), written("3", "1")
+    ('1.5°', '1.5°', '12 %', '3')
+    """
+    sign = unit_sign(unit)
+    return number + ("" if sign == DEGREE or not sign else " ") + sign
