@@ -55,6 +55,7 @@ def valid_of(skin_map: SkinMap) -> Bools:
 def of_map(
     quantity: str, estimate: SkinMap, true: NDArray[np.floating], skin: Bools, *, subject: str,
     band: str, channel: int | None = None, factor_95: float = GAUSSIAN_95,
+    over: NDArray[np.floating] | None = None,
 ) -> Trial:  # fmt: skip
     """Compare a map of numbers with the truth, where it is valid; widths are relative.
 
@@ -70,6 +71,9 @@ def of_map(
         (H, W): where there is a truth.
     channel
         Of a map of several.
+    over
+        Of the map's shape: what widths are relative to, such as what a change is one of. None: the
+        truth.
 
     Raises
     ------
@@ -84,8 +88,9 @@ def of_map(
     value = estimate.values[part].astype(np.float64)
     stderr = spread[part].astype(np.float64)
     truth = np.asarray(true, np.float64)[part]
-    with np.errstate(divide="ignore"):  # what does not change has a width of infinity
-        width = float(100.0 * np.median(stderr / np.abs(truth))) if value.size else float("nan")
+    whole = truth if over is None else np.asarray(over, np.float64)[part]
+    with np.errstate(divide="ignore"):  # what is nothing has a width of infinity
+        width = float(100.0 * np.median(stderr / np.abs(whole))) if value.size else float("nan")
     return Trial(quantity, subject, band, np.abs(value - truth) / stderr, width, "%", factor_95)
 
 

@@ -123,4 +123,5 @@ def _of_rig(
     change = moved.values.astype(np.float64) - rest.values
     yield of_map("hemoglobin of the rig", blood, moved.values, both, subject=subject, band=band,
                  factor_95=FACTOR_95)  # fmt: skip
-    yield of_map("change of hemoglobin", found, change, both, subject=subject, band=band)
+    yield of_map("change of hemoglobin", found, change, both, subject=subject, band=band,
+                 over=rest.values)  # fmt: skip

@@ -5,10 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from model.skin import SkinAppearance
+from model.skin import SkinAppearance, SkinMap
 from reconstruction.probe_stages import ANISOTROPY_FILE, SUBSURFACE_FILE
 from skinrig.benchmarks import interval_trials_probe as probe
 from skinrig.benchmarks.interval_coverage import pooled
+from skinrig.benchmarks.interval_trials import of_map
 
 PLACE = {"site": "cheek", "repeat": 0, "angle_deg": 0.0}
 CHANNELS = ("red", "green", "blue")
@@ -110,3 +111,20 @@ def test_axis_and_ratio_of_an_ellipse_are_judged_wherever_the_axis_lies(axis_deg
         ]
         for trials in zip(*made, strict=True):
             assert pooled(trials, level=68).verdict == verdict
+
+
+def test_widths_of_a_change_are_told_over_what_changes(rng):
+    """Rationale: over a change of nothing any width is infinite."""
+    rest = np.full((20, 20), 0.04)
+    change = np.where(np.arange(20) < 12, 0.0, 0.01) * np.ones((20, 1))
+    found = SkinMap(
+        (change + 0.002 * rng.standard_normal(change.shape)).astype(np.float32), "1",
+        np.full(change.shape, 0.002, np.float32), np.ones(change.shape, bool),
+    )  # fmt: skip
+    about = {"subject": "II 0", "band": "light"}
+    everywhere = np.ones(change.shape, bool)
+    alone = of_map("change", found, change, everywhere, **about)
+    over = of_map("change", found, change, everywhere, over=rest, **about)
+    assert alone.width == np.inf
+    assert over.width == pytest.approx(5.0)
+    np.testing.assert_array_equal(alone.deviation, over.deviation)
