@@ -17,8 +17,9 @@ from typing import Any
 from model import store
 from skinrig.console import Console, plain
 from skinrig.demo_rigs import RIGS, Findings
-from skinrig.next_steps import look, suggest
+from skinrig.next_steps import suggest
 from skinrig.simulating.simulation import truth_folder
+from skinrig.surroundings import look
 from skinrig.waiting_threads import WAITING_ASLEEP
 from skinrig.written_units import unit_sign
 

@@ -1,18 +1,15 @@
-"""What to do next: after a session was captured, and with what lies in a folder.
-
-Folders are told apart by their documents alone, and no map is read, so that a plain ``skinrig``
-answers at once.
-"""
+"""What to do next: after a session was captured, and with what lies in a folder."""
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+
+from skinrig.surroundings import Surroundings, look
 
 CALIBRATIONS: Final[Mapping[str, Mapping[str, str]]] = {
     "flash": {"white": "white", "flat": "sensor", "dark": "sensor", "chart": "color",
@@ -32,10 +29,6 @@ WANTS: Final[Mapping[str, str]] = {
 """What is usually wanted of a session of skin."""
 UNCALIBRATED: Final = ("flash", "photographs")
 """Rigs whose maps need no calibration; without one something is assumed, and said."""
-PHOTOGRAPHS: Final = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".tif",
-                      ".tiff", ".jpg", ".jpeg")  # fmt: skip
-REPORT_HEAD: Final = b"content=\"default-src 'none'; img-src data:; style-src 'sha256-"
-"""How the policy of a report's page begins; that of a live page allows a script."""
 OPENER: Final = {"darwin": "open", "win32": "start"}.get(sys.platform, "xdg-open")
 DEMO: Final = "demo"
 MOST: Final = 4
@@ -48,29 +41,6 @@ class Step:
 
     command: str
     why: str
-
-
-@dataclass(frozen=True, slots=True)
-class Surroundings:
-    """What lies in a folder, each sorted by name."""
-
-    sessions: Mapping[Path, Mapping[str, Any]] = field(default_factory=dict)
-    """With their session.json."""
-    appearances: Mapping[Path, Mapping[str, Any]] = field(default_factory=dict)
-    """With their appearance.json, truths left out."""
-    truths: tuple[Path, ...] = ()
-    calibrations: tuple[Path, ...] = ()
-    reports: tuple[Path, ...] = ()
-    photographs: int = 0
-
-    def summary(self) -> str:
-        """Return what is here in one line; empty where nothing of skinrig's is."""
-        counts = [
-            (len(self.sessions), "session"), (len(self.calibrations), "calibration"),
-            (len(self.appearances), "appearance"), (len(self.reports), "report"),
-            (self.photographs, "photograph"),
-        ]  # fmt: skip
-        return ", ".join(f"{n} {noun}{'s' if n > 1 else ''}" for n, noun in counts if n)
 
 
 def named(path: str | Path) -> str:
@@ -123,44 +93,13 @@ def after_session(
     return f"skinrig calibrate {kind} {given} --out {store}"
 
 
-def look(folder: Path) -> Surroundings:
-    """Find what skinrig wrote into a folder, and photographs.
-
-    Parameters
-    ----------
-    folder
-        One that exists; the folders in it are looked into, not below. What cannot be read or is
-        damaged is passed over: the commands that use it say what is wrong.
-    """
-    sessions, appearances, truths, calibrations = {}, {}, [], []
-    try:
-        entries = sorted(folder.iterdir())
-    except OSError:
-        return Surroundings()
-    for entry in entries:
-        if (document := _document(entry / "session.json")) is not None:
-            sessions[entry] = document
-        elif (document := _document(entry / "appearance.json")) is not None:
-            if document.get("parameters", {}).get("kind") == "truth":
-                truths.append(entry)
-            else:
-                appearances[entry] = document
-        elif entry.name.startswith("calibration") and entry.is_dir():
-            calibrations.append(entry)
-    reports = [e for e in entries if e.suffix == ".html" and _is_report(e)]
-    photographs = sum(e.suffix.lower() in PHOTOGRAPHS for e in entries)
-    return Surroundings(
-        sessions, appearances, tuple(truths), tuple(calibrations), tuple(reports), photographs
-    )
-
-
 def suggest(found: Surroundings, folder: Path) -> tuple[Step, ...]:
     """Return what to do next with what lies in a folder, the nearest first.
 
     Parameters
     ----------
     found
-        By `look`.
+        By `surroundings.look`.
     folder
         As it is to be named in commands.
     """
@@ -243,24 +182,6 @@ def welcome(folder: Path, version: str) -> str:
     return "\n".join(
         [*lines, "", "All commands: skinrig --help; one of them: skinrig report --help"]
     )
-
-
-def _document(path: Path) -> dict[str, Any] | None:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None
-
-
-def _is_report(path: Path) -> bool:
-    """Tell a report, which runs no script, from a live page and from pages of others."""
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(1000)
-    except OSError:
-        return False
-    return REPORT_HEAD in head
 
 
 def _target(session: Mapping[str, Any]) -> str:
