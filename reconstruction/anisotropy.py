@@ -27,9 +27,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special, stats
 
-from model import photon_table
-from reconstruction import diffusion_ellipse, direction_harmonics, profile_comparison
+from reconstruction import diffusion_ellipse, direction_harmonics
 from reconstruction.direction_harmonics import LEAST_DIRECTIONS
+from reconstruction.plane_vectors import (
+    UNKNOWN_AXIS_RAD,
+    axis_stderr,
+    length_and_errors,
+    quadratic_form,
+    within_period,
+)
 
 Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
@@ -42,8 +48,6 @@ LEAST_ERROR, MOST_ERROR = 1e-307, 1e150
 MOST_APART = 1e12
 """Standard errors over the least: directions of greater ones are left out, since beside the best
 ones rounding hides what they tell."""
-UNKNOWN_AXIS_RAD = math.pi / math.sqrt(12.0)
-"""Standard deviation of an axis that may point anywhere."""
 
 
 class AnisotropyError(ValueError):
@@ -64,7 +68,7 @@ class Anisotropy:
         than it is: isotropic tissue shows some 1 + ratio_stderr.
     axis_rad, axis_stderr_rad : ndarray
         Direction of greatest 1/sigma_tr in [0, pi), counted as the angles are, and its standard
-        error; up to `UNKNOWN_AXIS_RAD`, where the ratio cannot be told from 1.
+        error; up to `plane_vectors.UNKNOWN_AXIS_RAD`, where the ratio cannot be told from 1.
     p_value, log10_p : ndarray
         Chance that isotropic tissue shows such a harmonic in 2 theta, and its decimal logarithm.
     mean_per_mm, mean_stderr_per_mm : ndarray
@@ -211,12 +215,12 @@ def estimate(
         told_chi2 = residual / least / least
     chi2 = linear.dof.astype(np.float64) if stderr_per_mm is None else told_chi2
 
-    h, h_stderr, h_across = _length(p[:, 1:3], covariance[:, 1:3, 1:3])
+    h, h_stderr, h_across = length_and_errors(p[:, 1:3], covariance[:, 1:3, 1:3])
     mean, by_parameter = diffusion_ellipse.mean_over_directions(p[:, :3])
-    mean_error = np.sqrt(_quadratic(by_parameter, covariance[:, :3, :3]))
+    mean_error = np.sqrt(quadratic_form(by_parameter, covariance[:, :3, :3]))
     with np.errstate(over="ignore"):
         mean, mean_error = (np.ldexp(one * scale, exponent) for one in (mean, mean_error))
-    tilt, tilt_stderr, _ = _length(p[:, 3:], covariance[:, 3:, 3:])
+    tilt, tilt_stderr, _ = length_and_errors(p[:, 3:], covariance[:, 3:, 3:])
     ellipse = p[:, :3].copy()
     ellipse[:, 0] += 2.0 * (np.log(scale) + exponent * math.log(2.0))
     told, odd = linear.told, linear.odd
@@ -228,15 +232,15 @@ def estimate(
     return Anisotropy(
         ratio=shaped(np.exp(h), 1.0),
         ratio_stderr=shaped(np.exp(h) * h_stderr, math.inf),
-        axis_rad=shaped(_turned(0.5 * np.arctan2(p[:, 2], p[:, 1]), math.pi), 0.0),
-        axis_stderr_rad=shaped(_axis_stderr(h, h_across), UNKNOWN_AXIS_RAD),
+        axis_rad=shaped(within_period(0.5 * np.arctan2(p[:, 2], p[:, 1]), math.pi), 0.0),
+        axis_stderr_rad=shaped(axis_stderr(h, h_across), UNKNOWN_AXIS_RAD),
         p_value=shaped(np.exp(log_p), 1.0),
         log10_p=shaped(log_p / math.log(10.0), 0.0),
         mean_per_mm=shaped(mean, 0.0),
         mean_stderr_per_mm=shaped(mean_error, math.inf),
         tilt=shaped(tilt, 0.0, odd),
         tilt_stderr=shaped(tilt_stderr, math.inf, odd),
-        tilt_rad=shaped(_turned(np.arctan2(p[:, 4], p[:, 3]), math.tau), 0.0, odd),
+        tilt_rad=shaped(within_period(np.arctan2(p[:, 4], p[:, 3]), math.tau), 0.0, odd),
         tilt_p_value=shaped(np.exp(log_odd), 1.0, odd),
         chi2=shaped(chi2, 0.0),
         dof=linear.dof.reshape(shape),
@@ -248,134 +252,6 @@ def estimate(
         covariance=shaped(covariance[:, :3, :3], math.inf),
         errors=errors,
     )
-
-
-def estimate_from_profiles(
-    angle_rad: ArrayLike,
-    radius_mm: ArrayLike,
-    reflectance_per_mm2: ArrayLike,
-    variance: ArrayLike | None = None,
-    *,
-    sigma_a_per_mm: ArrayLike,
-    sigma_s_prime_per_mm: ArrayLike,
-    eta: float = 1.4,
-    g: float = 0.8,
-    collection: Literal["all", "fibre"] = "all",
-    core_mm: float = 0.0,
-    source_core_mm: float = 0.0,
-    valid: ArrayLike | None = None,
-    floor: float = 0.01,
-    errors: Errors = "relative",
-    outliers: bool = True,
-) -> Anisotropy:
-    """Tell ratio and axis of anisotropy from the profiles themselves.
-
-    Each profile is compared with the mean one (`profile_comparison`) and asked how much more
-    tissue scatters along its direction, and how well the head coupled. What is wrong with a fibre
-    in all directions cancels, and so does coupling: errors are several times smaller than those of
-    sigma_tr fitted direction by direction (bench stage "anisotropy").
-
-    Parameters
-    ----------
-    angle_rad : array_like, shape (N,)
-        As of :func:`estimate`.
-    radius_mm : array_like, shape (F,)
-        Distances of the fibres from the source, mm, at least 0.
-    reflectance_per_mm2 : array_like, shape (N, ..., F)
-        Profiles, 1/mm^2.
-    variance : array_like, shape (N, ..., F), optional
-        Of the profiles.
-    sigma_a_per_mm, sigma_s_prime_per_mm : array_like, shape (...)
-        Fitted to the mean profile, or means of fits, 1/mm. Where one is not finite and above 0
-        nothing is told.
-    eta, g, collection, core_mm, source_core_mm
-        As of `model.photon_table.reflectance`.
-    valid : array_like of bool, shape (N, ..., F), optional
-        Readings that count; those that are not finite never do.
-    floor : float
-        Relative error of each reading that its variance does not know of, at least 0: coupling
-        that differs from fibre to fibre.
-    errors, outliers
-        As of :func:`estimate`.
-
-    Returns
-    -------
-    Anisotropy
-        Directions with too few readings are not in `used`. The ratio's standard error holds
-        `profile_comparison.MODEL_ERROR`.
-
-    Raises
-    ------
-    AnisotropyError
-        As of :func:`estimate`, and for distances or a floor out of range.
-
-    Examples
-    --------
-    >>> angle, r = np.deg2rad(np.arange(16) * 22.5), 0.3 + 0.25 * np.arange(28)
-    >>> scattering = 1.5 * (1 - 0.2 * np.cos(2 * (angle - 0.3)))
-    >>> profiles = photon_table.reflectance(r, 0.04, scattering[:, None])
-    >>> found = estimate_from_profiles(
-    ...     angle, r, profiles, sigma_a_per_mm=0.04, sigma_s_prime_per_mm=1.5
-    ... )
-    >>> round(float(found.ratio), 2), round(float(found.axis_rad), 2)
-    (1.22, 0.3)
-    """
-    angle = np.asarray(angle_rad, np.float64)
-    r = np.asarray(radius_mm, np.float64)
-    profiles = np.asarray(reflectance_per_mm2, np.float64)
-    if r.ndim != 1 or not (np.isfinite(r).all() and (r >= 0).all()):
-        raise AnisotropyError(f"radius_mm: got shape {r.shape}, expected (F,), finite, 0 or above")
-    if profiles.ndim < 2 or (profiles.shape[0], profiles.shape[-1]) != (angle.size, r.size):
-        raise AnisotropyError(
-            f"reflectance_per_mm2: got shape {profiles.shape}, expected ({angle.size}, ..., "
-            f"{r.size})"
-        )
-    if not (math.isfinite(floor) and floor >= 0):
-        raise AnisotropyError(f"floor: got {floor}, expected 0 or above, finite")
-    if errors == "absolute" and variance is None:
-        raise AnisotropyError('variance: got none, expected one for "absolute" errors')
-    of_each: Floats = np.zeros_like(profiles)
-    if variance is not None:
-        of_each = np.asarray(variance, np.float64)
-    good = np.ones(profiles.shape, bool) if valid is None else np.array(valid, bool)
-    for name, array in (("variance", of_each), ("valid", good)):
-        if array.shape != profiles.shape:
-            raise AnisotropyError(f"{name}: got shape {array.shape}, expected {profiles.shape}")
-    good = good & np.isfinite(profiles) & np.isfinite(of_each)
-    if (of_each[good] < 0).any():
-        raise AnisotropyError(f"variance: got {of_each[good].min()}, expected 0 or above")
-    shape = profiles.shape[1:-1]
-    try:
-        a, s = (
-            np.broadcast_to(np.asarray(x, np.float64), shape).reshape(-1)
-            for x in (sigma_a_per_mm, sigma_s_prime_per_mm)
-        )
-    except ValueError as error:
-        raise AnisotropyError(
-            f"sigma_a_per_mm, sigma_s_prime_per_mm: got shapes {np.shape(sigma_a_per_mm)}, "
-            f"{np.shape(sigma_s_prime_per_mm)}, expected {shape}"
-        ) from error
-
-    def table(absorption: Floats, scattering: Floats) -> tuple[Floats, Floats]:
-        found = photon_table.derivatives(
-            r, absorption, scattering, eta=eta, g=g, collection=collection, core_mm=core_mm,
-            source_core_mm=source_core_mm,
-        )  # fmt: skip
-        return found.reflectance_per_mm2, found.by_sigma_s_prime
-
-    rows = (angle.size, -1, r.size)
-    found = profile_comparison.compare(
-        profiles.reshape(rows), of_each.reshape(rows), good.reshape(rows), a, s, table, floor=floor
-    )
-    told = found.valid
-    a, s = np.where(told, a, 1.0), np.where(told, s, 1.0) * np.exp(found.log_scattering)
-    sigma_tr = np.sqrt(3.0 * a * (a + s))
-    stderr = sigma_tr * 0.5 * s / (a + s) * np.where(told, found.stderr, 1.0)
-    back = (angle.size, *shape)
-    return estimate(
-        angle, sigma_tr.reshape(back), stderr.reshape(back), valid=told.reshape(back),
-        errors=errors, outliers=outliers, log_ratio_error=profile_comparison.MODEL_ERROR,
-    )  # fmt: skip
 
 
 def _checked(
@@ -428,46 +304,6 @@ def _far_exponent(largest: Floats) -> NDArray[np.int64]:
     return np.where((largest > 0) & (np.abs(exponent) > FAR), exponent, 0)
 
 
-def _quadratic(vectors: Floats, matrices: Floats) -> Floats:
-    return np.maximum(np.einsum("bi,bij,bj->b", vectors, matrices, vectors), 0.0)
-
-
-def _length(pair: Floats, covariance: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the length of vectors (B, 2) and its standard errors along and across them."""
-    length = np.hypot(pair[:, 0], pair[:, 1])
-    unit = np.where(length[:, None] > 0, pair / np.where(length > 0, length, 1.0)[:, None], 0.0)
-    unit[length == 0, 0] = 1.0
-    across = np.stack([-unit[:, 1], unit[:, 0]], axis=-1)
-    return (
-        length,
-        np.sqrt(_quadratic(unit, covariance)),
-        np.sqrt(_quadratic(across, covariance)),
-    )
-
-
-def _turned(angle: Floats, period: float) -> Floats:
-    """Return angles within [0, period); what rounds up to the period is 0."""
-    within = np.mod(angle, period)
-    return np.where(within >= period, 0.0, within)
-
-
-def _axis_stderr(h: Floats, across: Floats) -> Floats:
-    """Return the standard error of half the direction of a plane normal vector.
-
-    From the mean resultant length of the direction of a vector of length h with standard error
-    ``across``: close to across / (2 h) when that is small.
-    """
-    with np.errstate(divide="ignore", over="ignore"):
-        z = np.where(across > 0, 0.5 * (h / np.where(across > 0, across, 1.0)), math.inf) ** 2
-    far = z > 1e6
-    x = np.where(far, 1.0, z)
-    length = np.sqrt(0.5 * math.pi * x) * (special.ive(0, x) + special.ive(1, x))
-    spread = np.sqrt(-2.0 * np.log(np.clip(length, 1e-300, 1.0)))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        spread = np.where(far, 0.5 / np.sqrt(z), spread)
-    return np.minimum(0.5 * spread, UNKNOWN_AXIS_RAD)
-
-
 def _reasons(angle: Floats, used: Bools, told: Bools) -> NDArray[np.str_]:
     several = direction_harmonics.different_directions(angle, used)
     return np.array(
@@ -480,76 +316,4 @@ def _reasons(angle: Floats, used: Bools, told: Bools) -> NDArray[np.str_]:
             for ok, n in zip(told, several, strict=True)
         ],
         dtype=np.str_,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class OneDirectionBias:
-    """What a fit along one direction of anisotropic tissue is off from the mean over directions.
-
-    Attributes
-    ----------
-    bias, stderr : ndarray, shape (K, ...)
-        sigma_tr along each direction asked, over its mean, minus 1; and its standard error.
-    lowest, highest : ndarray, shape (...)
-        Least and greatest bias of any direction.
-    rms : ndarray, shape (...)
-        Root mean square over all directions: what a head set down at random is off.
-    """
-
-    bias: Floats
-    stderr: Floats
-    lowest: Floats
-    highest: Floats
-    rms: Floats
-
-
-def one_direction_bias(found: Anisotropy, angle_rad: ArrayLike) -> OneDirectionBias:
-    """Say how far sigma_tr along single directions is from its mean over all directions.
-
-    Parameters
-    ----------
-    found : Anisotropy
-        Where it is not `valid` biases are 0, with infinite standard errors.
-    angle_rad : array_like, shape (K,)
-        Directions in which the head would be set down, rad.
-
-    Returns
-    -------
-    OneDirectionBias
-
-    Examples
-    --------
-    >>> angle = np.deg2rad(np.arange(16) * 22.5)
-    >>> found = estimate(angle, np.hypot(np.cos(angle) / 1.2, np.sin(angle)))
-    >>> bias = one_direction_bias(found, [0.0, np.pi / 2])
-    >>> bias.bias.round(3).tolist(), round(float(bias.rms), 3)
-    ([-0.093, 0.089], 0.064)
-    """
-    angle = np.atleast_1d(np.asarray(angle_rad, np.float64))
-    if angle.ndim != 1 or not np.isfinite(angle).all():
-        raise AnisotropyError(f"angle_rad: got shape {angle.shape}, expected (K,), all finite")
-    shape = found.valid.shape
-    told = found.valid.reshape(-1)
-    p = found.parameters.reshape(-1, 3)
-    covariance = np.where(told[:, None, None], found.covariance.reshape(-1, 3, 3), 0.0)
-    flat = np.column_stack([np.zeros(len(p)), p[:, 1:]])
-    mean, mean_by = diffusion_ellipse.mean_over_directions(flat)
-    values, by_uv = diffusion_ellipse.relative_sigma_tr(angle, p[:, 1:])
-    ratio = values / mean[:, None]
-    by = (
-        by_uv / mean[:, None, None]
-        - (values / mean[:, None] ** 2)[..., None] * (mean_by[:, None, 1:])
-    )
-    variance = np.einsum("bki,bij,bkj->kb", by, covariance[:, 1:, 1:], by)
-    h = np.hypot(p[:, 1], p[:, 2])
-    every = diffusion_ellipse.all_directions()
-    around = diffusion_ellipse.relative_sigma_tr(every, p[:, 1:])[0] / mean[:, None]
-    stderr = np.where(told, np.sqrt(np.maximum(variance, 0.0)), math.inf)
-    return OneDirectionBias(
-        bias=(ratio - 1.0).T.reshape((-1, *shape)),
-        stderr=stderr.reshape((-1, *shape)),
-        lowest=(np.exp(-0.5 * h) / mean - 1.0).reshape(shape),
-        highest=(np.exp(0.5 * h) / mean - 1.0).reshape(shape),
-        rms=np.sqrt(((around - 1.0) ** 2).mean(axis=1)).reshape(shape),
     )

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.color_table import ColorTable
 from reconstruction import chromophore_ridge as ridge
 from reconstruction.chromophore_kernels import OUTSIDE_DISTANCE, OUTSIDE_SIGMAS
+from reconstruction.chromophore_lines import MELANIN_AXIS, lines_of
 from reconstruction.chromophore_start import LOWEST
 from reconstruction.chromophores import (
     RELATIVE_NOISE,
@@ -139,7 +140,7 @@ def weigh(
     fractions = np.stack([fitted.melanin, fitted.hemoglobin], axis=-1) / ends
     begin = np.clip(np.cbrt(np.where(usable[..., None], fractions, 0.1)), LOWEST, 1.0)
     noise = np.zeros(3) if variance is None else np.asarray(variance, dtype=np.float32)
-    lines = ridge.lines_of(table)
+    lines = lines_of(table)
     maps = np.empty((len(ridge.MAPS), pixels), dtype=np.float32)
     ridge.weigh_pixels(
         np.ascontiguousarray(colors).reshape(-1, 3),
@@ -177,8 +178,8 @@ def _of_face(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the kernel's -2 log probability of melanin, and its four numbers of blood."""
     if face is None:
-        return np.zeros(ridge.MELANIN_AXIS.size), np.array([0.5, 1.0, 0.0, 1.0])
-    density = face.melanin.relative_density(np.log(table.c_m_max * ridge.MELANIN_AXIS**3))
+        return np.zeros(MELANIN_AXIS.size), np.array([0.5, 1.0, 0.0, 1.0])
+    density = face.melanin.relative_density(np.log(table.c_m_max * MELANIN_AXIS**3))
     blood = face.blood
     return (
         -2.0 * np.log(density / density.max()),

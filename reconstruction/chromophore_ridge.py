@@ -12,20 +12,13 @@ against.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, types, void
-from numpy.typing import NDArray
 
-from model.color_table import ColorTable
-from reconstruction.chromophore_start import LOWEST, evaluate
+from reconstruction.chromophore_lines import LINES, NODES, PER_LINE
+from reconstruction.chromophore_start import LOWEST
 
-LINES = 49
-"""Values of melanin at which the ridge is followed, evenly spaced in the cube root."""
-NODES = 65
-"""Values of blood that each line's colors are stored at."""
 NEWTON_STEPS = 4
 REACH = 0.12
 """Longest step in blood, as a fraction of its axis."""
@@ -70,32 +63,7 @@ _LOW = float(LOWEST)
 _STEP_A = (1.0 - _LOW) / (LINES - 1)
 _STEP_B = (1.0 - _LOW) / (NODES - 1)
 _ROOM = (LINES - 1) * FEWEST + FINE
-PER_LINE = 32
-"""Nodes of melanin's probability from line to line."""
-MELANIN_AXIS = np.linspace(_LOW, 1.0, (LINES - 1) * PER_LINE + 1)
-"""Fractions of the melanin axis, its cube root, that they stand at."""
 _FAST = {"contract"}
-
-Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Lines:
-    """Log colors of skin along lines of equal melanin, each array (LINES, NODES, 3)."""
-
-    log_rgb: Floats
-    by_a: Floats
-    """Derivative by the fraction of the melanin axis."""
-    by_b: Floats
-    """Derivative by the fraction of the blood axis."""
-
-
-@lru_cache(maxsize=16)
-def lines_of(table: ColorTable) -> Lines:
-    """Return the lines of a table; kept for the tables used last."""
-    a, b = np.meshgrid(np.linspace(_LOW, 1.0, LINES), np.linspace(_LOW, 1.0, NODES), indexing="ij")
-    color, by_a, by_b = evaluate(table, a, b)
-    return Lines(np.log(color), by_a / color, by_b / color)
 
 
 @njit(fastmath=_FAST)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction import kernel_fit_kernels as kernels
-from reconstruction import normal_histogram
+from reconstruction import normal_blocks
 from reconstruction.block_errors import LEAST_BLOCKS
 from reconstruction.kernel_search import Buckets, Found, Relief
 
@@ -72,7 +72,7 @@ class BlockCounts:
     @property
     def effective_samples(self) -> float:
         """Independent samples that would be as noisy."""
-        return max(1.0, normal_histogram.effective_number(self.counts, self.samples) / self.growth)
+        return max(1.0, normal_blocks.effective_number(self.counts, self.samples) / self.growth)
 
     def residuals(self) -> Floats:
         """Return each block's part in the error of the shares, (blocks, buckets).
@@ -109,14 +109,14 @@ def of_kernel(relief: Relief, buckets: Buckets, alpha: float, sigma_um: float) -
         The kernel; sigma in um.
     """
     shape = (relief.code.shape[0], relief.code.shape[1])
-    blocks = normal_histogram.BLOCKS
-    group, groups = normal_histogram.block_of(relief.places, shape, blocks)
+    blocks = normal_blocks.BLOCKS
+    group, groups = normal_blocks.block_of(relief.places, shape, blocks)
     da, db = relief.change(sigma_um)
     a, b = relief.along + np.float32(alpha) * da, relief.across + np.float32(alpha) * db
     counts = kernels.count_in_groups(-a, -b, group, groups, buckets.bins, buckets.limit)
     steep = 1.0 + a * a + b * b
     growth = [
-        normal_histogram.block_error(m * m / steep, group, groups, shape, blocks)[1] for m in (a, b)
+        normal_blocks.block_error(m * m / steep, group, groups, shape, blocks)[1] for m in (a, b)
     ]
     return BlockCounts(np.asarray(counts, np.float64), 0.5 * (growth[0] + growth[1]))
 
@@ -227,7 +227,7 @@ def widths_of_pair(
         None where fewer than `block_errors.LEAST_BLOCKS` blocks are in both maps.
     """
     shape = (relief.code.shape[0], relief.code.shape[1])
-    group, groups = normal_histogram.block_of(relief.places, shape, normal_histogram.BLOCKS)
+    group, groups = normal_blocks.block_of(relief.places, shape, normal_blocks.BLOCKS)
     ours = np.bincount(group, minlength=groups)
     both = np.flatnonzero((ours > 0) & (target_blocks.sum(axis=1) > 0))
     if len(both) < LEAST_BLOCKS:

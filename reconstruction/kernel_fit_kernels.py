@@ -51,7 +51,7 @@ def slopes(height: Any, code: Any, right: Any, down: Any) -> Any:
     Parameters
     ----------
     height : (H, W) real
-    code : (H, W) uint8, of `normal_histogram.stencil`
+    code : (H, W) uint8, of `relief_slopes.stencil`
     right, down : float
         Distance to the next column and row along x and y, signed.
     """
@@ -110,7 +110,7 @@ def leans(height: Any, code: Any, starts: Any, right: Any, down: Any, a: Any, b:
     Parameters
     ----------
     height : (H, W) float32
-    code : (H, W) uint8, of `normal_histogram.stencil`
+    code : (H, W) uint8, of `relief_slopes.stencil`
     starts : (H,) int64, number of samples in the rows before
     right, down : float32
         Distance to the next column and row along the axes of the normal, signed.

@@ -68,7 +68,7 @@ class Relief:
     height_um : ndarray of float32, shape (H, W)
         About its mean; holes filled along the rows.
     code : ndarray of uint8, shape (H, W)
-        Where slopes are taken, of `normal_histogram.stencil`.
+        Where slopes are taken, of `relief_slopes.stencil`.
     right_um, down_um : float
         Deformed distance to the next column and row along the histogram's axes, signed.
     pixel_um : float

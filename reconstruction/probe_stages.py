@@ -22,6 +22,7 @@ from model.skin import SkinMap
 from reconstruction import anisotropy, nearest_medium, stages, subsurface, translucency
 from reconstruction.direction_harmonics import LEAST_DIRECTIONS
 from reconstruction.evidence import Evidence, EvidenceError
+from reconstruction.one_direction_bias import one_direction_bias
 from reconstruction.probe_images import Measurement, ProbeImages
 from reconstruction.subsurface import SubsurfaceFit
 
@@ -432,7 +433,7 @@ def _anisotropy(fits: Sequence[ProfileFit]) -> bytes:
         found = anisotropy.estimate(
             angle, np.where(valid, sigma_tr, 1.0), np.where(valid, stderr, np.inf), valid=valid
         )
-        bias = anisotropy.one_direction_bias(found, angle)
+        bias = one_direction_bias(found, angle)
         off = np.maximum(np.abs(bias.lowest), np.abs(bias.highest))
         for c, channel in enumerate(CHANNELS):
             rows.append(

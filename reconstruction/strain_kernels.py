@@ -12,15 +12,11 @@ from scipy import ndimage
 
 from model.microstructure import KernelTableError
 from model.skin import SkinMap
-from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, KernelFit, fit_kernel
+from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, fit_kernel
+from reconstruction.kernel_outcome import KernelFit
 from reconstruction.kernel_table import KernelTableFitError, direction_dependence, fit_table
-from reconstruction.normal_histogram import (
-    BLOCKS,
-    NormalStatistics,
-    block_counts,
-    grid_of,
-    measure,
-)
+from reconstruction.normal_blocks import BLOCKS, block_counts, grid_of
+from reconstruction.normal_statistics import NormalStatistics, measure
 from reconstruction.skin_strain import StateStrain
 
 LEAST_SAMPLES = 1000

@@ -21,8 +21,9 @@ from model.skin import SkinAppearance
 from reconstruction import pipeline
 from reconstruction.gradient_stages import CUTOFF_UM, KERNEL_FILE
 from reconstruction.height_filters import high_pass
-from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, KernelFit, fit_kernel
-from reconstruction.normal_histogram import measure
+from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, fit_kernel
+from reconstruction.kernel_outcome import KernelFit
+from reconstruction.normal_statistics import measure
 from reconstruction.strain_kernels import COARSER
 from skinrig.benchmarks.interval_coverage import GAUSSIAN_95, Trial
 from skinrig.benchmarks.interval_trials import (

@@ -11,7 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
-from reconstruction import kernel_fit, kernel_search, normal_histogram
+from reconstruction import (
+    kernel_fit,
+    kernel_outcome,
+    kernel_search,
+    neutral_relief,
+    normal_histogram,
+    normal_statistics,
+    relief_slopes,
+)
 from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import mean_error
@@ -98,14 +106,14 @@ def search(*, toy: bool) -> StageBenchmark:
 
     def fit(
         way: Literal["hierarchical", "exhaustive"], part: int, first: int, thin: int = 1
-    ) -> kernel_fit.KernelFit:
+    ) -> kernel_outcome.KernelFit:
         return kernel_fit.fit_kernel(
             height[:part, :part], target, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM,
             search=way, first_sample=first, alphas=alphas[::thin], sigmas_um=sigmas[::thin],
         )  # fmt: skip
 
     best = fit("exhaustive", side, 2)
-    whole = kernel_fit.relief_of(height, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM)
+    whole = neutral_relief.relief_of(height, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM)
     buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
     points = []
     ways: list[tuple[Literal["hierarchical", "exhaustive"], int, int, int]] = [
@@ -149,7 +157,7 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     target = normal_histogram.histogram(
         strained(height, rng=rng), pixel=(PIXEL_UM, PIXEL_UM * STRETCH)
     )
-    whole = kernel_fit.relief_of(height, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM)
+    whole = neutral_relief.relief_of(height, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM)
     buckets = kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
     few = SIGMAS_UM[[10, 60, 150]]
     ours_s = _spent(lambda: kernel_search.exhaustive(whole, buckets, ALPHAS, few))
@@ -171,12 +179,12 @@ def _full_size(rng: np.random.Generator) -> tuple[Limit, ...]:
     default_s = []
     for made in ("no kernel", "a kernel"):
         if made == "a kernel":
-            moved = kernel_fit.convolved(height, -0.63, 17.5, axis="x", pixel_um=PIXEL_UM)
+            moved = neutral_relief.convolved(height, -0.63, 17.5, axis="x", pixel_um=PIXEL_UM)
             target = normal_histogram.histogram(
                 np.asarray(moved, np.float64), pixel=(PIXEL_UM, PIXEL_UM * STRETCH)
             )
 
-        def run(target: Floats = target) -> kernel_fit.KernelFit:
+        def run(target: Floats = target) -> kernel_outcome.KernelFit:
             return kernel_fit.fit_kernel(
                 height, target, stretch=STRETCH, axis="x", pixel_um=PIXEL_UM
             )
@@ -205,7 +213,7 @@ def histograms(*, toy: bool) -> StageBenchmark:
     truth_map = relief(truth_side, rng=rng)
     points = []
     for bins in (32, 64) if toy else (16, 32, 64, 128):
-        truth = normal_histogram.measure(truth_map, pixel=PIXEL_UM, bins=bins)
+        truth = normal_statistics.measure(truth_map, pixel=PIXEL_UM, bins=bins)
         for part in (side // 2, side) if toy else (128, 256, 512, 1024):
             patches = [
                 np.ascontiguousarray(truth_map[rows, columns])
@@ -215,8 +223,8 @@ def histograms(*, toy: bool) -> StageBenchmark:
 
             def run(
                 height: Floats = patches[0], bins: int = bins
-            ) -> normal_histogram.NormalStatistics:
-                return normal_histogram.measure(height, pixel=PIXEL_UM, bins=bins)
+            ) -> normal_statistics.NormalStatistics:
+                return normal_statistics.measure(height, pixel=PIXEL_UM, bins=bins)
 
             timing = measure(run, repeats=1 if toy else 3, memory=part == side)
             off = mean_error(
@@ -228,7 +236,7 @@ def histograms(*, toy: bool) -> StageBenchmark:
             knobs: dict[str, str | int | float] = {"side": part, "bins": bins}
             points.append(Point(knobs, timing, off.error, off.error_interval))
     height = truth_map[:side, :side]
-    dx, dy, _ = normal_histogram.slopes(height, pixel=PIXEL_UM)
+    dx, dy, _ = relief_slopes.slopes(height, pixel=PIXEL_UM)
     edges = np.linspace(-1.0, 1.0, 65)
 
     def theirs() -> Floats:

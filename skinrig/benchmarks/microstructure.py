@@ -26,7 +26,7 @@ from model.displacement_convolution import (
 from model.mesh_strain import strain
 from model.microstructure import FOREHEAD, KernelTable, kernel_parameters
 from model.strain_fields import rasterize
-from reconstruction import kernel_fit, kernel_table, normal_histogram
+from reconstruction import kernel_fit, kernel_table, normal_histogram, relief_slopes
 from rigsim.microrelief import MicroSkin, make_micro_skin
 from rigsim.skin_stretch import StretchedSkin, deform
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure
@@ -64,11 +64,11 @@ WAVES = 60
 
 def slopes_under(height: NDArray[Any], state: StretchedSkin) -> tuple[Floats, Floats]:
     """Return slopes along and across the jaws of a relief that goes along with the skin."""
-    dx, dy, known = normal_histogram.slopes(height, pixel=TEXEL_UM)
+    dx, dy, known = relief_slopes.slopes(height, pixel=TEXEL_UM)
     inverse = np.linalg.inv(state.gradient)
     along_x = dx[known] * inverse[0, 0] + dy[known] * inverse[1, 0]
     along_y = dx[known] * inverse[0, 1] + dy[known] * inverse[1, 1]
-    return normal_histogram.turned(along_x, along_y, math.radians(state.angle_deg))
+    return relief_slopes.turned(along_x, along_y, math.radians(state.angle_deg))
 
 
 def fitted_table(

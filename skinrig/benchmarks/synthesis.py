@@ -11,7 +11,7 @@ from scipy import fft
 from scipy.special import ndtri
 
 from model import displacement_synthesis
-from reconstruction import normal_histogram
+from reconstruction import normal_histogram, relief_slopes
 from rigsim.microrelief import make_micro_skin
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure
 
@@ -212,7 +212,7 @@ def _judged(
     memory_gb = (held + 1e6 * THREADS * (timing.peak_memory_mb or 0.0) + 4.0 * LARGEST_PX**2) / 1e9
     part = layout.draw((0, 2 * rows), (0, 2 * columns))
     cuts = layout.at_cuts((0, 2 * rows), (0, 2 * columns))
-    slope_x, slope_y, _ = normal_histogram.slopes(part, pixel=PIXEL_UM)
+    slope_x, slope_y, _ = relief_slopes.slopes(part, pixel=PIXEL_UM)
     square = slope_x**2 + slope_y**2
     ours = normal_histogram.halved_distance(slope_histogram([part]), truth)
     skew = [skewness_of_curvature(h) for h in (part, theirs)]

@@ -13,7 +13,7 @@ from scipy import stats
 from threadpoolctl import threadpool_limits
 
 from model import photon_table
-from reconstruction import anisotropy, subsurface, translucency
+from reconstruction import anisotropy, profile_anisotropy, subsurface, translucency
 from reconstruction.translucency import SITE_UV, TEXTURE_MM, TranslucencyPrior
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.skin_bands import MELANIN_BANDS
@@ -62,7 +62,7 @@ def _told(
 ) -> anisotropy.Anisotropy:
     variance = np.full(profiles.shape, DARK**2)
     if way == "profiles":
-        return anisotropy.estimate_from_profiles(
+        return profile_anisotropy.estimate_from_profiles(
             angle, RADIUS_MM, profiles, variance, sigma_a_per_mm=medium[0],
             sigma_s_prime_per_mm=medium[1], eta=ETA, floor=FIBRE,
         )  # fmt: skip

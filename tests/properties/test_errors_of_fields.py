@@ -11,7 +11,7 @@ from reconstruction import (
     dense_flow,
     light_change,
     misplacement,
-    normal_histogram,
+    normal_blocks,
     perfusion_fit,
 )
 from reconstruction.expression_alignment import Alignment
@@ -100,8 +100,8 @@ def test_blood_of_vessels_is_the_square_of_its_root_with_its_error(start, end, t
 @given(seed=SEEDS, side=st.integers(24, 64), blocks=st.integers(3, 8))
 def test_blocks_of_a_map_have_the_error_of_their_means(seed, side, blocks):
     values = np.random.default_rng(seed).normal(size=side * side)
-    group, groups = normal_histogram.block_of(np.arange(side * side), (side, side), blocks)
-    error, growth = normal_histogram.block_error(values, group, groups, (side, side), blocks)
+    group, groups = normal_blocks.block_of(np.arange(side * side), (side, side), blocks)
+    error, growth = normal_blocks.block_error(values, group, groups, (side, side), blocks)
     # of samples that have nothing in common blocks tell about the error of independent ones
     assert 0.3 / side < error < 6.0 / side
     assert growth >= 1.0

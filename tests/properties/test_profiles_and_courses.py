@@ -14,12 +14,15 @@ from reconstruction import (
     direction_harmonics,
     perfusion_curves,
     perfusion_fit,
+    plane_vectors,
+    profile_anisotropy,
     repeatability,
     smooth_misfit,
     subsurface,
     tiles,
     translucency,
 )
+from reconstruction.one_direction_bias import one_direction_bias
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=25, database=None)
 FEW = settings(CHEAP, max_examples=8)
@@ -83,8 +86,46 @@ def test_anisotropy_knows_no_unit_and_turns_with_the_skin(ratio, axis, level, tu
     assert values.min() - 1e-9 <= mean[0] <= values.max() + 1e-9
     assert np.isfinite(by).all()
     assert diffusion_ellipse.all_directions().ndim == 1
-    bias = anisotropy.one_direction_bias(first, [0.0, 1.0])
-    assert bias is not None
+    bias = one_direction_bias(first, ANGLES)
+    expected = values[0] / mean[0] - 1.0
+    np.testing.assert_allclose(bias.bias, expected, atol=1e-5)
+    assert bias.lowest <= expected.min() + 1e-5
+    assert bias.highest >= expected.max() - 1e-5
+
+
+@CHEAP
+@given(seed=SEED, unit=st.floats(1e-6, 1e6), turn=st.floats(-20.0, 20.0))
+def test_lengths_and_directions_know_no_unit_and_turn_with_their_axes(seed, unit, turn):
+    rng = np.random.default_rng(seed)
+    pair, root = rng.standard_normal((7, 2)), rng.standard_normal((7, 2, 2))
+    covariance = root @ root.transpose(0, 2, 1)
+    length, along, across = plane_vectors.length_and_errors(pair, covariance)
+    c, s = np.cos(turn), np.sin(turn)
+    turned = np.array([[c, -s], [s, c]])
+    moved = turned @ covariance @ turned.T
+    for one, other in zip(
+        (length, along, across),
+        plane_vectors.length_and_errors(unit * pair @ turned.T, unit**2 * moved),
+        strict=True,
+    ):
+        np.testing.assert_allclose(unit * one, other, rtol=1e-6, atol=1e-6 * unit)
+    # along and across together hold all of the covariance
+    np.testing.assert_allclose(
+        along**2 + across**2, np.trace(covariance, axis1=1, axis2=2), rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        plane_vectors.quadratic_form(pair, covariance),
+        [v @ m @ v for v, m in zip(pair, covariance, strict=True)],
+        rtol=1e-9,
+        atol=1e-9,
+    )
+    stderr = plane_vectors.axis_stderr(length, across)
+    assert np.all((stderr > 0.0) & (stderr <= plane_vectors.UNKNOWN_AXIS_RAD))
+    np.testing.assert_allclose(
+        stderr, plane_vectors.axis_stderr(unit * length, unit * across), rtol=1e-6
+    )
+    angle = plane_vectors.within_period(np.arctan2(pair[:, 1], pair[:, 0]) + turn, np.pi)
+    assert np.all((angle >= 0.0) & (angle < np.pi))
 
 
 @CHEAP
@@ -246,7 +287,7 @@ def test_the_axis_of_profiles_is_found_with_fibres_lost_and_in_any_unit(
         profiles[rng.integers(12), rng.integers(18)] = rng.choice([np.nan, np.inf, -np.inf])
     kept = profiles.copy()
     told = {"sigma_a_per_mm": 0.04, "sigma_s_prime_per_mm": 1.5}
-    found = anisotropy.estimate_from_profiles(TURNS, RADIUS, profiles, **told)
+    found = profile_anisotropy.estimate_from_profiles(TURNS, RADIUS, profiles, **told)
     np.testing.assert_array_equal(profiles, kept)
     assert found.valid
     assert found.ratio >= 1.0
@@ -255,19 +296,19 @@ def test_the_axis_of_profiles_is_found_with_fibres_lost_and_in_any_unit(
         off = abs((float(found.axis_rad) - axis + np.pi / 2) % np.pi - np.pi / 2)
         assert off < 0.05
         assert found.p_value < 1e-6
-    none = anisotropy.estimate_from_profiles(TURNS, RADIUS, np.zeros((12, 18)), **told)
+    none = profile_anisotropy.estimate_from_profiles(TURNS, RADIUS, np.zeros((12, 18)), **told)
     assert not none.valid
     assert none.ratio == 1.0
     for name in ("sigma_a_per_mm", "sigma_s_prime_per_mm"):
         for bad in (np.nan, 0.0, -1.0, np.inf):
-            unknown = anisotropy.estimate_from_profiles(
+            unknown = profile_anisotropy.estimate_from_profiles(
                 TURNS, RADIUS, profiles, **(told | {name: bad})
             )
             assert not unknown.valid
     with pytest.raises(anisotropy.AnisotropyError, match="radius_mm"):
-        anisotropy.estimate_from_profiles(TURNS, -RADIUS, profiles, **told)
+        profile_anisotropy.estimate_from_profiles(TURNS, -RADIUS, profiles, **told)
     with pytest.raises(anisotropy.AnisotropyError, match="floor"):
-        anisotropy.estimate_from_profiles(TURNS, RADIUS, profiles, floor=np.nan, **told)
+        profile_anisotropy.estimate_from_profiles(TURNS, RADIUS, profiles, floor=np.nan, **told)
 
 
 @CHEAP

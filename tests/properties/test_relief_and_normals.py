@@ -19,9 +19,13 @@ from reconstruction import (
     landmark_field,
     light_selection,
     mesh_repair,
+    neutral_relief,
+    normal_blocks,
     normal_histogram,
     normal_integration,
+    normal_statistics,
     photometric_stereo,
+    relief_slopes,
     slope_fields,
     tangent_space,
     texture_fill,
@@ -52,15 +56,15 @@ def test_slopes_know_no_unit_and_no_constant(seed, sides, scale):
     rng = np.random.default_rng(seed)
     height, valid = rng.standard_normal(sides), masked(rng, sides)
     kept = height.copy()
-    first = normal_histogram.slopes(height, pixel=2.0, valid=valid)
+    first = relief_slopes.slopes(height, pixel=2.0, valid=valid)
     np.testing.assert_array_equal(height, kept)
-    scaled = normal_histogram.slopes(scale * (height + 1.0), pixel=2.0 * scale, valid=valid)
+    scaled = relief_slopes.slopes(scale * (height + 1.0), pixel=2.0 * scale, valid=valid)
     for a, b in zip(first, scaled, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
-    known = normal_histogram.stencil(height, valid) > 0
+    known = relief_slopes.stencil(height, valid) > 0
     np.testing.assert_array_equal(first[2], known)
     assert not known[~valid].any()
-    down = normal_histogram.slopes(height, pixel=normal_histogram.pixel_sides(2.0), valid=valid,
+    down = relief_slopes.slopes(height, pixel=relief_slopes.pixel_sides(2.0), valid=valid,
                                    y_up=False)  # fmt: skip
     np.testing.assert_allclose(down[1], -first[1], atol=1e-12)
 
@@ -73,16 +77,17 @@ def test_every_normal_is_in_a_bucket_or_outside(slope, bins, limit, turn):
     normal_histogram.check_buckets(bins, limit)
     counts, outside = normal_histogram.bucket_counts(x, y, bins=bins, limit=limit)
     assert counts.sum() + outside == x.size
-    a, b = normal_histogram.turned(x, y, turn)
+    a, b = relief_slopes.turned(x, y, turn)
     np.testing.assert_allclose(np.hypot(a, b), np.hypot(x, y), rtol=1e-9)
     if counts.sum():
         shares = normal_histogram.from_slopes(x, y, bins=bins, limit=limit)
+        np.testing.assert_array_equal(shares, normal_histogram.shares_of(counts))
         assert shares.sum() == pytest.approx(1.0)
         assert normal_histogram.distance(shares, shares) == 0.0
         floor = normal_histogram.noise_floor(shares, 50.0)
         assert 0.0 <= floor <= 2.0
         assert normal_histogram.noise_floor(shares, 500.0) <= floor + 1e-12
-        number = normal_histogram.effective_number(np.stack([counts.ravel()] * 3), 3 * x.size)
+        number = normal_blocks.effective_number(np.stack([counts.ravel()] * 3), 3 * x.size)
         assert 0.0 < number <= 3 * x.size
 
 
@@ -102,18 +107,18 @@ def test_histograms_and_kernels_of_what_is_not_finite_are_an_error(bad):
     assert normal_histogram.noise_floor(shares, np.inf) == 0.0
     for pair in ((np.array([bad]), np.ones(1)), (np.ones(1), np.array([bad]))):
         for angle in (0.0, 0.3):
-            with pytest.raises(normal_histogram.HistogramError, match=r"[ab]: got"):
-                normal_histogram.turned(*pair, angle)
-    with pytest.raises(normal_histogram.HistogramError, match="angle_rad"):
-        normal_histogram.turned(np.ones(1), np.ones(1), bad)
+            with pytest.raises(relief_slopes.SlopeError, match=r"[ab]: got"):
+                relief_slopes.turned(*pair, angle)
+    with pytest.raises(relief_slopes.SlopeError, match="angle_rad"):
+        relief_slopes.turned(np.ones(1), np.ones(1), bad)
     height = np.random.default_rng(0).standard_normal((12, 12))
-    relief = kernel_fit.relief_of(height, stretch=1.0, axis="x", pixel_um=10.0)
+    relief = neutral_relief.relief_of(height, stretch=1.0, axis="x", pixel_um=10.0)
     buckets = kernel_search.Buckets(np.append(shares.reshape(-1), 0.0), 4, 1.0)
     told = {"search": "exhaustive", "target_samples": 50.0, "first_sample": 2, "seed": 0}
     for grids, name in ((([-1.0, bad], [5.0]), "alphas"), (([-1.0, 0.0], [bad]), "sigmas_um")):
-        with pytest.raises(kernel_fit.KernelFitError, match=name):
+        with pytest.raises(neutral_relief.KernelFitError, match=name):
             kernel_fit.fit_relief(relief, buckets, *map(np.array, grids), **told)
-    with pytest.raises(kernel_fit.KernelFitError, match="target_samples"):
+    with pytest.raises(neutral_relief.KernelFitError, match="target_samples"):
         kernel_fit.fit_relief(
             relief, buckets, np.zeros(1), np.ones(1), **(told | {"target_samples": np.nan})
         )
@@ -130,15 +135,20 @@ def test_histograms_and_kernels_of_what_is_not_finite_are_an_error(bad):
 def test_histograms_of_a_relief_and_of_its_normals_agree(seed, bins, angle):
     rng = np.random.default_rng(seed)
     height = 0.3 * rng.standard_normal((14, 11))
-    x, y, known = normal_histogram.slopes(height, pixel=1.0)
+    x, y, known = relief_slopes.slopes(height, pixel=1.0)
     normals = np.stack([-x, -y, np.ones_like(x)], axis=-1)
+    lengths = rng.uniform(0.1, 10.0, known.shape)[..., None]
+    for ours, theirs in zip(
+        relief_slopes.slopes_of_normals(lengths * normals), (x, y), strict=False
+    ):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
     told = {"bins": bins, "angle_rad": angle}
     of_height = normal_histogram.histogram(height, pixel=1.0, **told)
     of_normals = normal_histogram.from_normals(normals, valid=known, **told)
     # at the edge of a bucket rounding decides
     assert normal_histogram.halved_distance(of_height, of_normals) <= 4.0 / known.sum()
-    measured = normal_histogram.measure(height, pixel=1.0, **told)
-    same = normal_histogram.measure_normals(normals, valid=known, **told)
+    measured = normal_statistics.measure(height, pixel=1.0, **told)
+    same = normal_statistics.measure_normals(normals, valid=known, **told)
     assert measured.histogram.sum() == pytest.approx(1.0)
     assert same.histogram.sum() == pytest.approx(1.0)
 
@@ -146,9 +156,9 @@ def test_histograms_of_a_relief_and_of_its_normals_agree(seed, bins, angle):
 @CHEAP
 @given(rows=st.integers(1, 40), columns=st.integers(1, 40), blocks=st.integers(1, 9))
 def test_every_pixel_is_in_one_block(rows, columns, blocks):
-    number, count = normal_histogram.block_of(np.arange(rows * columns), (rows, columns), blocks)
+    number, count = normal_blocks.block_of(np.arange(rows * columns), (rows, columns), blocks)
     assert set(number.tolist()) == set(range(count))
-    down, right = normal_histogram.grid_of((rows, columns), blocks)
+    down, right = normal_blocks.grid_of((rows, columns), blocks)
     assert down * right == count
 
 
@@ -158,15 +168,15 @@ def test_counts_of_blocks_are_those_of_the_whole(seed, bins, angle, sides):
     rng = np.random.default_rng(seed)
     height, valid = rng.standard_normal(sides), masked(rng, sides)
     told = {"pixel": 1.5, "bins": bins, "limit": 0.7, "valid": valid, "angle_rad": angle}
-    parts = normal_histogram.block_counts(height, rng.integers(0, 5, sides), 5, **told)
+    parts = normal_blocks.block_counts(height, rng.integers(0, 5, sides), 5, **told)
     assert parts.shape == (5, bins, bins)
     if parts.any():
         whole = normal_histogram.histogram(height, **told)
         np.testing.assert_allclose(parts.sum(axis=0) / parts.sum(), whole, atol=1e-12)
-    none = normal_histogram.block_counts(height, np.full(sides, -1), 5, **told)
+    none = normal_blocks.block_counts(height, np.full(sides, -1), 5, **told)
     assert not none.any()
     with pytest.raises(normal_histogram.HistogramError, match="block"):
-        normal_histogram.block_counts(height, np.zeros((1, 1, 1), int), 5, **told)
+        normal_blocks.block_counts(height, np.zeros((1, 1, 1), int), 5, **told)
 
 
 @CHEAP

@@ -12,7 +12,7 @@ from reconstruction import pipeline
 from reconstruction.evidence import EvidenceError
 from reconstruction.gradient_images import GradientImages
 from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, fit_kernel
-from reconstruction.normal_histogram import measure
+from reconstruction.normal_statistics import measure
 from skinrig.evaluating import microrelief as evaluation
 from skinrig.report import build
 from skinrig.simulating.simulation import simulate_session

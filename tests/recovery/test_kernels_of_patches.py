@@ -5,7 +5,8 @@ import pytest
 
 from reconstruction.height_filters import high_pass
 from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, fit_kernel
-from reconstruction.normal_histogram import BLOCKS, block_counts, grid_of, measure
+from reconstruction.normal_blocks import BLOCKS, block_counts, grid_of
+from reconstruction.normal_statistics import measure
 from rigsim.microrelief import make_micro_skin
 from rigsim.skin_stretch import deform
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reconstruction.height_filters import high_pass
-from reconstruction.normal_histogram import measure
+from reconstruction.normal_statistics import measure
 from rigsim.microrelief import make_micro_skin
 from rigsim.skin_stretch import deform
 

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from reconstruction import kernel_errors, kernel_fit, kernel_search, normal_histogram
+from reconstruction import (
+    kernel_errors,
+    kernel_fit,
+    kernel_search,
+    neutral_relief,
+    normal_blocks,
+    normal_histogram,
+    relief_slopes,
+)
 from reconstruction import kernel_fit_kernels as kernels
 
 ALPHAS, SIGMAS_UM = np.linspace(-1.0, 1.0, 21), np.linspace(2.0, 40.0, 20)
@@ -16,7 +24,7 @@ def case(rng, side=128):
     target = normal_histogram.histogram(
         1.1 * height + 0.2 * gaussian_filter(rng.standard_normal((side, side)), 1.0), pixel=6.0
     )
-    relief = kernel_fit.relief_of(height, stretch=1.0, axis="x", pixel_um=6.0)
+    relief = neutral_relief.relief_of(height, stretch=1.0, axis="x", pixel_um=6.0)
     return relief, kernel_search.Buckets(np.append(target.reshape(-1), 0.0), 64, 1.0)
 
 
@@ -92,11 +100,11 @@ def test_bounds_are_the_sums_of_plain_numpy(rng):
         np.testing.assert_allclose(found, np.stack([sampled, np.max(lows, axis=0)], 1), rtol=1e-12)
 
 
-def paired(height, strained, blocks=normal_histogram.BLOCKS):
+def paired(height, strained, blocks=normal_blocks.BLOCKS):
     """Return counts of a strained map in the blocks of the neutral one, pixel by pixel."""
-    rows, columns = normal_histogram.grid_of(height.shape, blocks)
-    group, groups = normal_histogram.block_of(np.arange(height.size), height.shape, blocks)
-    counts = normal_histogram.block_counts(
+    rows, columns = normal_blocks.grid_of(height.shape, blocks)
+    group, groups = normal_blocks.block_of(np.arange(height.size), height.shape, blocks)
+    counts = normal_blocks.block_counts(
         strained, group.reshape(height.shape), groups, pixel=6.0, bins=64
     )
     return counts.reshape(rows, columns, 64, 64)
@@ -105,7 +113,7 @@ def paired(height, strained, blocks=normal_histogram.BLOCKS):
 def strained_pair(rng, side=96):
     """Return a relief and what a kernel and a little of something else make of it."""
     height = 8.0 * gaussian_filter(rng.standard_normal((side, side)), 2.0)
-    deeper = kernel_fit.convolved(height, -0.4, 15.0, axis="x", pixel_um=6.0)
+    deeper = neutral_relief.convolved(height, -0.4, 15.0, axis="x", pixel_um=6.0)
     return height, deeper + 0.3 * gaussian_filter(rng.standard_normal((side, side)), 1.0)
 
 
@@ -161,17 +169,17 @@ def test_pairs_that_nothing_can_be_drawn_of_are_refused_or_left(rng):
     fit = kernel_fit.fit_kernel(height, target, axis="x", target_blocks=few, **TOLD)
     assert fit.alpha_stderr == alone.alpha_stderr  # of four blocks no scatter: as of other skin
     for wrong in (blocks[:7], blocks[..., :32], -blocks):
-        with pytest.raises(kernel_fit.KernelFitError, match="target_blocks"):
+        with pytest.raises(neutral_relief.KernelFitError, match="target_blocks"):
             kernel_fit.fit_kernel(height, target, axis="x", target_blocks=wrong, **TOLD)
 
 
 def test_normals_are_counted_in_blocks_of_any_shape(rng):
     height = 5.0 * gaussian_filter(rng.standard_normal((40, 50)), 2.0)
     block = rng.integers(-1, 3, height.shape)
-    counts = normal_histogram.block_counts(height, block, 3, pixel=6.0, angle_rad=0.3)
+    counts = normal_blocks.block_counts(height, block, 3, pixel=6.0, angle_rad=0.3)
     for k in range(3):
-        a, b, _ = normal_histogram.slopes(height, pixel=6.0)
-        x, y = normal_histogram.turned(a[block == k], b[block == k], 0.3)
+        a, b, _ = relief_slopes.slopes(height, pixel=6.0)
+        x, y = relief_slopes.turned(a[block == k], b[block == k], 0.3)
         np.testing.assert_allclose(
             counts[k] / counts[k].sum(), normal_histogram.from_slopes(x, y), atol=1e-12
         )

@@ -6,16 +6,9 @@ from model.microstructure import gaussian_weights
 from reconstruction import kernel_fit_kernels as kernels
 from reconstruction import kernel_search as ks
 from reconstruction import normal_histogram as nh
-from reconstruction.kernel_fit import (
-    ALPHAS,
-    SIGMAS_UM,
-    KernelFitError,
-    convolved,
-    convolved_histogram,
-    fit_kernel,
-    fit_two_axes,
-    relief_of,
-)
+from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, fit_kernel
+from reconstruction.neutral_relief import KernelFitError, convolved, convolved_histogram, relief_of
+from reconstruction.two_axis_fit import fit_two_axes
 
 PIXEL_UM = 6.0
 COARSE = {"alphas": np.round(np.arange(-2, 1.01, 0.1), 2), "sigmas_um": np.arange(2.0, 81.0, 3.0)}

@@ -3,6 +3,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from reconstruction import normal_histogram as nh
+from reconstruction import relief_slopes
 
 
 def rough(side, rng, *, correlation_px=2.0, slope=0.3):
@@ -40,12 +41,6 @@ def test_a_slope_that_falls_to_the_right_and_to_the_top_has_its_normal_there():
     assert down == 63 - y
 
 
-def test_a_wide_pixel_halves_the_slope_along_its_rows():
-    height = np.tile(0.4 * np.arange(9.0), (9, 1))
-    wide, _, _ = nh.slopes(height, pixel=(1.0, 2.0))
-    np.testing.assert_allclose(wide, 0.2, atol=1e-12)
-
-
 def test_turned_axes_see_a_ramp_along_the_jaws(rng):
     angle = np.radians(45.0)
     y, x = np.mgrid[0:20, 0:20][0][::-1], np.mgrid[0:20, 0:20][1]
@@ -68,14 +63,12 @@ def test_holes_and_nan_take_no_part(rng):
 
 def test_normals_and_heights_give_one_histogram(rng):
     height = rough(50, rng)
-    dx, dy, known = nh.slopes(height, pixel=1.0)
+    dx, dy, known = relief_slopes.slopes(height, pixel=1.0)
     normals = np.stack([-dx, -dy, np.ones_like(dx)], axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     assert known.all()
     by_normals = nh.from_normals(normals)
     assert nh.distance(by_normals, nh.histogram(height, pixel=1.0)) <= 4 / height.size
-    measured = nh.measure_normals(normals)
-    assert measured.variance_x == pytest.approx(np.var(normals[..., 0]), rel=1e-9)
 
 
 def test_single_precision_moves_few_samples(rng):
@@ -84,55 +77,16 @@ def test_single_precision_moves_few_samples(rng):
     assert nh.distance(single, nh.histogram(height, pixel=1.0)) < 2e-3
 
 
-def test_flat_patch_lies_in_one_bucket_and_is_not_called_aliased():
-    flat = nh.measure(np.zeros((20, 20)), pixel=1.0)
-    assert flat.occupied == 1
-    assert flat.variance_x == flat.variance_y == flat.stderr_x == 0.0
-    assert not flat.aliased
-    assert flat.histogram.sum() == 1.0
-
-
-def test_few_samples_for_many_buckets_are_called_aliased(rng):
-    height = rough(32, rng)
-    assert nh.measure(height, pixel=1.0).aliased
-    assert not nh.measure(height, pixel=1.0, bins=4).aliased
-
-
 def test_maps_without_slopes_are_refused():
     for height in (np.zeros((1, 9)), np.full((5, 5), np.nan), np.zeros((0, 0))):
         with pytest.raises(nh.HistogramError, match="no sample"):
             nh.histogram(height, pixel=1.0)
     with pytest.raises(nh.HistogramError, match="no sample"):
         nh.histogram(np.zeros((9, 9)), pixel=1.0, valid=np.eye(9, dtype=bool))
-    with pytest.raises(nh.HistogramError, match="pixel"):
+    with pytest.raises(relief_slopes.SlopeError, match="pixel"):
         nh.histogram(np.zeros((9, 9)), pixel=0.0)
     with pytest.raises(nh.HistogramError, match="limit"):
         nh.histogram(np.zeros((9, 9)), pixel=1.0, limit=1.5)
-
-
-def test_normals_beyond_the_limit_are_counted_apart():
-    height = np.tile(np.arange(8.0), (8, 1))
-    height[:, 4:] = height[:, 4:5]  # steep on the left, flat on the right
-    found = nh.measure(height, pixel=1.0, limit=0.6)
-    assert found.outside == 4 * 8  # columns 0...3 rise by 1 a pixel: n_x = -0.71
-    assert found.samples == height.size - found.outside
-    assert found.histogram.sum() == pytest.approx(1.0)
-
-
-def test_standard_error_of_variances_is_their_scatter(rng):
-    """Rationale: blocks are far larger than the correlation length of 3 px.
-
-    The ratio of a standard deviation of 60 values to its mean estimate lies within 0.72...1.28
-    in 99.7 %; blocks cut neighbours apart, which adds a little.
-    """
-    found = []
-    for _ in range(60):
-        white = rng.standard_normal((160, 160))
-        found.append(nh.measure(13.0 * gaussian_filter(white, 3.0, mode="wrap"), pixel=1.0))
-    scatter = np.std([m.variance_y for m in found], ddof=1)
-    assert 0.7 < scatter / np.mean([m.stderr_y for m in found]) < 1.35
-    plain = np.mean([np.sqrt(2 / m.samples) * m.variance_y for m in found])
-    assert scatter > 2.0 * plain  # as if pixels were independent: too small
 
 
 def test_noise_floor_is_the_mean_distance_of_independent_samples(rng):
@@ -145,20 +99,17 @@ def test_noise_floor_is_the_mean_distance_of_independent_samples(rng):
         assert abs(np.mean(distances) - nh.noise_floor(p, n)) < 4 * stderr + 0.005
 
 
-def test_effective_number_of_correlated_normals_tells_the_distance_of_two_patches(rng):
-    pairs = [[nh.measure(rough(192, rng, correlation_px=5.0), pixel=1.0, bins=16)
-              for _ in range(2)] for _ in range(12)]  # fmt: skip
-    real = np.mean([nh.distance(a.histogram, b.histogram) for a, b in pairs])
-    effective = [m.effective_samples for pair in pairs for m in pair]
-    told = nh.noise_floor(pairs[0][0].histogram, float(np.mean(effective)))
-    naive = nh.noise_floor(pairs[0][0].histogram, pairs[0][0].samples)
-    assert 0.7 < real / told < 1.4
-    assert real / naive > 2.0
-
-
 def test_halved_distance_is_the_share_in_other_buckets():
     a, b = np.array([0.5, 0.5, 0.0]), np.array([0.5, 0.0, 0.5])
     assert nh.distance(a, b) == 1.0
     assert nh.halved_distance(a, b) == 0.5
     with pytest.raises(nh.HistogramError, match="shape"):
         nh.distance(a, b[:2])
+
+
+def test_a_list_of_rows_is_a_relief_and_a_stack_is_none():
+    rows = [[0.0, 0.2, 0.5], [0.1, 0.2, 0.9]]
+    of_list = nh.histogram(rows, pixel=1.0, bins=8)
+    np.testing.assert_array_equal(of_list, nh.histogram(np.array(rows), pixel=1.0, bins=8))
+    with pytest.raises(relief_slopes.SlopeError, match=r"\(1, 2, 3\), expected .*one by one"):
+        nh.histogram([rows], pixel=1.0)

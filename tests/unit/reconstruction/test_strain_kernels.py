@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from model.skin import SkinMap
 from reconstruction.gradient_images import SkinState, state_name
-from reconstruction.normal_histogram import BLOCKS, block_counts, block_of, grid_of
+from reconstruction.normal_blocks import BLOCKS, block_counts, block_of, grid_of
 from reconstruction.skin_strain import StateStrain, skin_mask
 from reconstruction.strain import Strain
 from reconstruction.strain_kernels import (

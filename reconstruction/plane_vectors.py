@@ -1,0 +1,89 @@
+"""Length and direction of plane vectors that are known with errors."""
+
+from __future__ import annotations
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+Floats: TypeAlias = NDArray[np.float64]
+
+UNKNOWN_AXIS_RAD = math.pi / math.sqrt(12.0)
+"""Standard deviation of an axis that may point anywhere."""
+
+
+def quadratic_form(vectors: Floats, matrices: Floats) -> Floats:
+    """Return v' M v of vectors (B, n) and covariances (B, n, n): at least 0, (B,)."""
+    return np.maximum(np.einsum("bi,bij,bj->b", vectors, matrices, vectors), 0.0)
+
+
+def length_and_errors(pair: Floats, covariance: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the length of vectors, and their standard errors along and across themselves.
+
+    Parameters
+    ----------
+    pair : ndarray, shape (B, 2)
+        In any unit, which is that of the result.
+    covariance : ndarray, shape (B, 2, 2)
+
+    Returns
+    -------
+    length, along, across : ndarray, shape (B,)
+        A vector of length 0 is taken to point along the first axis.
+
+    Examples
+    --------
+    >>> length_and_errors(np.array([[0.0, 5.0]]), np.diag([9.0, 4.0])[None])
+    (array([5.]), array([2.]), array([3.]))
+    """
+    length = np.hypot(pair[:, 0], pair[:, 1])
+    unit = np.where(length[:, None] > 0, pair / np.where(length > 0, length, 1.0)[:, None], 0.0)
+    unit[length == 0, 0] = 1.0
+    across = np.stack([-unit[:, 1], unit[:, 0]], axis=-1)
+    return (
+        length,
+        np.sqrt(quadratic_form(unit, covariance)),
+        np.sqrt(quadratic_form(across, covariance)),
+    )
+
+
+def within_period(angle: Floats, period: float) -> Floats:
+    """Return angles within [0, period), in their unit; what rounds up to the period is 0.
+
+    Examples
+    --------
+    >>> within_period(np.array([-90.0, 450.0, -1e-30]), 360.0)
+    array([270.,  90.,   0.])
+    """
+    within = np.mod(angle, period)
+    return np.where(within >= period, 0.0, within)
+
+
+def axis_stderr(h: Floats, across: Floats) -> Floats:
+    """Return the standard error of half the direction of a vector with normal errors, rad.
+
+    From the mean resultant length of the direction of a vector of length h with standard error
+    ``across``: close to across / (2 h) when that is small, `UNKNOWN_AXIS_RAD` at most.
+
+    Parameters
+    ----------
+    h, across : ndarray, same shape
+        In one unit.
+
+    Examples
+    --------
+    >>> axis_stderr(np.array([1.0, 0.0]), np.array([0.02, 0.02])).round(3)
+    array([0.01 , 0.907])
+    """
+    with np.errstate(divide="ignore", over="ignore"):
+        z = np.where(across > 0, 0.5 * (h / np.where(across > 0, across, 1.0)), math.inf) ** 2
+    far = z > 1e6
+    x = np.where(far, 1.0, z)
+    length = np.sqrt(0.5 * math.pi * x) * (special.ive(0, x) + special.ive(1, x))
+    spread = np.sqrt(-2.0 * np.log(np.clip(length, 1e-300, 1.0)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread = np.where(far, 0.5 / np.sqrt(z), spread)
+    return np.minimum(0.5 * spread, UNKNOWN_AXIS_RAD)
