@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from reconstruction import kernel_fit_kernels as kernels
 from reconstruction import normal_blocks
 from reconstruction.block_errors import LEAST_BLOCKS
-from reconstruction.kernel_search import Buckets, Found, Relief
+from reconstruction.kernel_search import Buckets, Found
+from reconstruction.neutral_relief import Relief
 
 Floats = NDArray[np.float64]
 

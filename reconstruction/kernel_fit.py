@@ -22,8 +22,8 @@ from model.microstructure import ALPHA_LIMITS
 from reconstruction import kernel_fit_kernels as kernels
 from reconstruction import kernel_outcome, kernel_search, normal_blocks, normal_histogram
 from reconstruction.kernel_outcome import KernelFit
-from reconstruction.kernel_search import Buckets, Relief
-from reconstruction.neutral_relief import Axis, KernelFitError, relief_of
+from reconstruction.kernel_search import Buckets
+from reconstruction.neutral_relief import Axis, KernelFitError, Relief, relief_of
 
 Floats = NDArray[np.float64]
 
@@ -33,8 +33,39 @@ SIGMAS_UM = np.linspace(1.0, 100.0, 199)
 """The paper's grid of standard deviations, by 0.5 um."""
 
 
+def convolved_histogram(
+    neutral_height_um: ArrayLike,
+    alpha: float,
+    sigma_um: float,
+    *,
+    stretch: float,
+    axis: Axis,
+    pixel_um: float | tuple[float, float],
+    bins: int = 64,
+    limit: float = 1.0,
+    stretch_across: float = 1.0,
+    valid: ArrayLike | None = None,
+    y_up: bool = True,
+) -> Floats:
+    """Return the histogram that :func:`fit_kernel` compares with its target, (bins, bins).
+
+    Axes (n_y, n_x); the shares of all samples, so that what is beyond the limit is missing from
+    the sum. Parameters as of :func:`fit_kernel`.
+    """
+    relief = relief_of(
+        neutral_height_um, stretch=stretch, axis=axis, pixel_um=pixel_um,
+        stretch_across=stretch_across, valid=valid, y_up=y_up,
+    )  # fmt: skip
+    normal_histogram.check_buckets(bins, limit)
+    buckets = Buckets(np.zeros(bins * bins + 1), bins, limit)
+    change = relief.change(sigma_um)
+    counts = buckets.count((relief.along, relief.across), change, np.array([alpha])).sum(axis=0)[0]
+    shares = counts[:-1].reshape(bins, bins) / relief.places.size
+    return shares.T if axis in ("y", 0) else shares
+
+
 def fit_kernel(
-    neutral_height_um: NDArray[np.floating],
+    neutral_height_um: ArrayLike,
     target_histogram: NDArray[np.floating],
     *,
     stretch: float,
@@ -57,7 +88,7 @@ def fit_kernel(
 
     Parameters
     ----------
-    neutral_height_um : ndarray, shape (H, W)
+    neutral_height_um : array_like, shape (H, W)
         Displacement map of the neutral skin, um; row 0 is the top when ``y_up``. Heights that are
         not finite count as not valid.
     target_histogram : ndarray, shape (bins, bins)
@@ -102,6 +133,8 @@ def fit_kernel(
     ------
     KernelFitError
         For shapes, ranges or sums that do not fit, or a relief without slopes.
+    HistogramError
+        For numbers of buckets and limits that make no histogram.
     """
     normal_histogram.check_buckets(bins, limit)
     target = _target(target_histogram, bins, transposed=axis in ("y", 0))

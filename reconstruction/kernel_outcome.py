@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reconstruction import kernel_errors, kernel_search, normal_histogram
-from reconstruction.kernel_search import Buckets, Found, Relief
+from reconstruction.kernel_search import Buckets, Found
+from reconstruction.neutral_relief import Relief
 from reconstruction.normal_statistics import SAMPLES_PER_BUCKET
 
 Floats = NDArray[np.float64]

@@ -28,8 +28,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from model.microstructure import gaussian_weights
 from reconstruction import kernel_fit_kernels as kernels
+from reconstruction.neutral_relief import Relief
 
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -57,62 +57,6 @@ KEPT_BYTES = 100_000_000
 
 class KernelSearchError(ValueError):
     """A search for kernels without anything to search."""
-
-
-@dataclass(frozen=True, slots=True)
-class Relief:
-    """A neutral relief with its axis of strain along the rows, and the samples of its slopes.
-
-    Attributes
-    ----------
-    height_um : ndarray of float32, shape (H, W)
-        About its mean; holes filled along the rows.
-    code : ndarray of uint8, shape (H, W)
-        Where slopes are taken, of `relief_slopes.stencil`.
-    right_um, down_um : float
-        Deformed distance to the next column and row along the histogram's axes, signed.
-    pixel_um : float
-        Neutral side of a pixel along the rows, for sigma.
-    """
-
-    height_um: Float32
-    code: NDArray[np.uint8]
-    right_um: float
-    down_um: float
-    pixel_um: float
-    places: NDArray[np.int64] = field(init=False)
-    """(N,) pixels with slopes, y * W + x."""
-    starts: NDArray[np.int64] = field(init=False)
-    """(H,) samples in the rows before."""
-    along: Float32 = field(init=False)
-    """(N,) minus the neutral relief's slopes after stretching."""
-    across: Float32 = field(init=False)
-
-    def __post_init__(self) -> None:
-        """List the samples and their slopes."""
-        known = self.code > 0
-        a, b = np.cumsum(known.sum(axis=1)), known.sum(axis=1)
-        object.__setattr__(self, "places", np.flatnonzero(known))
-        object.__setattr__(self, "starts", (a - b).astype(np.int64))
-        along, across = self._leans(self.height_um)
-        object.__setattr__(self, "along", along)
-        object.__setattr__(self, "across", across)
-
-    def _leans(self, height: Float32) -> tuple[Float32, Float32]:
-        a, b = np.empty(self.places.size, np.float32), np.empty(self.places.size, np.float32)
-        right, down = np.float32(self.right_um), np.float32(self.down_um)
-        kernels.leans(height, self.code, self.starts, right, down, a, b)
-        return a, b
-
-    def weights(self, sigma_um: float) -> Float32:
-        """Return the discrete Gaussian's right half."""
-        return gaussian_weights(sigma_um / self.pixel_um).astype(np.float32)
-
-    def change(self, sigma_um: float) -> tuple[Float32, Float32]:
-        """Return what a Gaussian of sigma changes the samples' slopes by: (N,), (N,)."""
-        moved = np.empty_like(self.height_um)
-        kernels.blurred_less_itself(self.height_um, self.weights(sigma_um), moved)
-        return self._leans(moved)
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,6 +48,11 @@ def bucket_counts(
         Axes (n_y, n_x).
     outside : int
         Normals beyond the limit.
+
+    Raises
+    ------
+    HistogramError
+        For slopes that are not as many, and buckets that are none.
     """
     check_buckets(bins, limit)
     p = np.ascontiguousarray(slope_x, np.float64).reshape(-1)
@@ -163,11 +168,16 @@ def shares_of(counts: NDArray[np.int64]) -> Floats:
     return counts / total
 
 
-def distance(a: Floats, b: Floats) -> float:
+def distance(a: ArrayLike, b: ArrayLike) -> float:
     """Return ``sum |a - b|`` over buckets, 0...2: the total variation as eq. (7) has it.
 
     Half of it, 0...1, is what is elsewhere called the total variation distance
     (`model.metrics` and others): the share of samples that would have to change their bucket.
+
+    Parameters
+    ----------
+    a, b : array_like, same shape
+        Shares of samples.
 
     Raises
     ------
@@ -176,28 +186,29 @@ def distance(a: Floats, b: Floats) -> float:
 
     Examples
     --------
-    >>> distance(np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    >>> distance([1.0, 0.0], [0.0, 1.0])
     2.0
     """
-    if a.shape != b.shape:
-        raise HistogramError(f"b: got shape {b.shape}, expected {a.shape}")
-    apart = float(np.abs(a - b).sum())
+    ours, theirs = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    if ours.shape != theirs.shape:
+        raise HistogramError(f"b: got shape {theirs.shape}, expected {ours.shape}")
+    apart = float(np.abs(ours - theirs).sum())
     if not math.isfinite(apart):
         raise HistogramError(f"a, b: got a sum of differences of {apart}, expected finite shares")
     return apart
 
 
-def halved_distance(a: Floats, b: Floats) -> float:
+def halved_distance(a: ArrayLike, b: ArrayLike) -> float:
     """Return half of :func:`distance`, 0...1: the share of samples in other buckets."""
     return 0.5 * distance(a, b)
 
 
-def noise_floor(histogram: Floats, samples: float, other_samples: float | None = None) -> float:
+def noise_floor(histogram: ArrayLike, samples: float, other_samples: float | None = None) -> float:
     """Return the mean distance between two histograms of samples of one distribution.
 
     Parameters
     ----------
-    histogram : ndarray
+    histogram : array_like
         Shares that sum to 1.
     samples, other_samples : float
         Independent samples of each (the effective number); the second is as the first by default.

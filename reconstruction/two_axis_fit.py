@@ -51,7 +51,7 @@ class TwoAxisFit:
 
 
 def fit_two_axes(
-    neutral_height_um: NDArray[np.floating],
+    neutral_height_um: ArrayLike,
     target_histogram: NDArray[np.floating],
     *,
     stretch: float,
@@ -75,11 +75,23 @@ def fit_two_axes(
         alpha and sigma_um across the jaws to begin with; the least distance is taken.
     settings
         Others of `kernel_fit.fit_kernel`.
+
+    Returns
+    -------
+    TwoAxisFit
+        Of starts that come to equal distances, the first.
+
+    Raises
+    ------
+    KernelFitError
+        Without a round or a start, and as of `kernel_fit.fit_kernel`.
     """
-    if most_rounds < 1 or not starts:
-        raise KernelFitError(f"most_rounds: got {most_rounds}, expected at least 1, and a start")
+    if most_rounds < 1:
+        raise KernelFitError(f"most_rounds: got {most_rounds}, expected at least 1")
+    if not starts:
+        raise KernelFitError("starts: got none, expected one pair of alpha and sigma_um or more")
     other: Axis = "x" if axis in ("y", 0) else "y"
-    best: TwoAxisFit | None = None
+    found = []
     for start in starts:
         pair = [(0.0, 1.0), (float(start[0]), float(start[1]))]
         before: list[tuple[float, float]] = []
@@ -99,8 +111,5 @@ def fit_two_axes(
                 )  # fmt: skip
                 pair[turn] = fit.alpha, fit.sigma_um
                 fits.append(fit)
-        found = TwoAxisFit(fits[0], fits[1], fits[1].distance, rounds, pair == before)
-        if best is None or found.distance < best.distance:
-            best = found
-    assert best is not None  # noqa: S101
-    return best
+        found.append(TwoAxisFit(fits[0], fits[1], fits[1].distance, rounds, pair == before))
+    return min(found, key=lambda fit: fit.distance)

@@ -6,8 +6,8 @@ from model.microstructure import gaussian_weights
 from reconstruction import kernel_fit_kernels as kernels
 from reconstruction import kernel_search as ks
 from reconstruction import normal_histogram as nh
-from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, fit_kernel
-from reconstruction.neutral_relief import KernelFitError, convolved, convolved_histogram, relief_of
+from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, convolved_histogram, fit_kernel
+from reconstruction.neutral_relief import KernelFitError, convolved, relief_of
 from reconstruction.two_axis_fit import fit_two_axes
 
 PIXEL_UM = 6.0
@@ -327,6 +327,22 @@ def test_settings_that_do_not_fit_are_refused(rng):
             fit_kernel(height, target, **{**good, **change})
     with pytest.raises(KernelFitError, match="target_histogram"):
         fit_kernel(height, target * np.nan, **good)
+    for wrong, change, word in (
+        (np.zeros((2, 8, 8)), {}, "height: got .*one by one"),
+        ([[0.0, 1.0], [0.0]], {}, "height: got no array"),
+        (height, {"valid": np.ones((8, 7), bool)}, "valid: got"),
+        (height, {"pixel_um": 0.0}, "pixel: got"),
+    ):
+        with pytest.raises(KernelFitError, match=f"neutral relief, {word}"):
+            fit_kernel(wrong, target, **{**good, **change})
+
+
+def test_fits_of_two_axes_need_a_round_and_a_start():
+    height, target = np.zeros((8, 8)), np.full((64, 64), 1 / 4096)
+    good = {"stretch": 0.9, "stretch_across": 1.0, "axis": "x", "pixel_um": PIXEL_UM}
+    for change in ({"most_rounds": 0}, {"starts": ()}):
+        with pytest.raises(KernelFitError, match=next(iter(change))):
+            fit_two_axes(height, target, **good, **change)
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (0, 3), (3, 0), (3, 2)])
