@@ -12,8 +12,14 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import hypothesis
 import numpy as np
 import pytest
+
+# Tests draw the same examples in each run, as slowly as a busy machine likes; nothing is kept
+# from one run for the next.
+hypothesis.settings.register_profile("alike", derandomize=True, deadline=None, database=None)
+hypothesis.settings.load_profile("alike")
 
 # What one process writes another reads whether or not it has reached the disk: only a cut of power
 # tells, which tests/faults/test_power_cut.py models operation by operation. Each frame waits three

@@ -286,10 +286,10 @@ def test_a_served_camera_has_one_client_and_known_views(rig):
 
 
 def test_nobody_listening_is_a_lost_link():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-    with pytest.raises(LinkLost, match="is it being served"):
-        open_camera(f"tcp://127.0.0.1:{port}/cam")
+    with socket.socket() as taken:  # nobody else can listen there meanwhile
+        taken.bind(("127.0.0.1", 0))
+        with pytest.raises(LinkLost, match="is it being served"):
+            open_camera(f"tcp://127.0.0.1:{taken.getsockname()[1]}/cam")
 
 
 def test_a_server_that_goes_away_is_a_lost_link(rig):
