@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numba import get_num_threads
@@ -82,6 +82,13 @@ def half_widths(radius_px: float, rows: int, columns: int) -> NDArray[np.int64]:
     )
 
 
+def _only_read(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a view that cannot be written: a kernel is compiled anew for arrays that can."""
+    view = values.view()
+    view.flags.writeable = False
+    return view
+
+
 def measure(
     h: ArrayLike, radius_px: float, *, valid: NDArray[np.bool_] | None = None
 ) -> DiscStatistics:
@@ -144,7 +151,8 @@ def measure(
     for at in np.ndindex(h.shape[:-2]):
         mask = nothing if valid is None else np.ascontiguousarray(valid[at])
         disc_kernels.disc_moments(
-            np.ascontiguousarray(h[at]), mask.view(np.uint8), valid is not None, half, high, inner,
+            _only_read(np.ascontiguousarray(h[at])), _only_read(mask.view(np.uint8)),
+            valid is not None, half, high, inner,
             64 if radius_px <= 32.0 else 128, _WIDE, 4 * get_num_threads(), TRUSTED[h.dtype],
             mean[at], deviation[at], count[at],
         )  # fmt: skip

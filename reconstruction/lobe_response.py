@@ -179,6 +179,9 @@ class Response:
     step: float
     frame: Floats
 
+    def __post_init__(self) -> None:
+        self.coefficients.flags.writeable = False  # of one kind: what reads them is compiled once
+
 
 def _require_finite(name: str, values: Floats) -> None:
     wrong = int(np.size(values) - np.count_nonzero(np.isfinite(values)))
@@ -407,7 +410,6 @@ def _cached(
         [spline_filter(grid[..., k], order=3, mode="mirror") for k in range(grid.shape[2])],
         axis=-1,
     )
-    coefficients.flags.writeable = False
     return Response(coefficients, float(axis[0]), step, frame)
 
 

@@ -213,7 +213,8 @@ def densify(
 
 def _checked_weight(weight: NDArray[np.float32], usable: Bools) -> NDArray[np.float32]:
     good = np.isfinite(weight) & usable
-    known = np.where(good, weight, np.float32(0.0)).astype(np.float32)
+    # laid out by rows, however the weight was: the kernels are compiled for one layout
+    known = np.where(good, weight, np.float32(0.0)).astype(np.float32, order="C")
     if known.size and (known.min() < 0 or known.max() > 1):
         raise ValueError(f"weight: got {known.min():g} to {known.max():g}, expected 0 to 1")
     return known
