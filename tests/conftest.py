@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import importlib.util
 import os
 import sys
 from collections import Counter
@@ -28,6 +29,14 @@ hypothesis.settings.load_profile("alike")
 os.fsync = os.fdatasync = lambda descriptor: os.fstat(descriptor) and None
 
 ROOT = Path(__file__).parents[1]
+
+_REAL_TIME = importlib.util.spec_from_file_location(
+    "real_time", Path(__file__).with_name("real_time.py")
+)
+real_time = importlib.util.module_from_spec(_REAL_TIME)
+_REAL_TIME.loader.exec_module(real_time)
+pytest_runtest_protocol = real_time.pytest_runtest_protocol
+
 LONGEST_FIRST = (
     "tests/recovery/test_dome_rig.py",
     "tests/system/test_demo.py",

@@ -2,11 +2,9 @@
 
 import contextlib
 import dataclasses
-import importlib.util
 import itertools
 import socket
 import threading
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,13 +23,6 @@ from rigsim.serve import serve
 from rigsim.world import World
 
 NAMES = (f"protocol-{number}" for number in itertools.count())
-
-_REAL_TIME = importlib.util.spec_from_file_location(
-    "real_time", Path(__file__).with_name("real_time.py")
-)
-real_time = importlib.util.module_from_spec(_REAL_TIME)
-_REAL_TIME.loader.exec_module(real_time)
-pytest_runtest_protocol = real_time.pytest_runtest_protocol
 
 
 class Photometer:

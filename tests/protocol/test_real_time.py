@@ -55,7 +55,7 @@ def test_a_failure_says_how_long_the_machine_stood_still(tmp_path):
 
 
 def trial(tmp_path, **given):
-    hook = Path(__file__).with_name("real_time.py").read_text("utf-8")
+    hook = (Path(__file__).parents[1] / "real_time.py").read_text("utf-8")
     (tmp_path / "conftest.py").write_text(hook, encoding="utf-8")
     (tmp_path / "test_trial.py").write_text(TRIAL.format(**given), encoding="utf-8")
     return subprocess.run(

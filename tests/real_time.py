@@ -12,7 +12,7 @@ import pytest
 from _pytest.runner import runtestprotocol
 
 REAL_LINES = frozenset({"pty", "tcp", "rfc2217"})
-FIXTURES = ("bench", "served")
+PARAMETERS = ("bench", "served", "transport")
 STALL_S = 0.1
 PERIOD_S = 0.005
 ATTEMPTS = 5
@@ -46,7 +46,7 @@ class Stalls:
 def is_on_a_real_line(item):
     """Tell whether a test speaks over a line of the operating system."""
     given = getattr(getattr(item, "callspec", None), "params", {})
-    return any(given.get(name) in REAL_LINES for name in FIXTURES)
+    return any(given.get(name) in REAL_LINES for name in PARAMETERS)
 
 
 @pytest.hookimpl(tryfirst=True)
