@@ -107,6 +107,8 @@ class MicroSkin:
     poisson: float
     """Poisson's number of the tissue that bears it, 0 to 0.5. Below 0.5 fluid leaves or enters it
     while it is held, so that it thickens less than a fixed volume would."""
+    melanin: float | None = None
+    """Volume fraction of melanosomes; None: the preset's."""
 
     def __post_init__(self) -> None:
         shape = self.height_um.shape
@@ -132,6 +134,11 @@ class MicroSkin:
         """Side of the patch, mm."""
         return self.height_um.shape[0] * self.texel_um * 1e-3
 
+    @property
+    def melanin_fraction(self) -> float:
+        """Volume fraction of melanosomes around which the patch varies."""
+        return MELANIN_PRESETS[self.preset] if self.melanin is None else self.melanin
+
 
 def make_micro_skin(
     site: SiteName | str,
@@ -140,6 +147,7 @@ def make_micro_skin(
     size_mm: float,
     texel_um: float = 10.0,
     preset: str = "III",
+    melanin: float | None = None,
 ) -> MicroSkin:
     """Draw a patch of skin.
 
@@ -156,6 +164,8 @@ def make_micro_skin(
         Distance of texels, 2 to 40 um; detail finer than two texels is left out.
     preset
         How dark the skin is, one of `rigsim.pigment.MELANIN_PRESETS`.
+    melanin
+        Volume fraction of melanosomes instead of the preset's, 0.005 to 0.45.
 
     Returns
     -------
@@ -178,6 +188,9 @@ def make_micro_skin(
         raise MicroSkinError(
             f"preset: got {preset!r}, expected one of {', '.join(MELANIN_PRESETS)}"
         )
+    fraction = MELANIN_PRESETS[preset] if melanin is None else melanin
+    if not min(MELANIN_PRESETS.values()) <= fraction <= max(MELANIN_PRESETS.values()):
+        raise MicroSkinError(f"melanin: got {melanin}, expected 0.005 to 0.45")
     if seed < 0:
         raise MicroSkinError(f"seed: got {seed}, expected >= 0")
     if not TEXEL_RANGE_UM[0] <= texel_um <= TEXEL_RANGE_UM[1]:
@@ -199,11 +212,12 @@ def make_micro_skin(
         preset=preset,
         texel_um=texel_um,
         height_um=height,
-        albedo=_albedo(points, furrow, MELANIN_PRESETS[preset], own),
+        albedo=_albedo(points, furrow, fraction, own),
         alpha=_alpha(where, points, own),
         layer_um=np.asarray(where.layer_um * (1.0 - (1.0 - where.thin) * furrow), np.float32),
         stiffness_ratio=where.stiffness_ratio,
         poisson=where.poisson,
+        melanin=melanin,
     )
 
 

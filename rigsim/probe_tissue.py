@@ -206,11 +206,16 @@ class SkinTissue:
         One of `rigsim.pigment.MELANIN_PRESETS`.
     seed
         Of what differs between subjects and between the sites of one, >= 0.
+    melanin
+        Volume fraction of melanosomes of a face of this kind, instead of the preset's, 0.005 to
+        0.45.
+    blood
+        Factor of all blood, 0.1 to 4.
 
     Raises
     ------
     TissueError
-        The preset is unknown, or the seed negative.
+        The preset is unknown, the seed negative, or a number out of range.
 
     Notes
     -----
@@ -229,13 +234,20 @@ class SkinTissue:
     True
     """
 
-    def __init__(self, preset: str, *, seed: int = 0) -> None:
+    def __init__(
+        self, preset: str, *, seed: int = 0, melanin: float | None = None, blood: float = 1.0
+    ) -> None:
         if preset not in MELANIN_PRESETS:
             known = ", ".join(MELANIN_PRESETS)
             raise TissueError(f"preset: got {preset!r}, expected one of {known}")
         if seed < 0:
             raise TissueError(f"seed: got {seed}, expected >= 0")
-        self.preset, self.seed = preset, seed
+        if melanin is not None and not 0.005 <= melanin <= 0.45:
+            raise TissueError(f"melanin: got {melanin}, expected 0.005 to 0.45")
+        if not 0.1 <= blood <= 4.0:
+            raise TissueError(f"blood: got {blood}, expected 0.1 to 4")
+        self.preset, self.seed, self._blood = preset, seed, blood
+        self._melanin = MELANIN_PRESETS[preset] if melanin is None else melanin
         self._own = np.random.default_rng([seed, 0x736B]).standard_normal(2)
 
     @property
@@ -246,7 +258,7 @@ class SkinTissue:
     def melanin(self, site: str) -> float:
         """Return the volume fraction of melanosomes in an epidermis of 0.25 mm."""
         factor = math.exp(0.1 * float(self._own[0]) + 0.05 * self._drawn(site)[0])
-        return MELANIN_SHARE * MELANIN_PRESETS[self.preset] * factor
+        return MELANIN_SHARE * self._melanin * factor
 
     def epidermis_mm(self, site: str) -> float:
         """Return the epidermis's thickness, mm."""
@@ -279,8 +291,10 @@ class SkinTissue:
         if site not in BLOOD_AT_REST:
             known = ", ".join(BLOOD_AT_REST)
             raise TissueError(f"site: got {site!r}, expected one of {known}")
-        return BLOOD_AT_REST[site] * math.exp(
-            0.15 * float(self._own[1]) + 0.1 * self._drawn(site)[2]
+        return (
+            self._blood
+            * BLOOD_AT_REST[site]
+            * math.exp(0.15 * float(self._own[1]) + 0.1 * self._drawn(site)[2])
         )
 
     def _drawn(self, site: str) -> tuple[float, float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 from capture.rig import Probe, Rig, load_rig
 from capture.session import Session
 from skinrig.console import Console
-from skinrig.errors import INTERRUPTED
+from skinrig.errors import INTERRUPTED, UsageError
 from skinrig.next_steps import named
 from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
 from skinrig.simulating.shot_numbers import shots_made
-from skinrig.simulating.simulation import SIZES, SimulationError
+from skinrig.simulating.simulation import SIZES, OptionsError, SimulationError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -76,10 +77,12 @@ def serve_rig(
 
     if size not in SIZES:
         raise SimulationError(f"size: got {size!r}, expected one of {', '.join(SIZES)}")
+    if not re.fullmatch(r".+:\d+", tcp):
+        raise UsageError(f"--tcp: got {tcp!r}, expected HOST:PORT, such as 127.0.0.1:0")
     rig = load_rig(rig_name)
     made = _shots_made(resume, rig)
     if site is not None and rig.caliper is None:
-        raise SimulationError("site: only the gradient rig knows of it; leave it out")
+        raise OptionsError("site: only the gradient rig knows of it; leave it out")
     if "gradient_sphere" in rig.boxes:
         if size != "small":
             raise SimulationError(
@@ -87,7 +90,7 @@ def serve_rig(
                 "caliper waits for its host; skinrig simulate gradient makes them"
             )
         rig = rig.cropped(GRADIENT_WIDTH_PX)
-        scene = gradient.make_scene(rig, site=site, preset=subject, seed=seed)
+        scene = gradient.make_scene(rig, site=site, subject=subject, seed=seed)
         # what all states share is made before anybody asks, so that no client waits for it
         scene.lighting()
     elif rig.probe is not None:
@@ -136,32 +139,32 @@ def _shots_made(session: Path | None, rig: Rig) -> Mapping[str, int]:
 
 
 def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
+    from rigsim import subject_file
     from rigsim.scenes.flash import FlashScene
-    from rigsim.subject import make_subject
 
-    scene = FlashScene(rig, make_subject(subject, seed=seed), seed=seed)
+    scene = FlashScene(rig, subject_file.named(subject).face(seed=seed), seed=seed)
     # rendered before anybody asks, so that no client waits for it
     scene.radiance("crossed")
     return scene
 
 
 def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
+    from rigsim import subject_file
     from rigsim.dome_build import build
     from rigsim.scenes.dome import DomeScene
-    from rigsim.subject import make_subject
 
-    person = make_subject(subject, seed=seed)
+    person = subject_file.named(subject).face(seed=seed)
     return DomeScene(rig, person, dome=build(rig, seed=seed), seed=seed)
 
 
 def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
     from capture.plan.probe import PHANTOM, SITES
-    from rigsim import probe_tissue
+    from rigsim import probe_tissue, subject_file
     from rigsim.scenes.probe import ProbeScene
     from rigsim.suction import HeadState
 
     try:
-        tissue = probe_tissue.parse_subject(subject, seed=seed)
+        tissue = subject_file.tissue(subject, seed=seed)
     except probe_tissue.TissueError as error:
         raise SimulationError(str(error)) from error
     skin = ProbeScene(rig, tissue, seed=seed, photons=PROBE_PHOTONS)

@@ -20,7 +20,6 @@ from rigsim.hidden_lights import remove_hidden
 from rigsim.lobe_moments import MomentTable, Surface, build_table, direct_moments
 from rigsim.mesh import Float32Array
 from rigsim.microrelief import BAND_NM, MicroSkin
-from rigsim.pigment import MELANIN_PRESETS
 from rigsim.scenes.gradient_patch import PatchSurface
 from rigsim.scenes.skin_glow import SIGMAS_MM
 from rigsim.self_shadow import horizon_tangent
@@ -243,6 +242,6 @@ def lateral_kernel(skin: MicroSkin) -> tuple[FloatArray, FloatArray]:
     table = SkinTable.load()
     band = (table.wavelength_nm >= BAND_NM[0]) & (table.wavelength_nm <= BAND_NM[1])
     weights = (band / band.sum())[:, None]
-    kernels = table.lateral_kernels(MELANIN_PRESETS[skin.preset], BLOOD, weights)
+    kernels = table.lateral_kernels(skin.melanin_fraction, BLOOD, weights)
     gaussians = kernels.gaussians(SIGMAS_MM)
     return gaussians.sigmas_mm, gaussians.weights[0]

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from skinrig import errors
+from skinrig.commands import completion
 from skinrig.commands.options import Json, Rig, file_to_write
 from skinrig.console import Console
 from skinrig.next_steps import named
@@ -26,7 +27,11 @@ def plan(
         ),
     ] = "",
     subject: Annotated[
-        str, typer.Option(help="Preset of the skin that is forecast, I to VI.")
+        str,
+        typer.Option(
+            help="Skin that is forecast: a preset, I to VI, or a file NAME.toml.",
+            autocompletion=completion.subjects,
+        ),
     ] = "III",
     width: Annotated[
         int | None, typer.Option(help="Pixels across the cameras; default: the rig's own.")
@@ -63,7 +68,7 @@ def plan(
 
     console = Console(json)
     if not 0 < valid_share <= 1:
-        raise errors.UsageError(f"--valid-share: got {valid_share:g}, expected above 0, up to 1")
+        raise errors.UnusableError(f"--valid-share: got {valid_share:g}, expected above 0, up to 1")
     choice = choose(
         rig, want, subject=subject, seed=seed, width_px=width, most_lights=most_lights,
         valid_share=valid_share, forecast=forecast,

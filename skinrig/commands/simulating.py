@@ -51,8 +51,9 @@ def simulate(
     subject: Annotated[
         str,
         typer.Option(
-            help="Preset, I to VI, palest or darkest; of the dome also P01 to P87 of the "
-            "simulated population; of the probe also homogeneous:SIGMA_A,SIGMA_S_PRIME[,G] or "
+            help="Preset, I to VI, palest or darkest, or a file NAME.toml; of the dome also P01 to "
+            "P87 of the simulated population; of the probe also "
+            "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G] or "
             "anisotropic:SIGMA_A,SIGMA_S_PRIME[,STRENGTH[,AXIS]], 1/mm and degrees.",
             autocompletion=completion.subjects,
         ),
@@ -167,7 +168,8 @@ def simulate(
     )
     from skinrig.consent import subject_of
     from skinrig.next_steps import after_session
-    from skinrig.simulating.simulation import USES, pseudonym, simulate_session
+    from skinrig.simulating.simulation import USES, simulate_session
+    from skinrig.simulating.subject_records import pseudonym
 
     console = Console(json)
     done = simulate_session(

@@ -81,14 +81,14 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, points: int | None = None) -
     points
         How many to look at; `POINTS` by default.
     """
+    from rigsim import subject_file
     from rigsim.led_light import white_intensity
     from rigsim.render import OFFSET_MM, Caster
     from rigsim.sensor import sensor_of
-    from rigsim.subject import make_subject
     from rigsim.surface_brdf import skin_surface
 
     points = POINTS if points is None else points
-    face = make_subject(subject, seed=seed, size=TEXELS)
+    face = subject_file.named(subject).face(seed=seed, size=TEXELS)
     texels = np.flatnonzero(face.atlas.covered & (face.hair < 0.5))
     along_u, along_v = face.atlas.texel_mm()
     area = (along_u * along_v).reshape(-1)[texels]

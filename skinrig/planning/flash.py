@@ -108,14 +108,16 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, width_px: int = WIDTH_PX) ->
     """
     from model import color_table
     from model.tissue_optics import ANISOTROPY_SKIN
+    from rigsim import subject_file
     from rigsim.scenes.flash import FlashScene
     from rigsim.sensor import sensor_of, vignetting_map
-    from rigsim.subject import make_subject
     from skinrig.simulating.flash import to_superpixels
 
     small = rig.resized(width_px) if width_px < rig.views[0].width_px else rig
     view = small.views[0]
-    scene = FlashScene(small, make_subject(subject, seed=seed, size=TEXTURE_PX), seed=seed)
+    scene = FlashScene(
+        small, subject_file.named(subject).face(seed=seed, size=TEXTURE_PX), seed=seed
+    )
     truth = scene.truth()
     chip = sensor_of(view)
     light = scene.radiance("crossed") * vignetting_map(

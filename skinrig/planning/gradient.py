@@ -100,14 +100,14 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, side_px: int = PATCH_PX) -> 
         Pixels across.
     """
     from model.metrics import angular_error_rad
-    from rigsim.microrelief import make_micro_skin
+    from rigsim import subject_file
     from rigsim.scenes.gradient import GradientScene
     from rigsim.sphere_build import as_drawn
     from skinrig.benchmarks.gradient_normals import NEUTRAL, lights_of, pixel_geometry
 
     small = rig.cropped(side_px) if side_px < rig.views[0].width_px else rig
     size_mm = max(1.2, 0.8 + max(small.views[0].field_mm))
-    skin = make_micro_skin("forehead", seed=seed, size_mm=size_mm, preset=subject)
+    skin = subject_file.named(subject).patch("forehead", seed=seed, size_mm=size_mm)
     sphere = as_drawn(small)
     scene = GradientScene(small, skin, sphere=sphere, seed=seed)
     rates = {

@@ -55,9 +55,9 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
     sites
         Where the head may be placed.
     """
+    from rigsim import subject_file
     from rigsim.probe_build import SPOT_RADIUS_PX
     from rigsim.probe_profile import Profiles
-    from rigsim.probe_tissue import parse_subject
     from rigsim.scenes.probe import DARK_E_PER_S, METER_RATE_PER_S, VIGNETTING
     from rigsim.sensor import sensor_of
     from skinrig.phantom_reflectance import expected_reflectance, packaged_certificate
@@ -65,7 +65,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = SITES
 
     if rig.probe is None:
         raise PlanningError(f"rig: got {rig.name!r} without a probe, expected one with fibres")
-    tissue = parse_subject(subject, seed=seed)
+    tissue = subject_file.tissue(subject, seed=seed)
     profiles = Profiles(rig, tissue, photons=PHOTONS["small"], seed=seed)
     made = [profiles.profile(site, 0.0, rig.probe.suction_mbar) for site in sites]
     reflectance = np.stack([one.reflectance_per_mm2 for one in made])

@@ -17,7 +17,9 @@ from model import store
 from model.skin import SkinAppearance
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
 from skinrig.light_safety import light_figures, light_lines
+from skinrig.simulating import subject_records
 from skinrig.simulating.simulation import (
+    OptionsError,
     Order,
     Simulated,
     SimulationError,
@@ -64,8 +66,9 @@ def simulate_dome(order: Order) -> Simulated:
     if order.progress is not None:
         for line in light_lines(plan, rig):
             order.progress(line)
+    shown = subject_records.of_manifest(order.subject)
     asked = {
-        "rig": "dome", "width_px": rig.views[0].width_px, "subject": order.subject,
+        "rig": "dome", "width_px": rig.views[0].width_px, "subject": shown,
         "target": order.target or "", "mesh": str(order.mesh or ""), "lights": len(rig.lights),
         "views": len(rig.views), "move": order.move, "state": state, "movement": order.movement,
         "wrapped": order.wrapped, "plan": "" if order.plan is None else order.plan.to_json(),
@@ -75,7 +78,7 @@ def simulate_dome(order: Order) -> Simulated:
         if order.leave_out:
             asked["leave_out"] = list(order.leave_out)
     elif order.subsurface or order.interreflections or order.leave_out:
-        raise SimulationError("subsurface, interreflections: are of a face; a target has neither")
+        raise OptionsError("subsurface, interreflections: are of a face; a target has neither")
     if conditions:
         asked["conditions"] = conditions
     scene = _scene(rig, order, plan)
@@ -111,6 +114,7 @@ def simulate_dome(order: Order) -> Simulated:
                 **appearance.parameters,
                 **scan,
                 "landmarks_mm": _landmarks(scene.subject),
+                **subject_records.of_truth(order.subject, "dome", order.progress),
             },
             inputs={"session": session.content_hash},
             files=_truth_files(scene, appearance, order.seed),
@@ -128,7 +132,7 @@ def _state(order: Order) -> str:
     from rigsim.perfusion import STATES
 
     if len(order.states) != 1:
-        raise SimulationError(
+        raise OptionsError(
             f"states: got {', '.join(order.states) or 'none'}, expected one; a session of the dome "
             "shows one face, capture each state into a session of its own"
         )
@@ -137,7 +141,7 @@ def _state(order: Order) -> str:
             f"state: got {order.states[0]!r}, expected one of {', '.join(STATES)}"
         )
     if order.target is not None and order.states[0] != "neutral":
-        raise SimulationError(f"state: got {order.states[0]!r}, but a target has none")
+        raise OptionsError(f"state: got {order.states[0]!r}, but a target has none")
     return order.states[0]
 
 
@@ -146,9 +150,7 @@ def _conditions(order: Order) -> dict[str, float]:
     from rigsim.skin_conditions import ConditionError, checked
 
     if order.target is not None and order.conditions:
-        raise SimulationError(
-            f"condition: got {', '.join(order.conditions)}, but a target has none"
-        )
+        raise OptionsError(f"condition: got {', '.join(order.conditions)}, but a target has none")
     try:
         return checked(order.conditions)
     except ConditionError as error:
@@ -162,7 +164,7 @@ def _member(order: Order) -> Member | None:
     if order.target is not None or not re.fullmatch(r"P\d+", order.subject):
         return None
     if order.mesh is not None:
-        raise SimulationError(f"mesh: {order.subject} has a head already; leave it out")
+        raise OptionsError(f"mesh: {order.subject} has a head already; leave it out")
     try:
         return member(order.subject)
     except PopulationError as error:
@@ -283,7 +285,7 @@ def _rig(order: Order) -> Rig:
             width_px=width_px,
         )
     if (order.lights, order.views) != (None, None):
-        raise SimulationError("lights, views: a plan names its own; leave them out")
+        raise OptionsError("lights, views: a plan names its own; leave them out")
     dome = load_rig("dome")
     if order.plan.rig != dome.name:
         raise SimulationError(f"plan: got one of {order.plan.rig!r}, expected {dome.name!r}")
@@ -308,12 +310,12 @@ def _plan(rig: Rig, target: str | None, size: str) -> Plan:
 
 
 def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
+    from rigsim import subject_file
     from rigsim.dome_build import build
     from rigsim.head_motion import head_motion
     from rigsim.scene_needs import longest_on_s
     from rigsim.scenes.dome import DomeScene
     from rigsim.scenes.dome_targets import target_scene
-    from rigsim.subject import make_subject
     from rigsim.targets import make_target
 
     built = build(rig, seed=order.seed)
@@ -326,7 +328,8 @@ def _scene(rig: Rig, order: Order, plan: Plan) -> Any:
         person = one.face(TEXELS)
         conditions = dict(one.applied) | conditions
     else:
-        person = make_subject(order.subject, seed=order.seed, size=TEXELS, mesh=order.mesh)
+        subject = subject_file.named(order.subject)
+        person = subject.face(seed=order.seed, size=TEXELS, mesh=order.mesh)
     motion = head_motion(order.seed) if order.move else None
     return DomeScene(
         rig, person, dome=built, motion=motion, state=order.states[0], movement=order.movement,
@@ -345,7 +348,7 @@ def _light_of_skin(order: Order) -> dict[str, Any]:
     without = order.without("dome")
     for name in without:
         if asked.get(name):
-            raise SimulationError(f"leave_out: {name} was asked for, too")
+            raise OptionsError(f"leave_out: {name} was asked for, too")
     return {**asked, **without}
 
 

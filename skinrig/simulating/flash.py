@@ -12,6 +12,7 @@ from capture.plan import Plan, flash_calibration_plan, flash_plan
 from capture.rig import Rig, load_rig
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig.simulating import subject_records
 from skinrig.simulating.simulation import (
     Order,
     Simulated,
@@ -48,8 +49,9 @@ def simulate_flash(order: Order) -> Simulated:
     width = order.width_px or WIDTHS_PX[order.size]
     rig = load_rig("flash")
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
+    shown = subject_records.of_manifest(order.subject)
     asked = {
-        "rig": "flash", "width_px": width, "subject": order.subject, "target": target or "",
+        "rig": "flash", "width_px": width, "subject": shown, "target": target or "",
         "mesh": str(order.mesh or ""), "states": list(states), "repeats": order.repeats,
         "movement": order.movement,
         **({} if order.plan is None else {"plan": order.plan.to_json()}),
@@ -69,9 +71,10 @@ def simulate_flash(order: Order) -> Simulated:
     truth = None
     if target is None:
         truth = truth_folder(order.out)
+        told = subject_records.of_truth(order.subject, "flash", order.progress)
         for state, scene in scenes.items():
             folder = truth if state == states[0] else truth.with_name(f"{truth.name}-{state}")
-            appearance = truth_of(scene, seed, session.content_hash, state)
+            appearance = truth_of(scene, seed, session.content_hash, state, about=told)
             store.write(folder, appearance)
     blur = () if target else tuple(float(width) for width in first.resolution_mm())
     left_out = tuple(first.left_out)
@@ -90,9 +93,8 @@ def _plan(rig: Rig, target: str | None, states: tuple[str, ...], repeats: int) -
 
 
 def _scenes(rig: Rig, order: Order, plan: Plan) -> dict[str, Any]:
-    from rigsim import targets
+    from rigsim import subject_file, targets
     from rigsim.scenes.flash import FlashScene
-    from rigsim.subject import make_subject
 
     seed = order.seed
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]
@@ -100,7 +102,7 @@ def _scenes(rig: Rig, order: Order, plan: Plan) -> dict[str, Any]:
     if order.target is not None:
         state = "white" if order.target == "white" else ""
         return {state: FlashScene(rig, targets.make_target(order.target), seed=seed, power=power)}
-    person = make_subject(order.subject, seed=seed, mesh=order.mesh)
+    person = subject_file.named(order.subject).face(seed=seed, mesh=order.mesh)
     person = person.moved_by(_stance_mm(rig, order.nearer_mm))
     return {
         state: FlashScene(
@@ -190,8 +192,10 @@ def landmarks_at_superpixels(pixels: Mapping[str, tuple[float, float]]) -> dict[
     return {name: [0.5 * (x - 0.5), 0.5 * (y - 0.5)] for name, (x, y) in pixels.items()}
 
 
-def truth_of(scene: Any, seed: int, session: str, state: str) -> SkinAppearance:
-    """Return the truth of a scene of a face, at superpixels."""
+def truth_of(
+    scene: Any, seed: int, session: str, state: str, *, about: Mapping[str, Any] | None = None
+) -> SkinAppearance:
+    """Return the truth of a scene of a face, at superpixels; `about` joins its parameters."""
     maps: Mapping[str, NDArray[Any]] = scene.truth()
     mask = np.asarray(maps["mask"], bool)
     # a superpixel on the outline mixes skin and background: no truth is claimed for it
@@ -220,6 +224,7 @@ def truth_of(scene: Any, seed: int, session: str, state: str) -> SkinAppearance:
             "movement": scene.movement,
             "nearer_mm": _nearer_mm(scene),
             "landmarks_px": landmarks_at_superpixels(scene.landmarks_px()),
+            **(about or {}),
         },
         inputs={"session": session},
         left_out=tuple(scene.left_out),

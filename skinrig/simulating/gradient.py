@@ -20,6 +20,7 @@ from capture.rig import Rig, load_rig
 from capture.session import Session
 from model import store
 from skinrig.light_safety import light_figures, light_lines
+from skinrig.simulating import subject_records
 from skinrig.simulating.simulation import (
     Order,
     Simulated,
@@ -61,8 +62,9 @@ def simulate_gradient(order: Order) -> Simulated:
     if order.progress is not None:
         for line in light_lines(plan, rig):
             order.progress(line)
+    shown = subject_records.of_manifest(order.subject)
     asked = {
-        "rig": "gradient", "width_px": rig.views[0].width_px, "subject": order.subject,
+        "rig": "gradient", "width_px": rig.views[0].width_px, "subject": shown,
         "target": order.target or "", "site": order.site or SITE,
         "angles": ",".join(f"{angle:g}" for angle in order.angles or ANGLES_DEG[order.size] or ()),
         "steps": "" if order.steps is None else f"{order.steps[0]}..{order.steps[1]}",
@@ -70,7 +72,7 @@ def simulate_gradient(order: Order) -> Simulated:
         **({"leave_out": list(order.leave_out)} if order.leave_out else {}),
     }  # fmt: skip
     scene = make_scene(
-        rig, order.target, site=order.site, preset=order.subject, seed=order.seed, plan=plan,
+        rig, order.target, site=order.site, subject=order.subject, seed=order.seed, plan=plan,
         without=order.without("gradient"),
     )  # fmt: skip
     session = open_session(order, plan, rig, asked, scene)
@@ -89,7 +91,12 @@ def simulate_gradient(order: Order) -> Simulated:
         appearance = scene.truth_appearance(log.grips(session))
         appearance = dataclasses.replace(
             appearance,
-            parameters={"kind": "truth", "state": "neutral", **appearance.parameters},
+            parameters={
+                "kind": "truth",
+                "state": "neutral",
+                **appearance.parameters,
+                **subject_records.of_truth(order.subject, "gradient", order.progress),
+            },
             inputs={"session": session.content_hash},
             seed=order.seed,
         )
@@ -116,7 +123,7 @@ def make_scene(
     target: str | None = None,
     *,
     site: str | None = None,
-    preset: str = "III",
+    subject: str = "III",
     seed: int = 0,
     plan: Plan | None = None,
     without: Mapping[str, Any] | None = None,
@@ -129,14 +136,14 @@ def make_scene(
         Cropped as it is used.
     target : str, optional
         "ball", "flat" or "dark"; a patch of skin by default.
-    site, preset, seed
+    site, subject, seed
         Of the skin; the seed also of the sphere and of the patch's motion.
     plan : Plan, optional
         By whose angles the skin must be large enough; any angle by default.
     without
         What of the skin is not built, see `skinrig.simulating.leaving_out`.
     """
-    from rigsim.microrelief import make_micro_skin
+    from rigsim import subject_file
     from rigsim.patch_motion import PatchMotion
     from rigsim.scene_needs import longest_on_s
     from rigsim.scenes.gradient import GradientScene
@@ -151,7 +158,7 @@ def make_scene(
         max(rig.views[0].field_mm), STRETCHES,
         angle_deg=angles.pop() if len(angles) == 1 else None, shift_mm=SHIFT_MM,
     )  # fmt: skip
-    skin = make_micro_skin(site or SITE, seed=seed, size_mm=size_mm, preset=preset)
+    skin = subject_file.named(subject).patch(site or SITE, seed=seed, size_mm=size_mm)
     on_s = None if plan is None else longest_on_s(plan)
     return GradientScene(
         rig, skin, sphere=sphere, motion=PatchMotion(seed), seed=seed, on_s=on_s, **(without or {})

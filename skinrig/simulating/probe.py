@@ -23,6 +23,7 @@ from capture.session import Session
 from model import store
 from skinrig.acquisition import directions_of
 from skinrig.light_safety import light_figures, light_lines
+from skinrig.simulating import subject_records
 from skinrig.simulating.simulation import (
     Order,
     Simulated,
@@ -55,8 +56,9 @@ def simulate_probe(order: Order) -> Simulated:
         order.refuse("target of the probe", sites=None, angles=None)
     rig = load_rig("probe")
     plan = plan_of(rig, order)
+    shown = subject_records.of_manifest(order.subject)
     asked = {
-        "rig": "probe", "size": order.size, "subject": order.subject,
+        "rig": "probe", "size": order.size, "subject": shown,
         "target": order.target or "", "sites": ",".join(order.sites or SITES),
         "repeats": order.repeats, "angles": directions_of(order.angles),
         "all_brackets": order.all_brackets,
@@ -89,6 +91,7 @@ def simulate_probe(order: Order) -> Simulated:
             parameters={
                 "kind": "truth", "state": "neutral", "subject": order.subject,
                 **appearance.parameters,
+                **subject_records.of_truth(order.subject, "probe", order.progress),
             },
             inputs={"session": session.content_hash},
             seed=order.seed,
@@ -152,12 +155,13 @@ def make_scene(
     SimulationError
         For a subject that is none.
     """
+    from rigsim import subject_file
     from rigsim.probe_tissue import PHANTOM as BLOCK
-    from rigsim.probe_tissue import TissueError, parse_subject
+    from rigsim.probe_tissue import TissueError
     from rigsim.scenes.probe import ProbeScene
 
     try:
-        tissue = BLOCK if target == "phantom" else parse_subject(subject, seed=seed)
+        tissue = BLOCK if target == "phantom" else subject_file.tissue(subject, seed=seed)
     except TissueError as error:
         raise SimulationError(str(error)) from error
     return ProbeScene(rig, tissue, seed=seed, photons=PHOTONS[size])

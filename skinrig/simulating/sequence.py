@@ -16,6 +16,7 @@ from capture.rig import load_rig
 from capture.session import Session
 from model import store
 from skinrig.sequences import SequenceOrder, sequence_lines, sequence_plan
+from skinrig.simulating import subject_records
 from skinrig.simulating.flash import (
     WIDTHS_PX,
     landmarks_at_superpixels,
@@ -23,6 +24,7 @@ from skinrig.simulating.flash import (
     truth_of,
 )
 from skinrig.simulating.simulation import (
+    OptionsError,
     Order,
     Simulated,
     SimulationError,
@@ -55,10 +57,10 @@ RESUMED_AFTER_S = 10.0
 
 def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
     """Simulate a sequence with the flash rig; see `simulation.simulate_session`."""
+    from rigsim import subject_file
     from rigsim.perfusion import STATES
     from rigsim.perfusion_course import EventCourse, PromptedCourse
     from rigsim.scenes.flash_course import FlashCourseScene, FlashTime
-    from rigsim.subject import make_subject
 
     if sequence.state not in STATES or sequence.state == "neutral":
         expected = ", ".join(state for state in STATES if state != "neutral")
@@ -72,8 +74,9 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
     constant_s = order.relaxation_s
     if constant_s is not None and not 0 < constant_s < np.inf:
         raise SimulationError(f"relaxation: got {constant_s}, expected seconds > 0")
+    shown = subject_records.of_manifest(order.subject)
     asked = {
-        "rig": "flash", "width_px": width, "subject": order.subject,
+        "rig": "flash", "width_px": width, "subject": shown,
         "mesh": str(order.mesh or ""), "sequence": sequence.document(),
         "relaxation_s": constant_s, "movement": order.movement,
     }  # fmt: skip
@@ -81,7 +84,7 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
     if reaction_s is not None and not 0 <= reaction_s < np.inf:
         raise SimulationError(f"reaction: got {reaction_s}, expected seconds >= 0")
     if reaction_s is not None and not sequence.prompted:
-        raise SimulationError(f"reaction: is for prompts, and {sequence.state} follows an event")
+        raise OptionsError(f"reaction: is for prompts, and {sequence.state} follows an event")
     if sequence.prompted:
         own = {"rise_s": constant_s, "fall_s": constant_s, "reaction_s": reaction_s}
         told: dict[str, Any] = {name: v for name, v in own.items() if v is not None}
@@ -89,7 +92,8 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
     else:
         course = EventCourse(sequence.state, constant_s)
     texels = TEXELS[0] if width <= COARSE_PX else TEXELS[1]
-    person = make_subject(order.subject, seed=seed, size=texels, mesh=order.mesh)
+    subject = subject_file.named(order.subject)
+    person = subject.face(seed=seed, size=texels, mesh=order.mesh)
     plan = sequence_plan(rig, sequence)
     if order.progress is not None:
         for line in sequence_lines(plan):
@@ -121,7 +125,8 @@ def simulate_sequence(order: Order, sequence: SequenceOrder) -> Simulated:
     rig_seconds = drive(
         session, rig, scene, seed, prompt, order.progress, signal=signal, begun_s=begun_s
     )
-    _write_truth(truth, scene, session, sequence, log.read(), seed)
+    told = subject_records.of_truth(order.subject, "flash", order.progress)
+    _write_truth(truth, scene, session, sequence, log.read(), seed, told)
     log.remove()
     left_out = tuple(scene.left_out)
     return Simulated(
@@ -171,6 +176,7 @@ def _write_truth(
     sequence: SequenceOrder,
     flashes: Mapping[str, Mapping[str, Any]],
     seed: int,
+    about: Mapping[str, Any],
 ) -> None:
     """Write the truth at rest, and with it what each frame's blood was; and that of the state."""
     poses = sorted({"neutral", *(str(flash["pose"]) for flash in flashes.values())})
@@ -215,14 +221,15 @@ def _write_truth(
         "frames": frames,
     }
     table = ["name,x,y", *(f"{name},{x:.3f},{y:.3f}" for name, (x, y) in places["neutral"].items())]
-    rest = truth_of(scene.at("neutral", 0.0), seed, session.content_hash, "neutral")
+    rest = truth_of(scene.at("neutral", 0.0), seed, session.content_hash, "neutral", about=about)
     files = {
         COURSE_FILE: (json.dumps(document, indent=1) + "\n").encode(),
         LANDMARKS_FILE: ("\n".join(table) + "\n").encode(),
     }
     store.write(folder, dataclasses.replace(rest, files=files))
     pose = sequence.state if sequence.prompted else "neutral"
-    full = truth_of(scene.at(pose, 1.0), seed, session.content_hash, sequence.state)
+    state = sequence.state
+    full = truth_of(scene.at(pose, 1.0), seed, session.content_hash, state, about=about)
     store.write(folder.with_name(f"{folder.name}-{sequence.state}"), full)
 
 

@@ -23,9 +23,11 @@ from capture.devices.probe import ProbeBox
 from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, Subject
+from skinrig.errors import UsageError
 from skinrig.sequences import SequenceOrder
 from skinrig.simulating.leaving_out import left_out_of
 from skinrig.simulating.shot_numbers import shots_made
+from skinrig.simulating.subject_records import pseudonym
 
 RIGS = ("flash", "dome", "gradient", "probe")
 BOXES: Mapping[str, type[Box]] = {
@@ -40,6 +42,10 @@ USES = ("research", "publication")
 
 class SimulationError(ValueError):
     """A simulation that cannot be set up as asked."""
+
+
+class OptionsError(SimulationError, UsageError):
+    """Options of a simulation that do not go together, or with its rig."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,18 +78,6 @@ class Simulated:
             "light": dict(self.light),
             "effects": [dict(effect) for effect in self.effects],
         }
-
-
-def pseudonym(subject: str, seed: int) -> str:
-    """Return the pseudonym of a simulated subject.
-
-    Examples
-    --------
-    >>> pseudonym("III", 0), pseudonym("homogeneous:0.04,1.5", 2)
-    ('simulated-III-0', 'simulated-homogeneous-0.04-1.5-2')
-    """
-    name = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "-" for c in subject)
-    return f"simulated-{name}-{seed}"
 
 
 def truth_folder(session: Path) -> Path:
@@ -147,7 +141,7 @@ class Order:
         """Raise where something was asked for that the rig does not know."""
         for name, value in unset.items():
             if getattr(self, name) != value:
-                raise SimulationError(f"{name}: the {rig} rig knows nothing of it; leave it out")
+                raise OptionsError(f"{name}: the {rig} rig knows nothing of it; leave it out")
 
     def without(self, rig: str) -> dict[str, Any]:
         """Return arguments of a scene of skin that leave out what is to be left out.
@@ -161,7 +155,7 @@ class Order:
             return {}
         if self.target is not None or self.sequence is not None:
             what = "a sequence" if self.target is None else "a target"
-            raise SimulationError(f"leave_out: is of skin at rest or in a state, not of {what}")
+            raise OptionsError(f"leave_out: is of skin at rest or in a state, not of {what}")
         try:
             return left_out_of(rig, self.leave_out)
         except ValueError as exc:
@@ -174,10 +168,10 @@ class Order:
         if not math.isfinite(self.nearer_mm):
             raise SimulationError(f"nearer: got {self.nearer_mm}, expected finite millimetres")
         if rig != "flash":
-            raise SimulationError(f"nearer: the {rig} rig knows nothing of it; leave it out")
+            raise OptionsError(f"nearer: the {rig} rig knows nothing of it; leave it out")
         if self.target is not None or self.sequence is not None:
             what = "a sequence" if self.target is None else "a target"
-            raise SimulationError(f"nearer: is of a face at rest or in a state, not of {what}")
+            raise OptionsError(f"nearer: is of a face at rest or in a state, not of {what}")
 
     def check_plan(self, rig: str) -> None:
         """Raise where a plan was handed over that is another rig's, or a target's or sequence's."""
@@ -186,7 +180,7 @@ class Order:
         if self.plan.rig != rig:
             raise SimulationError(f"plan: got one of {self.plan.rig!r}, expected {rig!r}")
         if self.target is not None or self.sequence is not None:
-            raise SimulationError("plan: is for a subject; targets and sequences have their own")
+            raise OptionsError("plan: is for a subject; targets and sequences have their own")
 
 
 def simulate_session(
@@ -242,7 +236,8 @@ def simulate_session(
     subject
         Preset of the face, by skin type; of the dome also a member of the simulated population, P01
         to P87 (`rigsim.population.table_1`), with what it wears; of the probe also
-        "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm.
+        "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm. Of every rig also a file NAME.toml, see
+        `rigsim.subject_file`.
     mesh
         A face mesh to wear the skin instead of the procedural head.
     target
@@ -329,9 +324,9 @@ def simulate_session(
         order.check_plan(rig_name)
     order.without(rig_name)
     if sequence is not None and rig_name != "flash":
-        raise SimulationError(f"sequence: the {rig_name} rig knows nothing of it; leave it out")
+        raise OptionsError(f"sequence: the {rig_name} rig knows nothing of it; leave it out")
     if sequence is None and relaxation_s is not None:
-        raise SimulationError("relaxation: is for a sequence")
+        raise OptionsError("relaxation: is for a sequence")
     if rig_name == "dome":
         from skinrig.simulating.dome import simulate_dome
 

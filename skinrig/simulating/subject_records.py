@@ -1,0 +1,56 @@
+"""What manifests and truths of simulated captures hold of whom they show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+SUFFIX = ".toml"
+"""Of a subject's file, see `rigsim.subject_file`."""
+
+
+def pseudonym(subject: str, seed: int) -> str:
+    """Return the pseudonym of a simulated subject.
+
+    Examples
+    --------
+    >>> pseudonym("III", 0), pseudonym("homogeneous:0.04,1.5", 2), pseudonym("people/ann.toml", 0)
+    ('simulated-III-0', 'simulated-homogeneous-0.04-1.5-2', 'simulated-ann-0')
+    """
+    said = Path(subject).stem if subject.endswith(SUFFIX) else subject
+    name = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "-" for c in said)
+    return f"simulated-{name}-{seed}"
+
+
+def of_manifest(subject: str) -> str | dict[str, Any]:
+    """Return a subject as a session's manifest holds it: a preset, or all that its file says."""
+    from rigsim import subject_file
+
+    return subject_file.record(subject)
+
+
+def of_truth(subject: str, rig: str, progress: Callable[[str], None] | None) -> dict[str, Any]:
+    """Return parameters of a truth that tell of a subject's file; none of a preset.
+
+    Parameters
+    ----------
+    subject
+        As the command line has it.
+    rig
+        Name of the rig.
+    progress
+        Told what the file says and the rig does not see.
+    """
+    from rigsim import subject_file
+
+    if not subject_file.is_file(subject):
+        return {}
+    unused = list(subject_file.read(subject).unused(rig))
+    if unused and progress is not None:
+        progress(f"{subject}: the {rig} rig sees nothing of {', '.join(unused)}")
+    return {
+        "subject": Path(subject).stem,
+        "subject_file": subject_file.record(subject),
+        "subject_unused": unused,
+    }

@@ -1,0 +1,71 @@
+"""A subject's file from the command line to the truth."""
+
+import json
+
+import numpy as np
+import pytest
+
+from model import store
+from skinrig.cli import main
+
+FILE = 'schema = "skinrig.subject/1"\npreset = "II"\nmelanin = {melanin}\nfreckles = 0.0\n'
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def truth_of(here, melanin):
+    (here / "ann.toml").write_text(FILE.format(melanin=melanin), encoding="utf-8")
+    argv = ["simulate", "flash", "--width", "64", "--subject", "ann.toml", "--json"]
+    assert main([*argv, "--out", f"session-{melanin}"]) == 0
+    return store.read(here / f"truth-{melanin}")
+
+
+def test_a_files_melanin_is_that_of_the_truth_which_tells_of_the_file(here, capsys):
+    light, dark = (truth_of(here, melanin) for melanin in (0.02, 0.08))
+    medians = [
+        float(np.median(one.maps["melanin"].values[one.maps["melanin"].valid]))
+        for one in (light, dark)
+    ]
+    # variation is steps of log-odds against the limit of 0.5
+    odds = [value / (0.5 - value) for value in (*medians, 0.02, 0.08)]
+    assert odds[1] / odds[0] == pytest.approx(odds[3] / odds[2], rel=0.1)
+    assert dark.parameters["subject"] == "ann"
+    assert dark.parameters["subject_file"] == {
+        "file": "ann.toml", "preset": "II", "melanin": 0.08, "freckles": 0.0,
+    }  # fmt: skip
+    manifest = json.loads((here / "session-0.08" / "session.json").read_text(encoding="utf-8"))
+    assert manifest["subject"]["pseudonym"] == "simulated-ann-0"
+    assert str(here) not in json.dumps(manifest)
+
+
+def test_a_session_is_not_resumed_with_a_file_that_was_changed(here, capsys, monkeypatch):
+    (here / "ann.toml").write_text(FILE.format(melanin=0.02), encoding="utf-8")
+    argv = ["simulate", "flash", "--width", "64", "--subject", "ann.toml", "--out", "session"]
+
+    def broken(*args, **settings):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("skinrig.simulating.simulation.run_plan", broken)
+        assert main(argv) == 130
+    (here / "ann.toml").write_text(FILE.format(melanin=0.03), encoding="utf-8")
+    assert main([*argv, "--resume"]) == 3
+    assert "resume with the same settings" in capsys.readouterr().err
+    (here / "ann.toml").write_text(FILE.format(melanin=0.02), encoding="utf-8")
+    assert main([*argv, "--resume"]) == 0
+
+
+def test_a_forecast_is_of_the_skin_that_the_file_tells_of(here, capsys):
+    found = []
+    for melanin in (0.01, 0.2):
+        (here / "ann.toml").write_text(FILE.format(melanin=melanin), encoding="utf-8")
+        assert main(["plan", "gradient", "--subject", "ann.toml", "--width", "64", "--json"]) == 0
+        found.append(json.loads(capsys.readouterr().out)["forecasts"][0]["median"])
+    assert main(["plan", "gradient", "--subject", "II", "--width", "64", "--json"]) == 0
+    preset = json.loads(capsys.readouterr().out)["forecasts"][0]["median"]
+    assert found[0] != found[1]
+    assert preset not in found

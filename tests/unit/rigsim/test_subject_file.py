@@ -1,0 +1,168 @@
+"""Subjects by a file: what it says is what the face, the patch and the tissue are made of."""
+
+import numpy as np
+import pytest
+
+from model.store import write_exr
+from rigsim import pigment, subject_file
+from rigsim.perfusion import STATES
+from rigsim.probe_tissue import SkinTissue
+from rigsim.subject import make_subject
+from rigsim.subject_file import SubjectFileError, named, read, record
+
+SCHEMA = 'schema = "skinrig.subject/1"\n'
+
+
+@pytest.fixture
+def person(tmp_path):
+    def write(text, name="ann"):
+        path = tmp_path / f"{name}.toml"
+        path.write_text(SCHEMA + text, encoding="utf-8")
+        return str(path)
+
+    return write
+
+
+def test_a_file_that_says_nothing_is_the_usual_preset(person):
+    assert read(person("")) == named("III")
+
+
+def test_a_preset_by_its_name_is_the_face_of_that_preset():
+    by_name, made = named("V").face(seed=3, size=64), make_subject("V", seed=3, size=64)
+    np.testing.assert_array_equal(by_name.melanin, made.melanin)
+    np.testing.assert_array_equal(by_name.hemoglobin("anger"), made.hemoglobin("anger"))
+
+
+def test_melanin_between_two_presets_is_between_their_faces(person):
+    low, high = (pigment.MELANIN_PRESETS[name] for name in ("III", "IV"))
+    face = read(person(f"melanin = {(low * high) ** 0.5}\nfreckles = 0.5")).face(seed=2, size=64)
+    below, above = (
+        read(person(f'preset = "{name}"\nfreckles = 0.5', name)).face(seed=2, size=64).melanin
+        for name in ("III", "IV")
+    )
+    covered = face.atlas.covered
+    medians = [float(np.median(map_[covered])) for map_ in (below, face.melanin, above)]
+    assert medians[0] < medians[1] < medians[2]
+    assert medians[1] / medians[0] == pytest.approx((high / low) ** 0.5, rel=0.05)
+
+
+def test_blood_is_a_factor_and_freckles_are_where_they_are_asked_for(person):
+    usual = read(person("")).face(seed=4, size=64)
+    more = read(person("blood = 2\nfreckles = 1\noil = 1.5")).face(seed=4, size=64)
+    np.testing.assert_allclose(
+        more.perfusion.compartments, 2 * usual.perfusion.compartments, rtol=1e-6
+    )
+    none = read(person("freckles = 0")).face(seed=4, size=64)
+    covered = usual.atlas.covered
+    assert np.all(more.melanin[covered] >= none.melanin[covered])
+    assert np.any(more.melanin[covered] > 1.2 * none.melanin[covered])
+    assert more.oiliness == 1.5
+
+
+@pytest.mark.parametrize("ending", ["npy", "exr"])
+def test_textures_are_what_the_face_is_made_of(person, tmp_path, rng, ending):
+    own = {
+        "melanin_map": rng.uniform(0.01, 0.3, (64, 64)).astype(np.float32),
+        "hemoglobin_map": rng.uniform(0.0, 0.3, (64, 64)).astype(np.float32),
+    }
+    for name, values in own.items():
+        if ending == "npy":
+            np.save(tmp_path / f"{name}.npy", values)
+        else:
+            write_exr(tmp_path / f"{name}.exr", values)
+    text = "".join(f'{name} = "{name}.{ending}"\n' for name in own)
+    face = read(person(text)).face(seed=1, size=64)
+    np.testing.assert_array_equal(face.melanin, own["melanin_map"])
+    np.testing.assert_allclose(face.hemoglobin(), own["hemoglobin_map"], rtol=1e-5, atol=1e-9)
+    assert all(np.isfinite(face.hemoglobin(state)).all() for state in STATES)
+    finer = read(person(text)).face(seed=1, size=128)
+    inner = finer.melanin[1:-1, 1:-1]  # bilinear: a row is a quarter on from the first of the file
+    down = 0.75 * own["melanin_map"][:-1] + 0.25 * own["melanin_map"][1:]
+    np.testing.assert_allclose(inner[0, 0], 0.75 * down[0, 0] + 0.25 * down[0, 1], rtol=1e-5)
+
+
+def test_the_patch_and_the_tissue_are_of_the_same_person(person):
+    ann = read(person("melanin = 0.1\nblood = 1.5"))
+    patch, plain = ann.patch("cheek", seed=1, size_mm=0.3), named("V").patch(
+        "cheek", seed=1, size_mm=0.3
+    )  # fmt: skip
+    assert patch.melanin_fraction == 0.1
+    assert plain.melanin_fraction == pigment.MELANIN_PRESETS["V"]
+    assert patch.albedo.mean() < plain.albedo.mean()
+    skin, usual = ann.tissue(seed=2), SkinTissue("III", seed=2)
+    assert skin.melanin("cheek") / usual.melanin("cheek") == pytest.approx(0.1 / 0.028)
+    assert skin.blood("cheek", 60.0) == pytest.approx(1.5 * usual.blood("cheek", 60.0))
+    assert ann.unused("gradient") == ("blood",)
+    assert ann.unused("probe") == ann.unused("flash") == ann.unused("dome") == ()
+
+
+def test_the_record_tells_files_of_one_name_apart(person, tmp_path):
+    path = person('preset = "IV"\nmelanin_map = "m.npy"')
+    np.save(tmp_path / "m.npy", np.full((64, 64), 0.1, np.float32))
+    first = record(path)
+    np.save(tmp_path / "m.npy", np.full((64, 64), 0.2, np.float32))
+    assert record(path)["melanin_map"]["sha256"] != first["melanin_map"]["sha256"]
+    assert {key: first[key] for key in ("file", "preset")} == {"file": "ann.toml", "preset": "IV"}
+    assert str(tmp_path) not in str(first)
+    assert record("IV") == "IV"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("melanin = 0.9", r"melanin: got 0\.9, expected 0\.005 to 0\.45"),
+        ("blood = 0", "blood: got 0"),
+        ("melanine = 0.1", "did you mean melanin"),
+        ('preset = "VII"', "preset: got 'VII'"),
+        ('melanin = "dark"', "melanin"),
+        ("melanin = nan", "melanin"),
+        ('mesh = "none.obj"', "mesh: there is no file"),
+        ('melanin_map = "none.npy"', "melanin_map: there is no file"),
+        ('melanin_map = "flat.npy"', r"got float64 of shape \(64,\)"),
+        ('melanin_map = "much.npy"', r"got 0\.9 to 0\.9, expected finite volume fractions"),
+        ('melanin_map = "holes.npy"', "finite volume fractions"),
+        ('melanin_map = "flat.png"', r"expected a file \.npy or \.exr"),
+        ('melanin_map = "several.npy"', "is an archive of arrays"),
+        ('melanin_map = "text.npy"', r"is no \.npy file"),
+        ('melanin_map = "text.exr"', "expected an OpenEXR image"),
+        ('melanin = 0.1\nmelanin_map = "flat.npy"', "no melanin and freckles beside it"),
+        ('blood = 2\nhemoglobin_map = "flat.npy"', "no blood beside it"),
+        ("melanin", "is not TOML"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_named(person, tmp_path, text, said):
+    np.save(tmp_path / "flat.npy", np.ones(64))
+    np.save(tmp_path / "much.npy", np.full((64, 64), 0.9))
+    np.save(tmp_path / "holes.npy", np.full((64, 64), np.nan))
+    np.savez(tmp_path / "several.npz", a=np.ones((64, 64)))
+    (tmp_path / "several.npz").rename(tmp_path / "several.npy")
+    for name in ("flat.png", "text.npy", "text.exr"):
+        (tmp_path / name).write_text("words", encoding="utf-8")
+    with pytest.raises(SubjectFileError, match=said) as caught:
+        read(person(text))
+    assert "ann.toml" in str(caught.value) or "_map" in str(caught.value)
+
+
+def test_every_fault_is_told_at_once(person):
+    with pytest.raises(SubjectFileError) as caught:
+        read(person('melanin = 0.9\nblood = 9\npreset = "VII"'))
+    assert all(name in str(caught.value) for name in ("melanin", "blood", "preset"))
+
+
+def test_a_file_of_another_schema_or_of_none_is_refused(tmp_path):
+    for text in ('schema = "skinrig.subject/2"\n', "melanin = 0.1\n"):
+        (tmp_path / "ann.toml").write_text(text, encoding="utf-8")
+        with pytest.raises(SubjectFileError, match="schema"):
+            read(tmp_path / "ann.toml")
+
+
+@pytest.mark.parametrize("text", ["VII", "ann", "none.toml"])
+def test_what_is_neither_a_preset_nor_a_file_is_refused(text):
+    with pytest.raises(SubjectFileError, match=r"no such file|or a file NAME\.toml"):
+        subject_file.named(text)
+
+
+def test_a_mesh_is_named_once(person, tmp_path):
+    (tmp_path / "face.obj").write_text("v 0 0 0\n", encoding="utf-8")
+    with pytest.raises(SubjectFileError, match="leave the other out"):
+        read(person('mesh = "face.obj"')).face(seed=0, size=64, mesh="other.obj")
