@@ -27,7 +27,7 @@ from capture.rig import Rig, load_rig
 from capture.session import Session, Subject
 from skinrig.addresses import addresses, patiently, require_addresses
 from skinrig.console import Console
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError, UsageError
 from skinrig.light_safety import light_figures, light_lines
 from skinrig.next_steps import named
 from skinrig.sequences import SequenceOrder, sequence_lines, sequence_plan
@@ -44,10 +44,10 @@ def eyes_of(text: str) -> Eyes:
 
     Raises
     ------
-    UsageError
+    UnusableError
     """
     if text not in get_args(Eyes):
-        raise UsageError(f"--eyes: got {text!r}, expected one of {', '.join(get_args(Eyes))}")
+        raise UnusableError(f"--eyes: got {text!r}, expected one of {', '.join(get_args(Eyes))}")
     return cast(Eyes, text)
 
 
@@ -362,7 +362,7 @@ def capture_session(
     """
     box_urls, camera_urls = addresses(ports, "--port"), addresses(cameras, "--camera")
     if force_limit_n is not None and not 0.0 < force_limit_n < math.inf:
-        raise UsageError(f"--force-limit: got {force_limit_n:g}, expected more than 0 newton")
+        raise UnusableError(f"--force-limit: got {force_limit_n:g}, expected more than 0 newton")
     rig = load_rig(rig_name)
     chosen = choose_plan(
         rig, plan, target, angles=angles, steps=steps, sites=sites, repeats=repeats,

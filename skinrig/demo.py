@@ -78,6 +78,8 @@ def run_demo(
     unknown = [rig for rig in rigs if rig not in RIGS]
     if unknown or not rigs:
         raise DemoError(f"rigs: got {(*unknown, 'none')[0]!r}, expected out of {', '.join(RIGS)}")
+    if seed < 0:
+        raise DemoError(f"seed: got {seed}, expected 0 or more")
     _make_room(out)
     began = time.perf_counter()
     asked = [rig for rig in RIGS if rig in rigs]

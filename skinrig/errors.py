@@ -1,4 +1,20 @@
-"""From an exception to one sentence and an exit code."""
+"""From an exception to one sentence and an exit code.
+
+What a command ends with:
+
+=== ================================================================================
+0   done
+1   a limit was missed
+2   the command line cannot be read: a command or an option that does not exist, an argument that
+    is missing or not of its form, or two that do not go together
+3   it can be read, but what it names or asks for is not known, out of range, damaged or cannot be
+    used: a name, a number, a file, a session
+4   a device or a capture failed
+5   an optional part of the distribution is missing
+70  a fault of skinrig's own
+130 interrupted
+=== ================================================================================
+"""
 
 from __future__ import annotations
 
@@ -13,6 +29,14 @@ DEVICE_FAILED = 4
 EXTRA_MISSING = 5
 BUG = 70
 INTERRUPTED = 130
+CODES = (
+    f"{DONE} done; {LIMIT_MISSED} a limit was missed; {USAGE} the command line cannot be read (an "
+    f"argument missing, not of its form, or at odds with another); {BAD_INPUT} what it names is "
+    f"not known, out of range, damaged or of no use; {DEVICE_FAILED} a device or a capture failed; "
+    f"{EXTRA_MISSING} an optional part is missing; {BUG} a fault of skinrig's own; {INTERRUPTED} "
+    "interrupted."
+)
+"""What commands end with, as the help tells it; the module's text says it at length."""
 
 
 class MissingExtra(ImportError):
@@ -25,7 +49,11 @@ class MissingExtra(ImportError):
 
 
 class UsageError(ValueError):
-    """A command that lacks an argument, or has one of the wrong form."""
+    """An argument that is missing or not of its form, or that does not go with another."""
+
+
+class UnusableError(ValueError):
+    """An argument that can be read, but names or asks for what is not there or cannot be used."""
 
 
 def exit_code(error: BaseException) -> int:

@@ -23,7 +23,7 @@ from reconstruction.brdf_space import SpaceCurve
 from skinrig import consent
 from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf_space_datasets import Dataset
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError
 from skinrig.next_steps import named
 from skinrig.traits import labels as trait_labels
 
@@ -238,7 +238,7 @@ def analyse_measured(
     """
     names = [folder.name.removeprefix("appearance-") for folder in folders]
     if len(set(names)) < len(names):
-        raise UsageError(f"appearances: got {', '.join(names)}, one of them twice")
+        raise UnusableError(f"appearances: got {', '.join(names)}, one of them twice")
     table = None if labels is None else trait_labels.read(labels, names)
     materials = brdf_tables.default() if basis is None else brdf_tables.load(basis)
     rng = np.random.default_rng([seed, 71])

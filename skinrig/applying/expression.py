@@ -21,6 +21,7 @@ from model.wrinkle_model import FILE as WRINKLE_FILE
 from model.wrinkle_model import WrinkleModel
 from skinrig import consent, dynamic_appearance
 from skinrig.dynamic_appearance import FACIAL_COLOR, PARTS, WRINKLES
+from skinrig.errors import UsageError
 
 KIND = "expression"
 LEAST_SUM = 1e-6
@@ -30,6 +31,10 @@ OBSERVER, LIGHT = "linear sRGB", "D65"
 
 class ApplyError(ValueError):
     """Weights that cannot be applied."""
+
+
+class WeightsError(ApplyError, UsageError):
+    """Weights that cannot be read."""
 
 
 @dataclass(slots=True)
@@ -109,7 +114,7 @@ def parse_weights(text: str) -> dict[str, float]:
 
     Raises
     ------
-    ApplyError
+    WeightsError
         Naming the part that is no ``NAME=NUMBER``, or a name given twice.
 
     Examples
@@ -125,11 +130,11 @@ def parse_weights(text: str) -> dict[str, float]:
         except ValueError:
             weight = float("nan")
         if not (name and equals and np.isfinite(weight)):
-            raise ApplyError(
+            raise WeightsError(
                 f"weights: got {part.strip()!r}, expected NAME=NUMBER, for example smile=0.7"
             )
         if name in found:
-            raise ApplyError(f"weights: {name!r} is given twice")
+            raise WeightsError(f"weights: {name!r} is given twice")
         found[name] = weight
     return found
 

@@ -10,7 +10,7 @@ import typer
 from skinrig.commands.help import Subcommands
 from skinrig.commands.options import Json, Out
 from skinrig.console import Console
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError, UsageError
 
 Labels = Annotated[
     Path | None, typer.Option(help="Table name,TRAIT,... of 0 and 1, a line for each face.")
@@ -59,9 +59,9 @@ def analyse_brdf(
     from skinrig.analysing import brdf as analysing_brdf
 
     if method not in ("shares", "brdf"):
-        raise UsageError(f"--method: got {method!r}, expected shares or brdf")
+        raise UnusableError(f"--method: got {method!r}, expected shares or brdf")
     if points is not None and points < 20:
-        raise UsageError(f"--points: got {points}, expected 20 or more")
+        raise UnusableError(f"--points: got {points}, expected 20 or more")
     how = cast(Literal["shares", "brdf"], method)
     console = Console(json)
     if appearances:

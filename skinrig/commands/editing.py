@@ -9,7 +9,7 @@ import typer
 
 from skinrig.commands.options import Json, NewMaps, Seed
 from skinrig.console import Console
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError, UsageError
 from skinrig.next_steps import named
 
 
@@ -264,6 +264,6 @@ def parse_spots(text: str | None) -> tuple[Any, ...]:
 
 
 def one_of(option: str, given: str, allowed: tuple[str, ...]) -> None:
-    """Raise `UsageError` for a word that an option does not know."""
+    """Raise `UnusableError` for a word that an option does not know."""
     if given not in allowed:
-        raise UsageError(f"{option}: got {given!r}, expected {' or '.join(allowed)}")
+        raise UnusableError(f"{option}: got {given!r}, expected {' or '.join(allowed)}")

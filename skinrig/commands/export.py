@@ -10,7 +10,7 @@ import typer
 
 from skinrig.commands.options import Json, Out
 from skinrig.console import Console, counted
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError
 
 NEXT: Final[Mapping[str, str]] = {
     "maps": "read maps.json: units, ranges and frames; maps.mtlx holds the color spaces",
@@ -98,14 +98,14 @@ def export(
     console = Console(json)
     known = (*appearances.FORMATS, *brdfs.SUFFIX, *sessions.FORMATS, light_lists.NAME, stokes.NAME)
     if to not in known:
-        raise UsageError(f"--to: got {to!r}, expected one of {', '.join(known)}")
+        raise UnusableError(f"--to: got {to!r}, expected one of {', '.join(known)}")
     of_maps = (*appearances.FORMATS, *brdfs.SUFFIX)
     of_sessions = tuple(name for name in known if name not in of_maps)
     for file, kind, fitting in (
         ("session.json", "a session", of_sessions), ("appearance.json", "maps", of_maps),
     ):  # fmt: skip
         if (source / file).is_file() and to not in fitting:
-            raise UsageError(
+            raise UnusableError(
                 f"--to: got {to!r}, but {source} holds {kind}; expected one of {', '.join(fitting)}"
             )
     names = () if only is None else tuple(name.strip() for name in only.split(","))

@@ -67,9 +67,11 @@ def bench(
         raise errors.UsageError(f"{what}: cases of --extremes have one size each; leave it out")
     budget = BUDGET_S if budget is None else budget
     if not budget > 0:
-        raise errors.UsageError(f"--budget: got {budget:g}, expected seconds above 0")
+        raise errors.UnusableError(f"--budget: got {budget:g}, expected seconds above 0")
     if out is not None and out.exists() and not out.is_dir():
-        raise errors.UsageError(f"--out: {out} is a file, expected a folder, new or to be replaced")
+        raise errors.UnusableError(
+            f"--out: {out} is a file, expected a folder, new or to be replaced"
+        )
     wait_asleep(os.environ)  # before numerical libraries are loaded: one stage runs at a time
     if extremes:
         from skinrig.reporting.extremes import run_extremes

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from skinrig.commands import completion
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError, UsageError
 
 Rig = Annotated[
     str,
@@ -38,7 +38,7 @@ NewMaps = Annotated[Path, typer.Option("--out", callback=_free, help="Folder to 
 def file_to_write(context: typer.Context, out: Path | None) -> Path | None:
     """Refuse a folder where a file is to be written, before the work."""
     if out is not None and not context.resilient_parsing and out.is_dir():
-        raise UsageError(f"--out: {out} is a folder, expected a file to write")
+        raise UnusableError(f"--out: {out} is a folder, expected a file to write")
     return out
 
 

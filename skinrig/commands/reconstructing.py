@@ -14,7 +14,7 @@ from skinrig.commands.options import (
     Out,
 )
 from skinrig.console import Console, counted
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError
 from skinrig.next_steps import named
 
 
@@ -75,7 +75,7 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
 
     Raises
     ------
-    skinrig.errors.UsageError
+    skinrig.errors.UnusableError
         More lobes than materials; that there are fewer than one is told by the reconstruction.
     """
     if rank is None or (basis is not None and not basis.is_dir()):
@@ -88,7 +88,7 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
         most = sum(file.suffix.lower() == ".binary" for file in basis.iterdir())
     if rank > most:
         where = "the built-in basis" if basis is None else str(basis)
-        raise UsageError(
+        raise UnusableError(
             f"--rank: got {rank}, expected at most {most}: lobes are mixtures of the "
             f"{counted(most, 'material')} of {where}"
         )
@@ -178,7 +178,7 @@ def folders_of(sessions: Sequence[Path], out: Path) -> list[Path]:
 
     Raises
     ------
-    skinrig.errors.UsageError
+    skinrig.errors.UnusableError
         Where two sessions would go to one folder, or several into a folder of maps.
 
     Examples
@@ -191,12 +191,12 @@ def folders_of(sessions: Sequence[Path], out: Path) -> list[Path]:
     names = [session.absolute().name for session in sessions]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise UsageError(
+        raise UnusableError(
             f"SESSION: got two of the name {twice!r}, whose maps would go to one folder;"
             " reconstruct them one by one"
         )
     if (out / "appearance.json").exists():
-        raise UsageError(
+        raise UnusableError(
             f"--out: {out} holds the maps of one session, expected a folder for those of"
             f" {len(names)}; name another"
         )

@@ -113,18 +113,18 @@ def render(
     Example: skinrig render appearance --view C03 --light L017 --calibration calibration --out
     picture --components
     """
-    from skinrig.errors import UsageError
+    from skinrig.errors import UnusableError, UsageError
     from skinrig.rendering import figures
     from skinrig.rendering.render import Subsurface
     from skinrig.rendering.request import Stage, lights_of, subpixels_of
 
     console = Console(json)
     if subsurface not in get_args(Subsurface):
-        raise UsageError(
+        raise UnusableError(
             f"--subsurface: got {subsurface!r}, expected {', '.join(get_args(Subsurface))}"
         )
     if exposure is not None and not exposure > 0.0:
-        raise UsageError(f"--exposure: got {exposure}, expected a factor above 0")
+        raise UnusableError(f"--exposure: got {exposure}, expected a factor above 0")
     if len(appearance) > 1 and bases is None:
         raise UsageError("appearance: got several, expected one; several are for --bases")
     effort = figures.Effort(

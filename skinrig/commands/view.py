@@ -9,7 +9,9 @@ import typer
 
 from skinrig.commands.options import Json, Page
 from skinrig.console import Console
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError, UsageError
+
+MOST_PORT = 65_535
 
 
 def view(
@@ -45,8 +47,6 @@ def view(
     port: Annotated[
         int | None,
         typer.Option(
-            min=0,
-            max=65535,
             help="Serve the page and its large displacement on this port of this machine alone, 0: "
             "any free one, in place of writing it.",
         ),
@@ -76,6 +76,8 @@ def view(
     from skinrig.viewer.writing import compose, serve, write
 
     console = Console(json)
+    if port is not None and not 0 <= port <= MOST_PORT:
+        raise UnusableError(f"--port: got {port}, expected 0 to {MOST_PORT}")
     if displacement is not None and port is None:
         raise UsageError("displacement: a page in a file cannot fetch it; add --port 0")
     scene = compose(

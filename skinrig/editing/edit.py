@@ -25,6 +25,7 @@ from skinrig.editing import surface as editing_surface
 from skinrig.editing.albedo import AlbedoEdit
 from skinrig.editing.spots import SpotOrder
 from skinrig.editing.surface_mixtures import SurfaceMixtures
+from skinrig.errors import UsageError
 from skinrig.face_textures import Face
 from skinrig.traits import regions
 from skinrig.traits.regions import LibraryParts
@@ -85,7 +86,7 @@ class Order:
     def __post_init__(self) -> None:
         """Refuse an empty order and values out of range."""
         if not self.traits and not self.spots:
-            raise EditError("edit: got neither traits nor spots, expected some")
+            raise UsageError("edit: got neither traits nor spots, expected --trait or --spots")
         for name, amount in self.traits.items():
             if not abs(amount) <= MOST_AMOUNT:
                 raise EditError(

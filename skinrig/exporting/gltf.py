@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError, UsageError
 from skinrig.exporting import blender
 from skinrig.exporting.images import Image, ImageFolder, coded
 from skinrig.exporting.material import COLOR_NOTE, NOTES, Material
@@ -112,7 +112,7 @@ def write(appearance: SkinAppearance, folder: Path, delivery: Delivery) -> list[
             raise UsageError(f"{option}: got {value}, but glTF knows {only} alone; leave it out")
     material = Material.of(appearance, delivery.mesh)
     if material.tiles[1:]:
-        raise UsageError(
+        raise UnusableError(
             f"--mesh: reaches over tiles {', '.join(map(str, material.tiles))}, but glTF knows one "
             "alone; take mtlx or usd, or a mesh of tile 1001"
         )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError, UsageError
 
 UNITS_M: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of a scene unit, m."""
@@ -66,7 +66,7 @@ class Delivery:
             ("--udim", self.udim, TILES),
         ):
             if value is not None and value not in known:
-                raise UsageError(f"{option}: got {value!r}, expected one of {', '.join(known)}")
+                raise UnusableError(f"{option}: got {value!r}, expected one of {', '.join(known)}")
         for name in self.only:
             if not _WORD.fullmatch(name):
                 raise UsageError(f"--only: got {name!r}, expected names joined by commas")

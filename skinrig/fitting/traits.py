@@ -22,6 +22,7 @@ from reconstruction.common_parameterization import CommonFrame
 from skinrig import consent, face_textures
 from skinrig.editing import surface_mixtures
 from skinrig.editing.surface_mixtures import SurfaceMixtureError
+from skinrig.errors import UsageError
 from skinrig.face_textures import Face
 from skinrig.traits import albedo_vectors, regions
 from skinrig.traits import labels as trait_labels
@@ -226,11 +227,13 @@ def read_faces(appearances: Sequence[Path], landmarks: Path | None) -> list[Face
 
     Raises
     ------
+    skinrig.errors.UsageError
+        For fewer than two.
     TraitFitError
-        For fewer than two, names that are the same, or faces without landmarks, saying what to do.
+        For names that are the same, or faces without landmarks, saying what to do.
     """
     if len(appearances) < 2:
-        raise TraitFitError(f"appearances: got {len(appearances)}, expected two or more faces")
+        raise UsageError(f"appearances: got {len(appearances)}, expected two or more faces")
     if landmarks is not None and not landmarks.is_dir():
         raise TraitFitError(f"landmarks: {landmarks} is no folder; expected one with NAME.csv each")
     faces: list[Face] = []

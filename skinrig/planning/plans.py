@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from capture.plan import Plan
 from capture.rig import Rig, load_rig
+from skinrig.errors import UsageError
 from skinrig.light_safety import light_figures
 from skinrig.written_units import written
 
@@ -38,7 +39,11 @@ _WANT = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
 
 
 class PlanningError(ValueError):
-    """What is wanted cannot be read, or no plan can be made for it."""
+    """What is wanted is not known, or no plan can be made for it."""
+
+
+class OptionsError(PlanningError, UsageError):
+    """What is wanted cannot be read, or options do not go together, or with the rig."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +134,10 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
 
     Raises
     ------
-    PlanningError
+    OptionsError
         Naming the part that cannot be read, and what can be wanted.
+    PlanningError
+        Naming what the rig does not give, or a number out of range.
 
     Examples
     --------
@@ -145,7 +152,7 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
     for part in filter(str.strip, text.split(",")):
         match = _WANT.fullmatch(part)
         if match is None:
-            raise PlanningError(f"--want: got {part.strip()!r}, expected {known}")
+            raise OptionsError(f"--want: got {part.strip()!r}, expected {known}")
         name, number, unit = match.groups()
         if name not in units:
             close = difflib.get_close_matches(name, units, 1)
@@ -155,7 +162,7 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
                 hint = f"; {name} is planned for {', '.join(others)}"
             raise PlanningError(f"--want: got {name!r} of rig {rig!r}, expected {known}{hint}")
         if unit not in (None, units[name]):
-            raise PlanningError(f"--want: got {name} in {unit}, expected {units[name]}")
+            raise OptionsError(f"--want: got {name} in {unit}, expected {units[name]}")
         try:
             value = float(number)
         except ValueError:
@@ -163,7 +170,7 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
         if not 0.0 < value < 1e6:
             raise PlanningError(f"--want: got {name}<={number}, expected a number above 0")
         if name in wants:
-            raise PlanningError(f"--want: got {name} twice, expected it once")
+            raise OptionsError(f"--want: got {name} twice, expected it once")
         wants[name] = value
     return wants
 
@@ -213,11 +220,13 @@ def choose(
     rig = load_rig(rig_name)
     if width_px is not None:
         if rig_name == "probe":
-            raise PlanningError("--width: the probe's spots lie on its camera as it is; leave it")
+            raise OptionsError("--width: the probe's spots lie on its camera as it is; leave it")
         # the gradient sphere keeps its pixels' size and gives up field, as its simulation does
         rig = rig.cropped(width_px) if rig_name == "gradient" else rig.resized(width_px)
+    if most_lights is not None and most_lights < 1:
+        raise PlanningError(f"--most-lights: got {most_lights}, expected 1 or more")
     if most_lights is not None and rig_name != "dome":
-        raise PlanningError(f"--most-lights: is for the dome, not the {rig_name} rig")
+        raise OptionsError(f"--most-lights: is for the dome, not the {rig_name} rig")
     if forecast is not None:
         from skinrig.acquisition import read_plan
 

@@ -15,7 +15,7 @@ from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance
 from rigsim.render import Caster
 from skinrig import consent
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering import folder, shadow
 from skinrig.rendering.bases import RankError, reduced
 from skinrig.rendering.camera import Camera
@@ -160,7 +160,7 @@ def draw_photograph(
 
     Raises
     ------
-    UsageError
+    UnusableError
         The session holds no such photograph that the model has not seen.
     """
     from skinrig.rendering.photographs import Photographs
@@ -170,7 +170,7 @@ def draw_photograph(
     shot = next((s for s in photographs.shots if (s.view, s.light) == (view, light)), None)
     if shot is None:
         some = ", ".join(f"{s.view} {s.light}" for s in photographs.shots[:8])
-        raise UsageError(
+        raise UnusableError(
             f"--view {view} --light {light}: the session holds no such photograph that the model "
             f"has not seen; there are {some}{' ...' if len(photographs.shots) > 8 else ''}"
         )

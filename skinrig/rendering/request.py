@@ -16,7 +16,7 @@ from capture.rig import Rig, RigError, load_rig
 from model import store
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance, assemble
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera
 from skinrig.rendering.environment import environment_lights, read_environment
@@ -43,11 +43,11 @@ class Stage:
 
         Raises
         ------
-        UsageError
+        UnusableError
             `calibration` is no folder.
         """
         if calibration is not None and not calibration.is_dir():
-            raise UsageError(f"--calibration: {calibration} is no folder")
+            raise UnusableError(f"--calibration: {calibration} is no folder")
         return Stage(load_rig(rig), calibration, [])
 
     def camera(
@@ -67,7 +67,9 @@ class Stage:
         Raises
         ------
         UsageError
-            It is neither a place nor a view of the rig.
+            Numbers are not as many as they must be, or none.
+        UnusableError
+            The rig has no view of that name.
         """
         place = numbers(text, 3)
         if place is not None:
@@ -80,7 +82,7 @@ class Stage:
         try:
             view = self.rig.view(text)
         except RigError as error:
-            raise UsageError(f"--view: {error}; or give a place in mm, as 0,0,700") from error
+            raise _unread(text)(f"--view: {error}; or give a place in mm, as 0,0,700") from error
         camera = Camera.nominal(view)
         found = self._calibration("geometry", f"camera {text} stands as the rig's file draws it")
         if found is not None:
@@ -104,7 +106,9 @@ class Stage:
         Raises
         ------
         UsageError
-            It is none of these.
+            Numbers are not as many as they must be, or none.
+        UnusableError
+            The rig has no light of that name.
         """
         what, _, factor = text.partition("*")
         strength = (1.0, 1.0, 1.0) if not factor else _color(text, factor)
@@ -120,7 +124,7 @@ class Stage:
         try:
             drawn = self.rig.light(what)
         except RigError as error:
-            raise UsageError(
+            raise _unread(what)(
                 f"--light: {error}; or give a direction, as 1,1,2, or a place in mm, as "
                 "at:300,200,600"
             ) from error
@@ -228,7 +232,7 @@ def subpixels_of(samples: int) -> int:
 
     Raises
     ------
-    UsageError
+    UnusableError
         No square has so many.
 
     Examples
@@ -238,7 +242,7 @@ def subpixels_of(samples: int) -> int:
     """
     side = round(samples**0.5) if samples > 0 else 0
     if side < 1 or side * side != samples or side > 16:
-        raise UsageError(f"--samples: got {samples}, expected 1, 4, 9, 16 ... 256 rays a pixel")
+        raise UnusableError(f"--samples: got {samples}, expected 1, 4, 9, 16 ... 256 rays a pixel")
     return side
 
 
@@ -252,6 +256,11 @@ def numbers(text: str, count: int) -> Vector | None:
         return None
     x, y, z = values
     return x, y, z
+
+
+def _unread(text: str) -> type[UsageError] | type[UnusableError]:
+    """Return what to raise for a text that is no name: numbers are joined by commas."""
+    return UsageError if "," in text else UnusableError
 
 
 def _color(text: str, factor: str) -> Vector:

@@ -282,26 +282,30 @@ def test_none_of_something_is_not_taken_for_the_default(option, tmp_path, capsys
 
 
 @pytest.mark.parametrize(
-    ("order", "words"),
+    ("order", "code", "words"),
     [
-        (["bench", "--budget", "-1"], "--budget: got -1, expected seconds above 0"),
-        (["bench", "--extremes", "--toy"], "--toy: cases of --extremes have one size each"),
-        (["bench", "--extremes", "--budget", "5"], "--budget: cases of --extremes have one size"),
-        (["bench", "--budget", "nan"], "--budget: got nan, expected seconds above 0"),
-        (["bench", "--out", "FILE"], "is a file, expected a folder"),
-        (["plan", "flash", "--valid-share", "7"], "--valid-share: got 7, expected above 0"),
-        (["plan", "flash", "--valid-share", "nan"], "--valid-share: got nan"),
-        (["plan", "flash", "--out", "FOLDER"], "is a folder, expected a file"),
-        (["view", "--out", "FOLDER"], "is a folder, expected a file"),
-        (["report", "FOLDER", "--out", "FOLDER"], "is a folder, expected a file"),
-        (["view", "--port", "99999999"], "equal to 65535"),
+        (["bench", "--budget", "-1"], 3, "--budget: got -1, expected seconds above 0"),
+        (["bench", "--extremes", "--toy"], 2, "--toy: cases of --extremes have one size each"),
+        (
+            ["bench", "--extremes", "--budget", "5"],
+            2,
+            "--budget: cases of --extremes have one size",
+        ),
+        (["bench", "--budget", "nan"], 3, "--budget: got nan, expected seconds above 0"),
+        (["bench", "--out", "FILE"], 3, "is a file, expected a folder"),
+        (["plan", "flash", "--valid-share", "7"], 3, "--valid-share: got 7, expected above 0"),
+        (["plan", "flash", "--valid-share", "nan"], 3, "--valid-share: got nan"),
+        (["plan", "flash", "--out", "FOLDER"], 3, "is a folder, expected a file"),
+        (["view", "--out", "FOLDER"], 3, "is a folder, expected a file"),
+        (["report", "FOLDER", "--out", "FOLDER"], 3, "is a folder, expected a file"),
+        (["view", "--port", "99999999"], 3, "--port: got 99999999, expected 0 to 65535"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_wrong_numbers_and_places_are_refused_before_the_work(order, words, tmp_path, capsys):
+def test_wrong_numbers_and_places_are_refused_before_the_work(order, code, words, tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("mine")
     known = {"FILE": str(tmp_path / "notes.txt"), "FOLDER": str(tmp_path)}
-    assert main([known.get(word, word) for word in order]) == 2
+    assert main([known.get(word, word) for word in order]) == code
     told = capsys.readouterr()
     assert words in told.err
     assert not told.out

@@ -179,11 +179,11 @@ def test_several_sessions_are_reconstructed_into_folders_of_their_names(
     assert main([*command, str(monday)]) == 0
     assert asked[-1] == ("monday", out)
     assert json.loads(capsys.readouterr().out)["path"] == str(out)
-    assert main([*command, str(monday), str(tmp_path / "other" / "monday")]) == 2
+    assert main([*command, str(monday), str(tmp_path / "other" / "monday")]) == 3
     assert "two of the name 'monday'" in capsys.readouterr().err
     out.mkdir()
     (out / "appearance.json").write_text("{}")
-    assert main([*command, str(monday), str(tuesday)]) == 2
+    assert main([*command, str(monday), str(tuesday)]) == 3
     assert "holds the maps of one session" in capsys.readouterr().err
     assert len(asked) == 3
 

@@ -169,18 +169,18 @@ def test_translucency_that_is_asked_for_is_used(folder, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [
-        (["face", "--light", "L999"], 2, "L999"),
+        (["face", "--light", "L999"], 3, "L999"),
         (["face"], 2, "--light: got none"),
         (["face", "--light", "1,1,1", "--view", "0,0,-700"], 3, "behind the head"),
-        (["face", "--light", "1,1,1", "--view", "C99"], 2, "C99"),
-        (["face", "--light", "1,1,1", "--samples", "3"], 2, "--samples"),
-        (["face", "--light", "1,1,1", "--subsurface", "wax"], 2, "wax"),
+        (["face", "--light", "1,1,1", "--view", "C99"], 3, "C99"),
+        (["face", "--light", "1,1,1", "--samples", "3"], 3, "--samples"),
+        (["face", "--light", "1,1,1", "--subsurface", "wax"], 3, "wax"),
         (["face", "--light", "1,1,1", "--translucency", "1,2"], 2, "--translucency"),
         (["face", "--light", "1,1,1", "--bases", "2,24"], 3, "--rank 24"),
         (["face", "--light", "1,1,1", "--bases", "x"], 2, "--bases"),
-        (["face", "--light", "1,1,1", "--calibration", "none"], 2, "none"),
+        (["face", "--light", "1,1,1", "--calibration", "none"], 3, "none"),
         (["face", "--light", "1,1,1", "--mesh", "bare.obj"], 3, "no texture coordinates"),
-        (["face", "--light", "1,1,1", "--exposure", "0"], 2, "--exposure"),
+        (["face", "--light", "1,1,1", "--exposure", "0"], 3, "--exposure"),
         (["matt", "--light", "1,1,1"], 3, "basis_weight_0"),
         (["face", "face", "--light", "1,1,1"], 2, "--bases"),
         (["nothing", "--light", "1,1,1"], 3, "nothing"),
@@ -240,5 +240,5 @@ def test_a_photograph_is_taken_apart_beside_its_rendering(folder, monkeypatch, c
     np.testing.assert_allclose(left[skin], 0.7 - diffuse[skin], atol=1e-6)
     assert np.all(left[~skin] == 0.0)
     other = ("--view", "C03", "--light", "L020", "--out", "other")
-    assert run(folder, monkeypatch, *words, *other) == 2
+    assert run(folder, monkeypatch, *words, *other) == 3
     assert "C03 L017" in capsys.readouterr().err

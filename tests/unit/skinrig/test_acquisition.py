@@ -80,7 +80,7 @@ def test_an_unknown_kind_of_camera_is_told_before_a_port_is_opened(tmp_path, cap
 
 @pytest.mark.parametrize("force", ["0", "-1", "nan", "inf"])
 def test_a_force_that_is_none_is_refused_even_in_a_dry_run(force, capsys):
-    assert main(["capture", "gradient", "--dry-run", "--force-limit", force]) == 2
+    assert main(["capture", "gradient", "--dry-run", "--force-limit", force]) == 3
     assert f"--force-limit: got {force}, expected more than 0 newton" in capsys.readouterr().err
 
 

@@ -210,7 +210,7 @@ def test_the_same_seed_makes_the_same_face(source, library):
         (["--trait", "tann=1"], 3, "did you mean 'tan'?"),
         (["--trait", "tan"], 2, "NAME=NUMBER"),
         (["--trait", "tan=1,tan=2"], 2, "each name once"),
-        ([], 3, "neither traits nor spots"),
+        ([], 2, "neither traits nor spots"),
         (["--trait", "tan=1", "--region", "ears"], 3, "ears"),
         (["--trait", "tan=1", "--parts", "hair"], 3, "hair"),
         (["--spots", "pimples=1"], 3, "freckles, moles, follicles"),

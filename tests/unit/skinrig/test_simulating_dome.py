@@ -139,8 +139,8 @@ def test_a_plan_for_closed_eyes_says_so():
     assert "must be closed or shielded" in light_lines(plan, DOME)[0]
 
 
-def test_nonsense_about_the_eyes_is_a_usage_error(capsys):
-    assert main(["capture", "dome", "--dry-run", "--eyes", "shut"]) == 2
+def test_nonsense_about_the_eyes_is_refused(capsys):
+    assert main(["capture", "dome", "--dry-run", "--eyes", "shut"]) == 3
     assert "open, closed, shielded" in capsys.readouterr().err
 
 

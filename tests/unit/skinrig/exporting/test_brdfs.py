@@ -146,7 +146,7 @@ def test_the_command_line_exports_and_says_what_is_wrong(appearance, tmp_path, c
     assert (tmp_path / "out" / "place.bsdf").is_file()
     for arguments, code, message in [
         (["--to", "rgl", "--at", "here"], 2, "--at: got 'here'"),
-        (["--to", "mhl"], 2, "--to: got 'mhl', but"),
+        (["--to", "mhl"], 3, "--to: got 'mhl', but"),
         (["--to", "rgl"], 3, "exists"),
     ]:
         assert main(["export", str(appearance), *arguments, "--out", out]) == code

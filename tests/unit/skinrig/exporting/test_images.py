@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError
 from skinrig.exporting.images import CAMERA, SRGB, Image, ImageFolder, coded
 from skinrig.exporting.options import Delivery
 
@@ -89,5 +89,7 @@ def test_a_constant_map_and_one_without_a_valid_pixel_are_coded_without_division
     ("field", "value"), [("unit", "inch"), ("normal_y", "up"), ("udim", "1001")]
 )
 def test_a_word_that_means_nothing_is_refused_by_its_options_name(field, value):
-    with pytest.raises(UsageError, match=f"--{field.replace('_', '-')}: got '{value}', expected"):
+    with pytest.raises(
+        UnusableError, match=f"--{field.replace('_', '-')}: got '{value}', expected"
+    ):
         Delivery(**{field: value})

@@ -7,7 +7,7 @@ import OpenEXR
 import pytest
 
 from rigsim.mesh import Mesh, MeshError
-from skinrig.errors import UsageError
+from skinrig.errors import UnusableError, UsageError
 from skinrig.exporting import gltf, materialx, udim, usd
 from skinrig.exporting.material import Material
 from skinrig.exporting.options import Delivery
@@ -109,7 +109,7 @@ def test_names_without_numbers_and_gltf_are_refused_by_name(simulated_face, head
         UsageError, match="--udim: got none, but the mesh reaches over tiles 1001, "
     ):
         materialx.write(simulated_face, tmp_path, Delivery(mesh=head))
-    with pytest.raises(UsageError, match="tiles 1001, 1002, but glTF knows one"):
+    with pytest.raises(UnusableError, match="tiles 1001, 1002, but glTF knows one"):
         gltf.write(simulated_face, tmp_path, Delivery(mesh=head))
     assert list(tmp_path.iterdir()) == []
 

@@ -1,0 +1,177 @@
+"""One rule of exit codes for all commands: 2 where words cannot be read, 3 where they can."""
+
+import json
+
+import pytest
+import typer
+
+from skinrig import errors
+from skinrig.cli import app, main
+
+SPEECHLESS = ("demo", "doctor", "view", "bench")
+"""Commands that need no argument at all."""
+
+UNREADABLE = {
+    "demo": ["--seed one"],
+    "doctor": ["extra"],
+    "plan": ["dome --want normals<=soon", "probe --width 100", "flash --most-lights 3"],
+    "simulate": [
+        "flash", "flash --out x --width wide", "dome --out x --condition cold=very",
+        "flash --out x --lights 4", "flash --out x --condition cold", "gradient --out x --steps 3",
+        "gradient --out x --angles a", "flash --out x --relaxation 3",
+        "flash --out x --target white --nearer 3", "probe --out x --sequence smile",
+        "flash --out x --consent-expires 2020", "flash --out x --captures 3",
+    ],
+    "capture": [
+        "flash --out x", "flash --out x --port a", "gradient --dry-run --steps 1",
+        "flash --dry-run --sites cheek",
+    ],
+    "serve": ["flash --tcp here", "flash --site cheek"],
+    "verify": ["a b"],
+    "calibrate": ["sensor"],
+    "reconstruct": ["s --out a", "s --want melanin --out a --rank some"],
+    "bench": ["--budget long", "--extremes --toy"],
+    "render": [
+        "maps --out r", "maps --light 1,1,1 --target 0,0 --view 0,0,9 --out r",
+        "maps --light L017*bright --out r",
+    ],
+    "edit": ["maps --out e", "maps --out e --trait tan", "maps --out e --spots moles=lots"],
+    "report": ["maps -o - --json"],
+    "view": ["--port here", "--displacement d.npy"],
+    "export": ["maps --out e", "maps --to rgl --use research --out e --at here"],
+    "fit traits": ["a b --out t"],
+    "fit reflectance": ["--out t"],
+    "fit facial-color": ["s"],
+    "fit wrinkles": ["a"],
+    "fit microstructure": ["a"],
+    "import photos": ["d"],
+    "import lp": ["d"],
+    "import mesh": ["m.obj"],
+    "apply expression": ["moving --weights smile --out a"],
+    "apply microstructure": ["a --out b"],
+    "analyse albedo": ["maps --out a", "--labels l.csv --out a"],
+    "analyse brdf": ["--out a --labels l.csv"],
+}  # fmt: skip
+"""What no file could make right."""
+
+UNUSABLE = {
+    "demo": ["--rigs submarine", "--out file.txt", "--seed -1"],
+    "plan": [
+        "teapot", "probe --subject none.toml", "dome --want gloss<=1", "dome --want normals<=-1",
+        "dome --subject XX",
+        "dome --seed -1", "dome --most-lights 0", "dome --valid-share 2", "dome --width 3",
+        "dome --forecast none.json", "dome --out folder",
+    ],
+    "simulate": [
+        "teapot --out x", "flash --out x --size huge", "flash --out x --subject XX",
+        "flash --out x --seed -1", "flash --out x --width 3", "flash --out x --target moon",
+        "flash --out x --state happy", "flash --out x --mesh none.obj", "dome --out x --lights 0",
+        "flash --out x --leave-out gold", "flash --out x --nearer inf", "dome --out x --views 400",
+        "flash --out x --sequence tea", "dome --out x --condition mud",
+        "dome --out x --condition cold=2", "gradient --out x --site nose",
+        "gradient --out x --angles 3", "gradient --out x --steps 3..1",
+        "probe --out x --subject homogeneous:1",
+        "flash --out x --subject none.toml", "dome --out x --subject none.toml",
+    ],
+    "capture": [
+        "teapot --dry-run", "flash --dry-run --plan none", "flash --dry-run --repeats 0",
+        "dome --dry-run --eyes shut", "gradient --out x --force-limit -1",
+    ],
+    "serve": ["teapot", "flash --subject XX", "flash --size huge"],
+    "verify": ["none", "file.txt", "folder"],
+    "calibrate": ["taste folder", "sensor none"],
+    "reconstruct": ["none --want melanin --out a", "none --want normals --out a --rank 1000"],
+    "bench": ["--stage coffee", "--budget 0", "--out file.txt"],
+    "render": [
+        "folder --light 1,1,1 --out r", "folder --light 1,1,1 --exposure 0 --out r",
+        "folder --light 1,1,1 --samples 3 --out r", "folder --light 1,1,1 --subsurface wax --out r",
+        "folder --light 1,1,1 --calibration none --out r",
+    ],
+    "edit": ["none --out e --trait tan=1", "folder --out e --trait tan=1 --seed -1"],
+    "report": ["none", "file.txt", "folder", "folder -o folder"],
+    "view": ["none", "folder", "--port 70000", "--preset XX", "--size 3"],
+    "export": ["none --to maps --use research --out e", "folder --to fbx --use research --out e"],
+    "fit traits": ["none folder --labels l.csv --out t"],
+    "fit reflectance": ["none --out t"],
+    "fit facial-color": ["none --out m"],
+    "fit wrinkles": ["none --out m"],
+    "fit microstructure": ["none --out m"],
+    "import photos": ["none --out s", "folder --out s", "file.txt --out s"],
+    "import lp": ["none --out s", "folder --out s"],
+    "import mesh": ["none --session none", "file.txt --session folder"],
+    "apply expression": ["none --weights smile=1 --out a"],
+    "apply microstructure": ["none --weights smile=1 --mesh none.obj --out a"],
+    "analyse albedo": ["none folder --out a"],
+    "analyse brdf": ["none folder --out a"],
+}  # fmt: skip
+"""What another name, number or file would make right."""
+
+
+def leaves(command, name=()):
+    """Return the names of all commands, those of groups with the group's before."""
+    if not hasattr(command, "commands"):
+        return [" ".join(name)]
+    return [leaf for word, one in command.commands.items() for leaf in leaves(one, (*name, word))]
+
+
+COMMANDS = leaves(typer.main.get_command(app))
+
+
+def cases(table):
+    return [pytest.param([*name.split(), *tail.split()], id=f"{name} {tail}")
+            for name, tails in table.items() for tail in tails]  # fmt: skip
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file.txt").write_text("no session", encoding="utf-8")
+    (tmp_path / "folder").mkdir()
+    return tmp_path
+
+
+def told(capsys):
+    out, err = capsys.readouterr()
+    assert "Traceback" not in err
+    document = json.loads(out)
+    assert document["schema"] == "skinrig.error/1"
+    assert document["error"]
+    return document["exit_code"]
+
+
+def test_every_command_is_held_to_the_rule():
+    assert set(UNREADABLE) == set(COMMANDS)
+    assert set(UNUSABLE) == set(COMMANDS) - {"doctor"}  # which names nothing
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_words_of_every_command_are_checked_alike(name, here, capsys):
+    assert main([*name.split(), "--help"]) == errors.DONE
+    assert "Usage:" in capsys.readouterr().out
+    assert main([*name.split(), "--no-such-option", "--json"]) == errors.USAGE
+    assert told(capsys) == errors.USAGE
+    if name not in SPEECHLESS:
+        assert main([*name.split(), "--json"]) == errors.USAGE
+        assert told(capsys) == errors.USAGE
+
+
+@pytest.mark.parametrize("argv", cases(UNREADABLE))
+def test_words_that_no_file_could_make_right_end_with_2(argv, here, capsys):
+    assert main(argv if "--json" in argv else [*argv, "--json"]) == errors.USAGE
+    assert told(capsys) == errors.USAGE
+    assert sorted(path.name for path in here.iterdir()) == ["file.txt", "folder"]
+
+
+@pytest.mark.parametrize("argv", cases(UNUSABLE))
+def test_names_numbers_and_files_of_no_use_end_with_3(argv, here, capsys):
+    assert main([*argv, "--json"]) == errors.BAD_INPUT
+    assert told(capsys) == errors.BAD_INPUT
+    assert sorted(path.name for path in here.iterdir()) == ["file.txt", "folder"]
+
+
+def test_the_help_tells_every_exit_code(capsys):
+    assert main(["--help"]) == errors.DONE
+    said = " ".join(capsys.readouterr().out.split())
+    assert errors.CODES in said
+    for code in (0, 1, 2, 3, 4, 5, 70, 130):
+        assert f"{code} " in errors.CODES
