@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -48,11 +49,10 @@ def load(key: str, path: str) -> Float32Array:
     where = f"{key}: {path}"
     if path.endswith(".npy"):
         try:
-            values = np.load(path, allow_pickle=False)
+            with Path(path).open("rb") as stream:  # np.load takes archives of arrays, too
+                values = np.lib.format.read_array(stream, allow_pickle=False)
         except (ValueError, EOFError, OSError) as error:
             raise SubjectFileError(f"{where}: is no .npy file ({error})") from error
-        if not isinstance(values, np.ndarray):
-            raise SubjectFileError(f"{where}: is an archive of arrays, expected one array")
     elif path.endswith(".exr"):
         from model.store import StoreError, read_exr
 
