@@ -34,7 +34,7 @@ def test_bash_asks_and_is_refused_a_bare_command(served):
     url = served.addresses["flash"]
     path = url.replace("socket://", "/dev/tcp/").replace(":", "/")
     run = subprocess.run(
-        [bash, "-c", f"exec 3<>{path}\n{SCRIPT}"], capture_output=True, text=True, timeout=20
+        [bash, "-c", f"exec 3<>{path}\n{SCRIPT}"], capture_output=True, text=True, timeout=120
     )
     assert run.stdout.splitlines() == ANSWERS, run.stderr
     assert served.world.pops == []

@@ -40,7 +40,7 @@ def test_bash_asks_and_is_refused_a_bare_command(served, name):
     for text, answers in (("*IDN?", 1), (ACT[name], 0), ("SYST:ERR?", 1), (query, 1)):
         script += f"printf '{text}\\n' >&3\n"
         script += 'read -r -t 5 -u 3 line; echo "$line"\n' * answers
-    run = subprocess.run([bash, "-c", script], capture_output=True, text=True, timeout=20)
+    run = subprocess.run([bash, "-c", script], capture_output=True, text=True, timeout=120)
     assert run.stdout.splitlines() == [IDN[name], '203,"Unframed command"', answer], run.stderr
     assert served.world.patterns == []
     assert served.world.box("caliper").device.moves == []

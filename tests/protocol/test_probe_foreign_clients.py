@@ -33,7 +33,7 @@ def test_bash_asks_and_is_refused_a_bare_command(served):
     for text, answers in asked:
         script += f"printf '{text}\\n' >&3\n"
         script += 'read -r -t 5 -u 3 line; echo "$line"\n' * answers
-    run = subprocess.run([bash, "-c", script], capture_output=True, text=True, timeout=20)
+    run = subprocess.run([bash, "-c", script], capture_output=True, text=True, timeout=120)
     unframed = '203,"Unframed command"'
     expected = [IDN, unframed, unframed, '0,"No error"', "NONE"]
     assert run.stdout.splitlines() == expected, run.stderr
