@@ -7,14 +7,25 @@ are distributed over the face, the ridge is that of the product, and each line i
 the face's blood too. `reconstruction.chromophore_posterior` is the door;
 `reconstruction.chromophore_reference` sums the same over a dense plane and is what this is tested
 against.
+
+A pixel goes through `_weights`, `_follow`, `_lowest`, `_look_across` and `_sum_up`. These hand on:
+
+- `seen`: natural logarithms of the pixel's color;
+- `w`, `s`: of `_weights`;
+- `light`: -2 log probability of log shading at even nodes, the first of them, and their step;
+- `k`: a line of equal melanin; `a`, `b`: fractions of the melanin and the blood axis, cube roots of
+  volume fractions over the largest;
+- `between`: the lowest cost between each line and the next, of `_lowest`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, types, void
+from numpy.typing import NDArray
 
 from reconstruction.chromophore_lines import LINES, NODES, PER_LINE
 from reconstruction.chromophore_start import LOWEST
@@ -64,6 +75,44 @@ _STEP_A = (1.0 - _LOW) / (LINES - 1)
 _STEP_B = (1.0 - _LOW) / (NODES - 1)
 _ROOM = (LINES - 1) * FEWEST + FINE
 _FAST = {"contract"}
+
+Floats = NDArray[np.float64]
+
+
+class _Ridge(NamedTuple):
+    """What is found on each line, (LINES,) each: the ridge, where blood fits the color best."""
+
+    cost: Floats
+    """-2 log of the likelihood and of the face's blood there."""
+    slope: Floats
+    """Its derivative by the fraction of the melanin axis, along the ridge."""
+    shade: Floats
+    """Log shading."""
+    face_cost: Floats
+    """The face's part of the cost."""
+    blood: Floats
+    blood_slope: Floats
+    second: Floats
+    """Blood of another place on the line that matters, else that of the ridge."""
+    spread: Floats
+    """Standard deviation of blood by the curvature."""
+    pull: Floats
+    """Step that would be left where an end of the axis holds the ridge; else 0."""
+
+
+class _Beside(NamedTuple):
+    """How probability spreads over blood on each line, across the ridge."""
+
+    across: Floats
+    """(LINES, ACROSS): probability of each place, relative to the ridge's."""
+    low: Floats
+    """(LINES,): where the first place begins."""
+    width: Floats
+    """(LINES,): of a place."""
+    wide: NDArray[np.bool_]
+    """(LINES,): the curvature says little, see `WIDE`."""
+    coarse: Floats
+    """(COARSE,): costs on one wide line."""
 
 
 @njit(fastmath=_FAST)
@@ -226,6 +275,242 @@ def _center_and_reach(edges, total, count):  # type: ignore[no-untyped-def]
     return center, 0.5 * (low + high)
 
 
+@njit(fastmath=_FAST, error_model="numpy")
+def _weights(d0, d1, d2, noise, model):  # type: ignore[no-untyped-def]
+    """Return the weights of relative errors of a color, brightness projected out, and its own.
+
+    The first is the upper triangle of a matrix of rank 2; the second tells a log brightness from
+    log residuals.
+    """
+    a00 = noise[0] / (d0 * d0) + model[0]
+    a11 = noise[1] / (d1 * d1) + model[3]
+    a22 = noise[2] / (d2 * d2) + model[5]
+    a01, a02, a12 = model[1], model[2], model[4]
+    c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
+    scale = 1.0 / (a00 * c00 + a01 * c01 + a02 * c02)
+    w0, w1, w2 = c00 * scale, c01 * scale, c02 * scale
+    w3 = (a00 * a22 - a02 * a02) * scale
+    w4 = (a01 * a02 - a00 * a12) * scale
+    w5 = (a00 * a11 - a01 * a01) * scale
+    s0, s1, s2 = w0 + w1 + w2, w1 + w3 + w4, w2 + w4 + w5
+    whole = s0 + s1 + s2
+    s0, s1, s2 = s0 / whole, s1 / whole, s2 / whole
+    w = (
+        w0 - s0 * s0 * whole,
+        w1 - s0 * s1 * whole,
+        w2 - s0 * s2 * whole,
+        w3 - s1 * s1 * whole,
+        w4 - s1 * s2 * whole,
+        w5 - s2 * s2 * whole,
+    )
+    return w, (s0, s1, s2)
+
+
+@njit(fastmath=_FAST, error_model="numpy")
+def _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin, ridge):  # type: ignore[no-untyped-def]
+    """Write the ridge, followed to both sides of where the fit ended."""
+    cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.shade, ridge.face_cost
+    blood, blood_slope, second = ridge.blood, ridge.blood_slope, ridge.second
+    spread, pull = ridge.spread, ridge.pull
+    prior, prior_low, prior_step = light
+    first = min(max(int((begin[0] - _LOW) / _STEP_A + 0.5), 0), LINES - 1)
+    for side in range(2):
+        b = float64(begin[1])
+        if side == 1:
+            b = blood[first]
+        count = LINES - first if side == 0 else first
+        for index in range(count):
+            k = first + index if side == 0 else first - 1 - index
+            found = _descend(log_rgb, by_b, k, b, seen, w, blood_of_face)
+            after, least, more, t, held = _cost_after(w, s, found, blood_of_face)
+            b, second[k] = found[0], after
+            if abs(after - blood_of_face[0]) > 2.0 * blood_of_face[1]:
+                # the same melanin may have the color with blood that the face has
+                other = _descend(log_rgb, by_b, k, blood_of_face[0], seen, w, blood_of_face)
+                o_after, o_least, o_more, o_t, o_held = _cost_after(w, s, other, blood_of_face)
+                better = least + _prior_cost(prior, prior_low, prior_step, t)
+                better -= o_least + _prior_cost(prior, prior_low, prior_step, o_t)
+                if better > 0.0:
+                    second[k] = after if better < FAR else o_after
+                    found, after, least, more, t, held = (
+                        other, o_after, o_least, o_more, o_t, o_held
+                    )  # fmt: skip
+                elif better > -FAR:
+                    second[k] = o_after
+            _, step, _, stiff, _, e0, e1, e2, g0, g1, g2, j, x = found
+            h0 = by_a[k, j, 0] + x * (by_a[k, j + 1, 0] - by_a[k, j, 0])
+            h1 = by_a[k, j, 1] + x * (by_a[k, j + 1, 1] - by_a[k, j, 1])
+            h2 = by_a[k, j, 2] + x * (by_a[k, j + 1, 2] - by_a[k, j, 2])
+            blood_slope[k] = 0.0 if held else -_form(w, h0, h1, h2, g0, g1, g2) / stiff
+            spread[k] = 1.0 / math.sqrt(stiff)
+            pull[k] = step if held else 0.0
+            cost[k], face_cost[k], blood[k] = least, more, after
+            o0, o1, o2 = e0, e1, e2
+            if not held:
+                o0, o1, o2 = e0 - g0 * step, e1 - g1 * step, e2 - g2 * step
+            slope[k] = -2.0 * _form(w, h0, h1, h2, o0, o1, o2)
+            shade[k] = t
+
+
+@njit(fastmath=_FAST, error_model="numpy")
+def _lowest(ridge, light, melanin_of_face, between):  # type: ignore[no-untyped-def]
+    """Return the lowest cost along the ridge, and of colors alone; write it between the lines."""
+    cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.shade, ridge.face_cost
+    prior, prior_low, prior_step = light
+    lowest, color_lowest = np.inf, np.inf
+    for k in range(LINES - 1):
+        least = np.inf
+        for i in range(PROBES + 1):
+            x = float64(i) / PROBES
+            value, _ = _hermite(cost[k], cost[k + 1], slope[k], slope[k + 1], x, _STEP_A)
+            value = max(value, 0.0)
+            more = face_cost[k] + x * (face_cost[k + 1] - face_cost[k])
+            color_lowest = min(color_lowest, max(value - more, 0.0))
+            t = shade[k] + x * (shade[k + 1] - shade[k])
+            value += _prior_cost(prior, prior_low, prior_step, t)
+            value += _melanin_cost(melanin_of_face, k, x)
+            least = min(least, value)
+        between[k] = least
+        lowest = min(lowest, least)
+    return lowest, color_lowest
+
+
+@njit(fastmath=_FAST, error_model="numpy")
+def _look_across(  # type: ignore[no-untyped-def]
+    log_rgb, by_b, seen, w, s, light, blood_of_face, between, lowest, ridge, beside_ridge
+):
+    """Write how probability spreads over blood on each line that matters; return ends of blood."""
+    cost, shade, blood, second = ridge.cost, ridge.shade, ridge.blood, ridge.second
+    spread, pull = ridge.spread, ridge.pull
+    across, coarse, wide = beside_ridge.across, beside_ridge.coarse, beside_ridge.wide
+    across_low, across_width = beside_ridge.low, beside_ridge.width
+    l0, l1, l2 = seen
+    s0, s1, s2 = s
+    prior, prior_low, prior_step = light
+    b_low, b_high = 1.0, _LOW
+    for k in range(LINES):
+        beside = min(between[max(k - 1, 0)], between[min(k, LINES - 2)])
+        if not beside < lowest + NEGLIGIBLE:
+            continue
+        b = blood[k]
+        reach = 2.6 * spread[k]
+        if pull[k] != 0.0:
+            reach = min(reach, 5.0 * spread[k] * spread[k] / abs(pull[k]))
+        low = max(min(b, second[k]) - reach, _LOW)
+        high = min(max(b, second[k]) + reach, 1.0)
+        wide[k] = high - low > WIDE
+        if wide[k]:
+            # The curvature says little of the far ends: look where probability ends.
+            width = (1.0 - _LOW) / COARSE
+            least = np.inf
+            for i in range(COARSE):
+                f0, f1, f2 = _color(log_rgb, by_b, k, _LOW + (i + 0.5) * width)[:3]
+                e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
+                t = s0 * e0 + s1 * e1 + s2 * e2
+                value = _form(w, e0, e1, e2, e0, e1, e2)
+                value += _prior_cost(prior, prior_low, prior_step, t)
+                more, _, _ = _blood_cost(blood_of_face, _LOW + (i + 0.5) * width)
+                value += more
+                coarse[i] = value
+                least = min(least, value)
+            low, high = 1.0, _LOW
+            for i in range(COARSE):
+                if coarse[i] < least + FAR:
+                    low = min(low, _LOW + max(i - 0.5, 0.0) * width)
+                    high = max(high, _LOW + min(i + 1.5, COARSE + 0.0) * width)
+        width = (high - low) / ACROSS
+        across_low[k], across_width[k] = low, width
+        if beside < lowest + 10.0:
+            b_low, b_high = min(b_low, low), max(b_high, high)
+        here = cost[k] + _prior_cost(prior, prior_low, prior_step, shade[k])
+        deepest = 0.0
+        for i in range(ACROSS):
+            f0, f1, f2 = _color(log_rgb, by_b, k, low + (i + 0.5) * width)[:3]
+            e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
+            t = s0 * e0 + s1 * e1 + s2 * e2
+            more, _, _ = _blood_cost(blood_of_face, low + (i + 0.5) * width)
+            more += _form(w, e0, e1, e2, e0, e1, e2) - here
+            more += _prior_cost(prior, prior_low, prior_step, t)
+            across[k, i] = width * math.exp(-0.5 * max(more, -NEGLIGIBLE))
+            deepest = min(deepest, max(more, -NEGLIGIBLE))
+        if deepest < -MISSED:
+            # The ridge is not where the probability is; what lines have must not differ by
+            # much more than their neighbors', or the sum between them is of neither.
+            cost[k] += deepest
+            for i in range(ACROSS):
+                across[k, i] *= math.exp(0.5 * deepest)
+    return b_low, b_high
+
+
+@njit(fastmath=_FAST, error_model="numpy")
+def _sum_up(  # type: ignore[no-untyped-def]
+    ridge, beside_ridge, between, lowest, light, melanin_of_face, end, b_low, b_high, sums
+):
+    """Sum over melanin along the ridge, and over blood across it.
+
+    Returns how many edges there are along melanin, the sum of log shadings, and bins a blood.
+    """
+    cost, slope, shade = ridge.cost, ridge.slope, ridge.shade
+    blood, blood_slope = ridge.blood, ridge.blood_slope
+    across, wide = beside_ridge.across, beside_ridge.wide
+    across_low, across_width = beside_ridge.low, beside_ridge.width
+    edges_a, total_a, bins = sums
+    prior, prior_low, prior_step = light
+    live = 0
+    for k in range(LINES - 1):
+        live += between[k] < lowest + NEGLIGIBLE
+    per_b = BINS / max(b_high - b_low, 1e-9)
+    bins[:] = 0.0
+    each = max(FEWEST, FINE // live)
+    count = 0
+    total_a[0] = 0.0
+    mean_shade = 0.0
+    for k in range(LINES - 1):
+        if not between[k] < lowest + NEGLIGIBLE:
+            continue
+        if count > 0 and not between[k - 1] < lowest + NEGLIGIBLE:
+            # a gap without probability
+            count += 1
+            total_a[count] = total_a[count - 1]
+        edges_a[count] = _volume(k, 0.0, end)
+        for f in range(each):
+            x = (f + 0.5) / each
+            value, _ = _hermite(cost[k], cost[k + 1], slope[k], slope[k + 1], x, _STEP_A)
+            t = shade[k] + x * (shade[k + 1] - shade[k])
+            value = max(value, min(0.0, cost[k], cost[k + 1]))
+            value += _prior_cost(prior, prior_low, prior_step, t) - lowest
+            value += _melanin_cost(melanin_of_face, k, x)
+            mass = 0.0
+            if value < NEGLIGIBLE:
+                # every ratio of melanin is as likely as any other
+                weight = math.exp(-0.5 * value) / (each * (_LOW + (k + x) * _STEP_A))
+                b = (1.0 - x) * across_low[k] + x * across_low[k + 1]
+                if not (wide[k] or wide[k + 1]):
+                    bent, _ = _hermite(
+                        blood[k], blood[k + 1], blood_slope[k], blood_slope[k + 1], x,
+                        _STEP_A,
+                    )  # fmt: skip
+                    b += bent - (1.0 - x) * blood[k] - x * blood[k + 1]
+                width = across_width[k] + x * (across_width[k + 1] - across_width[k])
+                place, size = (b - b_low) * per_b, width * per_b
+                for i in range(ACROSS):
+                    part = weight * (across[k, i] + x * (across[k + 1, i] - across[k, i]))
+                    mass += part
+                    # one of the places fills as many bins as it is wide
+                    start = min(max(place + i * size, 0.0), BINS - 0.001)
+                    stop = min(max(place + (i + 1) * size, start + 0.001), float64(BINS))
+                    density = part / (stop - start)
+                    m = int(start)
+                    while m < stop:
+                        bins[m] += density * (min(stop, m + 1.0) - max(start, float64(m)))
+                        m += 1
+                mean_shade += mass * t
+            count += 1
+            edges_a[count] = _volume(k, (f + 1.0) / each, end)
+            total_a[count] = total_a[count - 1] + mass
+    return count, mean_shade, per_b
+
+
 def _given(dtype: types.Type, axes: int) -> types.Array:
     """Return the type of a contiguous argument that is only read, and may be read-only."""
     return types.Array(dtype, axes, "C", readonly=True)
@@ -278,17 +563,18 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
     """Weigh the chromophores of every pixel; the shapes are in the signature above."""
     pixels = rgb.shape[0]
     each_model = model.shape[0] > 1
+    light = prior, prior_low, prior_step
     for task in prange((pixels + block - 1) // block):
-        cost, slope = np.empty(LINES), np.empty(LINES)
-        blood, blood_slope = np.empty(LINES), np.empty(LINES)
-        spread, pull = np.empty(LINES), np.empty(LINES)
-        second = np.empty(LINES)
-        shade, face_cost = np.empty(LINES), np.empty(LINES)
+        ridge = _Ridge(
+            np.empty(LINES), np.empty(LINES), np.empty(LINES), np.empty(LINES), np.empty(LINES),
+            np.empty(LINES), np.empty(LINES), np.empty(LINES), np.empty(LINES),
+        )  # fmt: skip
+        beside = _Beside(
+            np.empty((LINES, ACROSS)), np.empty(LINES), np.empty(LINES),
+            np.empty(LINES, dtype=np.bool_), np.empty(COARSE),
+        )  # fmt: skip
         between = np.empty(LINES - 1)
         edges_a, total_a = np.empty(_ROOM + LINES), np.empty(_ROOM + LINES)
-        across, coarse = np.empty((LINES, ACROSS)), np.empty(COARSE)
-        wide = np.empty(LINES, dtype=np.bool_)
-        across_low, across_width = np.empty(LINES), np.empty(LINES)
         edges_b, total_b = np.empty(BINS + 1), np.empty(BINS + 1)
         bins = np.empty(BINS)
         for n in range(task * block, min(pixels, (task + 1) * block)):
@@ -297,196 +583,17 @@ def weigh_pixels(  # type: ignore[no-untyped-def]
                     maps[m, n] = np.nan
                 continue
             d0, d1, d2 = float64(rgb[n, 0]), float64(rgb[n, 1]), float64(rgb[n, 2])
-            l0, l1, l2 = math.log(d0), math.log(d1), math.log(d2)
-            # Weights of the relative errors, with the brightness projected out of them.
-            q = n if each_model else 0
-            a00 = variance[n, 0] / (d0 * d0) + model[q, 0]
-            a11 = variance[n, 1] / (d1 * d1) + model[q, 3]
-            a22 = variance[n, 2] / (d2 * d2) + model[q, 5]
-            a01, a02, a12 = model[q, 1], model[q, 2], model[q, 4]
-            c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
-            scale = 1.0 / (a00 * c00 + a01 * c01 + a02 * c02)
-            w0, w1, w2 = c00 * scale, c01 * scale, c02 * scale
-            w3 = (a00 * a22 - a02 * a02) * scale
-            w4 = (a01 * a02 - a00 * a12) * scale
-            w5 = (a00 * a11 - a01 * a01) * scale
-            s0, s1, s2 = w0 + w1 + w2, w1 + w3 + w4, w2 + w4 + w5
-            whole = s0 + s1 + s2
-            s0, s1, s2 = s0 / whole, s1 / whole, s2 / whole
-            w = (
-                w0 - s0 * s0 * whole,
-                w1 - s0 * s1 * whole,
-                w2 - s0 * s2 * whole,
-                w3 - s1 * s1 * whole,
-                w4 - s1 * s2 * whole,
-                w5 - s2 * s2 * whole,
+            seen = math.log(d0), math.log(d1), math.log(d2)
+            w, s = _weights(d0, d1, d2, variance[n], model[n if each_model else 0])
+            _follow(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, begin[n], ridge)
+            lowest, color_lowest = _lowest(ridge, light, melanin_of_face, between)
+            b_low, b_high = _look_across(
+                log_rgb, by_b, seen, w, s, light, blood_of_face, between, lowest, ridge, beside
             )
-            # Follow the ridge to both sides of where the fit ended.
-            first = min(max(int((begin[n, 0] - _LOW) / _STEP_A + 0.5), 0), LINES - 1)
-            for side in range(2):
-                b = float64(begin[n, 1])
-                if side == 1:
-                    b = blood[first]
-                count = LINES - first if side == 0 else first
-                for index in range(count):
-                    k = first + index if side == 0 else first - 1 - index
-                    found = _descend(log_rgb, by_b, k, b, (l0, l1, l2), w, blood_of_face)
-                    after, least, more, t, held = _cost_after(w, (s0, s1, s2), found, blood_of_face)
-                    b, second[k] = found[0], after
-                    if abs(after - blood_of_face[0]) > 2.0 * blood_of_face[1]:
-                        # the same melanin may have the color with blood that the face has
-                        other = _descend(
-                            log_rgb, by_b, k, blood_of_face[0], (l0, l1, l2), w, blood_of_face
-                        )
-                        o_after, o_least, o_more, o_t, o_held = _cost_after(
-                            w, (s0, s1, s2), other, blood_of_face
-                        )
-                        better = least + _prior_cost(prior, prior_low, prior_step, t)
-                        better -= o_least + _prior_cost(prior, prior_low, prior_step, o_t)
-                        if better > 0.0:
-                            second[k] = after if better < FAR else o_after
-                            found, after, least, more, t, held = (
-                                other, o_after, o_least, o_more, o_t, o_held
-                            )  # fmt: skip
-                        elif better > -FAR:
-                            second[k] = o_after
-                    _, step, _, stiff, _, e0, e1, e2, g0, g1, g2, j, x = found
-                    h0 = by_a[k, j, 0] + x * (by_a[k, j + 1, 0] - by_a[k, j, 0])
-                    h1 = by_a[k, j, 1] + x * (by_a[k, j + 1, 1] - by_a[k, j, 1])
-                    h2 = by_a[k, j, 2] + x * (by_a[k, j + 1, 2] - by_a[k, j, 2])
-                    blood_slope[k] = 0.0 if held else -_form(w, h0, h1, h2, g0, g1, g2) / stiff
-                    spread[k] = 1.0 / math.sqrt(stiff)
-                    pull[k] = step if held else 0.0
-                    cost[k], face_cost[k], blood[k] = least, more, after
-                    o0, o1, o2 = e0, e1, e2
-                    if not held:
-                        o0, o1, o2 = e0 - g0 * step, e1 - g1 * step, e2 - g2 * step
-                    slope[k] = -2.0 * _form(w, h0, h1, h2, o0, o1, o2)
-                    shade[k] = t
-            # The lowest cost, and between which lines there is probability at all.
-            lowest, color_lowest = np.inf, np.inf
-            for k in range(LINES - 1):
-                least = np.inf
-                for i in range(PROBES + 1):
-                    x = float64(i) / PROBES
-                    value, _ = _hermite(cost[k], cost[k + 1], slope[k], slope[k + 1], x, _STEP_A)
-                    value = max(value, 0.0)
-                    more = face_cost[k] + x * (face_cost[k + 1] - face_cost[k])
-                    color_lowest = min(color_lowest, max(value - more, 0.0))
-                    t = shade[k] + x * (shade[k + 1] - shade[k])
-                    value += _prior_cost(prior, prior_low, prior_step, t)
-                    value += _melanin_cost(melanin_of_face, k, x)
-                    least = min(least, value)
-                between[k] = least
-                lowest = min(lowest, least)
-            live = 0
-            for k in range(LINES - 1):
-                live += between[k] < lowest + NEGLIGIBLE
-            # On each line that matters: how probability spreads over blood, across the ridge.
-            b_low, b_high = 1.0, _LOW
-            for k in range(LINES):
-                beside = min(between[max(k - 1, 0)], between[min(k, LINES - 2)])
-                if not beside < lowest + NEGLIGIBLE:
-                    continue
-                b = blood[k]
-                reach = 2.6 * spread[k]
-                if pull[k] != 0.0:
-                    reach = min(reach, 5.0 * spread[k] * spread[k] / abs(pull[k]))
-                low = max(min(b, second[k]) - reach, _LOW)
-                high = min(max(b, second[k]) + reach, 1.0)
-                wide[k] = high - low > WIDE
-                if wide[k]:
-                    # The curvature says little of the far ends: look where probability ends.
-                    width = (1.0 - _LOW) / COARSE
-                    least = np.inf
-                    for i in range(COARSE):
-                        f0, f1, f2, g0, g1, g2, j, x = _color(
-                            log_rgb, by_b, k, _LOW + (i + 0.5) * width
-                        )
-                        e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
-                        t = s0 * e0 + s1 * e1 + s2 * e2
-                        value = _form(w, e0, e1, e2, e0, e1, e2)
-                        value += _prior_cost(prior, prior_low, prior_step, t)
-                        more, _, _ = _blood_cost(blood_of_face, _LOW + (i + 0.5) * width)
-                        value += more
-                        coarse[i] = value
-                        least = min(least, value)
-                    low, high = 1.0, _LOW
-                    for i in range(COARSE):
-                        if coarse[i] < least + FAR:
-                            low = min(low, _LOW + max(i - 0.5, 0.0) * width)
-                            high = max(high, _LOW + min(i + 1.5, COARSE + 0.0) * width)
-                width = (high - low) / ACROSS
-                across_low[k], across_width[k] = low, width
-                if beside < lowest + 10.0:
-                    b_low, b_high = min(b_low, low), max(b_high, high)
-                here = cost[k] + _prior_cost(prior, prior_low, prior_step, shade[k])
-                deepest = 0.0
-                for i in range(ACROSS):
-                    f0, f1, f2, g0, g1, g2, j, x = _color(log_rgb, by_b, k, low + (i + 0.5) * width)
-                    e0, e1, e2 = l0 - f0, l1 - f1, l2 - f2
-                    t = s0 * e0 + s1 * e1 + s2 * e2
-                    more, _, _ = _blood_cost(blood_of_face, low + (i + 0.5) * width)
-                    more += _form(w, e0, e1, e2, e0, e1, e2) - here
-                    more += _prior_cost(prior, prior_low, prior_step, t)
-                    across[k, i] = width * math.exp(-0.5 * max(more, -NEGLIGIBLE))
-                    deepest = min(deepest, max(more, -NEGLIGIBLE))
-                if deepest < -MISSED:
-                    # The ridge is not where the probability is; what lines have must not differ by
-                    # much more than their neighbors', or the sum between them is of neither.
-                    cost[k] += deepest
-                    for i in range(ACROSS):
-                        across[k, i] *= math.exp(0.5 * deepest)
-            per_b = BINS / max(b_high - b_low, 1e-9)
-            bins[:] = 0.0
-            # Sum over melanin along the ridge, and over blood across it.
-            each = max(FEWEST, FINE // live)
-            count = 0
-            total_a[0] = 0.0
-            mean_shade = 0.0
-            for k in range(LINES - 1):
-                if not between[k] < lowest + NEGLIGIBLE:
-                    continue
-                if count > 0 and not between[k - 1] < lowest + NEGLIGIBLE:
-                    # a gap without probability
-                    count += 1
-                    total_a[count] = total_a[count - 1]
-                edges_a[count] = _volume(k, 0.0, ends[0])
-                for f in range(each):
-                    x = (f + 0.5) / each
-                    value, _ = _hermite(cost[k], cost[k + 1], slope[k], slope[k + 1], x, _STEP_A)
-                    t = shade[k] + x * (shade[k + 1] - shade[k])
-                    value = max(value, min(0.0, cost[k], cost[k + 1]))
-                    value += _prior_cost(prior, prior_low, prior_step, t) - lowest
-                    value += _melanin_cost(melanin_of_face, k, x)
-                    mass = 0.0
-                    if value < NEGLIGIBLE:
-                        # every ratio of melanin is as likely as any other
-                        weight = math.exp(-0.5 * value) / (each * (_LOW + (k + x) * _STEP_A))
-                        b = (1.0 - x) * across_low[k] + x * across_low[k + 1]
-                        if not (wide[k] or wide[k + 1]):
-                            bent, _ = _hermite(
-                                blood[k], blood[k + 1], blood_slope[k], blood_slope[k + 1], x,
-                                _STEP_A,
-                            )  # fmt: skip
-                            b += bent - (1.0 - x) * blood[k] - x * blood[k + 1]
-                        width = across_width[k] + x * (across_width[k + 1] - across_width[k])
-                        place, size = (b - b_low) * per_b, width * per_b
-                        for i in range(ACROSS):
-                            part = weight * (across[k, i] + x * (across[k + 1, i] - across[k, i]))
-                            mass += part
-                            # one of the places fills as many bins as it is wide
-                            start = min(max(place + i * size, 0.0), BINS - 0.001)
-                            stop = min(max(place + (i + 1) * size, start + 0.001), float64(BINS))
-                            density = part / (stop - start)
-                            m = int(start)
-                            while m < stop:
-                                bins[m] += density * (min(stop, m + 1.0) - max(start, float64(m)))
-                                m += 1
-                        mean_shade += mass * t
-                    count += 1
-                    edges_a[count] = _volume(k, (f + 1.0) / each, ends[0])
-                    total_a[count] = total_a[count - 1] + mass
+            count, mean_shade, per_b = _sum_up(
+                ridge, beside, between, lowest, light, melanin_of_face, ends[0], b_low, b_high,
+                (edges_a, total_a, bins),
+            )  # fmt: skip
             edges_b[0], total_b[0] = ends[1] * b_low**3, 0.0
             for m in range(BINS):
                 edges_b[m + 1] = ends[1] * (b_low + (m + 1) / per_b) ** 3
