@@ -243,9 +243,11 @@ def gather(
     def one(start: int) -> None:
         part = slice(start, start + _CHUNK)
         media = Media.of(albedo[part], length[part], eta=eta)
+        here = np.ascontiguousarray(own[part]).view()
+        here.flags.writeable = False  # what may be written would have the kernel compiled anew
         dipole_gather_kernels.gather(
             (at[part] - tree.center_mm).astype(np.float32), media.sigma_tr_per_mm,
-            media.depth_mm, media.height_mm, media.scale, np.ascontiguousarray(own[part]),
+            media.depth_mm, media.height_mm, media.scale, here,
             tolerance / NODES, normalize, tree.place, tree.reach, tree.area, light, tree.seen,
             moments, tree.low, tree.high, tree.skip, found[part], bound[part], work[part],
         )  # fmt: skip
