@@ -29,7 +29,7 @@ from skinrig.commands import (
     simulating,
     view,
 )
-from skinrig.commands.help import Commands
+from skinrig.commands.help import Command, Commands
 from skinrig.commands.options import (
     Json,
     Out,
@@ -78,7 +78,7 @@ def _root(
         typer.echo(welcome(Path(), version_of("skinrig")))
 
 
-@app.command()
+@app.command(cls=Command)
 def demo(
     out: Out = Path("demo"),
     rigs: Annotated[
@@ -106,13 +106,13 @@ for command in (
     reconstructing.calibrate, reconstructing.reconstruct, measuring.bench, measuring.doctor,
     planning.plan, rendering.render, editing.edit, report.report, view.view, export.export,
 ):  # fmt: skip
-    app.command()(command)
-dynamic.fit_app.command("traits")(editing.fit_traits)
+    app.command(cls=Command)(command)
+dynamic.fit_app.command("traits", cls=Command)(editing.fit_traits)
 app.add_typer(importing.import_app, name="import")
-dynamic.fit_app.command("reflectance")(reflectance.fit_reflectance)
+dynamic.fit_app.command("reflectance", cls=Command)(reflectance.fit_reflectance)
 app.add_typer(dynamic.fit_app, name="fit")
 app.add_typer(dynamic.apply_app, name="apply")
-analysing.analyse_app.command("albedo")(editing.analyse_albedo)
+analysing.analyse_app.command("albedo", cls=Command)(editing.analyse_albedo)
 app.add_typer(analysing.analyse_app, name="analyse")
 
 

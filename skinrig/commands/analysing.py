@@ -7,7 +7,7 @@ from typing import Annotated, Literal, cast
 
 import typer
 
-from skinrig.commands.help import Subcommands
+from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Json, Out
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError
@@ -24,7 +24,7 @@ def analyse() -> None:
     """Analyse faces together."""
 
 
-@analyse_app.command("brdf")
+@analyse_app.command("brdf", cls=Command)
 def analyse_brdf(
     out: Out,
     appearances: Annotated[

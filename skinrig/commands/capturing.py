@@ -36,8 +36,12 @@ def capture(
         typer.Argument(help="Name of a rig, or its TOML file.", autocompletion=completion.rigs),
     ],
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the session.")] = None,
-    port: Annotated[list[str] | None, typer.Option(help="Box: NAME=URL; repeatable.")] = None,
-    camera: Annotated[list[str] | None, typer.Option(help="Camera: VIEW=URL; repeatable.")] = None,
+    port: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=URL", help="Address of a box; repeatable.")
+    ] = None,
+    camera: Annotated[
+        list[str] | None, typer.Option(metavar="VIEW=URL", help="Address of a camera; repeatable.")
+    ] = None,
     plan: Annotated[Path | None, typer.Option(help="Plan, JSON; default: the rig's own.")] = None,
     target: Annotated[
         str | None, typer.Option(help="Plan of a calibration target, named as for simulate.")
@@ -68,7 +72,9 @@ def capture(
     shot_period: ShotPeriod = None,
     captures: Captures = None,
     duration: Duration = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a session that was interrupted.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Run a plan on a rig: real, or served by `skinrig serve`.
@@ -109,7 +115,9 @@ def serve(
     anywhere: Annotated[
         bool, typer.Option("--allow-remote", help="Let other machines connect.")
     ] = False,
-    subject: Annotated[str, typer.Option(help="Preset of the simulated face.")] = "III",
+    subject: Annotated[
+        str, typer.Option(help="Whose skin: a preset, I to VI, or a file NAME.toml.")
+    ] = "III",
     site: Site = None,
     size: Annotated[str, typer.Option(help="small or full.")] = "small",
     seed: Seed = 0,

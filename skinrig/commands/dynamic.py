@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from skinrig.commands.help import Subcommands
+from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Json, NewMaps
 from skinrig.console import Console
 from skinrig.next_steps import named
@@ -36,7 +36,7 @@ apply_app = typer.Typer(
 )
 
 
-@fit_app.command("facial-color")
+@fit_app.command("facial-color", cls=Command)
 def fit_facial_color(
     sessions: Annotated[list[Path], typer.Argument(help="Flash sessions of one subject.")],
     out: NewMaps,
@@ -82,7 +82,7 @@ def fit_facial_color(
     )  # fmt: skip
 
 
-@fit_app.command("wrinkles")
+@fit_app.command("wrinkles", cls=Command)
 def fit_wrinkles(
     appearances: Annotated[
         list[Path], typer.Argument(help="Maps of dome sessions: neutral and expressions.")
@@ -114,7 +114,7 @@ def fit_wrinkles(
     )  # fmt: skip
 
 
-@fit_app.command("microstructure")
+@fit_app.command("microstructure", cls=Command)
 def fit_microstructure(
     appearances: Annotated[
         list[Path], typer.Argument(help="Maps of caliper sessions with heights and kernels.")
@@ -145,7 +145,7 @@ def fit_microstructure(
     )  # fmt: skip
 
 
-@apply_app.command("expression")
+@apply_app.command("expression", cls=Command)
 def apply_expression(
     appearance: Annotated[Path, typer.Argument(help="Folder that `skinrig fit` made.")],
     weights: Weights,
@@ -209,7 +209,7 @@ def apply_expression(
     _tell(console, out, done)
 
 
-@apply_app.command("microstructure")
+@apply_app.command("microstructure", cls=Command)
 def apply_microstructure(
     appearance: Annotated[Path, typer.Argument(help="Folder that `skinrig fit` made.")],
     mesh: Annotated[Path, typer.Option(help="Mesh with blend shapes: .npz, OBJ or glTF.")],

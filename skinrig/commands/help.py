@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
     ("Begin", ("demo", "doctor")),
@@ -16,6 +17,44 @@ SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
     ("Measure", ("bench",)),
 )  # fmt: skip
 OTHER: Final = "More"
+
+
+_KINDS: Final = ((re.compile(r"<list\[(\w+)\]>"), r"<\1>"), (re.compile("<%Y-%m-%d>"), "<date>"))
+"""How Typer writes kinds of arguments after Python's types, and what is written instead."""
+
+
+class Command(TyperCommand):
+    """A command whose help names kinds of arguments without Python's words for them."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write arguments and options, those that are repeated as what one of them is."""
+        super().format_options(ctx, _WithoutTypes(formatter))
+
+
+class _WithoutTypes:
+    """A formatter of help that writes lists of definitions without Python's types."""
+
+    def __init__(self, formatter: Any) -> None:
+        self._formatter = formatter
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._formatter, name)
+
+    def write_dl(self, rows: Iterable[tuple[str, str]], *args: Any, **settings: Any) -> None:
+        self._formatter.write_dl([(plain(name), text) for name, text in rows], *args, **settings)
+
+
+def plain(name: str) -> str:
+    """Return how an argument is listed, with what one of it is.
+
+    Examples
+    --------
+    >>> plain("paths... <list[Path]>"), plain("--consent-expires <%Y-%m-%d>"), plain("--size <int>")
+    ('paths... <path>', '--consent-expires <date>', '--size <int>')
+    """
+    for pattern, words in _KINDS:
+        name = pattern.sub(words, name)
+    return name.replace("<Path>", "<path>")
 
 
 class Commands(TyperGroup):

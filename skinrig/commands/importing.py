@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from skinrig.commands.help import Subcommands
+from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Consent, ConsentExpires, Json, Out
 from skinrig.console import Console, counted
 from skinrig.next_steps import named
@@ -17,7 +17,7 @@ import_app = typer.Typer(
 )
 
 
-@import_app.command("photos")
+@import_app.command("photos", cls=Command)
 def import_photos(
     directory: Annotated[Path, typer.Argument(help="Folder of photographs, or one file.")],
     out: Out,
@@ -68,7 +68,7 @@ def import_photos(
     )
 
 
-@import_app.command("mesh")
+@import_app.command("mesh", cls=Command)
 def import_mesh(
     file: Annotated[Path, typer.Argument(help="Scanned mesh: .obj or .ply.")],
     session: Annotated[Path, typer.Option(help="Session that gets the mesh.")],
@@ -100,7 +100,7 @@ def import_mesh(
     )  # fmt: skip
 
 
-@import_app.command("lp")
+@import_app.command("lp", cls=Command)
 def import_lp(
     directory: Annotated[Path, typer.Argument(help="Folder of pictures, one a light.")],
     out: Out,

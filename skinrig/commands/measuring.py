@@ -24,7 +24,7 @@ def bench(
     more: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[NAME]...",
+            metavar="NAME",
             help="Stages, like those of --stage; default all.",
             show_default=False,
             autocompletion=completion.stages,

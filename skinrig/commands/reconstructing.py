@@ -95,7 +95,7 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
 
 
 def reconstruct(
-    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="SESSION/ folder.")],
+    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION", help="SESSION/ folder.")],
     want: Annotated[
         str,
         typer.Option(

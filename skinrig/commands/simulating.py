@@ -52,9 +52,9 @@ def simulate(
         str,
         typer.Option(
             help="Preset, I to VI, palest or darkest, or a file NAME.toml; of the dome also P01 to "
-            "P87 of the simulated population; of the probe also "
-            "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G] or "
-            "anisotropic:SIGMA_A,SIGMA_S_PRIME[,STRENGTH[,AXIS]], 1/mm and degrees.",
+            "P87 of the simulated population; of the probe also a medium, "
+            "homogeneous:A,S[,G] or anisotropic:A,S[,STRENGTH[,AXIS]] with A sigma_a and S "
+            "sigma_s', 1/mm, and AXIS in degrees.",
             autocompletion=completion.subjects,
         ),
     ] = "III",
@@ -120,7 +120,8 @@ def simulate(
     condition: Annotated[
         list[str] | None,
         typer.Option(
-            help="Condition of the face in the dome, NAME or NAME=AMOUNT up to 1: cold, hot, "
+            metavar="NAME[=AMOUNT]",
+            help="Condition of the face in the dome, by up to 1 of it: cold, hot, "
             "sweat, lotion, makeup, powder; repeatable.",
             autocompletion=completion.conditions,
         ),
@@ -135,7 +136,10 @@ def simulate(
     ] = 0.0,
     plan: Annotated[
         Path | None,
-        typer.Option(help="Of the dome: the lights and cameras of a plan by `skinrig plan`."),
+        typer.Option(
+            help="What is captured of the subject, by `skinrig plan`; its lights and cameras are "
+            "also those of the dome's targets."
+        ),
     ] = None,
     sequence: Sequence = None,
     prompt_period: PromptPeriod = None,
@@ -151,7 +155,9 @@ def simulate(
     ] = None,
     consent: Consent = None,
     consent_expires: ConsentExpires = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a session.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a session that was interrupted.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Capture a simulated subject or target through the real drivers into SESSION/.

@@ -1,6 +1,7 @@
 """One rule of exit codes for all commands: 2 where words cannot be read, 3 where they can."""
 
 import json
+import re
 
 import pytest
 import typer
@@ -147,7 +148,11 @@ def test_every_command_is_held_to_the_rule():
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_words_of_every_command_are_checked_alike(name, here, capsys):
     assert main([*name.split(), "--help"]) == errors.DONE
-    assert "Usage:" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "Usage:" in said
+    assert not re.search(
+        r"list\[|Path|%Y|\.\.\.\]?\.\.\.", said
+    )  # Python, dots twice
     assert main([*name.split(), "--no-such-option", "--json"]) == errors.USAGE
     assert told(capsys) == errors.USAGE
     if name not in SPEECHLESS:
