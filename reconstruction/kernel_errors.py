@@ -84,7 +84,9 @@ class BlockCounts:
         sizes = self.counts.sum(axis=1)
         counts = self.counts[sizes > 0]
         n = len(counts)
-        return np.asarray(_apart(counts) * math.sqrt(n / max(n - 1, 1) * self.growth))
+        return np.asarray(
+            normal_blocks.residuals_of(counts) * math.sqrt(n / max(n - 1, 1) * self.growth)
+        )
 
     def noise(self, target: Floats, target_samples: float) -> float:
         """Return the standard error of the distance to a target of so many effective samples."""
@@ -233,7 +235,7 @@ def widths_of_pair(
     both = np.flatnonzero((ours > 0) & (target_blocks.sum(axis=1) > 0))
     if len(both) < LEAST_BLOCKS:
         return None
-    theirs = _apart(target_blocks[both])
+    theirs = normal_blocks.residuals_of(target_blocks[both])
     factors = rng.standard_normal((DRAWS, len(both)))
     factors = np.float32(math.sqrt(len(both) / (len(both) - 1) * growth)) * factors
     factors = factors.astype(np.float32)
@@ -252,7 +254,7 @@ def widths_of_pair(
                 group, groups, buckets.bins, buckets.limit,
             )  # fmt: skip
             gap = counts.sum(axis=0) / relief.places.size - buckets.target
-            apart = _apart(np.asarray(counts[both], np.float64)) - theirs
+            apart = normal_blocks.residuals_of(np.asarray(counts[both], np.float64)) - theirs
             used = np.flatnonzero((gap != 0.0) | apart.any(axis=0))
             moved = factors @ apart[:, used].astype(np.float32)
             distance[:, column] = np.abs(gap[used].astype(np.float32) + moved).sum(axis=1)
@@ -268,13 +270,6 @@ def of_grid(widths: HalfWidths, alphas: Floats, sigmas_um: Floats) -> HalfWidths
         for told, s in zip((widths.alpha, widths.sigma_um), step, strict=True)
     )  # fmt: skip
     return HalfWidths((alpha, alpha_95), (sigma, sigma_95))
-
-
-def _apart(counts: Floats) -> Floats:
-    """Return what each block adds to the error of the common shares, (blocks, buckets)."""
-    sizes = counts.sum(axis=1)
-    common = counts.sum(axis=0) / sizes.sum()
-    return np.asarray((counts - sizes[:, None] * common) / sizes.sum())
 
 
 def _widths(

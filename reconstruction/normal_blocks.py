@@ -86,6 +86,30 @@ def block_counts(
     return np.asarray(counts[:, :-1], np.int64).reshape(blocks, bins, bins)
 
 
+def residuals_of(counts: Floats) -> Floats:
+    """Return what each block adds to the error of the shares that all have in common.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (blocks, buckets)
+        Of each block; no count in a block adds nothing.
+
+    Returns
+    -------
+    ndarray of float64, shape (blocks, buckets)
+        To first order of a ratio of sums; they sum to 0 over blocks.
+
+    Examples
+    --------
+    >>> residuals_of(np.array([[3.0, 1.0], [1.0, 3.0]]))
+    array([[ 0.125, -0.125],
+           [-0.125,  0.125]])
+    """
+    sizes = counts.sum(axis=1)
+    common = counts.sum(axis=0) / sizes.sum()
+    return np.asarray((counts - sizes[:, None] * common) / sizes.sum())
+
+
 def effective_number(counts: Floats, samples: int) -> float:
     """Return how many independent samples would make blocks differ as much as they do.
 
@@ -108,8 +132,7 @@ def effective_number(counts: Floats, samples: int) -> float:
     if n < 2:
         return float(samples)
     p = counts.sum(axis=0) / sizes.sum()
-    # the ratio of sums, to first order: residual of each block from the common shares
-    residual = (counts - sizes[:, None] * p) / sizes.sum()
+    residual = residuals_of(counts)
     variance = n / (n - 1) * float(np.sum(residual * residual))
     spread = float(np.sum(p * (1.0 - p)))
     if variance <= 0 or spread <= 0:

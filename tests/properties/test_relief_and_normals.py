@@ -173,6 +173,10 @@ def test_counts_of_blocks_are_those_of_the_whole(seed, bins, angle, sides):
     if parts.any():
         whole = normal_histogram.histogram(height, **told)
         np.testing.assert_allclose(parts.sum(axis=0) / parts.sum(), whole, atol=1e-12)
+        residuals = normal_blocks.residuals_of(parts.reshape(5, -1).astype(np.float64))
+        np.testing.assert_allclose(residuals.sum(axis=0), 0.0, atol=1e-12)
+        empty = parts.sum(axis=(1, 2)) == 0
+        assert not residuals[empty].any()
     none = normal_blocks.block_counts(height, np.full(sides, -1), 5, **told)
     assert not none.any()
     with pytest.raises(normal_histogram.HistogramError, match="block"):
