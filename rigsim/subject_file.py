@@ -230,7 +230,10 @@ def read(path: str | Path) -> SubjectFile:
     place = Path(path)
     document = read_toml(place, error=SubjectFileError)
     if "schema" not in document:
-        document = {"schema": "none", **document}
+        raise SubjectFileError(
+            f'has no schema; is it a subject? Its first line is schema = "{SCHEMA}"',
+            where=str(path),
+        )
     found: SubjectFile = parse(SubjectFile, document, where=str(path), error=SubjectFileError)
     files = {
         key: str(place.parent / name) for key in _FILES if (name := getattr(found, key)) is not None

@@ -147,7 +147,7 @@ def sequence_of(
     Raises
     ------
     UsageError
-        For options without a sequence, or of another kind of it.
+        For options without a sequence, or of another kind of it, or that are no numbers.
     """
     if state is None:
         if any(option is not None for option in (prompt_period, shot_period, captures, duration)):
@@ -156,6 +156,12 @@ def sequence_of(
                 "--sequence STATE"
             )
         return None
+    for option, text in (
+        ("--prompt-period", prompt_period), ("--shot-period", shot_period),
+        ("--duration", duration),
+    ):  # fmt: skip
+        if text is not None:
+            _seconds(text, option)
     order = SequenceOrder(
         state=state, shot_period_s=shot_period, captures=captures, duration_s=duration
     )
@@ -164,6 +170,14 @@ def sequence_of(
     if not order.prompted and (prompt_period is not None or captures is not None):
         raise UsageError(f"--prompt-period, --captures: {state} is no expression; use --duration")
     return order if prompt_period is None else replace(order, prompt_period_s=prompt_period)
+
+
+def _seconds(text: str, option: str) -> None:
+    """Refuse what is no number; the plan keeps the digits as they were given."""
+    try:
+        float(text)
+    except ValueError as exc:
+        raise UsageError(f"{option}: got {text!r}, expected seconds, such as 5.5") from exc
 
 
 def read_plan(file: Path) -> Plan:

@@ -45,6 +45,12 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def _cell(value: object) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    return "–" if math.isnan(value) else f"{value:.4g}"
+
+
 @dataclass(slots=True)
 class Console:
     """Where a command writes.
@@ -66,10 +72,8 @@ class Console:
         print(f"[{seconds:6.1f} s] {text}", file=sys.stderr, flush=True)
 
     def rows(self, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
-        """Print a table with aligned columns."""
-        cells = [[str(h) for h in head]] + [
-            [f"{v:.4g}" if isinstance(v, float) else str(v) for v in row] for row in rows
-        ]
+        """Print a table with aligned columns; a dash stands where there is no number."""
+        cells = [[str(h) for h in head]] + [[_cell(value) for value in row] for row in rows]
         widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
         for row in cells:
             line = "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True))

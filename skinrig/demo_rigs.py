@@ -328,8 +328,17 @@ def _microrelief_rows(appearance: Path, truth: Path | None) -> list[list[Any]]:
                          100 * row.height_coverage, 100 * row.masked])  # fmt: skip
     strain = microrelief.compare_stretch(found, true)
     if strain:
+        from skinrig.reporting.map_names import state_words
+
         worst = max(strain, key=lambda row: abs(row.error))
         rows.append(
-            [name, f"stretch, {worst.state}", 100 * abs(worst.error), "%", float("nan"), 0.0]
+            [
+                name,
+                f"stretch, {state_words(worst.state)}",
+                100 * abs(worst.error),
+                "%",
+                float("nan"),
+                0.0,
+            ]
         )
     return rows

@@ -85,7 +85,7 @@ _ADVICE = {
     errno.ENOENT: "check the name, and the folder that the command runs in",
     errno.EEXIST: "something of that name is there already; name another",
     errno.ENOTDIR: "a part of this path is a file, expected a folder; name another",
-    errno.EISDIR: "is a folder, expected a file; name another",
+    errno.EISDIR: "expected a file; name another",
     errno.EACCES: "no right to it; change its rights, or name another",
     errno.EPERM: "no right to it; change its rights, or name another",
     errno.EROFS: "the disk is mounted for reading alone; name another",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from typer.core import TyperCommand, TyperGroup
 
@@ -28,7 +28,7 @@ class Command(TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write arguments and options, those that are repeated as what one of them is."""
-        super().format_options(ctx, _WithoutTypes(formatter))
+        super().format_options(ctx, cast(Any, _WithoutTypes(formatter)))
 
 
 class _WithoutTypes:

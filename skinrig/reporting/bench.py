@@ -50,8 +50,8 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> str:
     ]
     body += f'<div class="plots">{"".join(plots)}</div>'
     body += page.table(
-        ("stage", "setting", "seconds", "cold s", "peak MB", "error", "Cramér-Rao", "efficiency",
-         "place"),
+        ("stage", "setting", "seconds", "cold, s", "peak, MB", "error", "Cramér-Rao",
+         "efficiency", "place"),
         [
             (
                 name, ", ".join(f"{k} {v}" for k, v in point["knobs"].items()), point["seconds"],

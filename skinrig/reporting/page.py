@@ -87,8 +87,8 @@ def checks_table(checks: Sequence[Check]) -> str:
             f'<td class="n">{sign} {_with_unit(check.bound, check.unit)}</td>'
             f'<td class="n">{_percent(check.used)}</td>'
             f'<td class="n">{_percent(check.coverage)}</td>'
-            f'<td class="n">{_percent(check.masked)}</td><td>{escape(check.worst)}</td>'
-            f"<td>{escape(check.note)}</td></tr>"
+            f'<td class="n">{_percent(check.masked)}</td><td>{_joined(check.worst)}</td>'
+            f"<td>{_joined(check.note)}</td></tr>"
         )
     head = (
         ("verdict", ""), ("check", ""), ("measured", "n"), ("limit", "n"), ("of the limit", "n"),
@@ -100,6 +100,11 @@ def checks_table(checks: Sequence[Check]) -> str:
 
 def _with_unit(value: float, unit: str) -> str:
     return escape(written(number(value), unit))
+
+
+def _joined(text: str) -> str:
+    """Return text whose numbers keep their percent signs when a narrow cell breaks it."""
+    return escape(text).replace(" %", "\N{NO-BREAK SPACE}%")
 
 
 def _percent(share: float) -> str:

@@ -22,6 +22,7 @@ UNREADABLE = {
         "gradient --out x --angles a", "flash --out x --relaxation 3",
         "flash --out x --target white --nearer 3", "probe --out x --sequence smile",
         "flash --out x --consent-expires 2020", "flash --out x --captures 3",
+        "flash --out x --sequence exercise --duration long",
     ],
     "capture": [
         "flash --out x", "flash --out x --port a", "gradient --dry-run --steps 1",
@@ -68,7 +69,8 @@ UNUSABLE = {
         "flash --out x --seed -1", "flash --out x --width 3", "flash --out x --target moon",
         "flash --out x --state happy", "flash --out x --mesh none.obj", "dome --out x --lights 0",
         "flash --out x --leave-out gold", "flash --out x --nearer inf", "dome --out x --views 400",
-        "flash --out x --sequence tea", "dome --out x --condition mud",
+        "flash --out x --sequence tea",
+        "flash --out x --sequence exercise --duration -3", "dome --out x --condition mud",
         "dome --out x --condition cold=2", "gradient --out x --site nose",
         "gradient --out x --angles 3", "gradient --out x --steps 3..1",
         "probe --out x --subject homogeneous:1",
@@ -150,9 +152,7 @@ def test_the_words_of_every_command_are_checked_alike(name, here, capsys):
     assert main([*name.split(), "--help"]) == errors.DONE
     said = capsys.readouterr().out
     assert "Usage:" in said
-    assert not re.search(
-        r"list\[|Path|%Y|\.\.\.\]?\.\.\.", said
-    )  # Python, dots twice
+    assert not re.search(r"list\[|Path|%Y|\.\.\.\]?\.\.\.", said)  # Python, dots twice
     assert main([*name.split(), "--no-such-option", "--json"]) == errors.USAGE
     assert told(capsys) == errors.USAGE
     if name not in SPEECHLESS:

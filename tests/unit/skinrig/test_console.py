@@ -22,3 +22,8 @@ def test_a_person_reads_results_on_stdout_and_no_json(capsys):
     console.say("done")
     console.document("skinrig.x/1", {})
     assert capsys.readouterr().out == "done\n"
+
+
+def test_a_table_has_a_dash_where_there_is_no_number(capsys):
+    Console().rows(("what", "share, %"), [("known", 71.239), ("unknown", float("nan"))])
+    assert capsys.readouterr().out.splitlines()[1:] == ["known    71.24", "unknown  –"]

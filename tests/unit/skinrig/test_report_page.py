@@ -217,6 +217,13 @@ def test_a_check_is_told_the_same_way_in_the_table_and_in_the_verdict(unit, show
     assert f" {shown}" in verdict.section([check]).split("<h2>Checks</h2>")[0]
 
 
+def test_a_narrow_cell_does_not_part_a_number_from_its_percent_sign():
+    check = page.Check("melanin", 1.0, 2.0, "<=", "%", "bound 11 %", worst="dark: 20.8 %")
+    html = page.checks_table([check])
+    assert "20.8\N{NO-BREAK SPACE}%" in html
+    assert "11\N{NO-BREAK SPACE}%" in html
+
+
 def test_headings_of_tables_set_units_apart_by_a_comma():
     joined = re.compile(r"[^,0-9 ] (%|°|um|mm|1/mm|px|N)$")
     found = [
