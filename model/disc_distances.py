@@ -139,14 +139,16 @@ def _offsets(a: float, b: float) -> tuple[FloatArray, FloatArray]:
 
 def _shared_area(s: FloatArray, small: float, large: float) -> FloatArray:
     """Return the area that two discs share whose centres are `s` apart."""
-    s_safe = np.maximum(s, 1e-300)
-    first = np.clip((s**2 + small**2 - large**2) / (2.0 * s_safe * small), -1.0, 1.0)
-    second = np.clip((s**2 + large**2 - small**2) / (2.0 * s_safe * large), -1.0, 1.0)
     square = (small + large - s) * (s + small - large) * (s - small + large) * (s + small + large)
+    kite = np.sqrt(np.maximum(square, 0.0))
+    first = np.arctan2(kite, s**2 + small**2 - large**2)
+    second = np.arctan2(kite, s**2 + large**2 - small**2)
+    # the large disc's segment, in terms that are small where the other disc is: a sector less a
+    # triangle would leave nothing of their digits
+    sine = np.sin(second)
     return np.asarray(
-        small**2 * np.arccos(first)
-        + large**2 * np.arccos(second)
-        - 0.5 * np.sqrt(np.maximum(square, 0.0))
+        small**2 * (first - np.sin(first) * np.cos(first))
+        + large**2 * (second - sine * np.cos(second))
     )
 
 

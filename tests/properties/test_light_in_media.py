@@ -322,6 +322,7 @@ def test_light_far_from_its_source_decays_between_absorption_and_diffusion(ratio
 
 @CHEAP
 @given(radius=st.floats(0.0, 1e3), core=st.floats(0.0, 5.0), source=st.floats(0.0, 5.0))
+@example(radius=0.0, core=1.0, source=1e-5)
 def test_averages_over_two_cores_are_exact_for_the_mean_square_distance(radius, core, source):
     distance, weight = disc_distances.distance_rule(radius, core, source)
     assert np.all(distance >= 0.0)
