@@ -16,11 +16,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import hypothesis
 import numpy as np
 import pytest
+from hypothesis.internal.conjecture import providers
 
 # Tests draw the same examples in each run, as slowly as a busy machine likes; nothing is kept
-# from one run for the next.
+# from one run for the next. Derandomized or not, Hypothesis would also draw the numbers that stand
+# in the source of all modules imported by then, and which those are is chance: other tests of the
+# same process.
 hypothesis.settings.register_profile("alike", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("alike")
+providers._get_local_constants = providers.Constants
 
 # What one process writes another reads whether or not it has reached the disk: only a cut of power
 # tells, which tests/faults/test_power_cut.py models operation by operation. Each frame waits three
