@@ -25,6 +25,7 @@ from reconstruction import (
     expression_alignment,
     misplacement,
     model_error,
+    repeat_average,
     repeatability,
     shading_prior,
     shared_melanin,
@@ -320,26 +321,11 @@ def _aligned(image: StateImage, diffuse: SkinMap, alignment: Alignment | None) -
 def _average(
     images: list[AlignedImage],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], Mask]:
-    """Return the mean of a state's images where any is valid, and the variance of the mean.
-
-    Repeats that differ by more than their noise say how far skin or pose repeat: their scatter
-    takes the place of the stated noise where it is larger.
-    """
-    count = np.sum([one.valid for one in images], axis=0)
-    many = np.maximum(count, 1)[..., None]
-    rgb = np.sum([one.rgb for one in images], axis=0, dtype=np.float64) / many
-    noise = np.sum([one.variance for one in images], axis=0, dtype=np.float64) / many**2
-    if len(images) > 1:
-        squares = np.sum(
-            [np.where(one.valid[..., None], (one.rgb - rgb) ** 2, 0.0) for one in images], axis=0
-        )
-        scatter = squares / np.maximum(many - 1, 1) / many
-        # one pixel's scatter of a few repeats is known poorly: it widens on the whole, not there
-        with np.errstate(invalid="ignore", divide="ignore"):
-            seen = (count > 1) & (noise > 0).all(axis=-1)
-        ratio = np.mean(scatter[seen] / noise[seen]) if seen.any() else 1.0
-        noise *= max(1.0, float(ratio))
-    return rgb.astype(np.float32), noise.astype(np.float32), np.asarray(count > 0)
+    return repeat_average.average(
+        np.stack([one.rgb for one in images]),
+        np.stack([one.variance for one in images]),
+        np.stack([one.valid for one in images]),
+    )
 
 
 def _model_error(averages: list[tuple[NDArray[np.float32], NDArray[np.float32], Mask]]) -> Floats:

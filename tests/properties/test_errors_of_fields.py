@@ -13,6 +13,7 @@ from reconstruction import (
     misplacement,
     normal_blocks,
     perfusion_fit,
+    repeat_average,
 )
 from reconstruction.expression_alignment import Alignment
 
@@ -151,3 +152,23 @@ def test_light_that_changes_alike_everywhere_is_told_whatever_pixels_lack(seed, 
     middle = (change[1] - change[0]).reshape(side, side)[8:-8, 8:-8]
     # about 200 pixels within a window, less those that lack a state
     assert np.abs(middle - step).max() < 1.0 * noise + 1e-5
+
+
+@CHEAP
+@given(seed=SEEDS, count=st.integers(1, 5), unit=st.floats(1e-9, 1e9), noise=st.floats(1e-6, 0.2),
+       bad=st.sampled_from([np.nan, np.inf, -np.inf, 0.0]))  # fmt: skip
+def test_means_of_repeats_follow_their_unit_whatever_is_masked(seed, count, unit, noise, bad):
+    rng = np.random.default_rng(seed)
+    rgb = 0.4 * np.exp(noise * rng.normal(size=(count, 8, 9, 3)))
+    variance = np.square(noise * rgb)
+    valid = rng.random((count, 8, 9)) < 0.8
+    rgb[~valid], variance[~valid] = bad, bad
+    mean, told, known = repeat_average.average(rgb, variance, valid)
+    scaled, told_scaled, _ = repeat_average.average(unit * rgb, unit**2 * variance, valid)
+    assert np.isfinite(mean).all()
+    np.testing.assert_array_equal(known, valid.any(axis=0))
+    np.testing.assert_allclose(scaled, unit * mean, rtol=1e-5)
+    np.testing.assert_allclose(told_scaled, unit**2 * told, rtol=1e-4)
+    assert not mean[~known].any()
+    assert (told[known] > 0.0).all()
+    assert repeat_average.excess(rgb, variance, valid) >= 1.0

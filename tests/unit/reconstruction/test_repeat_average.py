@@ -1,0 +1,90 @@
+"""Means of repeats: what they err by is told of their colors, not of flashes that repeat less."""
+
+import numpy as np
+import pytest
+
+from reconstruction import repeat_average
+
+NOISE = 0.004
+
+
+def repeats(rng, *, count=2, size=60, color=1.0, brightness=0.0):
+    """Pictures of one skin whose repeats differ by `color` times their noise, and in brightness."""
+    skin = np.array([0.5, 0.3, 0.2]) * np.exp(0.2 * rng.standard_normal((size, size, 1)))
+    shape = (count, size, size, 3)
+    relative = 1.0 + color * NOISE * rng.standard_normal(shape)
+    relative *= 1.0 + brightness * rng.standard_normal((count, 1, 1, 1))
+    rgb = (skin * relative).astype(np.float32)
+    variance = np.broadcast_to(np.square(NOISE * skin), shape).astype(np.float32)
+    return rgb, variance, np.ones(shape[:-1], bool), skin
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_the_variance_of_the_mean_is_that_of_its_errors(rng, count):
+    """Tolerance: 5 standard errors of a variance of 10,800 numbers."""
+    rgb, variance, valid, skin = repeats(rng, count=count)
+    mean, told, known = repeat_average.average(rgb, variance, valid)
+    error = (mean - skin) / np.sqrt(told)
+    assert known.all()
+    assert np.mean(np.square(error)) == pytest.approx(1.0, abs=5 * np.sqrt(2 / error.size) + 0.02)
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_colors_that_repeat_less_than_their_noise_widen_the_error(rng, count):
+    """Tolerance: the median of 3,600 chi-squared numbers is off by 3 % at most."""
+    rgb, variance, valid, _ = repeats(rng, count=count, color=3.0)
+    assert repeat_average.excess(rgb, variance, valid) == pytest.approx(9.0, rel=0.09)
+    told = repeat_average.average(rgb, variance, valid)[1]
+    assert np.median(told / variance[0]) == pytest.approx(9.0 / count, rel=0.1)
+
+
+def test_flashes_that_repeat_less_are_no_error_of_colors(rng):
+    """Rationale: two percent from flash to flash are five times the noise of each pixel; all
+    channels alike have them."""
+    rgb, variance, valid, _ = repeats(rng, count=3, brightness=0.02)
+    scatter = np.mean(rgb.var(axis=0, ddof=1) / variance[0])
+    assert scatter > 5.0
+    assert repeat_average.excess(rgb, variance, valid) == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_few_pixels_laid_over_others_do_not_count_for_all(rng):
+    rgb, variance, valid, _ = repeats(rng)
+    rgb[1, :6] = rgb[1, :6, ::-1] * [1.0, 1.3, 0.8]
+    assert np.mean(np.square(rgb[1] - rgb[0]) / variance[0]) > 20.0
+    assert repeat_average.excess(rgb, variance, valid) < 1.3
+
+
+def test_each_pixel_is_the_mean_of_the_repeats_that_show_it(rng):
+    rgb, variance, valid, _ = repeats(rng)
+    one = variance[0].copy()
+    valid[0, :10], valid[1, 5:20] = False, False
+    rgb[~valid], variance[~valid] = np.nan, np.nan
+    mean, told, known = repeat_average.average(rgb, variance, valid)
+    np.testing.assert_array_equal(known, valid.any(axis=0))
+    np.testing.assert_array_equal(mean[:5], rgb[1, :5])
+    np.testing.assert_array_equal(mean[10:20], rgb[0, 10:20])
+    assert not mean[5:10].any()
+    assert not told[5:10].any()
+    single, double = np.median(told[:5] / one[:5]), np.median(told[30:] / one[30:])
+    assert single / double == pytest.approx(2.0, rel=1e-5)
+
+
+def test_one_picture_is_itself(rng):
+    rgb, variance, valid, _ = repeats(rng, count=1, color=5.0)
+    mean, told, _ = repeat_average.average(rgb, variance, valid)
+    np.testing.assert_array_equal(mean, rgb[0])
+    np.testing.assert_array_equal(told, variance[0])
+
+
+@pytest.mark.parametrize(
+    ("rgb", "variance", "valid", "match"),
+    [
+        (np.ones((2, 4, 4)), np.ones((2, 4, 4)), np.ones((2, 4), bool), "rgb, variance"),
+        (np.ones((2, 4, 4, 3)), np.ones((4, 4, 3)), np.ones((2, 4, 4), bool), "rgb, variance"),
+        (np.ones((2, 4, 4, 3)), np.ones((2, 4, 4, 3)), np.ones((4, 4), bool), "valid"),
+        (np.ones((2, 4, 4, 3)), np.ones((2, 4, 4, 3)), np.ones((2, 4, 4)), "valid"),
+    ],
+)
+def test_what_does_not_fit_is_named(rgb, variance, valid, match):
+    with pytest.raises(ValueError, match=match):
+        repeat_average.average(rgb, variance, valid)
