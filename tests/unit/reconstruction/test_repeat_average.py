@@ -38,6 +38,20 @@ def test_colors_that_repeat_less_than_their_noise_widen_the_error(rng, count):
     assert np.median(told / variance[0]) == pytest.approx(9.0 / count, rel=0.1)
 
 
+@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("ratio", [4.0, 16.0, 100.0])
+def test_repeats_of_unequal_noise_are_no_worse_than_said(rng, count, ratio):
+    """Rationale: one repeat of a shorter exposure has more noise, which its variance tells.
+
+    Tolerance: 4 standard errors of the median of 10,000 chi-squared numbers.
+    """
+    rgb, variance, valid, skin = repeats(rng, count=count, size=100)
+    rgb[1] = skin * (1.0 + np.sqrt(ratio) * (rgb[1] / skin - 1.0))
+    assert repeat_average.excess(rgb, variance, valid) > 1.3
+    variance[1] *= ratio
+    assert repeat_average.excess(rgb, variance, valid) == pytest.approx(1.0, abs=0.06)
+
+
 def test_flashes_that_repeat_less_are_no_error_of_colors(rng):
     """Rationale: two percent from flash to flash are five times the noise of each pixel; all
     channels alike have them."""
