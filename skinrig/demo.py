@@ -14,11 +14,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from model import store
 from skinrig.console import Console, plain
 from skinrig.demo_rigs import RIGS, Findings
 from skinrig.next_steps import suggest
-from skinrig.simulating.simulation import truth_folder
 from skinrig.surroundings import look
 from skinrig.waiting_threads import WAITING_ASLEEP
 from skinrig.written_units import unit_sign
@@ -40,12 +38,6 @@ Shares = dict[str, float]
 
 class DemoError(ValueError):
     """A demo that cannot run as asked."""
-
-
-def truth_beside(session: Path) -> Path | None:
-    """Return the truth folder beside a session, or None."""
-    folder = truth_folder(session)
-    return folder if (folder / store.DOCUMENT).is_file() else None
 
 
 def run_demo(

@@ -134,14 +134,14 @@ def reconstruct(
     Example: skinrig reconstruct monday tuesday --want melanin --out appearances
     """
     from reconstruction import pipeline
-    from skinrig.demo import truth_beside
+    from skinrig.state_truth import truth_beside
 
     console = Console(json)
     check_rank(rank, basis)
     wants = [name.strip() for name in want.split(",") if name.strip()]
     made = []
     for session, folder in zip(sessions, folders_of(sessions, out), strict=True):
-        truth = truth_beside(session)
+        truth = truth_beside(session, state)
         if len(sessions) > 1:
             console.say(f"{session}:")
         done = pipeline.reconstruct(

@@ -18,7 +18,7 @@ from reconstruction.facial_color_fit import FacialColorFit, UnknownBloodError
 from reconstruction.state_images import Landmarks, Subject
 from skinrig import dynamic_appearance
 from skinrig.dynamic_appearance import FACIAL_COLOR, Part
-from skinrig.simulating.simulation import truth_folder
+from skinrig.state_truth import truth_of_state
 
 
 class FacialColorInputError(ValueError):
@@ -184,7 +184,8 @@ def _landmarks(
 def _truths(subject: Subject, sessions: Sequence[Path]) -> dict[str, Path | None]:
     """Return the folder with each state's truth, beside the session that shows it first."""
     return {
-        state: _truth_of(sessions[subject.of(state)[0].session], state) for state in subject.states
+        state: truth_of_state(sessions[subject.of(state)[0].session], state)
+        for state in subject.states
     }
 
 
@@ -196,14 +197,3 @@ def _point(place: Path, name: str, value: Any) -> tuple[float, float]:
         raise FacialColorInputError(
             f"{place}: landmark {name!r} is {json.dumps(value)}, expected two numbers"
         ) from error
-
-
-def _truth_of(session: Path, state: str) -> Path | None:
-    """Return the folder with a simulated session's truth of a state, where there is one."""
-    first = truth_folder(session)
-    # a session's first state has no name in its folder's
-    for named in (first, first.with_name(f"{first.name}-{state}")):
-        if (named / store.DOCUMENT).is_file():
-            if store.read_document(named).parameters.get("state") == state:
-                return named
-    return None

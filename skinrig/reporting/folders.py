@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from capture.calibration.store import SCHEMA as CALIBRATION_SCHEMA
 from model import store
 from model.skin import SkinAppearance
 from skinrig.reporting import pictures as pictures_section
@@ -111,6 +112,8 @@ def _sort_in(entry: Path, found: Findings) -> None:
     if entry.is_file() and entry.suffix == ".json" and entry.name != store.DOCUMENT:
         if (entry.parent / store.DOCUMENT).is_file():
             return  # of the appearance itself, which its section shows
+        if _is_of_a_calibration(entry):
+            return  # its folder's section tells all of them
         text = entry.read_text(encoding="utf-8", errors="replace")
         if '"schema"' in text and '"skinrig.' in text and "session" not in entry.name:
             found.documents.append(entry)
@@ -121,8 +124,19 @@ def _sort_in(entry: Path, found: Findings) -> None:
         found.sessions.append(entry)
     elif entry.is_dir() and pictures_section.folder_document(entry) is not None:
         found.pictures.append(entry)
-    elif entry.is_dir() and entry.name.startswith("calibration"):
+    elif entry.is_dir() and (
+        entry.name.startswith("calibration") or any(map(_is_of_a_calibration, entry.glob("*.json")))
+    ):
         found.calibrations.append(entry)
+
+
+_HEAD_CHARS = 400
+"""Within which a document names its schema."""
+
+
+def _is_of_a_calibration(file: Path) -> bool:
+    with file.open(encoding="utf-8", errors="replace") as text:
+        return f'"{CALIBRATION_SCHEMA}"' in text.read(_HEAD_CHARS)
 
 
 def read_json(path: Path) -> dict[str, Any]:

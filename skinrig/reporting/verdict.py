@@ -26,13 +26,18 @@ def headline(checks: Sequence[page.Check]) -> str:
     >>> headline([])
     'No limit was checked: there is no truth and no benchmark here.'
     >>> headline([page.Check("error", 2.0, 1.0, "<=")])
-    '1 of 1 checks missed their limit.'
+    '1 of 1 checks missed its limit.'
+    >>> headline([page.Check("error", 0.5, 1.0, "<=")])
+    'The only check kept its limit.'
     """
     missed = sum(not check.passed for check in checks)
     if not checks:
         return "No limit was checked: there is no truth and no benchmark here."
     if missed:
-        return f"{missed} of {len(checks)} checks missed their limit."
+        whose = "its" if missed == 1 else "their"
+        return f"{missed} of {len(checks)} checks missed {whose} limit."
+    if len(checks) == 1:
+        return "The only check kept its limit."
     return f"All {len(checks)} checks kept their limits."
 
 

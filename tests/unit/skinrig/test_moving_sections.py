@@ -61,10 +61,10 @@ def test_a_rig_that_has_the_true_blood_keeps_its_limit_and_one_that_has_not_miss
     write_truth(tmp_path / "truth-smile", "smile", "hemoglobin_at_rest", 1.5 * neutral)
     page = report.build([tmp_path])
     assert "Moving face: moving" in page
-    assert "All 1 checks kept their limits." in page
+    assert "The only check kept its limit." in page
     assert "blood of smile, by the rig" in page
     write_truth(tmp_path / "truth-smile", "smile", "hemoglobin_at_rest", 2.5 * neutral)
-    assert "1 of 1 checks missed their limit." in report.build([tmp_path])
+    assert "1 of 1 checks missed its limit." in report.build([tmp_path])
 
 
 def test_without_truth_the_face_is_shown_with_its_own_errors(tmp_path):

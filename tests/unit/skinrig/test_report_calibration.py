@@ -46,7 +46,7 @@ def write_run(folder, *, captured="2026-03-10", valid_until=date(2026, 6, 1), wo
 
 def test_a_calibration_is_as_old_as_it_was_at_capture(tmp_path):
     html = report.build([write_run(tmp_path)])
-    assert "All 1 checks kept" in html
+    assert "The only check kept its limit" in html
     assert "in force, 83 days left" in html  # 10 March to 1 June
     assert ">9<" in html  # days from 1 to 10 March
 
@@ -79,3 +79,13 @@ def test_without_a_session_no_age_is_claimed(tmp_path):
     html = report.build([folder])
     assert "no session here tells when it was used" in html
     assert "No limit was checked" in html
+
+
+@pytest.mark.parametrize("given", ["folder", "file by file"])
+def test_a_calibration_is_known_by_what_it_holds_whatever_its_folder_is_called(tmp_path, given):
+    folder = write_run(tmp_path)
+    (folder / "calibration").rename(folder / "mine")
+    places = [folder] if given == "folder" else [folder / "maps", folder / "mine"]
+    html = report.build([*places, folder / "session"])
+    assert "in force, 83 days left" in html
+    assert ">skinrig.calibration/1<" not in html

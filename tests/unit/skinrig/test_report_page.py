@@ -202,7 +202,7 @@ def test_skin_that_fares_worse_than_the_whole_is_named_though_the_check_is_kept(
 
 def test_a_check_that_is_no_number_is_missed():
     missed = page.Check("error", float("nan"), 1.0, "<=")
-    assert verdict.headline([missed]) == "1 of 1 checks missed their limit."
+    assert verdict.headline([missed]) == "1 of 1 checks missed its limit."
     assert "missed: error, – , at most 1" in " ".join(verdict.weaknesses([missed])).replace(
         "–,", "– ,"
     )

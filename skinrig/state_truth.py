@@ -1,0 +1,38 @@
+"""Where the truth of a simulated session's state lies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from model import store
+from skinrig.simulating.simulation import truth_folder
+
+USUAL: Final = "neutral"
+"""The state that is meant where none is said."""
+
+
+def truth_of_state(session: Path, state: str) -> Path | None:
+    """Return the folder with a simulated session's truth of a state, where there is one.
+
+    A session's first state has no name in its folder's: ``truth-face`` of `session-face`, and
+    ``truth-face-smile`` of a state that comes later.
+    """
+    first = truth_folder(session)
+    for named in (first, first.with_name(f"{first.name}-{state}")):
+        if (named / store.DOCUMENT).is_file():
+            if store.read_document(named).parameters.get("state") == state:
+                return named
+    return None
+
+
+def truth_beside(session: Path, state: str = USUAL) -> Path | None:
+    """Return the folder with what maps of a session's state are to be compared with, or None.
+
+    Where no state is asked for, as of rigs before which faces hold still, it is the session's own.
+    """
+    found = truth_of_state(session, state)
+    if found is not None or state != USUAL:
+        return found
+    folder = truth_folder(session)
+    return folder if (folder / store.DOCUMENT).is_file() else None
