@@ -69,7 +69,8 @@ def section(
          "lost by storing small, rms, points", "largest, points", "error of place, px",
          "placed by"),
         rows,
-        caption="States; points are percent of the dermis' volume",
+        caption="States; points are percent of the dermis' volume, the mean change is over all "
+        "pixels whose change was found",
     )  # fmt: skip
     body += _repeats(part.get("repeatability"))
     if truths:
@@ -169,7 +170,8 @@ def _errors(
              100 * row.bias, 100 * row.coverage, row.pixels)
             for row in states
         ],
-        caption="Against the true blood of each state, by way of getting it",
+        caption="Against the true blood of each state, by way of getting it; pixels that every "
+        "way tells",
     )  # fmt: skip
     body += page.table(
         ("state", "true change, points", "found, points", "rms of the map, points",
@@ -178,12 +180,14 @@ def _errors(
             (row.state, 100 * row.true, 100 * row.found, 100 * row.rms, 100 * row.coverage)
             for row in changes
         ],
-        caption="Change of blood from the neutral state, one melanin for all states",
+        caption="Change of blood from the neutral state, one melanin for all states; over those of "
+        "these pixels whose change was found",
     )  # fmt: skip
     if banded:
         body += page.table(
             ("state", "band", "pixels", "median |error|, %", "bias, %", "68 % coverage, %"), banded,
-            caption="Blood by the rig, by band of the true melanin fraction C_m",
+            caption="Blood by the rig, by band of the true melanin fraction C_m; all pixels that "
+            "the rig tells, also where the state itself was not measured",
         )  # fmt: skip
     labels = list(dict.fromkeys(row.state for row in states))
     series = {
@@ -208,7 +212,7 @@ def errors_by_band(
     rig
         Its states.
     truths
-        Of each state; a state whose truth has no "melanin" is left out.
+        Of each state; a state whose truth has no "melanin", at rest, is left out.
 
     Returns
     -------
@@ -219,7 +223,8 @@ def errors_by_band(
     rows: list[tuple[object, ...]] = []
     for state in rig.states:
         true = evaluation.true_blood(truths[state]) if state in truths else None
-        melanin = truths[state].maps.get("melanin") if state in truths else None
+        of_truth = truths[state].maps if state in truths else {}
+        melanin = of_truth.get("melanin_at_rest", of_truth.get("melanin"))
         if true is None or melanin is None:
             continue
         blend = rig.evaluate({state: 1.0})
