@@ -178,13 +178,17 @@ def simulate(
     from skinrig.simulating.subject_records import pseudonym
 
     console = Console(json)
+    # a resumed session keeps what it was begun with, unless something else is said
+    said = not resume or consent or consent_expires is not None
     done = simulate_session(
         rig, out, size=size, width_px=width, seed=seed, subject=subject, mesh=mesh, target=target,
         states=tuple(state or ("neutral",)), resume=resume, lights=lights, views=views, move=move,
         site=site, angles=numbers_of(angles, "--angles"), steps=range_of(steps, "--steps"),
         sites=names_of(sites), repeats=repeats, all_brackets=all_brackets,
         movement=movement, wrapped=wrapped, progress=console.progress,
-        person=subject_of(pseudonym(subject, seed), consent or USES, consent_expires),
+        person=subject_of(pseudonym(subject, seed), consent or USES, consent_expires)
+        if said
+        else None,
         sequence=sequence_of(sequence, prompt_period, shot_period, captures, duration),
         relaxation_s=relaxation, subsurface=subsurface, interreflections=interreflections,
         conditions=amounts_of(condition, "--condition"),

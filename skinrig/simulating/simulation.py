@@ -26,6 +26,7 @@ from capture.session import Session, Subject
 from skinrig.errors import UsageError
 from skinrig.sequences import SequenceOrder
 from skinrig.simulating.leaving_out import left_out_of
+from skinrig.simulating.resumption import refusals
 from skinrig.simulating.shot_numbers import shots_made
 from skinrig.simulating.subject_records import pseudonym
 
@@ -276,7 +277,8 @@ def simulate_session(
     created
         Date of the session; None: now.
     person
-        Pseudonym and consent to record; None: one who agreed to :data:`USES`.
+        Pseudonym and consent to record; None: one who agreed to :data:`USES`, or, where a session
+        is gone on with, as it was begun. Others than it was begun with are refused.
     progress
         Called with one line a frame.
     sequence
@@ -355,11 +357,13 @@ def open_session(
     """Begin the session of an order, or go on with it where it was begun with the same settings."""
     if order.resume:
         session = Session.resume(order.out)
-        if session.manifest.extra.get("simulation") != asked or session.seed != order.seed:
+        lines = refusals(session, asked, order.seed, order.person)
+        if lines:
             session.release()
+            told = "".join(f"\n  {line}" for line in lines)
             raise SimulationError(
-                f"{order.out}: was simulated with {session.manifest.extra.get('simulation')} and "
-                f"seed {session.seed}; resume with the same settings"
+                f"{order.out}: cannot be gone on with as asked{told}\n"
+                "  resume with the same settings, or name another folder"
             )
         return session
     order.out.parent.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,102 @@
+"""Whether a simulated session may be gone on with: how it was begun, against what is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from capture.session import Session, Subject
+
+_LONGEST = 60
+"""Characters of a value that are shown; of a plan nobody reads more."""
+
+
+def differences(
+    begun: Mapping[str, Any], asked: Mapping[str, Any], *, of: str = ""
+) -> tuple[str, ...]:
+    """Return what of two settings differs, a line each.
+
+    Parameters
+    ----------
+    begun, asked
+        JSON values by name, as a session's manifest and an order hold them. A record of a file,
+        with its ``file`` and ``sha256``, is told by its name where that stayed.
+    of
+        What they are settings of, where they lie inside another.
+
+    Examples
+    --------
+    >>> differences({"width_px": 64, "mesh": ""}, {"width_px": 96, "mesh": "", "nearer_mm": 5.0})
+    ('width_px: begun with 64, got 96', 'nearer_mm: begun without, got 5.0')
+    >>> differences({"map": {"file": "m.npy", "sha256": "a"}},
+    ...             {"map": {"file": "m.npy", "sha256": "b"}}, of="subject")
+    ('subject map: the file m.npy was changed since',)
+    """
+    lines: list[str] = []
+    for key in dict.fromkeys((*begun, *asked)):
+        name = f"{of} {key}" if of else key
+        was, now = begun.get(key), asked.get(key)
+        if was == now and (key in begun) == (key in asked):
+            continue
+        if isinstance(was, Mapping) and isinstance(now, Mapping) and key != "plan":
+            if "sha256" in was and was.get("file") == now.get("file"):
+                lines.append(f"{name}: the file {was['file']} was changed since")
+            else:
+                file = was.get("file")
+                same = file is not None and file == now.get("file")
+                lines += differences(was, now, of=f"{name} {file}" if same else name)
+        elif key == "plan" and was and now:
+            lines.append(f"{name}: begun with {_short(was)}, got another")
+        else:
+            old = f"with {_short(was)}" if key in begun else "without"
+            new = _short(now) if key in asked else "none"
+            lines.append(f"{name}: begun {old}, got {new}")
+    return tuple(lines)
+
+
+def refusals(
+    session: Session, asked: Mapping[str, Any], seed: int, person: Subject | None
+) -> tuple[str, ...]:
+    """Return why a session cannot be gone on with as asked, a line each; empty where it can.
+
+    Parameters
+    ----------
+    session
+        Begun by a simulation, or by something else, which is told too.
+    asked
+        Settings of the simulation.
+    seed
+        Of subject, sensor and boxes.
+    person
+        Pseudonym and consent; None: nothing is said of them, and those of the session stay.
+    """
+    begun = session.manifest.extra.get("simulation")
+    if not isinstance(begun, Mapping):
+        return ("it was not begun by a simulation",)
+    lines = list(differences({**begun, "seed": session.seed}, {**asked, "seed": seed}))
+    if person is not None:
+        lines += differences(_agreed(session.manifest.subject), _agreed(person))
+    return tuple(lines)
+
+
+def _agreed(person: Subject) -> dict[str, Any]:
+    """Return whom a session is of; uses sorted, since their order says nothing."""
+    day = person.consent_expires
+    return {
+        "pseudonym": person.pseudonym,
+        "consent": ", ".join(sorted(person.consent_scope)) or "nothing",
+        "consent_expires": "no end" if day is None else day.isoformat(),
+    }
+
+
+def _short(value: Any) -> str:
+    """Return a value as people read it: of files their name, of lists their members."""
+    if isinstance(value, Mapping) and "file" in value:
+        return str(value["file"])
+    if isinstance(value, Mapping) and "steps" in value:
+        return f"a plan of {len(value['steps'])} steps"
+    if isinstance(value, list | tuple) and all(isinstance(one, str) for one in value):
+        text = ", ".join(value) or "none"
+    else:
+        text = value if isinstance(value, str) and value else repr(value)
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
