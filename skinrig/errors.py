@@ -116,6 +116,8 @@ def interruption(given: Sequence[str]) -> str:
     'interrupted; bench.json in --out keeps what was measured'
     """
     command = next((word for word in given if not word.startswith("-")), "")
+    if command == "serve":  # what it is resumed with is not its own
+        return "interrupted; serve with --resume SESSION to go on with a session captured from it"
     if command in RESUMED:
         return "interrupted; the same command with --resume goes on"
     kept = any(word == "--out" or word.startswith("--out=") for word in given)

@@ -17,6 +17,7 @@ from skinrig.simulating import dome as simulating_dome
 from skinrig.simulating import flash, gradient
 from skinrig.simulating.shot_numbers import shots_made
 from skinrig.simulating.simulation import SIZES, OptionsError, SimulationError
+from skinrig.simulating.subject_records import unseen
 
 if TYPE_CHECKING:
     import numpy as np
@@ -83,6 +84,9 @@ def serve_rig(
     made = _shots_made(resume, rig)
     if site is not None and rig.caliper is None:
         raise OptionsError("site: only the gradient rig knows of it; leave it out")
+    # a rig's own file may have any name: what it sees hangs on what it is built of
+    kind = "gradient" if "gradient_sphere" in rig.boxes else "probe" if rig.probe else "other"
+    unseen(subject, kind, lambda text: print(text, file=sys.stderr))
     if "gradient_sphere" in rig.boxes:
         if size != "small":
             raise SimulationError(

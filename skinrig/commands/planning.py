@@ -65,10 +65,12 @@ def plan(
     Example: skinrig plan dome --forecast plan.json
     """
     from skinrig.planning.plans import choose, confirmed, lines
+    from skinrig.simulating.subject_records import unseen
 
     console = Console(json)
     if not 0 < valid_share <= 1:
         raise errors.UnusableError(f"--valid-share: got {valid_share:g}, expected above 0, up to 1")
+    unused = unseen(subject, rig, console.progress)
     choice = choose(
         rig, want, subject=subject, seed=seed, width_px=width, most_lights=most_lights,
         valid_share=valid_share, forecast=forecast,
@@ -76,6 +78,8 @@ def plan(
     for line in lines(choice):
         console.say(line)
     document = choice.to_document()
+    if unused:
+        document["subject_unused"] = list(unused)
     reached = choice.reached
     if confirm is not None:
         found = confirmed(choice, confirm, subject=subject, seed=seed, progress=console.progress)

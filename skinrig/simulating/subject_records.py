@@ -30,6 +30,28 @@ def of_manifest(subject: str) -> str | dict[str, Any]:
     return subject_file.record(subject)
 
 
+def unseen(subject: str, rig: str, tell: Callable[[str], None] | None = None) -> tuple[str, ...]:
+    """Return the keys of a subject's file of which a rig sees nothing; none of a preset.
+
+    Parameters
+    ----------
+    subject
+        As the command line has it.
+    rig
+        Name of the rig.
+    tell
+        Told of them, in one line, where there are any.
+    """
+    from rigsim import subject_file
+
+    if not subject_file.is_file(subject):
+        return ()
+    keys = subject_file.read(subject).unused(rig)
+    if keys and tell is not None:
+        tell(f"{subject}: the {rig} rig sees nothing of {', '.join(keys)}")
+    return keys
+
+
 def of_truth(subject: str, rig: str, progress: Callable[[str], None] | None) -> dict[str, Any]:
     """Return parameters of a truth that tell of a subject's file; none of a preset.
 
@@ -46,11 +68,8 @@ def of_truth(subject: str, rig: str, progress: Callable[[str], None] | None) -> 
 
     if not subject_file.is_file(subject):
         return {}
-    unused = list(subject_file.read(subject).unused(rig))
-    if unused and progress is not None:
-        progress(f"{subject}: the {rig} rig sees nothing of {', '.join(unused)}")
     return {
         "subject": Path(subject).stem,
         "subject_file": subject_file.record(subject),
-        "subject_unused": unused,
+        "subject_unused": list(unseen(subject, rig, progress)),
     }

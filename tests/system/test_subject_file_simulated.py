@@ -42,7 +42,9 @@ def test_a_files_melanin_is_that_of_the_truth_which_tells_of_the_file(here, caps
     assert str(here) not in json.dumps(manifest)
 
 
-def test_a_session_is_not_resumed_with_a_file_that_was_changed(here, capsys, monkeypatch):
+@pytest.fixture
+def killed(here, capsys, monkeypatch):
+    """Arguments of a simulation that was interrupted before its first frame."""
     (here / "ann.toml").write_text(FILE.format(melanin=0.02), encoding="utf-8")
     argv = ["simulate", "flash", "--width", "64", "--subject", "ann.toml", "--out", "session"]
 
@@ -51,12 +53,62 @@ def test_a_session_is_not_resumed_with_a_file_that_was_changed(here, capsys, mon
 
     with monkeypatch.context() as patch:
         patch.setattr("skinrig.simulating.simulation.run_plan", broken)
-        assert main(argv) == 130
+        assert main([*argv, "--consent", "research,teaching"]) == 130
+    capsys.readouterr()
+    return argv
+
+
+def test_a_session_is_not_resumed_with_a_file_that_was_changed(here, capsys, killed):
     (here / "ann.toml").write_text(FILE.format(melanin=0.03), encoding="utf-8")
-    assert main([*argv, "--resume"]) == 3
-    assert "resume with the same settings" in capsys.readouterr().err
+    assert main([*killed, "--resume", "--nearer", "5", "--seed", "1"]) == 3
+    said = capsys.readouterr().err
+    assert "resume with the same settings" in said
+    told = [line.strip() for line in said.splitlines() if "begun" in line]
+    assert told == [
+        "subject ann.toml melanin: begun with 0.02, got 0.03", "seed: begun with 0, got 1",
+        "nearer_mm: begun without, got 5.0",
+    ]  # fmt: skip
     (here / "ann.toml").write_text(FILE.format(melanin=0.02), encoding="utf-8")
-    assert main([*argv, "--resume"]) == 0
+    assert main([*killed, "--resume"]) == 0
+    manifest = json.loads((here / "session" / "session.json").read_text(encoding="utf-8"))
+    # nothing was said of the consent when it was resumed: it is as it was begun
+    assert manifest["subject"]["consent_scope"] == ["research", "teaching"]
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--consent", "research"], ["consent: begun with research, teaching, got research"]),
+        (
+            ["--consent", "research,teaching", "--consent-expires", "2031-01-01"],
+            ["consent_expires: begun with no end, got 2031-01-01"],
+        ),
+    ],
+)
+def test_a_session_is_not_resumed_with_another_consent(here, capsys, killed, options, told):
+    assert main([*killed, "--resume", *options]) == 3
+    said = capsys.readouterr().err.splitlines()
+    assert [line.strip() for line in said if "begun" in line] == told
+
+
+def test_a_consent_is_the_same_in_any_order(killed):
+    assert main([*killed, "--resume", "--consent", "teaching,research"]) == 0
+
+
+@pytest.mark.parametrize("command", ["plan", "serve"])
+def test_what_a_rig_sees_nothing_of_is_said_before_the_work(here, capsys, monkeypatch, command):
+    (here / "ann.toml").write_text(FILE.format(melanin=0.02) + "oil = 2.0\n", encoding="utf-8")
+
+    def stopped(*args, **settings):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("skinrig.planning.plans.choose", stopped)
+    monkeypatch.setattr("skinrig.simulating.gradient.make_scene", stopped)
+    assert main([command, "gradient", "--subject", "ann.toml"]) == 130
+    said = capsys.readouterr().err
+    assert "ann.toml: the gradient rig sees nothing of freckles, oil" in said
+    if command == "serve":
+        assert "the same command" not in said
 
 
 def test_a_forecast_is_of_the_skin_that_the_file_tells_of(here, capsys):
