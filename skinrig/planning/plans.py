@@ -11,7 +11,7 @@ import difflib
 import importlib
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,9 @@ UNITS: Mapping[str, Mapping[str, str]] = {
     "probe": {"sigma_tr": "%"},
 }
 """What can be wanted of each rig, and in which unit."""
+
+BY_SITE = "percent_by_site"
+"""Knob of the probe's choices: error of sigma_tr by site, red, green and blue, %."""
 
 _WANT = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
 
@@ -168,7 +171,9 @@ def read_wants(text: str, rig: str) -> dict[str, float]:
         except ValueError:
             value = -1.0
         if not 0.0 < value < 1e6:
-            raise PlanningError(f"--want: got {name}<={number}, expected a number above 0")
+            raise PlanningError(
+                f"--want: got {name}<={number}{unit or ''}, expected a number above 0 and below 1e6"
+            )
         if name in wants:
             raise OptionsError(f"--want: got {name} twice, expected it once")
         wants[name] = value
@@ -324,6 +329,9 @@ def lines(choice: Choice) -> list[str]:
         )
     out += [f"why: {reason}" for reason in choice.reasons]
     for name, value in choice.knobs.items():
+        if name == BY_SITE:
+            out.append(f"percent by site: {_by_site(value)}")
+            continue
         shown = f"{len(value)}: {', '.join(map(str, value))}" if isinstance(value, list) else ""
         out.append(f"{name.replace('_', ' ')}: {shown or _told(value)}")
     out.append(
@@ -333,6 +341,29 @@ def lines(choice: Choice) -> list[str]:
     out += [f"left out: {what} ({why})" for what, why in choice.left_out]
     out += [f"light: {name.replace('_', ' ')} {_told(v)}" for name, v in choice.light.items()]
     return out
+
+
+def _by_site(errors: Mapping[str, Sequence[float]]) -> str:
+    """Return the errors of sites as people read them, each of its color.
+
+    Parameters
+    ----------
+    errors
+        Percent by site, red, green and blue; infinite where nothing is told.
+
+    Examples
+    --------
+    >>> _by_site({"chin": (0.444, 1.399, math.inf), "cheek": (0.5, 1.0, 2.0)})
+    'chin red 0.444 %, green 1.4 %, blue not told; cheek red 0.5 %, green 1 %, blue 2 %'
+    """
+    return "; ".join(
+        f"{site} "
+        + ", ".join(
+            f"{color} " + (f"{one:.3g} %" if math.isfinite(one) else "not told")
+            for color, one in zip(("red", "green", "blue"), row, strict=True)
+        )
+        for site, row in errors.items()
+    )
 
 
 def _told(value: Any) -> str:

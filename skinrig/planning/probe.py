@@ -19,6 +19,7 @@ from capture.plan.probe import BRACKETS, LONGEST_S, exposure_series_s, probe_pla
 from capture.plan.suction import placement_of
 from capture.rig import Rig
 from skinrig.planning.plans import (
+    BY_SITE,
     Choice,
     Forecast,
     PlanningError,
@@ -269,7 +270,7 @@ def _choice(
         {
             "sites": list(setting.sites), "repeats": setting.repeats, "directions": 1,
             "exposures_s": [round(seconds, 5) for seconds in setting.exposures_s],
-            "darks": setting.darks, "valid_share": found.valid_share, "percent_by_site": by_site,
+            "darks": setting.darks, "valid_share": found.valid_share, BY_SITE: by_site,
         },
         tuple(left_out), path, reasons, light_of(plan, rig),
     )  # fmt: skip

@@ -30,6 +30,19 @@ def test_what_cannot_be_wanted_is_told(text, word):
         plans.read_wants(text, "dome")
 
 
+def test_a_number_that_cannot_be_wanted_is_told_as_it_was_written():
+    with pytest.raises(plans.PlanningError, match="got melanin<=0%, expected a number above 0"):
+        plans.read_wants("melanin<=0%", "flash")
+
+
+def test_errors_by_site_are_told_with_their_colors():
+    rig = load_rig("flash")
+    knobs = {plans.BY_SITE: {"chin": [0.444, 1.399, math.inf]}}
+    choice = plans.Choice(rig, flash_plan(rig), (), 1.0, 2.0, knobs, ())
+    told = plans.lines(choice)
+    assert "percent by site: chin red 0.444 %, green 1.4 %, blue not told" in told
+
+
 def test_a_rig_that_has_no_plans_of_its_own_is_told(capsys):
     assert main(["plan", "moon", "--want", "normals<=1deg"]) == 3
     assert "expected one of dome" in capsys.readouterr().err
