@@ -269,7 +269,8 @@ def _faults(line: Any, kind: type) -> Iterable[Fault]:
     elif line["type"] in ("missing", "missing_argument"):
         yield Fault(_path(location), "nothing", "a value: the key is required")
     else:
-        reason = str(line["msg"]).removeprefix("Value error, ")
+        # the library's sentences begin so; after our "expected" only their rest reads on
+        reason = str(line["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
         yield Fault(
             _path(location), shown(line["input"]), reason[:1].lower() + reason[1:].rstrip(".")
         )

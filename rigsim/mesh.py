@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -212,6 +213,9 @@ def centered(mesh: Mesh, *, nose_tip_mm: tuple[float, float, float] = (0.0, -8.0
 
 
 def _load_npz(path: Path) -> Mesh:
+    if path.is_file() and not zipfile.is_zipfile(path):
+        # NumPy would take it for a pickle, and advise to allow that
+        raise MeshFileError(f"{path}: cannot be read as .npz: expected an archive of arrays")
     try:
         with np.load(path, allow_pickle=False) as arrays:
             missing = {"vertices_mm", "faces", "uv"} - set(arrays.files)
@@ -224,8 +228,13 @@ def _load_npz(path: Path) -> Mesh:
             return build_mesh(arrays["vertices_mm"], arrays["faces"], arrays["uv"], shapes=shapes)
     except MeshError:
         raise
+    except FileNotFoundError as error:
+        raise MeshFileError(f"{path}: cannot be read: there is no such file") from error
     except Exception as error:  # zip, pickle and header errors have no common base
-        raise MeshFileError(f"{path}: cannot be read as .npz: {error}") from error
+        # of objects of Python NumPy says how to read them; nobody's face is worth that
+        pickled = "allow_pickle" in str(error)
+        why = "holds objects, expected arrays of numbers" if pickled else error
+        raise MeshFileError(f"{path}: cannot be read as .npz: {why}") from error
 
 
 def _load_obj(path: Path) -> Mesh:

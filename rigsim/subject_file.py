@@ -22,8 +22,10 @@ What is left to chance is drawn by the seed, as for a preset.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,12 +33,12 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from capture.documents import STRICT, Checks, parse, read_toml
+from capture.documents import STRICT, Checks, Fault, parse, read_toml
 from rigsim import pigment
-from rigsim.mesh import Mesh
+from rigsim.mesh import Mesh, MeshError, load_mesh
 from rigsim.microrelief import MicroSkin, make_micro_skin
 from rigsim.perfusion import HEMOGLOBIN_LIMIT
-from rigsim.probe_tissue import ProbedTissue, SkinTissue, parse_subject
+from rigsim.probe_tissue import ProbedTissue, SkinTissue, TissueError, parse_subject
 from rigsim.subject import PRESETS, Subject, make_subject
 from rigsim.subject_textures import MAP_RANGES, SubjectFileError, load, texture
 
@@ -216,7 +218,14 @@ def tissue(text: str, *, seed: int) -> ProbedTissue:
     seed
         Of what differs between subjects.
     """
-    return named(text).tissue(seed=seed) if is_file(text) else parse_subject(text, seed=seed)
+    if is_file(text):
+        return named(text).tissue(seed=seed)
+    try:
+        return parse_subject(text, seed=seed)
+    except TissueError as error:
+        if ":" in text:  # a medium whose numbers are wrong
+            raise
+        raise TissueError(f"{error}, or a file NAME{SUFFIX}") from error
 
 
 def read(path: str | Path) -> SubjectFile:
@@ -229,23 +238,52 @@ def read(path: str | Path) -> SubjectFile:
     """
     place = Path(path)
     document = read_toml(place, error=SubjectFileError)
+    faults: list[Fault] = []
     if "schema" not in document:
-        raise SubjectFileError(
-            f'has no schema; is it a subject? Its first line is schema = "{SCHEMA}"',
-            where=str(path),
-        )
-    found: SubjectFile = parse(SubjectFile, document, where=str(path), error=SubjectFileError)
+        faults.append(Fault("schema", "nothing", f'a first line schema = "{SCHEMA}"'))
+    found = _parsed(document, str(path), faults)
     files = {
         key: str(place.parent / name) for key in _FILES if (name := getattr(found, key)) is not None
     }
-    found = dataclasses.replace(found, **cast(Any, files))
     for key, name in files.items():
         if not Path(name).is_file():
-            raise SubjectFileError(f"{key}: there is no file {name}", where=str(path))
-    for key in MAP_RANGES:
-        if key in files:
-            load(key, files[key])
-    return found
+            faults.append(Fault(key, name, "a file that is there"))
+    if faults:
+        number = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
+        raise SubjectFileError(number, where=str(path), faults=faults)
+    for key, name in files.items():
+        if key in MAP_RANGES:
+            load(key, name)
+        else:
+            _check_mesh(str(path), name, Path(name).stat().st_mtime_ns)
+    return dataclasses.replace(found, **cast(Any, files))
+
+
+def _parsed(document: Mapping[str, Any], where: str, faults: list[Fault]) -> SubjectFile:
+    """Return what the right keys of a document say, the others' faults added to a list.
+
+    Ranges are looked at only when all types are right: so that both are told at once, keys with
+    faults are taken out, and the rest is looked at again.
+    """
+    rest = dict(document)
+    while True:
+        try:
+            return parse(SubjectFile, rest, where=where, error=SubjectFileError)
+        except SubjectFileError as error:
+            faults += error.faults
+            wrong = {re.split(r"[.\[]", fault.path)[0] for fault in error.faults}
+            if not wrong & rest.keys():  # a name that is no key of ours, such as "a.b"
+                raise SubjectFileError(error.what, where=where, faults=faults) from error
+            rest = {key: value for key, value in rest.items() if key not in wrong}
+
+
+@functools.lru_cache(maxsize=8)
+def _check_mesh(where: str, path: str, changed_ns: int) -> None:
+    """Raise where a mesh cannot be used; one is read once as long as it is not changed."""
+    try:
+        load_mesh(path)
+    except MeshError as error:
+        raise SubjectFileError(f"mesh: {error}", where=where) from error
 
 
 def record(text: str) -> str | dict[str, Any]:

@@ -1,14 +1,17 @@
 """Subjects by a file: what it says is what the face, the patch and the tissue are made of."""
 
+import math
+
 import numpy as np
 import pytest
 
 from model.store import write_exr
 from rigsim import pigment, subject_file
 from rigsim.perfusion import STATES
-from rigsim.probe_tissue import SkinTissue
+from rigsim.probe_tissue import SkinTissue, TissueError
 from rigsim.subject import make_subject
 from rigsim.subject_file import SubjectFileError, named, read, record
+from rigsim.subject_textures import texture
 
 SCHEMA = 'schema = "skinrig.subject/1"\n'
 
@@ -116,14 +119,22 @@ def test_the_record_tells_files_of_one_name_apart(person, tmp_path):
         ('preset = "VII"', "preset: got 'VII'"),
         ('melanin = "dark"', "melanin"),
         ("melanin = nan", "melanin"),
-        ('mesh = "none.obj"', "mesh: there is no file"),
-        ('melanin_map = "none.npy"', "melanin_map: there is no file"),
+        ('mesh = "none.obj"', r"mesh: got .*none\.obj, expected a file that is there"),
+        ('mesh = "text.npz"', r"mesh: .*text\.npz: cannot be read as \.npz"),
+        ('mesh = "objects.npz"', r"mesh: .*objects\.npz: .*arrays of numbers"),
+        ('mesh = "text.obj"', r"mesh: .*text\.obj"),
+        ('mesh = "flat.npy"', r"mesh: .*expected \.npz or \.obj"),
+        ('melanin_map = "none.npy"', r"melanin_map: got .*none\.npy, expected a file"),
         ('melanin_map = "flat.npy"', r"got float64 of shape \(64,\)"),
         ('melanin_map = "much.npy"', r"got 0\.9 to 0\.9, expected finite volume fractions"),
         ('melanin_map = "holes.npy"', "finite volume fractions"),
         ('melanin_map = "flat.png"', r"expected a file \.npy or \.exr"),
         ('melanin_map = "several.npy"', r"is no \.npy file"),
         ('melanin_map = "text.npy"', r"is no \.npy file"),
+        ('melanin_map = "header.npy"', r"got float64 of shape \(1000000, 1000000\)"),
+        ('melanin_map = "large.npy"', r"got float32 of shape \(8193, 8193\)"),
+        ('melanin_map = "cut.npy"', "got 10 bytes of data, expected 32768 "),
+        ('melanin_map = "objects.npy"', "got object of shape"),
         ('melanin_map = "text.exr"', "expected an OpenEXR image"),
         ('melanin = 0.1\nmelanin_map = "flat.npy"', "no melanin and freckles beside it"),
         ('blood = 2\nhemoglobin_map = "flat.npy"', "no blood beside it"),
@@ -136,17 +147,74 @@ def test_what_is_wrong_with_a_file_is_named(person, tmp_path, text, said):
     np.save(tmp_path / "holes.npy", np.full((64, 64), np.nan))
     np.savez(tmp_path / "several.npz", a=np.ones((64, 64)))
     (tmp_path / "several.npz").rename(tmp_path / "several.npy")
-    for name in ("flat.png", "text.npy", "text.exr"):
+    for name, kind, side in (
+        ("header", "<f8", 10**6), ("large", "<f4", 8193), ("cut", "<f8", 64), ("objects", "|O", 64),
+    ):  # fmt: skip
+        with (tmp_path / f"{name}.npy").open("wb") as stream:
+            header = {"descr": kind, "fortran_order": False, "shape": (side, side)}
+            np.lib.format.write_array_header_1_0(stream, header)
+            stream.write(bytes(10))
+    objects = {name: np.array([{}]) for name in ("vertices_mm", "faces", "uv")}
+    np.savez(tmp_path / "objects.npz", **objects)
+    for name in ("flat.png", "text.npy", "text.exr", "text.npz", "text.obj"):
         (tmp_path / name).write_text("words", encoding="utf-8")
     with pytest.raises(SubjectFileError, match=said) as caught:
         read(person(text))
     assert "ann.toml" in str(caught.value) or "_map" in str(caught.value)
+    assert "pickle" not in str(caught.value)
 
 
 def test_every_fault_is_told_at_once(person):
     with pytest.raises(SubjectFileError) as caught:
         read(person('melanin = 0.9\nblood = 9\npreset = "VII"'))
     assert all(name in str(caught.value) for name in ("melanin", "blood", "preset"))
+
+
+def test_faults_of_type_of_range_and_of_names_are_told_together(tmp_path):
+    (tmp_path / "ann.toml").write_text(
+        'melanin = nan\nblood = inf\noil = -1\nfre = 2\npreset = 3\nmesh = "none.obj"\n',
+        encoding="utf-8",
+    )
+    with pytest.raises(SubjectFileError, match="7 faults") as caught:
+        read(tmp_path / "ann.toml")
+    keys = [fault.path for fault in caught.value.faults]
+    assert sorted(keys) == ["blood", "fre", "melanin", "mesh", "oil", "preset", "schema"]
+    assert "preset: got 3, expected a valid string" in str(caught.value)
+
+
+def test_a_key_that_is_no_name_of_ours_ends_in_one_error(person):
+    with pytest.raises(SubjectFileError, match=r"a\.b.*an unknown key"):
+        read(person('"a.b" = 1\n"" = 2'))
+
+
+@pytest.mark.parametrize("size", [64, 77, 100])
+def test_texels_that_get_fewer_are_means_of_the_area_that_they_cover(tmp_path, rng, size):
+    """Expected: means over a grid so fine that it divides both, in double precision."""
+    values = rng.uniform(0.01, 0.3, (128, 128)).astype(np.float32)
+    np.save(tmp_path / "m.npy", values)
+    small = texture("melanin_map", str(tmp_path / "m.npy"), size)
+    parts = math.lcm(128, size)
+    rows = np.arange(parts) * 128 // parts  # of the file, for each fine row
+    by_row = values.astype(np.float64)[rows].reshape(size, -1, 128).mean(axis=1)
+    expected = by_row[:, rows].reshape(size, size, -1).mean(axis=2)
+    np.testing.assert_allclose(small, expected, rtol=2e-6)
+
+
+def test_fine_stripes_leave_no_coarse_ones(tmp_path):
+    """Of 2.56 texels two, a bright and a dark one, make up for each other; 0.56 are left."""
+    values = np.tile(np.array([0.01, 0.3], np.float32), (256, 128))
+    np.save(tmp_path / "m.npy", values)
+    small = texture("melanin_map", str(tmp_path / "m.npy"), 100)
+    assert np.abs(small - 0.155).max() <= 0.145 * 0.56 / 2.56 * (1.0 + 1e-4)
+    assert small.mean() == pytest.approx(0.155, rel=1e-5)
+
+
+def test_a_tissue_that_is_not_known_is_told_of_files():
+    with pytest.raises(TissueError, match=r"got 'ann\.TOML'.*or a file NAME\.toml"):
+        subject_file.tissue("ann.TOML", seed=0)
+    with pytest.raises(TissueError) as caught:
+        subject_file.tissue("homogeneous:-1,1", seed=0)
+    assert "a file NAME" not in str(caught.value)
 
 
 def test_a_file_of_another_schema_or_of_none_is_refused(tmp_path):
@@ -163,6 +231,7 @@ def test_what_is_neither_a_preset_nor_a_file_is_refused(text):
 
 
 def test_a_mesh_is_named_once(person, tmp_path):
-    (tmp_path / "face.obj").write_text("v 0 0 0\n", encoding="utf-8")
+    corners = "v 0 0 0\nv 9 0 0\nv 0 9 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
+    (tmp_path / "face.obj").write_text(corners, encoding="utf-8")
     with pytest.raises(SubjectFileError, match="leave the other out"):
         read(person('mesh = "face.obj"')).face(seed=0, size=64, mesh="other.obj")
