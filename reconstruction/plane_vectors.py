@@ -36,8 +36,9 @@ def length_and_errors(pair: Floats, covariance: Floats) -> tuple[Floats, Floats,
 
     Examples
     --------
-    >>> length_and_errors(np.array([[0.0, 5.0]]), np.diag([9.0, 4.0])[None])
-    (array([5.]), array([2.]), array([3.]))
+    >>> found = length_and_errors(np.array([[0.0, 5.0]]), np.diag([9.0, 4.0])[None])
+    >>> [values.tolist() for values in found]
+    [[5.0], [2.0], [3.0]]
     """
     length = np.hypot(pair[:, 0], pair[:, 1])
     unit = np.where(length[:, None] > 0, pair / np.where(length > 0, length, 1.0)[:, None], 0.0)
@@ -55,8 +56,8 @@ def within_period(angle: Floats, period: float) -> Floats:
 
     Examples
     --------
-    >>> within_period(np.array([-90.0, 450.0, -1e-30]), 360.0)
-    array([270.,  90.,   0.])
+    >>> within_period(np.array([-90.0, 450.0, -1e-30]), 360.0).tolist()
+    [270.0, 90.0, 0.0]
     """
     within = np.mod(angle, period)
     return np.where(within >= period, 0.0, within)
@@ -75,8 +76,8 @@ def axis_stderr(h: Floats, across: Floats) -> Floats:
 
     Examples
     --------
-    >>> axis_stderr(np.array([1.0, 0.0]), np.array([0.02, 0.02])).round(3)
-    array([0.01 , 0.907])
+    >>> axis_stderr(np.array([1.0, 0.0]), np.array([0.02, 0.02])).round(3).tolist()
+    [0.01, 0.907]
     """
     with np.errstate(divide="ignore", over="ignore"):
         z = np.where(across > 0, 0.5 * (h / np.where(across > 0, across, 1.0)), math.inf) ** 2

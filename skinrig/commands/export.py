@@ -31,7 +31,7 @@ def export(
         str,
         typer.Option(
             help="Of an appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. "
-            "Of a session: mhl, frames, event-model, lp, stokes."
+            "Of a session: mhl, frames, lp, stokes, event-model."
         ),
     ],
     out: Out,
