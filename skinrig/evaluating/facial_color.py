@@ -79,12 +79,13 @@ class ChangeError:
 def true_blood(truth: SkinAppearance) -> SkinMap | None:
     """Return a state's true blood on the face at rest, after light has spread where that is told.
 
-    Pictures show blood through skin: what can be measured is the blurred map.
+    Pictures show blood through skin: what can be measured is the blurred map. Where a truth has it
+    of the face as it moved alone, there is none at rest: a sharp map less a blurred one of another
+    state would show the skin's fine structure as a change.
     """
-    names = ("hemoglobin_blurred_at_rest", "hemoglobin_at_rest")
-    if truth.parameters.get("state") == NEUTRAL:
-        names = ("hemoglobin_blurred", "hemoglobin")
-    return next((truth.maps[name] for name in names if name in truth.maps), None)
+    at_rest = "" if truth.parameters.get("state") == NEUTRAL else "_at_rest"
+    spread = "_blurred" if "hemoglobin_blurred" in truth.maps else ""
+    return truth.maps.get(f"hemoglobin{spread}{at_rest}")
 
 
 def compare(

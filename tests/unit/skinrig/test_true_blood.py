@@ -1,0 +1,31 @@
+"""Which map of a truth a state's blood is compared with."""
+
+import numpy as np
+import pytest
+
+from model.skin import UNITS, SkinAppearance, SkinMap
+from skinrig.evaluating.facial_color import true_blood
+
+MOVED = ("hemoglobin", "hemoglobin_at_rest")
+SPREAD = ("hemoglobin_blurred", "hemoglobin_blurred_at_rest")
+
+
+@pytest.mark.parametrize(
+    ("state", "names", "taken"),
+    [
+        ("neutral", ("hemoglobin",), "hemoglobin"),
+        ("neutral", ("hemoglobin", "hemoglobin_blurred"), "hemoglobin_blurred"),
+        ("smile", MOVED, "hemoglobin_at_rest"),
+        ("smile", (*MOVED, *SPREAD), "hemoglobin_blurred_at_rest"),
+        # blurred as it moved alone: the sharp one at rest goes with no blurred neutral one
+        ("smile", (*MOVED, "hemoglobin_blurred"), None),
+        ("smile", ("hemoglobin",), None),
+    ],
+)
+def test_blood_is_taken_as_light_spreads_in_all_states_or_in_none(state, names, taken):
+    maps = {
+        name: SkinMap(np.full((2, 2), number, np.float32), UNITS["hemoglobin"])
+        for number, name in enumerate(names)
+    }
+    truth = SkinAppearance(maps, "simulated", parameters={"kind": "truth", "state": state})
+    assert true_blood(truth) is (None if taken is None else maps[taken])
