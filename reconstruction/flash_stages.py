@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from capture import raw
 from capture.calibration.color import ColorMatrix
-from capture.calibration.color import from_calibration as color_matrix_from
+from capture.calibration.color.matrix import from_calibration as color_matrix_from
+from capture.calibration.color.white import WhiteReference
 from capture.calibration.polarization import PolarizationCalibration
-from capture.calibration.sensor import QUANTIZATION_DN2, SensorCalibration
-from capture.calibration.white import WhiteReference
+from capture.calibration.sensor import SensorCalibration
+from capture.calibration.sensor.noise_model import QUANTIZATION_DN2
 from capture.session import FrameRecord, Session
 from model import color_table
 from model.skin import UNITS, SkinMap

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from capture.calibration.led_sphere.lights import SphereFilms, SphereLightTable
 from capture.calibration.sensor import SensorCalibration
-from capture.calibration.sphere_lights import SphereFilms, SphereLightTable
 from capture.session import Session
 from model.skin import UNITS, SkinMap
 from reconstruction import relief_errors, stages

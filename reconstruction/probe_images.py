@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.calibration.fibre_darks import CameraNoise, DarkModel, measure_darks
-from capture.calibration.fibre_merge import MergedSeries, merge_series
+from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_darks
+from capture.calibration.fiber.merge import MergedSeries, merge_series
 from capture.plan.suction import Placement, placement_of
 from capture.session import FrameRecord, Session
 from reconstruction.evidence import EvidenceError

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.calibration.fibre import FibreCalibration, FibreReflectance
-from capture.calibration.fibre_darks import CameraNoise
-from capture.calibration.fibre_readings import sum_spots
+from capture.calibration.fiber.darks import CameraNoise
+from capture.calibration.fiber.gains import FibreCalibration, FibreReflectance
+from capture.calibration.fiber.readings import sum_spots
 from capture.calibration.sensor import SensorCalibration
 from capture.rig import Probe
 from capture.session import Session

@@ -12,8 +12,8 @@ import tty
 from collections.abc import Callable
 from typing import Protocol
 
-from .link import Link, LinkStalled, Unplugged
-from .world import World
+from rigsim.link import Link, LinkStalled, Unplugged
+from rigsim.world import World
 
 __all__ = ["BoxEnd", "PtyEnd", "TcpEnd"]
 

@@ -23,8 +23,7 @@ from capture.devices.camera import (
     Trigger,
 )
 from capture.rig import RigError, View
-
-from .world import World, get_by_name_or_box
+from rigsim.world import World, get_by_name_or_box
 
 __all__ = ["CameraBody", "SimCamera", "open_camera"]
 

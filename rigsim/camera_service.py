@@ -1,4 +1,4 @@
-"""A world's cameras on one TCP port; `capture.devices.camera_wire` says how they are spoken to."""
+"""Serve a world's cameras on one TCP port; see `capture.devices.cameras.camera_wire`."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from capture.devices import camera_wire
 from capture.devices.camera import CameraError, Exposure, FrameTimeout, Trigger
-from capture.devices.camera_wire import BadMessage
-
-from .camera import CameraBody, SimCamera
-from .world import World
+from capture.devices.cameras import camera_wire
+from capture.devices.cameras.camera_wire import BadMessage
+from rigsim.camera import CameraBody, SimCamera
+from rigsim.world import World
 
 __all__ = ["CameraService"]
 

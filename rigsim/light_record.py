@@ -7,10 +7,10 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-from .boxes.dome import LedPulse
-from .boxes.flash import FlashPop
-from .boxes.gradient_sphere import PatternLight
-from .boxes.probe import SourceLight
+from rigsim.boxes.dome import LedPulse
+from rigsim.boxes.flash import FlashPop
+from rigsim.boxes.gradient_sphere import PatternLight
+from rigsim.boxes.probe import SourceLight
 
 __all__ = ["FlashPop", "LedPulse", "Light", "LightRecord", "PatternLight", "SourceLight"]
 

@@ -13,8 +13,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .boxes.controller import Controller
-from .faults import Faults
+from rigsim.boxes.controller import Controller
+from rigsim.faults import Faults
 
 __all__ = ["Link", "LinkStalled", "Unplugged"]
 

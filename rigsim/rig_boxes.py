@@ -9,17 +9,16 @@ from typing import Final
 import numpy as np
 
 from capture.rig import LedLimits, Rig
-
-from .boxes.caliper import CaliperUnit
-from .boxes.controller import Controller, Device
-from .boxes.dome import DomeUnit
-from .boxes.flash import FlashUnit
-from .boxes.gradient_sphere import GradientSphereUnit
-from .boxes.probe import ProbeUnit
-from .faults import Faults
-from .light_record import LightRecord
-from .suction import SuckedHead
-from .taped_skin import TapedSkin
+from rigsim.boxes.caliper import CaliperUnit
+from rigsim.boxes.controller import Controller, Device
+from rigsim.boxes.dome import DomeUnit
+from rigsim.boxes.flash import FlashUnit
+from rigsim.boxes.gradient_sphere import GradientSphereUnit
+from rigsim.boxes.probe import ProbeUnit
+from rigsim.faults import Faults
+from rigsim.light_record import LightRecord
+from rigsim.suction import SuckedHead
+from rigsim.taped_skin import TapedSkin
 
 SERIAL_NUMBERS: Final = {
     "flash": "FL-0001",

@@ -8,8 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .suction import HeadState
-from .taped_skin import GripState
+from rigsim.suction import HeadState
+from rigsim.taped_skin import GripState
 
 __all__ = ["CaliperScene", "ProbeScene", "Scene"]
 

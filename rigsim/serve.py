@@ -19,11 +19,10 @@ from types import TracebackType
 from typing import Self
 
 from capture.rig import Rig, load_rig
-
-from .box_ends import BoxEnd, PtyEnd, TcpEnd
-from .camera_service import CameraService
-from .faults import Faults
-from .world import CaliperScene, ProbeScene, Scene, World
+from rigsim.box_ends import BoxEnd, PtyEnd, TcpEnd
+from rigsim.camera_service import CameraService
+from rigsim.faults import Faults
+from rigsim.world import CaliperScene, ProbeScene, Scene, World
 
 __all__ = ["ServeError", "Served", "serve"]
 

@@ -22,18 +22,17 @@ from numpy.typing import NDArray
 
 from capture.devices.camera import Exposure
 from capture.rig import Rig, View, load_rig
-
-from .boxes.controller import Controller
-from .faults import NO_FAULTS, Faults
-from .light_record import FlashPop, LedPulse, Light, LightRecord, PatternLight, SourceLight
-from .link import Link
-from .rig_boxes import Wiring, make_box
-from .scene_protocols import CaliperScene, ProbeScene, Scene
-from .suction import CameraCooler, HeadState, SuckedHead
-from .taped_skin import GripState, TapedSkin
+from rigsim.boxes.controller import Controller
+from rigsim.faults import NO_FAULTS, Faults
+from rigsim.light_record import FlashPop, LedPulse, Light, LightRecord, PatternLight, SourceLight
+from rigsim.link import Link
+from rigsim.rig_boxes import Wiring, make_box
+from rigsim.scene_protocols import CaliperScene, ProbeScene, Scene
+from rigsim.suction import CameraCooler, HeadState, SuckedHead
+from rigsim.taped_skin import GripState, TapedSkin
 
 if TYPE_CHECKING:
-    from .camera import CameraBody
+    from rigsim.camera import CameraBody
 
 __all__ = [
     "CaliperScene",
@@ -234,7 +233,7 @@ class World:
 
     def camera(self, view_name: str) -> CameraBody:
         """Return the camera of a view; it lives as long as the world."""
-        from .camera import CameraBody
+        from rigsim.camera import CameraBody
 
         with self.lock:
             if view_name not in self._cameras:

@@ -94,7 +94,7 @@ def _serial_ports() -> list[Finding]:
 
 def _camera_producers() -> Finding:
     from capture.devices.camera import CameraUrlError
-    from capture.devices.genicam_producer import SEARCH_PATH, producer_files
+    from capture.devices.cameras.genicam_producer import SEARCH_PATH, producer_files
 
     try:
         state = ", ".join(file.name for file in producer_files("genicam", ""))

@@ -7,7 +7,7 @@ from typing import Final
 
 from capture.plan import Plan
 from capture.plan.dose import dose_report
-from capture.plan.fibre_light import SKIN_APERTURE_MM, fibre_light
+from capture.plan.fiber_light import SKIN_APERTURE_MM, fibre_light
 from capture.plan.flicker import flicker_report
 from capture.plan.gradient import scan_duty, states
 from capture.rig import LedLimits, Rig

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.calibration.phantom import (
+from capture.calibration.fiber.phantom import (
     CertificateError,
     ExpectedReflectance,
     PhantomCertificate,
@@ -41,7 +41,7 @@ def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedR
 
     Examples
     --------
-    >>> from capture.calibration.phantom import CertificateUncertainty
+    >>> from capture.calibration.fiber.phantom import CertificateUncertainty
     >>> from capture.rig import load_rig
     >>> paper = PhantomCertificate(
     ...     eta=1.4, g=0.8, wavelength_nm=(550.0,), sigma_a_per_mm=(0.01,),

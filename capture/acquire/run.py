@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from capture.acquire.dome import run_dome
-from capture.acquire.flash import run_flash
-from capture.acquire.gradient import run_gradient
+from capture.acquire.flash.run import run_flash
+from capture.acquire.gradient.run import run_gradient
 from capture.acquire.outcome import Acquired, AcquisitionError, Operator
-from capture.acquire.probe import run_probe
+from capture.acquire.probe.run import run_probe
 from capture.devices.camera import Camera, check_serials
 from capture.devices.dome import Eyes
 from capture.devices.port import SYSTEM_CLOCK, Clock

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, ClassVar, Self
 
-from . import wire
-from .port import BadAnswer, DeviceError, Hello, Port, WrongDevice
+from capture.devices import wire
+from capture.devices.port import BadAnswer, DeviceError, Hello, Port, WrongDevice
 
 log = logging.getLogger(__name__)
 

@@ -15,8 +15,8 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from .box import Box, BoxStatus
-from .port import PortTimeout
+from capture.devices.box import Box, BoxStatus
+from capture.devices.port import PortTimeout
 
 __all__ = ["CaliperBox", "CaliperStatus", "Ended", "MoveReport"]
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from .led_box import LEVEL_STEPS, Eyes, Judgment, LedBox, LedStatus, Position
+from capture.devices.led_box import LEVEL_STEPS, Eyes, Judgment, LedBox, LedStatus, Position
 
 __all__ = ["DomeBox", "Eyes", "Judgment", "Position", "TableRow"]
 

@@ -12,8 +12,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from .box import Box, BoxStatus
-from .port import Clock, LinkLost, Port, PortTimeout, WrongDevice
+from capture.devices.box import Box, BoxStatus
+from capture.devices.port import Clock, LinkLost, Port, PortTimeout, WrongDevice
 
 __all__ = ["ChargeState", "FlashBox", "FlashReport", "Status", "find_box"]
 

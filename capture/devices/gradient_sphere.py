@@ -14,10 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+from capture.devices.led_box import LEVEL_STEPS, Eyes, Judgment, LedBox, LedStatus, Position
+from capture.devices.port import PortTimeout
 from capture.plan.steps import PATTERNS
-
-from .led_box import LEVEL_STEPS, Eyes, Judgment, LedBox, LedStatus, Position
-from .port import PortTimeout
 
 __all__ = [
     "READINGS_DEG",

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from . import wire
-from .box import Box, BoxStatus
-from .port import Port
+from capture.devices import wire
+from capture.devices.box import Box, BoxStatus
+from capture.devices.port import Port
 
 __all__ = ["LEVEL_STEPS", "Eyes", "Judgment", "LedBox", "LedStatus", "Position"]
 

@@ -28,8 +28,8 @@ from typing import Any, Protocol, Self
 
 import serial
 
-from . import wire
-from .wire import Code, Event, Reply, Request
+from capture.devices import wire
+from capture.devices.wire import Code, Event, Reply, Request
 
 __all__ = [
     "SYSTEM_CLOCK",

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from capture import raw
 from capture.documents import Fault
 from capture.importers import light_lists
+from capture.importers.images import Photo, PhotoError, read_photo
 from capture.importers.light_lists import LightList, LightListError
-from capture.importers.pictures import Photo, PhotoError, read_photo
 from capture.plan import Plan, Step, Value
 from capture.rig import Light, Rig, View
 from capture.session import Session, Subject

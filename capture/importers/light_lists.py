@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.documents import Fault, InputError
-from capture.importers.pictures import read_photo
+from capture.importers.images import read_photo
 from capture.raw import RawFrame
 
 Floats = NDArray[np.float64]
@@ -333,7 +333,7 @@ def _from_text(path: Path, directory: Path) -> LightList:
 
 
 def _from_ball(folder: Path, count: int) -> Floats:
-    from capture.calibration.chrome_ball import ChromeBallError, directions_from_chrome_ball
+    from capture.calibration.lights.chrome_ball import ChromeBallError, directions_from_chrome_ball
 
     pictures, mask = pictures_in(folder), mask_of(folder)
     if len(pictures) != count or mask is None:

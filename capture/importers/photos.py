@@ -15,7 +15,7 @@ from pathlib import Path
 
 from capture import raw
 from capture.documents import Fault, InputError
-from capture.importers.pictures import Encoding, Photo, PhotoError, read_photo
+from capture.importers.images import Encoding, Photo, PhotoError, read_photo
 from capture.plan import Kind, Plan, Step, Value
 from capture.rig import Light, Rig, View
 from capture.session import Session, SessionDiskError, Subject

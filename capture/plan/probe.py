@@ -145,7 +145,7 @@ def probe_calibration_plan(
     target : {"phantom", "dark"}
         "phantom": darks; the series of exposures on a block of known optics; then per fibre some
         exposures with all other fibres covered, `MASK_EVERY` brackets apart. Of those only two
-        that serve are taken unless all are asked for, see `capture.acquire.mask_choice`;
+        that serve are taken unless all are asked for, see `capture.acquire.probe.mask_choice`;
         "dark": the darks only.
     repeats : int
         Placements on the phantom, >= 1; fibres are covered at the first.

@@ -26,8 +26,7 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import Caliper
-
-from .controller import Command, Refused, number
+from rigsim.boxes.controller import Command, Refused, number
 
 __all__ = ["CONTROL_S", "CaliperUnit", "JawLoad"]
 

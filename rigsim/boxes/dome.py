@@ -17,11 +17,18 @@ from dataclasses import dataclass
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits, Light
-
-from .controller import Command, Refused, number
-from .eye_guard import Lit
-from .led_sequencer import LED_MS, LedSequencer, Run, whole
-from .led_table import LEVEL_STEPS, Row, Switch, lit_by, parse_leds, parse_rows, switches
+from rigsim.boxes.controller import Command, Refused, number
+from rigsim.boxes.eye_guard import Lit
+from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run, whole
+from rigsim.boxes.led_table import (
+    LEVEL_STEPS,
+    Row,
+    Switch,
+    lit_by,
+    parse_leds,
+    parse_rows,
+    switches,
+)
 
 __all__ = ["DomeUnit", "LedPulse"]
 

@@ -22,8 +22,7 @@ from typing import Any, Literal
 import numpy as np
 
 from capture.devices.wire import Code
-
-from .controller import Command, Later, Refused, choice, number, word
+from rigsim.boxes.controller import Command, Later, Refused, choice, number, word
 
 __all__ = ["FlashPop", "FlashUnit"]
 

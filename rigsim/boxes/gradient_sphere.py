@@ -23,12 +23,11 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits, Light
-
-from .controller import Command, Refused, choice, number
-from .eye_guard import Lit
-from .led_sequencer import LED_MS, LedSequencer, Run, whole
-from .led_table import LEVEL_STEPS, Switch, table_crc
-from .pattern_table import (
+from rigsim.boxes.controller import Command, Refused, choice, number
+from rigsim.boxes.eye_guard import Lit
+from rigsim.boxes.led_sequencer import LED_MS, LedSequencer, Run, whole
+from rigsim.boxes.led_table import LEVEL_STEPS, Switch, table_crc
+from rigsim.boxes.pattern_table import (
     ANALYSER_DEG,
     PatternRow,
     parse_patterns,

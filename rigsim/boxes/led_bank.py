@@ -10,9 +10,8 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits, Light
-
-from .controller import Refused
-from .eye_guard import Lit
+from rigsim.boxes.controller import Refused
+from rigsim.boxes.eye_guard import Lit
 
 __all__ = ["LedBank"]
 

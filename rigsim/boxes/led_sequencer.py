@@ -17,11 +17,10 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits, Light
-
-from .controller import Command, Refused, choice, word
-from .eye_guard import EyeGuard, Lit
-from .led_bank import LedBank
-from .led_table import LEVEL_STEPS, ROW_US, Switch, table_crc
+from rigsim.boxes.controller import Command, Refused, choice, word
+from rigsim.boxes.eye_guard import EyeGuard, Lit
+from rigsim.boxes.led_bank import LedBank
+from rigsim.boxes.led_table import LEVEL_STEPS, ROW_US, Switch, table_crc
 
 __all__ = ["LED_MS", "LedSequencer", "Run", "TableRow", "whole"]
 

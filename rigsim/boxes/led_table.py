@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 from capture.devices import wire
 from capture.devices.wire import Code
-
-from .controller import Refused
-from .eye_guard import Lit
+from rigsim.boxes.controller import Refused
+from rigsim.boxes.eye_guard import Lit
 
 __all__ = ["Row", "Switch", "lit_by", "parse_leds", "parse_rows", "switches", "table_crc"]
 

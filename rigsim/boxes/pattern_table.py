@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from capture.devices.wire import Code
 from capture.plan.steps import PATTERNS
 from capture.rig import Light
-
-from .controller import Refused, number
-from .led_table import LEVEL_STEPS, ROW_US, Switch
+from rigsim.boxes.controller import Refused, number
+from rigsim.boxes.led_table import LEVEL_STEPS, ROW_US, Switch
 
 __all__ = ["ANALYSER_DEG", "PatternRow", "parse_patterns", "pattern_shares", "schedule", "starts"]
 

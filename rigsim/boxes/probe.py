@@ -25,10 +25,17 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits, Light, Probe
-
-from .controller import Command, Later, Refused, number, word
-from .source_shutter import COVER_S, LEVEL_STEPS, SHUTTER_MS, SourceLight, SourceShutter
-from .suction_pump import CONTROL_S, LEAST_MBAR, LEAST_MS, REACH_S, Gauge, SuctionLoad, SuctionPump
+from rigsim.boxes.controller import Command, Later, Refused, number, word
+from rigsim.boxes.source_shutter import COVER_S, LEVEL_STEPS, SHUTTER_MS, SourceLight, SourceShutter
+from rigsim.boxes.suction_pump import (
+    CONTROL_S,
+    LEAST_MBAR,
+    LEAST_MS,
+    REACH_S,
+    Gauge,
+    SuctionLoad,
+    SuctionPump,
+)
 
 __all__ = ["ProbeUnit", "SourceLight"]
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.devices.wire import Code
-
-from .controller import Refused
+from rigsim.boxes.controller import Refused
 
 __all__ = ["LEVEL_STEPS", "SHUTTER_MS", "SourceLight", "SourceShutter"]
 

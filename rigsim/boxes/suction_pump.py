@@ -17,8 +17,7 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import Probe
-
-from .controller import Refused
+from rigsim.boxes.controller import Refused
 
 __all__ = ["CONTROL_S", "LEAST_MBAR", "REACH_S", "Gauge", "SuctionLoad", "SuctionPump"]
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.calibration import bundle, mirror_lights, mirror_sphere
-from capture.calibration.board import Board, Sighting, find_board
-from capture.calibration.geometry import CameraPose, nominal_cameras
-from capture.calibration.mosaic import channel_levels, neutral_mosaic
+from capture.calibration.geometry import CameraPose, bundle, nominal_cameras
+from capture.calibration.geometry.board import Board, Sighting, find_board
+from capture.calibration.lights import mirror_lights, mirror_sphere
+from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.raw import RawFrame, linear_rgb
 from capture.rig import Rig, load_rig
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.calibration.fibre_darks import CameraNoise, DarkModel, measure_darks
-from capture.calibration.fibre_merge import color_masks
-from capture.calibration.fibre_readings import FibreReadings, read_fibres
-from capture.calibration.fibre_spots import FibreSpots
+from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_darks
+from capture.calibration.fiber.merge import color_masks
+from capture.calibration.fiber.readings import FibreReadings, read_fibres
+from capture.calibration.fiber.spots import FibreSpots
 from capture.plan.probe import exposure_series_s
 from capture.rig import load_rig
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure

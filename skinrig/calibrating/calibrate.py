@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture import raw
-from capture.calibration import chart, color, colorimetry, polarization, sensor, store, white
-from capture.calibration.phantom import read_certificate
-from capture.calibration.photon_transfer import FlatPair
+from capture.calibration import polarization, sensor, store
+from capture.calibration.color import chart, colorimetry, white
+from capture.calibration.color import matrix as color
+from capture.calibration.fiber.phantom import read_certificate
+from capture.calibration.sensor.transfer_curve import FlatPair
 from capture.session import FrameRecord, Session
 from skinrig.calibrating import dome, gradient, probe, white_tile
 

@@ -11,19 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture import raw
-from capture.calibration import (
-    bundle,
-    geometry,
-    light_fit,
-    mirror_lights,
-    mirror_sphere,
-    moved_camera,
-    store,
-)
-from capture.calibration.board import Board, Sighting, find_board
-from capture.calibration.lights import LightTable
-from capture.calibration.mosaic import channel_levels, neutral_mosaic
-from capture.calibration.white_plate import PlateSamples, PlateWindow, WhitePlate
+from capture.calibration import geometry, store
+from capture.calibration.geometry import bundle, moved_camera
+from capture.calibration.geometry.board import Board, Sighting, find_board
+from capture.calibration.lights import LightTable, light_fit, mirror_lights, mirror_sphere
+from capture.calibration.lights.white_plate import PlateSamples, PlateWindow, WhitePlate
+from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.rig import Rig
 from capture.session import FrameRecord, Session
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.calibration import sensor, store
-from capture.calibration.photon_transfer import FlatPair
+from capture.calibration.fiber.spot_photometry import Shot, shot
+from capture.calibration.led_sphere.survey import GlassBall, SphereSurvey, survey_sphere
 from capture.calibration.record import Quantity
-from capture.calibration.sphere_survey import GlassBall, SphereSurvey, survey_sphere
-from capture.calibration.spot_photometry import Shot, shot
+from capture.calibration.sensor.transfer_curve import FlatPair
 from capture.raw import RawFrame
 from capture.session import FrameRecord, Session
 

@@ -12,12 +12,12 @@ from typing import Final
 import numpy as np
 
 from capture.calibration import sensor, store
-from capture.calibration.fibre import FibreCalibration, calibrate_fibres
-from capture.calibration.fibre_darks import CameraNoise, DarkModel, measure_darks
-from capture.calibration.fibre_merge import MergedSeries, merge_series
-from capture.calibration.fibre_readings import FibreReadings, sum_spots
-from capture.calibration.fibre_spots import find_fibre_spots
-from capture.calibration.phantom import PhantomCertificate
+from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_darks
+from capture.calibration.fiber.gains import FibreCalibration, calibrate_fibres
+from capture.calibration.fiber.merge import MergedSeries, merge_series
+from capture.calibration.fiber.phantom import PhantomCertificate
+from capture.calibration.fiber.readings import FibreReadings, sum_spots
+from capture.calibration.fiber.spots import find_fibre_spots
 from capture.session import FrameRecord, Session
 from skinrig.phantom_reflectance import expected_reflectance, packaged_certificate
 

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.calibration.photon_transfer import block_sums
+from capture.calibration.sensor.transfer_curve import block_sums
 
 __all__ = ["LEAST_EVEN", "NoTileError", "evenness", "examine"]
 

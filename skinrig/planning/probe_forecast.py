@@ -175,7 +175,7 @@ def _fitted(
     look: Sight, read: Sequence[Floats], places: Sequence[int], exposures: int, *, noise: bool
 ) -> Sequence[Any]:
     """Return the fits of profiles with these variances of their readings."""
-    from capture.calibration.fibre import FibreReflectance
+    from capture.calibration.fiber.gains import FibreReflectance
     from reconstruction.probe_images import Measurement
     from reconstruction.probe_stages import Profile, fit_profiles
 
@@ -208,7 +208,7 @@ def _crosstalk(count: int) -> Any:
     on the phantom; what a calibration has wrong of their light in far spots cancels only as far as
     the two are alike.
     """
-    from capture.calibration.fibre_crosstalk import CrossTalk
+    from capture.calibration.fiber.crosstalk import CrossTalk
 
     place = np.arange(count)
     apart = np.minimum(np.abs(place[:, None] - place), len(CROSSTALK_ERROR) - 1)

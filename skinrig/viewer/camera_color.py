@@ -87,7 +87,8 @@ def _beside(appearance: SkinAppearance, path: Path) -> Path | None:
 
 
 def _calibrated(folder: Path) -> CameraColor:
-    from capture.calibration import color, store
+    from capture.calibration import store
+    from capture.calibration.color import matrix as color
 
     found = store.load(folder, COLOR)
     cameras = [

@@ -7,8 +7,8 @@ import pytest
 
 from capture import raw
 from capture.acquire import run_plan
+from capture.devices.cameras.hot_folder import HotFolder
 from capture.devices.flash import FlashBox
-from capture.devices.hot_folder import HotFolder
 from capture.devices.port import Port
 from capture.plan import flash_plan
 from capture.rig import load_rig

@@ -8,7 +8,6 @@ import threading
 import numpy as np
 import pytest
 
-from capture.devices import camera_wire
 from capture.devices.camera import (
     CameraBusy,
     CameraError,
@@ -24,8 +23,9 @@ from capture.devices.camera import (
     next_frame,
     open_camera,
 )
+from capture.devices.cameras import camera_wire
+from capture.devices.cameras.remote_camera import RemoteCamera
 from capture.devices.port import LinkLost
-from capture.devices.remote_camera import RemoteCamera
 from capture.rig import load_rig
 from rigsim.faults import Faults
 from rigsim.serve import serve

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import serial
 
-from capture.devices import camera_wire, wire
+from capture.devices import wire
+from capture.devices.cameras import camera_wire
 from capture.devices.port import DeviceError, Port
 from capture.devices.wire import Reply, Request
 from rigsim.world import World

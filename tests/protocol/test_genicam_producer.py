@@ -17,8 +17,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from capture.devices import genicam as backend
-from capture.devices import genicam_producer
 from capture.devices.camera import (
     CameraBusy,
     CameraError,
@@ -29,8 +27,10 @@ from capture.devices.camera import (
     next_frame,
     open_camera,
 )
-from capture.devices.genicam_address import parse_address
-from capture.devices.genicam_features import Features
+from capture.devices.cameras import genicam as backend
+from capture.devices.cameras import genicam_producer
+from capture.devices.cameras.genicam_address import parse_address
+from capture.devices.cameras.genicam_features import Features
 
 package = pytest.importorskip("genicam")
 pytest.importorskip("harvesters")

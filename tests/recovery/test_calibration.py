@@ -13,10 +13,12 @@ import pytest
 from scipy.stats import binom
 
 from capture import raw
-from capture.calibration import color, colorimetry, polarization
-from capture.calibration.chart import find_chart, measure_patches
-from capture.calibration.photon_transfer import FlatPair
+from capture.calibration import polarization
+from capture.calibration.color import colorimetry
+from capture.calibration.color import matrix as color
+from capture.calibration.color.chart import find_chart, measure_patches
 from capture.calibration.sensor import photon_transfer
+from capture.calibration.sensor.transfer_curve import FlatPair
 from capture.plan import FLAT_POWERS, MALUS_ANGLES_DEG
 from capture.rig import load_rig
 from model import spectra

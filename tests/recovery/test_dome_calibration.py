@@ -11,20 +11,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from capture.calibration import (
-    bundle,
-    geometry,
-    light_fit,
-    mirror_lights,
-    mirror_sphere,
-    moved_camera,
-    store,
-)
-from capture.calibration.board import Board, find_board
-from capture.calibration.geometry import CameraPose
-from capture.calibration.lights import LightTable
-from capture.calibration.mosaic import channel_levels, neutral_mosaic
-from capture.calibration.white_plate import PlateWindow, WhitePlate
+from capture.calibration import geometry, store
+from capture.calibration.geometry import CameraPose, bundle, moved_camera
+from capture.calibration.geometry.board import Board, find_board
+from capture.calibration.lights import LightTable, light_fit, mirror_lights, mirror_sphere
+from capture.calibration.lights.white_plate import PlateWindow, WhitePlate
+from capture.calibration.sensor.mosaic import channel_levels, neutral_mosaic
 from capture.raw import RawFrame, linear_rgb
 from capture.rig import load_rig
 from rigsim.dome_build import Tolerances, build, image_of

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from capture.calibration.fibre import FibreCalibration
+from capture.calibration.fiber.gains import FibreCalibration
 from capture.session import Session
 from rigsim.probe_build import build_probe
 from skinrig.cli import main

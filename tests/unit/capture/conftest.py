@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import erfc
 
-from capture.calibration.fibre_darks import CameraNoise, measure_darks
+from capture.calibration.fiber.darks import CameraNoise, measure_darks
 from capture.rig import load_rig
 
 EXPOSURES_S = 30.0 * 2.0 ** (-(22 - np.arange(23)) * 2 / 3)

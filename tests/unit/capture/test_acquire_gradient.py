@@ -8,8 +8,8 @@ import pytest
 
 from capture import raw
 from capture.acquire import AcquisitionError, Interrupted, run_plan
+from capture.acquire.gradient.travel_limit import EndOfSkin, ForceWatch
 from capture.acquire.pattern_scan import reading_deg
-from capture.acquire.skin_end import EndOfSkin, ForceWatch
 from capture.devices.caliper import CaliperBox, MoveReport
 from capture.devices.camera import CameraError, Trigger, open_camera
 from capture.devices.gradient_sphere import GradientSphereBox

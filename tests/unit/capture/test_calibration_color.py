@@ -6,8 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture.calibration import color, colorimetry, store
-from capture.calibration.color import ChartError, find_chart, fit_matrix, measure_patches
+from capture.calibration import store
+from capture.calibration.color import colorimetry
+from capture.calibration.color import matrix as color
+from capture.calibration.color.chart import ChartError, find_chart, measure_patches
+from capture.calibration.color.matrix import fit_matrix
 
 DATA = Path(os.environ.get("SKINRIG_TEST_DATA", Path(__file__).parents[4] / "shared" / "data"))
 needs_data = pytest.mark.skipif(

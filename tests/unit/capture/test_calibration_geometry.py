@@ -5,9 +5,10 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.calibration import board, bundle, geometry, moved_camera, store
-from capture.calibration.board import Board, BoardError, Sighting
-from capture.calibration.geometry import CameraPose, calibrate_intrinsics
+from capture.calibration import geometry, store
+from capture.calibration.geometry import board, bundle, moved_camera
+from capture.calibration.geometry.board import Board, BoardError, Sighting, calibrate_intrinsics
+from capture.calibration.geometry.intrinsics import CameraPose
 from capture.rig import load_rig
 
 DOME = load_rig("dome")

@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.calibration import light_fit, mirror_lights, mirror_sphere
-from capture.calibration.chrome_ball import ChromeBallError, directions_from_chrome_ball
-from capture.calibration.geometry import CameraPose, nominal_cameras
-from capture.calibration.lights import CameraResponse, LightTable
-from capture.calibration.mirror_sphere import SphereError, SpherePlace
-from capture.calibration.white_plate import PlateSamples, WhitePlate
+from capture.calibration.geometry.intrinsics import CameraPose, nominal_cameras
+from capture.calibration.lights import light_fit, mirror_lights, mirror_sphere
+from capture.calibration.lights.chrome_ball import ChromeBallError, directions_from_chrome_ball
+from capture.calibration.lights.light_list import CameraResponse, LightTable
+from capture.calibration.lights.mirror_sphere import SphereError, SpherePlace
+from capture.calibration.lights.white_plate import PlateSamples, WhitePlate
 from capture.rig import load_rig
 
 DOME = load_rig("dome")

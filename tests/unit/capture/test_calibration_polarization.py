@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import binom
 
 from capture.calibration import store
-from capture.calibration.polarization import (
+from capture.calibration.polarization.malus import (
     PolarizationCalibration,
     PolarizationError,
     fit_malus,

@@ -6,13 +6,8 @@ import pytest
 from scipy.stats import binom
 
 from capture.calibration import store
-from capture.calibration.photon_transfer import cfa_planes
-from capture.calibration.sensor import (
-    FlatPair,
-    PhotonTransferError,
-    SensorCalibration,
-    photon_transfer,
-)
+from capture.calibration.sensor.noise_model import SensorCalibration, photon_transfer
+from capture.calibration.sensor.transfer_curve import FlatPair, PhotonTransferError, cfa_planes
 
 
 @dataclasses.dataclass(frozen=True)

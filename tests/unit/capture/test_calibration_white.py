@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capture.calibration import store
-from capture.calibration.white import WhiteReference, white_reference
+from capture.calibration.color.white import WhiteReference, white_reference
 
 SHAPE = (60, 90)
 

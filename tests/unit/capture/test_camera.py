@@ -5,9 +5,9 @@ import pytest
 
 from capture import raw
 from capture.devices import camera as cameras
-from capture.devices import gphoto
 from capture.devices.camera import CameraInfo, Exposure, Frame, Trigger, check_frame, next_frame
-from capture.devices.hot_folder import HotFolder
+from capture.devices.cameras import gphoto
+from capture.devices.cameras.hot_folder import HotFolder
 
 INFO = CameraInfo("A1", "test", 4, 2, "RGGB", (64.0,) * 4, 4095, (Trigger.EDGE,))
 WANT = Exposure(0.01, 100)

@@ -8,15 +8,15 @@ import pytest
 from scipy.stats import chi2
 
 from capture.calibration import store
-from capture.calibration.fibre import FibreCalibration, FibreError, calibrate_fibres
-from capture.calibration.fibre_crosstalk import CrossTalk, measure_crosstalk
-from capture.calibration.fibre_readings import FibreReadings
-from capture.calibration.fibre_spots import FibreSpots
-from capture.calibration.phantom import (
+from capture.calibration.fiber.crosstalk import CrossTalk, measure_crosstalk
+from capture.calibration.fiber.gains import FibreCalibration, FibreError, calibrate_fibres
+from capture.calibration.fiber.phantom import (
     CertificateError,
     ExpectedReflectance,
     read_certificate,
 )
+from capture.calibration.fiber.readings import FibreReadings
+from capture.calibration.fiber.spots import FibreSpots
 from capture.calibration.record import CalibrationMismatch
 from capture.rig import load_rig
 

@@ -7,10 +7,10 @@ import pytest
 from scipy.stats import chi2
 
 from capture import hdr
-from capture.calibration.fibre_darks import DarkError, measure_darks
-from capture.calibration.fibre_merge import merge_series
-from capture.calibration.fibre_readings import read_fibres, sum_spots
-from capture.calibration.fibre_spots import FibreSpots
+from capture.calibration.fiber.darks import DarkError, measure_darks
+from capture.calibration.fiber.merge import merge_series
+from capture.calibration.fiber.readings import read_fibres, sum_spots
+from capture.calibration.fiber.spots import FibreSpots
 from capture.hdr import BracketError
 
 FALSE_ALARM = 1e-5

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from capture.acquire.fibre_signal import FibreSignal, said_of
+from capture.acquire.probe.fiber_signal import FibreSignal, said_of
 from capture.plan.probe import exposure_series_s
 from capture.rig import load_rig
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from capture.calibration.fibre_merge import merge_series
-from capture.calibration.fibre_spots import SpotError, find_fibre_spots
+from capture.calibration.fiber.merge import merge_series
+from capture.calibration.fiber.spots import SpotError, find_fibre_spots
 
 SHORT_S = (0.01, 1.0, 30.0)
 

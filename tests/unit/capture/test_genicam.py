@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from capture.acquire.frame_stream import FrameStream, compare_clocks
-from capture.devices import genicam, genicam_producer
 from capture.devices.camera import (
     CameraBusy,
     CameraError,
@@ -30,6 +29,7 @@ from capture.devices.camera import (
     next_frame,
     open_camera,
 )
+from capture.devices.cameras import genicam, genicam_producer
 from capture.devices.port import LinkLost
 
 WANT = Exposure(0.008, 200)
@@ -535,7 +535,7 @@ def test_a_camera_whose_library_is_missing_names_the_extra(monkeypatch):
 
 def test_the_library_is_imported_by_nothing_but_such_an_address():
     code = (
-        "import sys, capture.devices.genicam\n"
+        "import sys, capture.devices.cameras.genicam\n"
         "from capture.devices.camera import check_address\n"
         "check_address('genicam:1')\n"
         "print(sorted({'harvesters', 'genicam'} & set(sys.modules)))\n"

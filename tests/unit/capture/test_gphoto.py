@@ -20,7 +20,7 @@ from capture.devices.camera import (
     Trigger,
     next_frame,
 )
-from capture.devices.gphoto import GphotoCamera
+from capture.devices.cameras.gphoto import GphotoCamera
 
 WANT = Exposure(0.008, 100)
 

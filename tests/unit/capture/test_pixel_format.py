@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from capture.devices import pixel_format
+from capture.devices.cameras import pixel_format
 
 BAYER = {"RG": "RGGB", "GR": "GRBG", "GB": "GBRG", "BG": "BGGR"}
 PACKED = ["Mono10p", "Mono12p", "Mono14p", "Mono10Packed", "Mono12Packed"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from capture.plan import Plan, PlanError, Step
-from capture.plan.fibre_light import fibre_light
+from capture.plan.fiber_light import fibre_light
 from capture.plan.probe import (
     MASK_LONGEST_S,
     all_series,

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from capture.calibration.geometry import CameraPose
-from capture.calibration.lights import LightTable
+from capture.calibration.geometry.intrinsics import CameraPose
+from capture.calibration.lights.light_list import LightTable
 from capture.rig import load_rig
 from reconstruction.calibrated_dome import Dome, seen_from
 

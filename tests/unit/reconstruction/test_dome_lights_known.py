@@ -7,7 +7,7 @@ import pytest
 
 from capture import raw
 from capture.calibration import store
-from capture.calibration.lights import LightTable
+from capture.calibration.lights.light_list import LightTable
 from capture.plan import Plan, Step
 from capture.rig import load_rig
 from capture.session import Session, Subject

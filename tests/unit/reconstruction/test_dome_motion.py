@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture.calibration.geometry import CameraPose
+from capture.calibration.geometry.intrinsics import CameraPose
 from capture.raw import RawFrame
 from capture.rig import load_rig
 from reconstruction.dome_images import DomeImage

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from capture.calibration.fibre import FibreReflectance
+from capture.calibration.fiber.gains import FibreReflectance
 from capture.plan.suction import Placement
 from capture.rig import load_rig
 from model import photon_table

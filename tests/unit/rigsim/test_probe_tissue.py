@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from capture.calibration.phantom import read_certificate
+from capture.calibration.fiber.phantom import read_certificate
 from capture.rig import load_rig
 from rigsim import probe_tissue, skin_layers
 from rigsim.fibre_profile import fibre_profile

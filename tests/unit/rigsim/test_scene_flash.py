@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from capture.calibration.chart import find_chart
+from capture.calibration.color.chart import find_chart
 from capture.rig import Rig, load_rig
 from rigsim.films import IDEAL, FilmError, Films, films_of
 from rigsim.scenes.exposing import SceneError

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from capture.calibration import store
-from capture.calibration.sensor import SensorCalibration
+from capture.calibration.sensor.noise_model import SensorCalibration
 from capture.raw import RawFrame
 from capture.rig import load_rig
 from skinrig.calibrating.gradient import (

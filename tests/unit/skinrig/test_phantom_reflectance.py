@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from capture.calibration.phantom import (
+from capture.calibration.fiber.phantom import (
     CertificateError,
     CertificateUncertainty,
     PhantomCertificate,

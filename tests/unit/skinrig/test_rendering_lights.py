@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from capture.calibration.lights import LightTable
+from capture.calibration.lights.light_list import LightTable
 from capture.rig import load_rig
 from model import store
 from skinrig.errors import UnusableError, UsageError

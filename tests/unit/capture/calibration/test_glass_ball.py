@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import brentq, minimize
 from scipy.stats import chi2
 
-from capture.calibration.geometry import CameraPose
-from capture.calibration.glass_ball import (
+from capture.calibration.geometry.intrinsics import CameraPose
+from capture.calibration.led_sphere.glass_ball import (
     Ball,
     BallError,
     find_spots,

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from capture.calibration import polarized_reflection
-from capture.calibration.geometry import CameraPose
-from capture.calibration.glass_ball import mirrored
-from capture.calibration.polarization import PolarizationError
-from capture.calibration.polarized_reflection import Reflection, fresnel_amplitudes
+from capture.calibration.geometry.intrinsics import CameraPose
+from capture.calibration.led_sphere.glass_ball import mirrored
+from capture.calibration.polarization import polarized_reflection
+from capture.calibration.polarization.malus import PolarizationError
+from capture.calibration.polarization.polarized_reflection import Reflection, fresnel_amplitudes
 from capture.rig import load_rig
 from rigsim import shading
 from rigsim.films import absorbing_axis

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from capture.calibration import store
+from capture.calibration.led_sphere.lights import SphereCalibration, SphereFilms, SphereLightTable
 from capture.calibration.record import Quantity
-from capture.calibration.sphere_lights import SphereCalibration, SphereFilms, SphereLightTable
 from capture.rig import load_rig
 
 RIG = load_rig("gradient")

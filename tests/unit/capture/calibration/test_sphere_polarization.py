@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from capture.calibration.geometry import CameraPose
-from capture.calibration.glass_ball import mirrored
-from capture.calibration.polarization import PolarizationError
-from capture.calibration.polarized_reflection import Reflection
-from capture.calibration.sphere_polarization import fit_films, leakage
+from capture.calibration.geometry.intrinsics import CameraPose
+from capture.calibration.led_sphere.glass_ball import mirrored
+from capture.calibration.led_sphere.polarization import fit_films, leakage
+from capture.calibration.polarization.malus import PolarizationError
+from capture.calibration.polarization.polarized_reflection import Reflection
 from capture.rig import load_rig
 
 RIG = load_rig("gradient")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from capture.calibration.spot_photometry import (
+from capture.calibration.fiber.spot_photometry import (
     Shot,
     measure_flux,
     measure_middles,

@@ -7,7 +7,8 @@ from datetime import date
 import numpy as np
 import pytest
 
-from capture.calibration import color, store
+from capture.calibration import store
+from capture.calibration.color import matrix as color
 from capture.calibration.record import Quantity
 from model import color_table, spectra
 from model.skin import SkinAppearance, SkinMap

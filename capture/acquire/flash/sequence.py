@@ -1,0 +1,295 @@
+"""Run the timed part of a flash plan: prompts and shots, each at its time.
+
+Time 0 of a sequence is the first prompt after the lead, or the end of the event that a course
+follows. Shots begin at their times, or as soon after as the camera and the flash allow; the time
+at which the flash really popped goes into the session with every frame, and nothing that reads it
+needs the planned one.
+
+A prompted subject does the same every cycle, so a shot that failed is taken again whole cycles
+later. A resumed sequence leads in anew, goes on with the shots that are missing at their phases,
+and counts its time on as if no time had passed in between; its frames bear the number of the run,
+``block``. What follows an event once cannot be had back: shots whose time has passed are left out,
+with the reason.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from capture.acquire.flash.shot import Flash, expose, keep, let_go, power_of, set_light, token_of
+from capture.acquire.outcome import MAX_ATTEMPTS, Operator, given_up
+from capture.devices.camera import Camera, FrameRefused, FrameTimeout
+from capture.devices.port import CommandRefused
+from capture.devices.wire import Code
+from capture.plan import Plan, Step
+from capture.rig import Rig
+from capture.session import Session
+
+log = logging.getLogger(__name__)
+
+SLICE_S = 1.0
+"""Longest sleep, after which the operator is asked whether to stop."""
+BEFORE_RELEASE_S = 0.05
+"""Prompts are given by the clock up to here before a frame is due; then it is waited for."""
+COMMANDS_S = 0.1
+"""No prompt is due so soon after the commands that set the light begin."""
+ALMOST_S = 1e-6
+"""Rounding of times that are sums of periods."""
+
+
+def run_sequence(
+    steps: Sequence[Step],
+    plan: Plan,
+    rig: Rig,
+    *,
+    box: Flash,
+    cameras: Mapping[str, Camera],
+    session: Session,
+    operator: Operator,
+    taken: Mapping[tuple[str, str], int],
+    counts: dict[str, int],
+) -> None:
+    """Capture the timed steps that a session still lacks; see `run_flash`.
+
+    Each frame's ``actual`` gets ``time_s`` (s, when the flash popped, in the sequence's time),
+    ``late_s`` (s after its planned time), ``time_error_s`` (s, how well the clocks of host and box
+    could be compared), ``block`` (0, and one more each time that the sequence is resumed); and of
+    a prompted one ``phase_s`` (s since the last prompt of the expression was given), ``prompt``
+    (what was asked for last).
+    """
+    period_s = float(plan.limits.get("prompt_period_s", 0.0))
+    if period_s > 0:
+        rhythm: _Rhythm = _Prompted(steps, plan, session, operator, period_s)
+    else:
+        rhythm = _Once(steps, session, operator)
+    spacing_s = float(plan.limits.get("shot_period_s", 0.0))
+    waiting = deque((step, 1) for step in rhythm.possible(steps))
+    free_s = -math.inf
+    if waiting:
+        set_light(waiting[0][0], box)
+        rhythm.begin()
+    number = 0
+    while waiting:
+        operator.stop_if_asked()
+        step, attempt = waiting.popleft()
+        number += 1
+        due_s = rhythm.due_s(step, free_s)
+        free_s = due_s + spacing_s
+        operator.progress(f"{number}/{number + len(waiting)} {step.id} {step.kind} t={due_s:g} s")
+        moment = _Moment(step, rig, box, rhythm, due_s, waiting[0][0] if waiting else None)
+        token = token_of(f"{operator.run_id}.t{number}", attempt, step)
+        try:
+            report, frames, stale = expose(
+                step, rig, box, cameras, operator, token,
+                before=moment.wait, meanwhile=moment.look,
+            )  # fmt: skip
+        except (FrameRefused, FrameTimeout, CommandRefused) as error:
+            if isinstance(error, CommandRefused) and error.code != Code.HARDWARE:
+                raise
+            log.warning("step %s, attempt %d: %s", step.id, attempt, error)
+            counts["retakes"] += 1
+            let_go(step, rig, cameras, error)
+            if attempt == MAX_ATTEMPTS:
+                raise given_up(f"step {step.id}", str(error), session) from error
+            waiting.extend(rhythm.again(step, attempt, str(error)))
+            if waiting:
+                set_light(waiting[0][0], box)
+            continue
+        counts["stale"] += stale
+        keep(
+            step, rig, cameras, session, frames, report=report, tries=attempt, taken=taken,
+            t_host_s=operator.clock(), noted=moment.noted,
+        )  # fmt: skip
+        counts["frames"] += len(frames)
+        counts["steps"] += 1
+
+
+class _Rhythm:
+    """The time of a sequence, and what happens in it beside the shots."""
+
+    block = 0
+    """How often the sequence was begun before."""
+
+    def __init__(self, operator: Operator) -> None:
+        self.operator = operator
+        self._zero = 0.0
+
+    def possible(self, steps: Sequence[Step]) -> list[Step]:
+        """Return the steps that can still be taken."""
+        return list(steps)
+
+    def begin(self) -> None:
+        """Start the clock."""
+
+    def now_s(self) -> float:
+        """Return the sequence's time, s."""
+        return self.operator.timer.monotonic() - self._zero
+
+    def since_zero(self, timer_s: float) -> float:
+        """Return the sequence's time at a reading of the timer, s."""
+        return timer_s - self._zero
+
+    def due_s(self, step: Step, free_s: float) -> float:
+        """Return when a step is to be taken, s; not before ``free_s`` where that can be helped."""
+        return float(step.settings["start_s"])
+
+    def again(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
+        """Return the step and its next attempt where it can be taken later, else nothing."""
+        raise NotImplementedError
+
+    def wait(self, until_s: float) -> None:
+        """Let time pass; stop in good order where that is asked for."""
+        while (rest_s := until_s - self.now_s()) > ALMOST_S:
+            self.operator.timer.sleep(min(rest_s, SLICE_S))
+            self.operator.stop_if_asked()
+
+    def find_quiet(self, span_s: float) -> None:
+        """Let time pass until nothing is due for a while, s."""
+
+    def noted_at(self, time_s: float) -> dict[str, str | float | int]:
+        """Return what is to be noted of a shot at a time, s."""
+        return {"time_s": time_s, "block": self.block}
+
+
+class _Prompted(_Rhythm):
+    """A subject who changes with every prompt."""
+
+    def __init__(
+        self,
+        steps: Sequence[Step],
+        plan: Plan,
+        session: Session,
+        operator: Operator,
+        period_s: float,
+    ) -> None:
+        super().__init__(operator)
+        self._period_s = period_s
+        shown = {float(s.index["phase_s"]) < period_s: str(s.index["state"])
+                 for s in plan.steps if "start_s" in s.settings}  # fmt: skip
+        self._states = (shown.get(True, "expression"), shown.get(False, "neutral"))
+        first_s = min(float(step.settings["start_s"]) for step in steps)
+        cycle_s = 2 * period_s
+        # a resumed run begins with the cycle of its first shot
+        self._first_s = cycle_s * math.floor(first_s / cycle_s + ALMOST_S)
+        self._lead_s = float(plan.limits.get("lead_s", 0.0))
+        self._next = 0
+        self._given: list[tuple[float, str]] = []
+        blocks = [int(r.line.actual["block"]) for r in session.frames()
+                  if "block" in r.line.actual]  # fmt: skip
+        self.block = max(blocks, default=-1) + 1
+
+    def begin(self) -> None:
+        self.operator.prompt(f"{self._states[1]}, then change at each sound")
+        start_s = self._first_s - self._lead_s
+        self._zero = self.operator.timer.monotonic() - start_s
+        self._next = round(start_s / self._period_s)
+        self.wait(start_s)
+
+    def due_s(self, step: Step, free_s: float) -> float:
+        due_s = float(step.settings["start_s"])
+        cycle_s = 2 * self._period_s
+        behind_s = max(free_s, self._first_s) - due_s
+        return due_s + cycle_s * max(0, math.ceil(behind_s / cycle_s - ALMOST_S))
+
+    def again(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
+        return [(step, attempt + 1)]
+
+    def wait(self, until_s: float) -> None:
+        while (prompt_s := self._next * self._period_s) <= until_s + ALMOST_S:
+            super().wait(prompt_s)
+            state = self._states[self._next % 2]
+            self.operator.signal(state)
+            self._given.append((self.now_s(), state))
+            self._next += 1
+        super().wait(until_s)
+
+    def find_quiet(self, span_s: float) -> None:
+        if (prompt_s := self._next * self._period_s) <= self.now_s() + span_s:
+            self.wait(prompt_s)
+
+    def noted_at(self, time_s: float) -> dict[str, str | float | int]:
+        before = [entry for entry in self._given if entry[0] <= time_s]
+        onsets = [given_s for given_s, state in before if state == self._states[0]]
+        noted = super().noted_at(time_s)
+        if onsets:
+            noted |= {"phase_s": time_s - onsets[-1], "prompt": before[-1][1]}
+        return noted
+
+
+class _Once(_Rhythm):
+    """What follows an event, which happens once."""
+
+    def __init__(self, steps: Sequence[Step], session: Session, operator: Operator) -> None:
+        super().__init__(operator)
+        self._state = str(steps[0].index.get("state", "event"))
+        self._session = session
+        self._elapsed_s = 0.0
+        # the host's clock alone knows how long a run was interrupted
+        for record in session.frames("subject"):
+            if "time_s" in record.line.actual:
+                zero = record.line.t_host_s - float(record.line.actual["time_s"])
+                self._elapsed_s = operator.clock() - zero
+                self.block = max(self.block, int(record.line.actual["block"]) + 1)
+
+    def possible(self, steps: Sequence[Step]) -> list[Step]:
+        if self.block == 0:
+            return list(steps)
+        passed = [s.id for s in steps if float(s.settings["start_s"]) < self._elapsed_s]
+        self._leave_out(passed, "its time passed while the capture was interrupted")
+        return [step for step in steps if step.id not in passed]
+
+    def begin(self) -> None:
+        if self.block == 0:
+            self.operator.prompt(self._state)
+        self._zero = self.operator.timer.monotonic() - self._elapsed_s
+
+    def again(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
+        self._leave_out([step.id], f"failed at its time, which does not come again: {why}")
+        return []
+
+    def _leave_out(self, ids: Sequence[str], why: str) -> None:
+        if ids:
+            log.warning("steps %s: %s", ", ".join(ids), why)
+            self._session.leave_out(ids, reason=why, t_host_s=self.operator.clock())
+
+
+class _Moment:
+    """One shot's time: waited for, kept, and compared with the box's."""
+
+    def __init__(
+        self, step: Step, rig: Rig, box: Flash, rhythm: _Rhythm, due_s: float, then: Step | None
+    ) -> None:
+        self._box, self._rhythm, self._due_s, self._then = box, rhythm, due_s, then
+        views = [rig.view(name) for name in step.cameras]
+        self._charged_s = rig.recycle_s * power_of(step)
+        self._busy_s = float(step.settings["exposure_s"])
+        self._busy_s += max(view.shutter_lag_s + view.readout_s for view in views)
+        self.noted: dict[str, str | float | int] = {}
+
+    def wait(self) -> None:
+        """Wait until the shot is due."""
+        self._rhythm.wait(self._due_s)
+
+    def look(self, report: Any | None) -> None:
+        """Find out when the flash popped; make the light ready for the next shot; go on in time."""
+        timer = self._rhythm.operator.timer
+        before = timer.monotonic()
+        box_s = self._box.ping()
+        after = timer.monotonic()
+        popped_s = before if report is None else 0.5 * (before + after) - box_s + report.t_box_s
+        time_s = self._rhythm.since_zero(popped_s)
+        self.noted = {
+            **self._rhythm.noted_at(time_s),
+            "late_s": time_s - self._due_s,
+            "time_error_s": 0.5 * (after - before),
+        }
+        if self._then is not None:
+            # waiting for the charge would keep a prompt waiting, and so would the commands
+            self._rhythm.wait(time_s + self._charged_s)
+            self._rhythm.find_quiet(COMMANDS_S)
+            set_light(self._then, self._box)
+        self._rhythm.wait(time_s + self._busy_s - BEFORE_RELEASE_S)

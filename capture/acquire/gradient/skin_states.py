@@ -1,0 +1,346 @@
+"""States of skin in a caliper, scanned as far as the skin lets itself be moved.
+
+Per angle a person tapes the jaws to the skin once; neutral is scanned, then the jaws go step by
+step to where the skin buckles, back, and to where it comes off. What cannot be reached is left out
+of the session with the reason. All frames of a state are of one scan of one taping: when the skin
+is let go in between, for whatever reason, it is taped again, the newly taped neutral is pictured
+once, the jaws walk the same way, and the state is scanned anew.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any, Protocol, cast
+
+from capture.acquire.gradient.travel_limit import End, EndOfSkin, ForceWatch
+from capture.acquire.outcome import (
+    MAX_ATTEMPTS,
+    AcquisitionError,
+    Operator,
+    given_up,
+    steps_to_do,
+)
+from capture.acquire.pattern_scan import Scanner, Taken
+from capture.devices.caliper import CaliperStatus, MoveReport
+from capture.devices.port import CommandRefused, DeviceError
+from capture.devices.wire import Code
+from capture.plan import Plan, Step, Value
+from capture.plan.gradient import state_name, state_of
+from capture.plan.rows import passes
+from capture.rig import Caliper, Rig
+from capture.session import Session
+
+log = logging.getLogger(__name__)
+
+CALIPER_LEASE_S = 5.0
+"""A camera's frames may keep the host busy for a while; after this silence the skin is let go."""
+FORCE_READINGS = 8
+
+
+class CaliperDriver(Protocol):
+    """The part of the caliper's driver that a capture needs."""
+
+    @property
+    def limits(self) -> Mapping[str, Any]:
+        """What the box allows, in its own words and units."""
+
+    def arm(self) -> None:
+        """Allow moves."""
+
+    def dark(self) -> None:
+        """Let the skin go and disarm."""
+
+    def ping(self) -> float:
+        """Return the box's clock, s; renews the lease."""
+
+    def set_lease(self, lease_s: float) -> None:
+        """Set after how much silence the box lets the skin go."""
+
+    def set_force_limit(self, newton: float) -> None:
+        """Set the greatest force between the jaws, N."""
+
+    def status(self) -> CaliperStatus:
+        """Return the status bits."""
+
+    def home(self) -> MoveReport:
+        """Find the home mark and stand at step 0."""
+
+    def set_angle(self, angle_deg: float) -> None:
+        """Turn the jaws."""
+
+    def attach(self) -> None:
+        """Pass on that a person has taped the jaws to the skin."""
+
+    def attached(self) -> bool:
+        """Tell whether the box holds skin."""
+
+    def move_to(self, step: int) -> MoveReport:
+        """Move the jaws to a step."""
+
+    def force_n(self) -> float:
+        """Return the force between the jaws, N."""
+
+    def release(self) -> None:
+        """Let the skin go."""
+
+
+class _LetGo(Exception):
+    """The skin was let go though nothing ended; it can be taped again."""
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """A state of the skin that is to be scanned."""
+
+    angle_deg: float
+    position: int
+    steps: tuple[Step, ...]
+
+    @property
+    def name(self) -> str:
+        return state_name(self.angle_deg, self.position)
+
+
+class SkinStates:
+    """The states of one run: what is held, how far it went, what is left."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        caliper: CaliperDriver,
+        scanner: Scanner,
+        session: Session,
+        operator: Operator,
+        force_limit_n: float,
+    ) -> None:
+        self._drawn = cast(Caliper, rig.caliper)
+        self._caliper = caliper
+        self._scanner = scanner
+        self._session = session
+        self._operator = operator
+        self._force_limit_n = force_limit_n
+        self._states = list(_states(session.plan))
+        self._attachment = _attachments_so_far(session)
+        self._position = 0
+        self._reading_mm = self._force_n = 0.0
+
+    def run(self) -> None:
+        """Scan what is missing, angle by angle, in the plan's order."""
+        for angle_deg in dict.fromkeys(state.angle_deg for state in self._states):
+            self._angle(angle_deg)
+
+    def _missing(self, angle_deg: float) -> list[_State]:
+        """Return the states of an angle that are not there, or not from one taping."""
+        left_out = self._session.left_out()
+        frames: dict[str, set[object]] = {}
+        for record in self._session.frames("gradient"):
+            frames.setdefault(record.step_id, set()).add(record.actual.get("attachment"))
+        undone = {step.id for step in steps_to_do(self._session)}
+        found = []
+        for state in self._states:
+            ids = [step.id for step in state.steps]
+            if state.angle_deg != angle_deg or any(step in left_out for step in ids):
+                continue
+            tapings = set().union(*(frames.get(step, set()) for step in ids))
+            if undone & set(ids) or len(tapings) != 1:
+                found.append(state)
+        return found
+
+    def _angle(self, angle_deg: float) -> None:
+        """Scan an angle's states; tape the skin again where it was let go."""
+        before, tries = len(self._missing(angle_deg)), 0
+        why = ""
+        while missing := self._missing(angle_deg):
+            tries = tries + 1 if len(missing) == before else 1
+            before = len(missing)
+            if tries > MAX_ATTEMPTS:
+                raise given_up(f"state {missing[0].name}", why, self._session)
+            try:
+                self._attach(angle_deg)
+                self._scan_angle(angle_deg)
+            except _LetGo as stop:
+                why = str(stop)
+                log.warning("%s; the skin is taped again", why)
+            finally:
+                let_go(self._caliper)
+
+    def _attach(self, angle_deg: float) -> None:
+        """Bring empty jaws to step 0 at an angle and have a person tape them to the skin."""
+        caliper = self._caliper
+        self._operator.stop_if_asked()
+        caliper.dark()
+        caliper.set_lease(CALIPER_LEASE_S)
+        caliper.arm()
+        caliper.set_force_limit(self._force_limit_n)
+        report = caliper.move_to(0) if caliper.status().homed else caliper.home()
+        if report.ended == "stall":
+            report = caliper.home()
+        if report.ended != "reached":
+            raise AcquisitionError(
+                f"caliper: homing ended as {report.ended!r} at {report.reading_mm:.2f} mm; "
+                "nothing is held: check the home mark and the motor, then use --resume"
+            )
+        caliper.set_angle(angle_deg)
+        caliper.dark()  # a person's hands are at the jaws now
+        self._operator.prompt(f"tape the skin at {angle_deg:g} degrees")
+        caliper.arm()
+        caliper.attach()
+        self._attachment += 1
+        log.info("attachment %d, at %g degrees", self._attachment, angle_deg)
+
+    def _scan_angle(self, angle_deg: float) -> None:
+        """Scan neutral, then compression, then stretching, of what is missing."""
+        self._position = 0
+        self._settle(self._drawn.reading_mm(0))
+        for state in self._states:
+            if (state.angle_deg, state.position) != (angle_deg, 0):
+                continue
+            if state in self._missing(angle_deg):
+                self._take(state, "reached")
+            else:
+                self._picture_neutral(state)
+        for direction in (-1, 1):
+            self._branch(angle_deg, direction)
+
+    def _branch(self, angle_deg: float, direction: int) -> None:
+        """Walk from neutral as far as states are missing, or as the skin lets itself be moved."""
+        wanted = {
+            state.position: state
+            for state in self._missing(angle_deg)
+            if state.position * direction > 0
+        }
+        if not wanted:
+            return
+        if self._position != 0:
+            self._move(0)
+        watch = ForceWatch(self._drawn, direction, at_rest_n=self._force_n)
+        farthest = max(wanted, key=abs)
+        for position in range(direction, farthest + direction, direction):
+            self._operator.stop_if_asked()
+            try:
+                report = self._move(position)
+                watch.check(position, report, self._force_n)
+                if position in wanted:
+                    self._take(wanted[position], report.ended)
+            except EndOfSkin as end:
+                self._leave_out(angle_deg, direction, end)
+                break
+        if not self._caliper.attached() and self._missing(angle_deg):
+            raise _LetGo("the skin came off")
+
+    def _move(self, position: int) -> MoveReport:
+        """Move, and let the skin creep; raise `_LetGo` where it was let go for another reason."""
+        try:
+            self._scanner.turn_to(self._states[0].steps[0])  # while the jaws are on their way
+            report = self._caliper.move_to(position)
+        except CommandRefused as error:
+            if error.code not in (Code.WATCHDOG_TRIPPED, Code.NOT_ARMED):
+                raise
+            raise _LetGo(str(error)) from error
+        if report.ended in ("stopped", "stall", "no_home"):
+            raise _LetGo(f"position {position}: the move ended as {report.ended!r}")
+        self._position = report.step
+        if report.ended == "reached":
+            self._settle(report.reading_mm)
+        return report
+
+    def _settle(self, reading_mm: float) -> None:
+        self._scanner.pause(self._drawn.settle_s)
+        readings = [self._caliper.force_n() for _ in range(FORCE_READINGS)]
+        self._reading_mm, self._force_n = reading_mm, sum(readings) / len(readings)
+
+    def _take(self, state: _State, ended: str) -> None:
+        """Scan a state and commit it when it was held to the end."""
+        self._operator.progress(
+            f"{state.name}: {self._reading_mm:.2f} mm, {self._force_n:+.3f} N, {ended}"
+        )
+        taken: list[Taken] = []
+        for piece in passes(state.steps):
+            taken += self._scanner.scan(piece)
+        self._still_held(state.position)
+        self._scanner.commit(taken, self._actual(ended))
+
+    def _still_held(self, position: int) -> None:
+        """Raise where the skin was lost while it was scanned."""
+        if self._caliper.attached():
+            return
+        status = self._caliper.status()
+        if position == 0 or status.tripped or status.stopped or not status.armed:
+            raise _LetGo(f"position {position}: the caliper let the skin go while it was scanned")
+        raise EndOfSkin(End("detached", position, self._reading_mm, self._force_n))
+
+    def _actual(self, ended: str) -> dict[str, Value]:
+        return {
+            "aperture_mm": self._reading_mm,
+            "force_n": self._force_n,
+            "ended": ended,
+            "attachment": self._attachment,
+        }
+
+    def _picture_neutral(self, neutral: _State) -> None:
+        """Attach one picture of newly taped neutral skin, by which tapings can be compared."""
+        step = next((s for s in neutral.steps if s.settings["pattern"] == "full"), neutral.steps[0])
+        (one,) = self._scanner.scan([step])
+        self._still_held(0)
+        number = "" if len(one.frames) == 1 else "{}-"
+        for name in one.frames:
+            file = f"neutral-a{round(neutral.angle_deg):03d}-{number.format(name)}"
+            self._session.attach(
+                f"{file}{self._attachment}.dng",
+                self._scanner.encoded(one, name),
+                about={
+                    "kind": "neutral skin, taped again", "state": neutral.name,
+                    "step": step.id, "camera": name, **self._actual("reached"),
+                },
+            )  # fmt: skip
+
+    def _leave_out(self, angle_deg: float, direction: int, end: EndOfSkin) -> None:
+        """Note in the session that this way goes no further."""
+        left_out = self._session.left_out()
+        first = direction * end.end.position
+        ids = [
+            step.id
+            for state in self._states
+            if state.angle_deg == angle_deg and direction * state.position >= first
+            for step in state.steps
+            if step.id not in left_out
+        ]
+        reason = f"{angle_deg:g} degrees, from position {end.end.position} on: {end}"
+        log.info(reason)
+        self._operator.progress(reason)
+        if ids:
+            about: dict[str, Value] = {
+                "angle": angle_deg, "caliper": end.end.position, "end": end.end.kind,
+                "aperture_mm": end.end.reading_mm, "force_n": end.end.force_n,
+                "attachment": self._attachment,
+            }  # fmt: skip
+            self._session.leave_out(
+                ids, reason=reason, about=about, t_host_s=self._operator.clock()
+            )
+
+
+def _states(plan: Plan) -> Iterator[_State]:
+    for name, group in groupby(plan.steps, key=state_of):
+        if name is not None:
+            steps = tuple(group)
+            index = steps[0].index
+            yield _State(float(index["angle"]), int(index["caliper"]), steps)
+
+
+def _attachments_so_far(session: Session) -> int:
+    """Return how often the skin was taped before, as far as anything came of it."""
+    lines = [session.attachment_line(name).about for name in session.attachments()]
+    lines += [record.actual for record in session.frames("gradient")]
+    lines += [session.left_out_line(step).about for step in session.left_out()]
+    return max((int(line.get("attachment", 0)) for line in lines), default=0)
+
+
+def let_go(caliper: CaliperDriver) -> None:
+    """Release the skin and disarm; nothing here hides the error that led here."""
+    try:
+        caliper.dark()
+    except DeviceError as error:
+        log.error("the caliper could not be told to let go: %s; its lease does", error)

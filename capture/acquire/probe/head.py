@@ -1,0 +1,267 @@
+"""The probe's head on the skin: placed by a person, held by suction, watched.
+
+A placement lasts as long as the head is held or rests in good order. Where the suction ends by
+itself, or is not reached, nobody knows whether the head is still where it was: a person places it
+anew, and all exposures of the series are taken again.
+"""
+
+from __future__ import annotations
+
+import logging
+
+from capture.acquire.outcome import MAX_ATTEMPTS, AcquisitionError, Operator
+from capture.acquire.probe.driver import ProbeDriver
+from capture.devices.port import CommandRefused
+from capture.devices.wire import Code
+from capture.plan.probe import CAP
+from capture.plan.suction import SLACK_S, Placement
+from capture.rig import Probe
+
+log = logging.getLogger(__name__)
+
+LISTEN_S = 0.1
+REACH_MARGIN_S = 1.0
+"""Beyond the box's own time for reaching a suction."""
+OFF_SHARE = 0.5
+"""A head under less than this of its suction has come off."""
+COOL_S = 180.0
+"""How long a camera that is too warm, or too cold, is waited for, s."""
+COOL_LISTEN_S = 1.0
+
+
+class HeadLost(Exception):
+    """Nobody knows whether the head is where it was placed; it can be placed anew."""
+
+
+class NotHeld(Exception):
+    """Suction or temperature went beyond its limits during an exposure; it can be taken again."""
+
+
+class Head:
+    """Where the head is, and whether it is held there.
+
+    Parameters
+    ----------
+    probe
+        For suction, tolerances and times.
+    box
+        Its driver.
+    operator
+        Who places it.
+    placements
+        How often it was placed in earlier runs.
+
+    Attributes
+    ----------
+    placements : int
+        How often it was placed, these included.
+    """
+
+    def __init__(
+        self, probe: Probe, box: ProbeDriver, operator: Operator, *, placements: int
+    ) -> None:
+        self._probe = probe
+        self._box = box
+        self._operator = operator
+        self._place: Placement | None = None
+        self._again = ""
+        self.placements = placements
+
+    def at(self, place: Placement) -> None:
+        """Have the head at a placement; a person is asked where it is not there."""
+        if self._place == place:
+            return
+        self.let_go()
+        self._operator.stop_if_asked()
+        self._operator.prompt(
+            f"place the head on the {place.site} at {place.angle_deg:g} degrees" + self._again
+        )
+        self._again = ""
+        self._box.arm()
+        self._box.place(place.site, place.angle_deg)
+        self._place = place
+        self.placements += 1
+        log.info("placement %d: %s", self.placements, place)
+
+    def cap(self) -> None:
+        """Have a person cap the head, so that no light of the room enters the fibres."""
+        self.let_go()
+        self._operator.stop_if_asked()
+        self._operator.prompt("put the cap on the head")
+        self.keep_capped()
+
+    def keep_capped(self) -> None:
+        """Tell a box that has let go of everything meanwhile that the cap is where it was."""
+        if not self._box.status().placed:
+            self._box.arm()
+            self._box.place(CAP, 0.0)
+
+    def let_go(self) -> None:
+        """Vent, disarm and forget the placement: a person's hands are at the head now."""
+        self._box.dark()
+        self._place = None
+
+    def lost(self, why: str) -> None:
+        """Have the head placed anew before anything else, and say why."""
+        self.let_go()
+        self._again = f" again: {why}"
+
+    def hold(self, level: float, next_s: float) -> None:
+        """Have the head held, settled, for at least so long, and the LED lit.
+
+        Raises
+        ------
+        HeadLost
+            Where the suction is not reached, or was lost.
+        AcquisitionError
+            Where the gauge is dead.
+        """
+        state = self._box.suction()
+        if state.on and state.left_s >= next_s + SLACK_S:
+            return
+        if state.on:
+            self.release()
+        self._check_place()
+        while (state := self._box.suction()).left_s > 0.0 and not state.on:
+            self._box.listen(min(state.left_s, LISTEN_S))
+        self._cool()
+        try:
+            self._box.set_level(level)
+            self._box.suck(self._probe.suction_mbar, self._probe.max_suction_s)
+        except CommandRefused as error:
+            raise self._lost_by(error) from error
+        self._settle()
+
+    def release(self) -> None:
+        """Vent; the head stays where it is, and the skin has its rest."""
+        self._box.vent()
+
+    def readings(self) -> tuple[float, float]:
+        """Return suction, mbar, and the camera's temperature, degrees Celsius, both within limits.
+
+        Raises
+        ------
+        NotHeld
+            Where one is not; the head is vented then.
+        HeadLost
+            Where the box has let go of the head, or it has come off.
+        """
+        probe = self._probe
+        suction_mbar, camera_c = self._box.pressure_mbar(), self._box.camera_c()
+        if not self._box.suction().on:
+            raise HeadLost(self._how_it_ended())
+        if suction_mbar < OFF_SHARE * probe.suction_mbar:
+            raise HeadLost(f"the suction fell to {self._compared(suction_mbar)}")
+        if abs(suction_mbar - probe.suction_mbar) > probe.suction_tolerance_mbar:
+            self.release()
+            raise NotHeld(f"the suction is {self._compared(suction_mbar)}")
+        if not self._cold(camera_c):
+            self.release()
+            raise NotHeld(f"the camera is at {self._temperature(camera_c)}")
+        return suction_mbar, camera_c
+
+    def temperature_c(self) -> float:
+        """Return the camera's temperature, degrees Celsius, after it has come within its limits."""
+        return self._cool()
+
+    def refusal(self, place: Placement, why: str, *, captured: bool) -> AcquisitionError:
+        """Return the error of a placement at which the measurement cannot be made."""
+        after = (
+            "what was captured before is safe: mend the cause and run the same command with "
+            "--resume"
+            if captured
+            else "nothing was captured: mend the cause and start again"
+        )
+        return AcquisitionError(
+            f"measurement of {place}: refused, {why}, {MAX_ATTEMPTS} times; no frame of it is "
+            "kept. Check that the membrane is whole and the tube is on, and that no fold and no "
+            f"hair lies under the rim; {after}"
+        )
+
+    # what is waited for -----------------------------------------------------------------------
+
+    def _settle(self) -> None:
+        """Wait until the suction has stayed within its limits for as long as the rig says."""
+        probe = self._probe
+        reach_s = float(self._box.limits["reach_ms"]) / 1e3 + REACH_MARGIN_S
+        waited_s, within_s = 0.0, 0.0
+        suction_mbar = 0.0
+        while True:
+            suction_mbar = self._box.pressure_mbar()
+            if not self._box.suction().on:
+                raise HeadLost(self._how_it_ended())
+            good = abs(suction_mbar - probe.suction_mbar) <= probe.suction_tolerance_mbar
+            if not good:
+                within_s = 0.0
+                if waited_s >= reach_s + probe.settle_s:
+                    raise HeadLost(f"the suction is {self._compared(suction_mbar)}")
+            elif within_s >= probe.settle_s:
+                return
+            pause_s = LISTEN_S if not good else min(LISTEN_S, probe.settle_s - within_s)
+            self._box.listen(max(pause_s, 1e-3))
+            waited_s += pause_s
+            within_s += pause_s if good else 0.0
+
+    def _cool(self) -> float:
+        """Wait until the camera is as cold as it is to be; return its temperature."""
+        waited_s = 0.0
+        while not self._cold(camera_c := self._box.camera_c()):
+            if waited_s == 0.0:
+                text = f"the camera is at {self._temperature(camera_c)}; waiting for it"
+                self._operator.progress(text)
+            if waited_s >= COOL_S:
+                raise AcquisitionError(
+                    f"camera: still at {self._temperature(camera_c)} after {COOL_S:g} s; its dark "
+                    "current would not be that of the dark frames: check its cooling, then run "
+                    "the same command with --resume"
+                )
+            self._operator.stop_if_asked()
+            self._box.listen(COOL_LISTEN_S)
+            waited_s += COOL_LISTEN_S
+        return camera_c
+
+    def _check_place(self) -> None:
+        if self._place is not None and not self._box.status().placed:
+            raise HeadLost(self._how_it_ended())
+
+    def _lost_by(self, error: CommandRefused) -> Exception:
+        """Return what a refusal of the pump or the LED means."""
+        if error.code in (Code.WATCHDOG_TRIPPED, Code.NOT_ARMED, Code.IGNORED):
+            return HeadLost("the box had let go of the head")
+        return error
+
+    def _how_it_ended(self) -> str:
+        """Return in words how the last suction ended."""
+        report = self._box.last_suction()
+        if report is None:
+            return "the box had let go of the head"
+        if report.ended == "gauge":
+            raise AcquisitionError(
+                "the pressure gauge of the probe's box is dead; the head was vented: have it "
+                "mended, then run the same command with --resume"
+            )
+        found = self._compared(report.suction_mbar)
+        return {
+            "low": f"the suction reached only {found}",
+            "lost": f"the suction fell to {found}",
+            "high": f"the suction rose to {found}",
+            "timed": "the suction came to its end too early",
+            "asked": "the head was vented",
+        }.get(report.ended, "the box had let go of the head")
+
+    def _compared(self, suction_mbar: float) -> str:
+        probe = self._probe
+        return (
+            f"{suction_mbar:.0f} mbar, expected {probe.suction_mbar:g} "
+            f"+- {probe.suction_tolerance_mbar:g} mbar"
+        )
+
+    def _cold(self, camera_c: float) -> bool:
+        return abs(camera_c - self._probe.camera_c) <= self._probe.camera_tolerance_c
+
+    def _temperature(self, camera_c: float) -> str:
+        probe = self._probe
+        return (
+            f"{camera_c:.1f} degrees Celsius, expected {probe.camera_c:g} "
+            f"+- {probe.camera_tolerance_c:g}"
+        )

@@ -1,0 +1,153 @@
+"""One exposure of the probe: light through the source fibre, and the frame that it made.
+
+The shutter pulses the camera's line when its blades are clear and ends the light by itself. A frame
+is believed when it began with that pulse and has the exposure that was asked for, and when the
+shutter says that its light lasted as long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from capture.acquire.frames import configure, wanted_exposure
+from capture.acquire.probe.driver import RENEW_S, ProbeDriver
+from capture.acquire.probe.head import HeadLost
+from capture.devices.camera import Camera, Frame, FrameRefused, Trigger, next_frame
+from capture.devices.port import CommandRefused
+from capture.devices.probe import Opening
+from capture.devices.wire import Code
+from capture.plan import Step
+from capture.rig import Rig
+
+FRAME_S = 3.0
+"""How long a frame may take after its read-out, s: the box waits a little longer for its host."""
+CLOSING_S = 0.2
+"""How long the end of an opening may take to be told, s."""
+SHUTTER_DEVIATION = 0.02
+"""How far the light's time may be off what was asked for, relative; a fibre's light is as much."""
+SHUTTER_MARGIN_S = 5e-5
+"""And beyond that, s: of the shortest exposure this is within a stop's twentieth."""
+
+
+class ShutterFault(FrameRefused):
+    """The shutter did not let light through for as long as it was asked to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Exposed:
+    """One exposure that is believed, one frame a camera."""
+
+    step: Step
+    frames: Mapping[str, Frame]
+    t_box_s: float
+    """When the cameras were released, on the box's clock."""
+    open_s: float
+    """How long the light lasted, s; 0 in the dark."""
+    stale: int
+    """Stale frames that were dropped on the way."""
+
+
+def expose_dark(
+    step: Step, rig: Rig, box: ProbeDriver, cameras: Mapping[str, Camera], *, token: str
+) -> Exposed:
+    """Expose without light; see `expose`."""
+    return _expose(step, rig, box, cameras, lambda: (box.trigger_camera(token), 0.0))
+
+
+def expose(step: Step, rig: Rig, box: ProbeDriver, cameras: Mapping[str, Camera]) -> Exposed:
+    """Open the shutter once, and collect one frame a camera.
+
+    Raises
+    ------
+    FrameRefused, FrameTimeout
+        Where a frame is not believed or does not come; it can be tried again.
+    HeadLost
+        Where the box has let go of the head meanwhile.
+    CommandRefused
+        Where the box forbids it for another reason.
+    """
+    seconds = float(step.settings["exposure_s"])
+
+    readout_s = max(rig.view(name).readout_s for name in step.cameras)
+
+    def release() -> tuple[float, float]:
+        try:
+            opening = box.open_shutter(seconds)
+        except CommandRefused as error:
+            if error.code == Code.HARDWARE:
+                mend(box, step)
+                raise ShutterFault(str(error)) from error
+            if error.code in (Code.WATCHDOG_TRIPPED, Code.NOT_ARMED, Code.IGNORED):
+                raise HeadLost("the box did not hold the head") from error
+            raise
+        try:
+            return opening.t_open_s, _light_s(step, box, opening)
+        except (ShutterFault, HeadLost):
+            # the camera still exposes or reads out, and would miss the next pulse
+            over_s = opening.t_open_s + seconds + readout_s + CLOSING_S
+            box.listen(over_s - box.ping(), every_s=RENEW_S)
+            raise
+
+    return _expose(step, rig, box, cameras, release)
+
+
+def _light_s(step: Step, box: ProbeDriver, opening: Opening) -> float:
+    """Wait until the shutter has closed and return how long its light lasted, s."""
+    seconds = float(step.settings["exposure_s"])
+    box.listen(seconds, every_s=RENEW_S)
+    last = box.last_opening()
+    waited_s = 0.0
+    while last is not None and last.ended == "open" and waited_s < CLOSING_S:
+        box.listen(CLOSING_S / 10.0)
+        waited_s += CLOSING_S / 10.0
+        last = box.last_opening()
+    ended = "not at all" if last is None or last.number != opening.number else last.ended
+    if last is None or ended != "timed":
+        if ended in ("pump", "interlock", "dark"):
+            raise HeadLost("the suction failed while the shutter was open")
+        mend(box, step)
+        raise ShutterFault(f"the shutter closed as {ended!r} instead of by its own end")
+    open_s = last.t_shut_s - last.t_open_s
+    if abs(open_s - seconds) > SHUTTER_DEVIATION * seconds + SHUTTER_MARGIN_S:
+        raise ShutterFault(f"the shutter was open for {open_s:g} s, expected {seconds:g} s")
+    return open_s
+
+
+def mend(box: ProbeDriver, step: Step) -> None:
+    """Try to close a shutter that is stuck, and to light the LED again that was put out for it."""
+    try:
+        box.close_shutter()
+        box.set_level(float(step.settings["level"]))
+    except CommandRefused as error:
+        if error.code != Code.HARDWARE:
+            raise HeadLost("the box had let go of the head") from error
+
+
+def _expose(
+    step: Step,
+    rig: Rig,
+    box: ProbeDriver,
+    cameras: Mapping[str, Camera],
+    release: Callable[[], tuple[float, float]],
+) -> Exposed:
+    want = wanted_exposure(step)
+    chosen = {name: cameras[name] for name in step.cameras}
+    not_before: dict[str, float] = {}
+    for name, camera in chosen.items():
+        configure(name, camera, want)
+        camera.arm(1, Trigger.EDGE)
+        not_before[name] = camera.clock_s()
+    t_box_s, open_s = release()
+    readout_s = max(rig.view(name).readout_s for name in chosen)
+    # the lease is renewed up to the moment at which the frame should be there
+    dark_s = 0.0 if open_s else want.exposure_s
+    box.listen(dark_s + readout_s, every_s=RENEW_S)
+    frames: dict[str, Frame] = {}
+    stale = 0
+    for name, camera in chosen.items():
+        frames[name], dropped = next_frame(
+            camera, seq=0, not_before_s=not_before[name], want=want, timeout_s=FRAME_S
+        )
+        stale += dropped
+    return Exposed(step, frames, t_box_s, open_s, stale)

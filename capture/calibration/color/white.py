@@ -1,0 +1,205 @@
+"""White reference: what light falls where, as this camera sees it, from a white tile."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Unpack
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
+from capture.calibration.sensor.flat_field import fit_smooth_field
+from capture.calibration.sensor.transfer_curve import block_sums
+
+__all__ = ["WhiteReference", "white_reference"]
+
+Float32 = NDArray[np.float32]
+
+BLOCKS = 24  # samples along the shorter side for the smooth fit
+
+
+@dataclass(frozen=True, slots=True)
+class WhiteReference:
+    """Signal of a perfect white diffuser at every pixel, at unit light.
+
+    Attributes
+    ----------
+    signal : ndarray of float32, shape (H, W, 3)
+        Fraction of full scale for reflectance 1 and unit light; NaN where not `valid`.
+    stderr : ndarray of float32, shape (H, W, 3)
+        Standard error; NaN where not `valid`.
+    valid : ndarray of bool, shape (H, W)
+    residual : ndarray of float64, shape (3,)
+        Relative scatter of the tile around the smooth fit; 0 where nothing was smoothed.
+    """
+
+    signal: Float32
+    stderr: Float32
+    valid: NDArray[np.bool_]
+    residual: NDArray[np.float64]
+
+    def balance(
+        self, rgb: NDArray, *, light: float = 1.0, variance: NDArray | None = None
+    ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
+        """Return reflectance per channel, its variance, and where it holds.
+
+        A white surface comes out as (1, 1, 1) in every channel and at every pixel.
+
+        Parameters
+        ----------
+        rgb : ndarray of float, shape (H, W, 3)
+            Linear camera RGB, fraction of full scale.
+        light : float
+            Amount of light relative to that of the reference (flash power).
+        variance : ndarray of float, shape (H, W, 3), optional
+            Variance of `rgb`.
+
+        Returns
+        -------
+        reflectance, variance : ndarray of float32, shape (H, W, 3)
+            NaN where not valid. The variance holds that of the reference.
+        valid : ndarray of bool, shape (H, W)
+        """
+        if rgb.shape != self.signal.shape:
+            raise ValueError(
+                f"rgb: got shape {rgb.shape}, expected {self.signal.shape} as the white reference;"
+                " take both with the same camera settings and demosaic"
+            )
+        if not light > 0:
+            raise ValueError(f"light: got {light}, expected > 0")
+        # in float64: thin signals squared leave the range of float32 weights
+        signal = self.signal.astype(np.float64) * light
+        reflectance = rgb / signal
+        own = 0.0 if variance is None else variance / signal**2
+        reference = (reflectance * self.stderr.astype(np.float64) * light / signal) ** 2
+        return (
+            reflectance.astype(np.float32),
+            (own + reference).astype(np.float32),
+            self.valid & np.logical_and.reduce(np.isfinite(reflectance), axis=-1),
+        )
+
+    def to_calibration(
+        self,
+        **about: Unpack[Provenance],
+    ) -> Calibration:
+        """Return this as a `Calibration` of kind "white" for one camera; not valid is 0 there."""
+        white = np.nanmean(self.signal[self.valid].astype(np.float64), axis=0)
+        return of_one_device(
+            "white",
+            {"mean_signal": Quantity(white), "residual": Quantity(self.residual)},
+            maps={
+                "signal": np.where(self.valid[..., None], self.signal, np.float32(0.0)),
+                "stderr": np.where(self.valid[..., None], self.stderr, np.float32(0.0)),
+            },
+            notes={"unit": "fraction of full scale for reflectance 1 at unit light"},
+            **about,
+        )
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration, serial: str) -> "WhiteReference":
+        """Return the white reference of one camera from a loaded `Calibration`."""
+        signal, stderr = calibration.maps["signal"], calibration.maps["stderr"]
+        valid = np.logical_and.reduce(signal > 0, axis=-1)
+        blank = np.float32(np.nan)
+        return cls(
+            np.where(valid[..., None], signal, blank).astype(np.float32),
+            np.where(valid[..., None], stderr, blank).astype(np.float32),
+            valid,
+            calibration.quantity(serial, "residual").value,
+        )
+
+
+def white_reference(
+    images: Sequence[NDArray],
+    *,
+    variances: Sequence[NDArray],
+    valid: Sequence[NDArray[np.bool_]],
+    lights: ArrayLike | None = None,
+    reflectance: float = 1.0,
+    degree: int | None = 4,
+) -> WhiteReference:
+    """Average images of a white tile that fills the field into a white reference.
+
+    Parameters
+    ----------
+    images : sequence of ndarray of float, shape (H, W, 3)
+        Linear camera RGB, fraction of full scale. For diffuse images take the tile the same way
+        (crossed, or the diffuse of `reconstruction.polarization.separate`).
+    variances : sequence of ndarray of float, shape (H, W, 3)
+        Variance of each image.
+    valid : sequence of ndarray of bool, shape (H, W)
+        False where an image is saturated.
+    lights : array_like, shape (N,), optional
+        Relative amount of light of each image (flash power); default 1.
+    reflectance : float
+        Of the tile, in (0, 1].
+    degree : int or None
+        Total degree of the polynomial the shading is smoothed by; None keeps every pixel with its
+        own noise.
+
+    Returns
+    -------
+    WhiteReference
+
+    Raises
+    ------
+    ValueError
+        If shapes differ or no pixel is usable.
+    """
+    if not images or len({len(images), len(variances), len(valid)}) != 1:
+        raise ValueError(
+            f"images, variances, valid: got {len(images)}, {len(variances)} and {len(valid)},"
+            " expected equally many, at least one"
+        )
+    if not 0 < reflectance <= 1:
+        raise ValueError(f"reflectance: got {reflectance}, expected 0 < reflectance <= 1")
+    if len({image.shape for image in images}) != 1 or images[0].ndim != 3:
+        raise ValueError(
+            f"images: got shapes {[image.shape for image in images]}, expected one (H, W, 3)"
+        )
+    light = np.ones(len(images)) if lights is None else np.asarray(lights, dtype=np.float64)
+    if light.shape != (len(images),) or not (light > 0).all():
+        raise ValueError(f"lights: got {light.tolist()}, expected {len(images)} numbers > 0")
+    total = np.zeros(images[0].shape)
+    weight = np.zeros(images[0].shape[:2])
+    noise = np.zeros(images[0].shape)
+    for image, variance, ok, x in zip(images, variances, valid, light, strict=True):
+        usable = ok & np.logical_and.reduce(np.isfinite(image), axis=-1)
+        # light as weight: the mean of signal / light with weights light^2 / variance ~ light
+        total += np.where(usable[..., None], image, 0.0)
+        noise += np.where(usable[..., None], variance, 0.0)
+        weight += usable * x
+    good = weight > 0
+    if not good.any():
+        raise ValueError("images: every pixel of the white tile is saturated; use less light")
+    scale = np.where(good, weight, 1.0)[..., None] * reflectance
+    signal, stderr = total / scale, np.sqrt(noise) / scale
+    residual = np.zeros(3)
+    if degree is not None:
+        signal, stderr, residual = _smooth(signal, good, degree)
+    positive = good & np.logical_and.reduce(signal > 0, axis=-1)
+    return WhiteReference(
+        np.where(positive[..., None], signal, np.nan).astype(np.float32),
+        np.where(positive[..., None], stderr, np.nan).astype(np.float32),
+        positive,
+        residual,
+    )
+
+
+def _smooth(
+    signal: NDArray[np.float64], good: NDArray[np.bool_], degree: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Replace a shaded white tile by its polynomial, with the error of the fit."""
+    height, width = good.shape
+    side = max(min(height, width) // BLOCKS, 1)
+    count = block_sums(good.astype(np.float64), side)
+    r, c = np.nonzero(count >= side * side / 2)
+    rows, columns = r * side + (side - 1) / 2, c * side + (side - 1) / 2
+    out, errors, residual = np.empty_like(signal), np.empty_like(signal), np.empty(3)
+    for k in range(3):
+        means = block_sums(np.where(good, signal[..., k], 0.0), side)[r, c] / count[r, c]
+        field = fit_smooth_field(means, rows, columns, shape=(height, width), degree=degree)
+        out[..., k] = field.level * field.evaluate(height, width)
+        errors[..., k] = field.level * field.evaluate_stderr(height, width)
+        residual[k] = field.residual
+    return out, errors, residual

@@ -1,0 +1,1 @@
+"""Calibration of the fiber probe: gains, positions, cross-talk and dark signal."""

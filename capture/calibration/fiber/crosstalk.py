@@ -1,0 +1,331 @@
+"""Cross-talk of fibres: what each spot reads of every other fibre's light, and stray light."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration.fiber.readings import FibreReadings
+from capture.calibration.record import CalibrationError
+
+__all__ = ["CrossTalk", "CrossTalkError", "measure_crosstalk", "no_crosstalk"]
+
+FloatArray = NDArray[np.float64]
+
+DISTANCE_EDGES: Final = (1, 2, 3, 4, 6, 9, 14, 21)
+"""First distance, in fibres, of each group that is taken to be alike."""
+FAR: Final = 4
+"""Places apart, out of `DISTANCE_EDGES`, from which pairs are known by their group's mean alone."""
+LEAST_SCATTER: Final = 0.3
+"""Of pairs as far apart about their mean, relative: a few of them may agree by chance."""
+OVERLAP: Final = 0.05
+"""Above this a pair's spots overlap: they tell nothing of others as far apart."""
+UNEVEN_COVER: Final = 0.3
+"""By how much covers may differ in what they let through, relative."""
+ROUNDS: Final = 30
+
+
+class CrossTalkError(CalibrationError):
+    """Spots whose light cannot be told apart."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CrossTalk:
+    """How light of the fibres mixes in the spots' readings: ``s = X u + o``.
+
+    Attributes
+    ----------
+    matrix, stderr : ndarray of float64, shape (F, F)
+        X: ``matrix[j, i]`` is what spot j reads of fibre i's light, over what spot i reads of it;
+        1 on the diagonal, with error 0.
+    offset, offset_stderr : ndarray of float64, shape (F, C)
+        o: stray light in each spot that is no fibre's, full scales per second; the error of each
+        by itself.
+    offset_common : ndarray of float64, shape (F, C)
+        By how much one standard error that the spots of a color share changes the offsets.
+    measured : bool
+        False: no frames told it; the matrix is 1, and its errors are unknown.
+    cover_leak, cover_leak_stderr : float
+        What a covered fibre still let through when this was measured, of its own light.
+    """
+
+    matrix: FloatArray
+    stderr: FloatArray
+    offset: FloatArray
+    offset_stderr: FloatArray
+    offset_common: FloatArray
+    measured: bool = True
+    cover_leak: float = 0.0
+    cover_leak_stderr: float = 0.0
+
+    def __post_init__(self) -> None:
+        count = len(np.asarray(self.matrix))
+        colors = np.shape(self.offset)[-1]
+        for name, shape in (
+            ("matrix", (count, count)), ("stderr", (count, count)),
+            ("offset", (count, colors)), ("offset_stderr", (count, colors)),
+            ("offset_common", (count, colors)),
+        ):  # fmt: skip
+            _freeze(self, name, shape)
+        if not (np.diagonal(self.matrix) == 1.0).all():
+            raise ValueError("CrossTalk.matrix: got a diagonal other than 1")
+        away = np.abs(self.matrix).sum(axis=0) - 1.0
+        if count and not float(away.max()) < 0.9:
+            raise CrossTalkError(
+                f"cross-talk: got {float(away.max()):.2f} of a fibre's light in the others' spots,"
+                " expected less than 0.9: they cannot be told apart; check focus and cover"
+            )
+
+    def unmix(self, signal: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the light of each fibre by itself, and its variance.
+
+        Parameters
+        ----------
+        signal, variance : ndarray of float64, shape (F, C)
+            Of readings; the readings' errors are independent.
+
+        Returns
+        -------
+        light, variance : ndarray of float64, shape (F, C)
+            The variance holds the readings' errors and those of the offset, not the matrix's: see
+            `matrix_variance`.
+        """
+        back = np.linalg.inv(self.matrix)
+        light = back @ (signal - self.offset)
+        return light, back**2 @ (variance + self.offset_stderr**2)
+
+    def matrix_variance(
+        self, light: FloatArray, reference: FloatArray, ratio: FloatArray
+    ) -> FloatArray:
+        """Return the variance that the matrix's errors add to light judged by a reference.
+
+        Parameters
+        ----------
+        light : ndarray of float64, shape (F, C)
+            Of the fibres, unmixed.
+        reference : ndarray of float64, shape (F, C)
+            Light of a target unmixed by the same matrix, by which `light` is divided; its errors
+            are the same ones, so that what both have alike cancels.
+        ratio : ndarray of float64, shape (F, C)
+            ``light / reference``, or 0 where only `light` is asked for.
+
+        Returns
+        -------
+        ndarray of float64, shape (F, C)
+            In the unit of ``light`` squared.
+        """
+        # -d(u_j) = sum_i dX_ji u_i to first order, and the same of the reference times the ratio
+        moved = light[None] - ratio[:, None] * reference[None]  # (F j, F i, C)
+        return np.asarray(np.einsum("ji,jic->jc", self.stderr**2, moved**2))
+
+    def shared_changes(
+        self, light: FloatArray, reference: FloatArray, ratio: FloatArray
+    ) -> FloatArray:
+        """Change of `light` for one standard error of each far group of pairs, shape (G, F, C).
+
+        Pairs of fibres that are `FAR` places apart or more are fainter than their noise: what is
+        known of them is the mean of their group, whose error is the same in all of them.
+
+        Parameters
+        ----------
+        light, reference, ratio : ndarray of float64, shape (F, C)
+            As of `matrix_variance`.
+        """
+        place = np.arange(len(light))
+        group = np.searchsorted(DISTANCE_EDGES, np.abs(place[:, None] - place), side="right") - 1
+        moved = light[None] - ratio[:, None] * reference[None]
+        each = range(DISTANCE_EDGES.index(FAR), len(DISTANCE_EDGES))
+        return np.stack(
+            [-np.einsum("ji,jic->jc", np.where(group == g, self.stderr, 0.0), moved) for g in each]
+        )
+
+
+def no_crosstalk(count: int, colors: int) -> CrossTalk:
+    """Return a matrix of no cross-talk, for where none was measured."""
+    nothing = np.zeros((count, colors))
+    return CrossTalk(np.eye(count), np.zeros((count, count)), nothing, nothing, nothing, False)
+
+
+def measure_crosstalk(masks: Mapping[int, FibreReadings], phantom: FibreReadings) -> CrossTalk:
+    """Measure cross-talk and stray light with one fibre uncovered at a time.
+
+    Parameters
+    ----------
+    masks : mapping of int to FibreReadings
+        By the number of the uncovered fibre, on one bright target with one light; not all fibres
+        need to be there.
+    phantom : FibreReadings
+        The same with no fibre covered: tells what leaks through the covers from stray light.
+
+    Returns
+    -------
+    CrossTalk
+
+    Notes
+    -----
+    Spot j reads ``X_ji`` times what the uncovered fibre i gives, and light that is the same
+    whichever fibre is uncovered: stray light ``o_j``, and what leaks through the fibre's own cover,
+    a share of its light that all covers have in common but for 30 %.
+
+    Most of the 756 pairs of 28 fibres are fainter than their noise; each is drawn to the mean of
+    the pairs as far apart, as far as their own scatter (the random-effects estimate of DerSimonian
+    and Laird 1986, doi 10.1016/0197-2456(86)90046-2) tells. The three colors share one matrix.
+    """
+    first = next(iter(masks.values()))
+    count, colors = first.signal.shape
+    used = [i for i in sorted(masks) if masks[i].valid[i].any()]
+    # source: light of the uncovered fibre in its own spot; column i, color c
+    source = np.zeros((count, colors))
+    value = np.zeros((count, count, colors))  # reading of j with i uncovered
+    weight = np.zeros((count, count, colors))
+    for i in used:
+        readings = masks[i]
+        # a fibre that gives no light tells of stray light only
+        source[i] = np.where(readings.detected[i], readings.signal[i], 0.0)
+        good = readings.valid & readings.valid[i]
+        value[:, i] = readings.signal
+        weight[:, i] = np.where(good, 1.0 / np.maximum(readings.variance, 1e-300), 0.0)
+    rows = np.arange(count)
+    weight[rows, rows] = 0.0
+    distance = np.abs(rows[:, None] - rows[None])
+    group = np.searchsorted(DISTANCE_EDGES, distance, side="right") - 1  # -1 on the diagonal
+    offset, offset_variance = np.zeros((count, colors)), np.zeros((count, colors))
+    matrix, variance = np.zeros((count, count)), np.zeros((count, count))
+    information = np.einsum("jic,ic->ji", weight, source**2)
+    for _ in range(ROUNDS):
+        # each pair by itself, given the stray light
+        seen = np.einsum("jic,ic->ji", weight * (value - offset[:, None]), source)
+        matrix, variance = _pooled(seen, information, group)
+        # stray light, given the pairs; what is uncertain of a pair counts as noise
+        doubt = weight / (1.0 + weight * source[None] ** 2 * variance[..., None])
+        total = doubt.sum(axis=1)
+        rest = value - matrix[..., None] * source[None]
+        known = total > 0
+        before = offset
+        offset = np.where(known, (doubt * rest).sum(axis=1) / np.where(known, total, 1.0), 0.0)
+        offset_variance = np.where(known, 1.0 / np.where(known, total, 1.0), 0.0)
+        if (np.abs(offset - before) <= 1e-3 * np.sqrt(offset_variance)).all():
+            break
+    np.fill_diagonal(matrix, 1.0)
+    np.fill_diagonal(variance, 0.0)
+    leak, leak_stderr, offset, offset_stderr, common = _stray(offset, offset_variance, phantom)
+    return CrossTalk(
+        matrix, np.sqrt(variance), offset, offset_stderr, common, True, leak, leak_stderr
+    )
+
+
+def _stray(
+    steady: FloatArray, variance: FloatArray, phantom: FibreReadings
+) -> tuple[float, float, FloatArray, FloatArray, FloatArray]:
+    """Part light that is the same in all masks into a cover's leak and stray light.
+
+    Returns the leak, its standard error, and stray light drawn to the mean of each color's spots,
+    with its errors by itself and in common, shape (F, C).
+    """
+    count, colors = steady.shape
+    good = phantom.valid & (variance > 0)
+    source = np.where(good, np.maximum(phantom.signal, 0.0), 0.0)
+    leak, leak_variance = 0.0, 0.0
+    level = np.zeros(colors)
+    for _ in range(ROUNDS):
+        # one leak and a stray light in each color; covers differ, so bright fibres do not rule
+        spread = np.where(good, variance + (UNEVEN_COVER * leak * source) ** 2, np.inf)
+        design = np.zeros((count, colors, 1 + colors))
+        design[..., 0] = source
+        design[:, np.arange(colors), 1 + np.arange(colors)] = 1.0
+        weighed = design / spread[..., None]
+        normal = np.einsum("fcp,fcq->pq", weighed, design)
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        inverse = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+        found = inverse @ np.einsum("fcp,fc->p", weighed, np.where(good, steady, 0.0))
+        before = leak
+        leak, leak_variance = max(float(found[0]), 0.0), float(inverse[0, 0])
+        level = found[1:]
+        if abs(leak - before) <= 1e-3 * leak:
+            break
+    rest = steady - leak * source
+    doubt = variance + source**2 * (leak_variance + (UNEVEN_COVER * leak) ** 2)
+    stray = np.tile(level, (count, 1))
+    own, common = np.zeros((count, colors)), np.zeros((count, colors))
+    for c in range(colors):
+        if good[:, c].any():
+            stray[:, c], own[:, c], common[:, c] = shrunk(
+                rest[:, c], np.where(good[:, c], 1.0 / np.maximum(doubt[:, c], 1e-300), 0.0), 0.0
+            )
+    return leak, float(np.sqrt(leak_variance)), stray, own, common
+
+
+def _pooled(
+    seen: FloatArray, information: FloatArray, group: NDArray[np.intp]
+) -> tuple[FloatArray, FloatArray]:
+    """Return each pair drawn to its group's mean, and its variance."""
+    matrix, variance = np.zeros_like(seen), np.zeros_like(seen)
+    own = np.divide(seen, information, out=np.zeros_like(seen), where=information > 0)
+    last = 0.0
+    overlap = own > OVERLAP
+    matrix[overlap] = own[overlap]
+    variance[overlap] = 1.0 / information[overlap]
+    for number in range(int(group.max(initial=-1)) + 1):
+        here = (group == number) & ~overlap
+        if (information[here] > 0).any():
+            matrix[here], alone, common = shrunk(own[here], information[here], LEAST_SCATTER)
+            variance[here] = alone**2 + common**2
+            last = float(np.median(np.abs(matrix[here])))
+        else:
+            # nothing is told of such a distance: no more than of the one before
+            variance[here] = last**2
+    return matrix, variance
+
+
+def shrunk(
+    value: FloatArray, information: FloatArray, least_scatter: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return values drawn to their mean as far as their own scatter tells, and standard errors.
+
+    The first errors are of each by itself, the second what all share by the error of the mean.
+
+    Parameters
+    ----------
+    value : ndarray of float64, shape (n,)
+    information : ndarray of float64, shape (n,)
+        Inverse variances; 0 where nothing was measured, 1 or more of them above 0.
+    least_scatter : float
+        Standard deviation of the true values over their mean, at least: a few may agree by chance.
+
+    Examples
+    --------
+    >>> value, _, _ = shrunk(np.array([1.0, 3.0, 9.0]), np.array([1e4, 1e4, 0.0]), 0.0)
+    >>> value.round(2).tolist()
+    [1.0, 3.0, 2.0]
+    """
+    told = information > 0
+    w, x = information[told], value[told]
+    mean = float((w * x).sum() / w.sum())
+    spread = float((w * (x - mean) ** 2).sum()) - (len(x) - 1)
+    scale = float(w.sum() - (w**2).sum() / w.sum())
+    between = max(spread / scale, 0.0) if scale > 0 else mean**2
+    between = max(between, (least_scatter * mean) ** 2)
+    both = 1.0 / (1.0 / w + between)
+    mean, error = float((both * x).sum() / both.sum()), 1.0 / float(both.sum())
+    share = between * information / (1.0 + between * information)
+    known = np.where(told, value, mean)
+    return (
+        share * known + (1.0 - share) * mean,
+        np.sqrt((1.0 - share) * between),
+        (1.0 - share) * np.sqrt(error),
+    )
+
+
+def _freeze(row: Any, name: str, shape: tuple[int, ...]) -> None:
+    array = np.array(getattr(row, name), np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(
+            f"{type(row).__name__}.{name}: got shape {array.shape}, expected finite numbers of"
+            f" shape {shape}"
+        )
+    array.setflags(write=False)
+    object.__setattr__(row, name, array)

@@ -1,0 +1,181 @@
+"""Blurred discs in a raw mosaic: places that look like one, and the fit of one."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.optimize import least_squares
+from scipy.special import erfc
+
+from capture.calibration.fiber.merge import MergedSeries, color_masks
+
+__all__ = ["DiscFit", "candidates", "distinct", "fit_disc", "gray_image"]
+
+FloatArray = NDArray[np.float64]
+GrayImage = tuple[FloatArray, FloatArray]
+"""Sum of a cell's colors at every pixel, full scales per second, and its variance, (H, W)."""
+DiscFit = tuple[FloatArray, FloatArray, float]
+"""x, y, radius, edge in pixels, their standard errors, and the radius of a disc as large as what is
+brighter than half."""
+
+SMOOTH_PITCH: Final = 0.12
+"""Blur of the search for spots, in distances between neighbors."""
+SIGMAS: Final = 8.0
+"""What a spot stands out of the noise by."""
+CONTRAST: Final = 0.3
+"""What a spot stands out of the light around it by, at least."""
+BORDER_PITCH: Final = 0.2
+"""Nearer to the image's border than this no spot is sought, in distances between neighbors."""
+WORST_PITCH: Final = 0.04
+"""Standard error of a place that is no place any more."""
+STRUCTURE: Final = 0.03
+"""How far pixels of a spot scatter about a smooth disc, relative."""
+UNEVEN: Final = 0.1
+"""Slopes and bend of the light over a spot, relative, as large as they may well be."""
+
+
+def gray_image(merged: MergedSeries, pattern: str) -> GrayImage:
+    """Return the sum of a cell's colors at every pixel, and its variance; gaps are filled."""
+    values = np.where(merged.valid, merged.rate, merged.smooth)
+    # saturated in every frame: brighter than what was measured anywhere near
+    if merged.saturated.any():
+        top = float(values.max(initial=0.0))
+        values = np.where(merged.saturated, max(top, 1e-12), values)
+    if pattern == "MONO":
+        return values, merged.variance
+    total, variance = np.zeros_like(values), np.zeros_like(values)
+    padded = np.pad(values, 1, mode="edge")
+    noisy = np.pad(merged.variance, 1, mode="edge")
+    height, width = values.shape
+    # (1 2 1) x (1 2 1) holds each color of a 2 x 2 cell with the same weight, about the pixel
+    for i, a in enumerate((0.25, 0.5, 0.25)):
+        for j, b in enumerate((0.25, 0.5, 0.25)):
+            total += a * b * padded[i : i + height, j : j + width]
+            variance += (a * b) ** 2 * noisy[i : i + height, j : j + width]
+    return total, variance
+
+
+def candidates(image: GrayImage, pitch: float) -> FloatArray:
+    """Return the tops that stand out of noise and surroundings, brightest first, shape (n, 2)."""
+    gray, variance = image
+    blur = SMOOTH_PITCH * pitch
+    smooth = gaussian_filter(gray, blur, mode="nearest")
+    # the blurred noise of a cell's sum, whose neighbors share pixels: at most 4 pixels' worth
+    noise = np.sqrt(gaussian_filter(variance, blur, mode="nearest") * 4.0) / (2.0 * blur)
+    side = 2 * int(0.3 * pitch) + 1
+    top = smooth == maximum_filter(smooth, side, mode="nearest")
+    lift = round(0.65 * pitch)
+    above = np.pad(smooth, ((lift, 0), (0, 0)), mode="edge")[: smooth.shape[0]]
+    below = np.pad(smooth, ((0, lift), (0, 0)), mode="edge")[lift:]
+    around = np.minimum(above, below)
+    stands = (smooth - around > SIGMAS * noise) & (smooth - around > CONTRAST * np.abs(around))
+    # beside the border the blur doubles what noise there is
+    border = round(BORDER_PITCH * pitch)
+    inner = np.zeros_like(top)
+    inner[border : top.shape[0] - border, border : top.shape[1] - border] = True
+    rows, columns = np.nonzero(top & stands & inner & (smooth > 0))
+    order = np.argsort(-smooth[rows, columns], kind="stable")[:200]
+    return np.stack([columns, rows], axis=1)[order].astype(np.float64)
+
+
+def fit_disc(
+    merged: MergedSeries,
+    image: GrayImage,
+    pattern: str,
+    place: FloatArray,
+    pitch: float,
+) -> DiscFit | None:
+    """Fit a disc with a blurred edge to the raw mosaic about a place; None where none fits."""
+    height, width = merged.rate.shape
+    half = int(0.5 * pitch)
+    x0, y0 = (round(float(v)) for v in place)
+    rows = slice(max(y0 - half, 0), min(y0 + half + 1, height))
+    columns = slice(max(x0 - half, 0), min(x0 + half + 1, width))
+    if rows.stop - rows.start < half or columns.stop - columns.start < half:
+        return None
+    y, x = np.mgrid[rows, columns].astype(np.float64)
+    good = merged.valid[rows, columns]
+    if good.sum() < 50:
+        return None
+    colors = [mask[rows, columns] & good for mask in color_masks(merged.rate.shape, pattern)]
+    value, spread = merged.rate[rows, columns], merged.variance[rows, columns]
+    gray = image[0][rows, columns]
+    top = float(np.quantile(gray, 0.98))
+    bottom = float(np.quantile(gray, 0.02))
+    if top <= bottom:
+        return None
+    area = float((gray > 0.5 * (top + bottom)).sum())
+    start_radius = float(np.clip(np.sqrt(area / np.pi), 1.5, 0.5 * pitch))
+    order = [np.flatnonzero(mask.ravel()) for mask in colors]
+    index = np.concatenate(order)
+    color = np.concatenate([np.full(len(part), c) for c, part in enumerate(order)])
+    px, py, data = x.ravel()[index], y.ravel()[index], value.ravel()[index]
+    levels = np.array(
+        [max(float(np.quantile(data[color == c], 0.9)), 0.0) for c in range(len(colors))]
+    )
+    scale = max(float(levels.max()), 1e-30)
+    sigma = np.sqrt(spread.ravel()[index] + (STRUCTURE * levels[color]) ** 2) / scale
+    sigma = np.maximum(sigma, 1e-9)
+    data = data / scale
+
+    parts = [np.flatnonzero(color == c) for c in range(len(colors))]
+    # slopes and bend of a color may be as large as UNEVEN of its level, with a normal prior
+    stiff = [np.array([0.0, 1.0, 1.0, 1.0, 0.0]) / (UNEVEN * max(v / scale, 1e-3)) for v in levels]
+
+    def split(p: FloatArray) -> tuple[list[FloatArray], list[FloatArray], FloatArray]:
+        """Return residuals of each color's best linear model, and their amplitudes.
+
+        A fibre's modes are not filled alike: light over the disc has slopes and a bend.
+        """
+        u, v = (px - p[0]) / p[2], (py - p[1]) / p[2]
+        d = np.hypot(u, v)
+        disc = 0.5 * erfc((d - 1.0) * (p[2] / (np.sqrt(2.0) * p[3])))
+        bend = np.minimum(d, 1.2) ** 2 - 0.5
+        design = np.stack([disc, disc * u, disc * v, disc * bend, np.ones_like(disc)])
+        residuals, priors = [], []
+        amplitude = np.zeros(len(parts))
+        for c, at in enumerate(parts):
+            rows = design[:, at] / sigma[at]
+            value = data[at] / sigma[at]
+            normal = rows @ rows.T + np.diag(stiff[c] ** 2)
+            found = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(5), rows @ value)
+            residuals.append(value - found @ rows)
+            priors.append((stiff[c] * found)[1:4])
+            amplitude[c] = found[0]
+        return residuals, priors, amplitude
+
+    def misfit(p: FloatArray) -> FloatArray:
+        residuals, priors, _ = split(p)
+        return np.concatenate([*residuals, *priors])
+
+    begin = np.array([*place, start_radius, max(0.1 * start_radius, 0.7)])
+    low = np.array([place[0] - 0.5 * pitch, place[1] - 0.5 * pitch, 1.0, 0.2])
+    high = np.array([place[0] + 0.5 * pitch, place[1] + 0.5 * pitch, 0.7 * pitch, 0.3 * pitch])
+    begin = np.clip(begin, low + 1e-6, high - 1e-6)
+    done = least_squares(misfit, begin, bounds=(low, high), x_scale=[1, 1, 1, 0.5], max_nfev=30)
+    amplitude = split(done.x)[2]
+    at_bound = bool(((done.x <= low + 1e-3) | (done.x >= high - 1e-3))[:2].any())
+    if at_bound or amplitude.max() <= 0:
+        return None
+    normal = done.jac.T @ done.jac
+    chi2 = 2.0 * done.cost / max(len(data) - 4 - 5 * len(colors), 1)
+    try:
+        covariance = np.linalg.inv(normal) * max(chi2, 1.0)
+    except np.linalg.LinAlgError:
+        return None
+    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if not np.isfinite(error).all() or error[:2].max() > WORST_PITCH * pitch:
+        return None
+    return done.x, error, start_radius
+
+
+def distinct(fits: list[DiscFit], apart: float) -> list[DiscFit]:
+    """Return the fits without those that ended on an earlier one."""
+    kept: list[DiscFit] = []
+    for fit in fits:
+        if all(np.hypot(*(fit[0][:2] - other[0][:2])) > apart for other in kept):
+            kept.append(fit)
+    return kept

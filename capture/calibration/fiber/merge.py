@@ -1,0 +1,295 @@
+"""Brackets of exposures merged to the rate of light on each pixel, the dark signal taken off."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import uniform_filter
+
+from capture.calibration.fiber.darks import CameraNoise, DarkModel
+from capture.calibration.sensor.transfer_curve import cfa_planes
+from capture.documents import Checks
+from capture.hdr import BracketError
+
+__all__ = ["MergedSeries", "color_masks", "merge_series"]
+
+FloatArray = NDArray[np.float64]
+
+SMOOTH: Final = 3
+"""Side of the square of one color's pixels that the noise of each is told from."""
+MARGIN_SIGMAS: Final = 4.0
+LEAST_SIGMAS: Final = 20.0
+"""Of a pixel's light over its error, to tell how bright the source was in each frame."""
+WIDEST_RIPPLE: Final = 0.1
+"""Standard deviation of the source's light from frame to frame, relative, at most."""
+LEAST_EVIDENCE: Final = 3.0
+"""By how much the logarithm of the evidence for a ripple has to be more than for none."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergedSeries:
+    """Light on each pixel, from all exposures of a series.
+
+    Attributes
+    ----------
+    rate : ndarray of float64, shape (H, W)
+        Full scales per second above the dark signal, raw mosaic; may be negative; 0 where not
+        valid.
+    variance : ndarray of float64, shape (H, W)
+        Of `rate`; 0 where not valid.
+    smooth : ndarray of float64, shape (H, W)
+        `rate` averaged over the nearest valid pixels of the same color.
+    valid : ndarray of bool, shape (H, W)
+        False where a pixel is hot or saturated in every frame.
+    saturated : ndarray of bool, shape (H, W)
+        In every frame; not hot.
+    exposures_s : tuple of float
+        Ascending.
+    scale, scale_stderr : tuple of float
+        Light of each frame per second over the mean of all, from what the frames tell of each
+        other, and its standard error: a source that is not steady, a shutter that is not exact.
+    """
+
+    rate: FloatArray
+    variance: FloatArray
+    smooth: FloatArray
+    valid: NDArray[np.bool_]
+    saturated: NDArray[np.bool_]
+    exposures_s: tuple[float, ...]
+    scale: tuple[float, ...]
+    scale_stderr: tuple[float, ...]
+
+
+def merge_series(
+    frames: Sequence[NDArray[np.integer]],
+    exposures_s: ArrayLike,
+    *,
+    darks: DarkModel,
+    noise: CameraNoise,
+    light_s: ArrayLike | None = None,
+) -> MergedSeries:
+    """Merge raw frames of one scene at several exposure times, and take off the dark signal.
+
+    Parameters
+    ----------
+    frames : sequence of N arrays of integers, shape (H, W)
+        Raw DN, nothing subtracted; the light does not change between them.
+    exposures_s : array_like, shape (N,)
+        s, > 0, any order.
+    darks : DarkModel
+        At the frames' temperature.
+    noise : CameraNoise
+    light_s : array_like, shape (N,), optional
+        How long the light lasted in each frame, s, > 0; None: as long as the exposure.
+
+    Returns
+    -------
+    MergedSeries
+
+    Raises
+    ------
+    BracketError, DarkError
+        Where shapes or times do not fit.
+
+    Notes
+    -----
+    As `capture.hdr.merge`, by weights ``t / variance``, but for light that is fainter than the
+    dark signal and than the noise of a pixel:
+
+    - bias and dark current are each pixel's own, and their shot noise and errors count;
+    - a weight follows from the light on the pixel's neighbors too. From the pixel's own noisy
+      value alone it would favor low readings, by a tenth of an electron each, which sums up over
+      a spot to more than the farthest fibres give;
+    - frames that two exposures or more show unsaturated tell how bright the source was in each,
+      if it was not steady: see `MergedSeries.scale`;
+    - whether a pixel is near saturation is told from its neighbors, not from its own value, which
+      would leave out its high readings.
+    """
+    stack = [np.asarray(frame) for frame in frames]
+    times = np.asarray(exposures_s, np.float64)
+    _check(stack, times, darks)
+    lit = times if light_s is None else np.asarray(light_s, np.float64)
+    _check(stack, lit, darks, "light_s")
+    darks.require(times)
+    order = np.argsort(times, kind="stable")
+    stack, times, lit = [stack[k] for k in order], times[order], lit[order]
+    # what each frame shows without light is the same in all that follows
+    base = [noise.black_dn + darks.bias_dn + darks.rate_dn_per_s * t for t in times]
+    shape = stack[0].shape
+    usable = _usable(stack, noise)
+    hot = darks.hot
+    # first by read noise alone, then with the noise of the light that was found
+    guess, seen = _weigh(stack, times, lit, base, usable, darks, noise, np.zeros(shape))[:2]
+    smooth = _smooth(guess, seen & ~hot, noise.pattern)
+    light = np.maximum(smooth, 0.0)
+    rate, seen, variance = _weigh(stack, times, lit, base, usable, darks, noise, light)
+    clear = np.flatnonzero(seen & ~hot & (rate > LEAST_SIGMAS * np.sqrt(variance)))
+    scale, scale_stderr = np.ones(len(times)), np.zeros(len(times))
+    if len(times) > 1 and clear.size:
+        scale, scale_stderr = _scales(
+            np.stack(
+                [f.ravel()[clear] - b.ravel()[clear] for f, b in zip(stack, base, strict=True)]
+            ),
+            np.stack([use.ravel()[clear] for use in usable]),
+            times, lit, rate.ravel()[clear], light.ravel()[clear], darks, noise,
+        )  # fmt: skip
+        if (scale != 1.0).any():
+            rate, seen, variance = _weigh(
+                stack, times, lit * scale, base, usable, darks, noise, light
+            )
+    valid = seen & ~hot
+    rate, variance = np.where(valid, rate, 0.0), np.where(valid, variance, 0.0)
+    span = noise.span_dn
+    return MergedSeries(
+        rate / span,
+        variance / span**2,
+        _smooth(rate, valid, noise.pattern) / span,
+        valid,
+        ~seen & ~hot,
+        tuple(float(t) for t in times),
+        tuple(float(f) for f in scale),
+        tuple(float(e) for e in scale_stderr),
+    )
+
+
+def color_masks(shape: tuple[int, ...], pattern: str) -> list[NDArray[np.bool_]]:
+    """Return where each color's pixels lie in a raw frame, in the order R, G, B (or one, MONO).
+
+    Examples
+    --------
+    >>> [int(mask.sum()) for mask in color_masks((4, 6), "RGGB")]
+    [6, 12, 6]
+    """
+    planes = cfa_planes(pattern)
+    step = 1 if pattern == "MONO" else 2
+    masks = []
+    for color in ("R", "G", "B") if step == 2 else tuple(planes):
+        mask = np.zeros(shape, np.bool_)
+        for row, column in planes[color]:
+            mask[row::step, column::step] = True
+        masks.append(mask)
+    return masks
+
+
+def _check(
+    stack: list[NDArray[np.integer]],
+    times: FloatArray,
+    darks: DarkModel,
+    name: str = "exposures_s",
+) -> None:
+    checks = Checks("Series of a probe", BracketError)
+    checks.that("frames", len(stack), len(stack) > 0, "at least one frame")
+    shapes = sorted({frame.shape for frame in stack})
+    expected = darks.bias_dn.shape
+    checks.that("frames", shapes, shapes in ([], [expected]), f"the dark frames' shape {expected}")
+    whole = all(np.issubdtype(frame.dtype, np.integer) for frame in stack)
+    checks.that("frames", [str(f.dtype) for f in stack][:3], whole, "raw DN, whole numbers")
+    checks.that(name, times.shape, times.shape == (len(stack),), f"{len(stack)} times")
+    positive = bool(np.isfinite(times).all() and (times > 0).all())
+    checks.that(name, times.tolist(), positive, "finite seconds > 0")
+    checks.close()
+
+
+def _usable(stack: list[NDArray[np.integer]], noise: CameraNoise) -> list[NDArray[np.bool_]]:
+    """Return in which pixels each frame is not saturated, nor would be by chance."""
+    spread = np.sqrt(noise.span_dn / noise.gain_e_per_dn + noise.floor_dn2)
+    highest = noise.white_dn - MARGIN_SIGMAS * spread
+    result = []
+    for frame in stack:
+        use = frame < noise.white_dn
+        if int(frame.max()) > highest:
+            everywhere = np.ones(frame.shape, np.bool_)
+            use &= _smooth(frame.astype(np.float64), everywhere, noise.pattern) < highest
+        result.append(use)
+    return result
+
+
+def _weigh(
+    stack: list[NDArray[np.integer]],
+    times: FloatArray,
+    lit: FloatArray,
+    base: list[FloatArray],
+    usable: list[NDArray[np.bool_]],
+    darks: DarkModel,
+    noise: CameraNoise,
+    light: FloatArray,
+) -> tuple[FloatArray, NDArray[np.bool_], FloatArray]:
+    """Return rate, where any frame counts, and variance, DN/s, weighed for light of some rate."""
+    shape, gain = stack[0].shape, noise.gain_e_per_dn
+    current = max(darks.mean_rate_dn_per_s, 0.0) / gain
+    shot = light / gain
+    signal, time = np.zeros(shape), np.zeros(shape)
+    weights, dark_time = np.zeros(shape), np.zeros(shape)
+    for frame, t, t_light, dark, use in zip(stack, times, lit, base, usable, strict=True):
+        weight = np.where(use, t_light / (noise.floor_dn2 + current * t + shot * t_light), 0.0)
+        signal += weight * (frame - dark)
+        time += weight * t_light
+        weights += weight
+        dark_time += weight * t
+    seen = time > 0
+    below = np.where(seen, time, 1.0)
+    # what errors of a pixel's bias and dark current become
+    by_bias, by_rate = weights / below, dark_time / below
+    (bias2, both), (_, rate2) = darks.covariance
+    variance = 1.0 / below + bias2 * by_bias**2 + 2.0 * both * by_bias * by_rate
+    return signal / below, seen, variance + rate2 * by_rate**2
+
+
+def _scales(
+    value: FloatArray,
+    usable: NDArray[np.bool_],
+    times: FloatArray,
+    lit: FloatArray,
+    rate: FloatArray,
+    light: FloatArray,
+    darks: DarkModel,
+    noise: CameraNoise,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the light of each frame over the mean, and its standard error.
+
+    Least squares of ``value = rate scale time`` over pixels (K, P) whose rates are free, with a
+    normal prior of the scales about 1, as wide as their evidence is greatest for.
+    """
+    variance = (
+        noise.floor_dn2
+        + (max(darks.mean_rate_dn_per_s, 0.0) * times[:, None] + light * lit[:, None])
+        / noise.gain_e_per_dn
+    )
+    expected = rate * lit[:, None]
+    information = np.where(usable, expected**2 / variance, 0.0)
+    miss = np.where(usable, value / expected - 1.0, 0.0)
+    total = information.sum(axis=0)
+    mean = (information * miss).sum(axis=0) / total
+    normal = np.diag(information.sum(axis=1)) - (information / total) @ information.T
+    right = (information * (miss - mean)).sum(axis=1)
+    # the prior's width of most evidence; where the frames tell little of each other, none
+    values, vectors = np.linalg.eigh(0.5 * (normal + normal.T))
+    values, along = np.maximum(values, 0.0), vectors.T @ right
+    best, width2 = LEAST_EVIDENCE, 0.0
+    for width in np.geomspace(1e-4, WIDEST_RIPPLE, 16):
+        grown = 1.0 + width**2 * values
+        evidence = 0.5 * float(width**2 * (along**2 / grown).sum() - np.log(grown).sum())
+        if evidence > best:
+            best, width2 = evidence, float(width**2)
+    covariance = (vectors * (width2 / (1.0 + width2 * values))) @ vectors.T
+    away = covariance @ right
+    return 1.0 + away, np.sqrt(np.diag(covariance))
+
+
+def _smooth(values: FloatArray, valid: NDArray[np.bool_], pattern: str) -> FloatArray:
+    """Return the mean over the neighbors of the same place in the cell; 0 where there is none."""
+    result = np.zeros_like(values)
+    step = 1 if pattern == "MONO" else 2
+    for row in range(step):
+        for column in range(step):
+            place = (slice(row, None, step), slice(column, None, step))
+            share = uniform_filter(valid[place].astype(np.float64), SMOOTH, mode="nearest")
+            total = uniform_filter(
+                np.where(valid[place], values[place], 0.0), SMOOTH, mode="nearest"
+            )
+            result[place] = np.where(share > 1e-6, total / np.maximum(share, 1e-6), 0.0)
+    return result

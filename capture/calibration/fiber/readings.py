@@ -1,0 +1,209 @@
+"""What each detection fibre gives: a series of brackets summed over the fibres' spots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.calibration.fiber.darks import CameraNoise, DarkModel
+from capture.calibration.fiber.merge import MergedSeries, color_masks, merge_series
+from capture.calibration.fiber.spots import FibreSpots
+
+__all__ = ["FibreReadings", "read_fibres", "sum_spots"]
+
+FloatArray = NDArray[np.float64]
+
+GUARD_PX: Final = 6.0
+"""Between the row's apertures and the pixels that tell the light around them."""
+COLUMNS_PITCH: Final = 2.0
+"""How far to the sides of a spot that light is looked at, in distances between neighbors."""
+LEAST_AROUND: Final = 200
+"""Pixels of a color that tell the light around a spot."""
+FILL_STDERR: Final = 0.1
+"""Of a pixel that is filled from its neighbors, relative."""
+MOST_FILLED: Final = 0.2
+"""Share of an aperture's pixels of one color that may be filled."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FibreReadings:
+    """Light out of each fibre in each color.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the F fibres.
+    signal : ndarray of float64, shape (F, C)
+        Full scales per second, summed over the pixels of a color in the fibre's aperture, above
+        the dark signal and the light around the spot; may be negative; 0 where not valid. C = 3
+        (R, G, B), or 1 (MONO).
+    variance : ndarray of float64, shape (F, C)
+        Of `signal`: shot, read and dark noise, rounding, errors of the dark frames and of the light
+        around; 0 where not valid.
+    valid : ndarray of bool, shape (F, C)
+        False where saturated, or where too many pixels are hot.
+    saturated : ndarray of bool, shape (F, C)
+        A pixel of the spot is at the white level even in the shortest frame.
+    around : ndarray of float64, shape (F, C)
+        Light around the spot that was taken off, full scales per second and pixel.
+    exposures_s : tuple of float
+        Of the frames, ascending.
+    noise_origin : str
+        Where gain and read noise are from: "nominal" or "calibrated".
+    """
+
+    names: tuple[str, ...]
+    signal: FloatArray
+    variance: FloatArray
+    valid: NDArray[np.bool_]
+    saturated: NDArray[np.bool_]
+    around: FloatArray
+    exposures_s: tuple[float, ...]
+    noise_origin: str = "nominal"
+
+    def __post_init__(self) -> None:
+        """Check the arrays against each other."""
+        shape = np.shape(self.signal)
+        if len(shape) != 2 or shape[0] != len(self.names):
+            raise ValueError(
+                f"FibreReadings.signal: got shape {shape}, expected ({len(self.names)}, colors)"
+            )
+        for name in ("variance", "valid", "saturated", "around"):
+            if np.shape(getattr(self, name)) != shape:
+                raise ValueError(
+                    f"FibreReadings.{name}: got shape {np.shape(getattr(self, name))}, expected"
+                    f" {shape}"
+                )
+        if not np.isfinite(self.signal).all() or not (np.asarray(self.variance) >= 0).all():
+            raise ValueError("FibreReadings: got a signal that is not finite or a variance < 0")
+
+    @property
+    def stderr(self) -> FloatArray:
+        """Standard error of `signal`, shape (F, C)."""
+        return np.sqrt(self.variance)
+
+    @property
+    def detected(self) -> NDArray[np.bool_]:
+        """Where a valid signal is more than three standard errors above none, shape (F, C)."""
+        return np.asarray(self.valid & (self.signal > 3.0 * self.stderr))
+
+
+def read_fibres(
+    frames: Sequence[NDArray[np.integer]],
+    exposures_s: ArrayLike,
+    *,
+    spots: FibreSpots,
+    darks: DarkModel,
+    noise: CameraNoise,
+    temperature_c: float | None = None,
+    light_s: ArrayLike | None = None,
+) -> FibreReadings:
+    """Read the fibres from a series of exposures.
+
+    Parameters
+    ----------
+    frames : sequence of N arrays of integers, shape (H, W)
+        Raw DN of one series, nothing subtracted; one frame or more.
+    exposures_s : array_like, shape (N,)
+        s, > 0, any order.
+    spots : FibreSpots
+        Where the fibres end in these frames.
+    darks : DarkModel
+        See `fibre_darks.measure_darks`.
+    noise : CameraNoise
+    temperature_c : float, optional
+        Of the camera during the series; the dark current is carried over to it.
+    light_s : array_like, shape (N,), optional
+        How long the light lasted in each frame, s, > 0; None: as long as the exposure.
+
+    Returns
+    -------
+    FibreReadings
+
+    Raises
+    ------
+    BracketError, DarkError
+        Where shapes, times or temperatures do not fit.
+    """
+    merged = merge_series(
+        frames, exposures_s, darks=darks.at(temperature_c), noise=noise, light_s=light_s
+    )
+    return sum_spots(merged, spots, noise=noise)
+
+
+def sum_spots(merged: MergedSeries, spots: FibreSpots, *, noise: CameraNoise) -> FibreReadings:
+    """Sum a merged series over the apertures of the spots.
+
+    Parameters
+    ----------
+    merged : MergedSeries
+    spots : FibreSpots
+    noise : CameraNoise
+        For its color filter pattern.
+
+    Returns
+    -------
+    FibreReadings
+
+    Notes
+    -----
+    Light around a spot is the mean over pixels above and below the row, up to two neighbors away:
+    stray light, the lens's veil, and what the dark frames have wrong in common, as a camera that
+    has warmed up. Pixels that are hot are filled from their neighbors, with 10 % of standard error.
+    """
+    shape = merged.rate.shape
+    colors = color_masks(shape, noise.pattern)
+    count = len(spots.names)
+    signal, variance = np.zeros((count, len(colors))), np.zeros((count, len(colors)))
+    around = np.zeros((count, len(colors)))
+    valid = np.zeros((count, len(colors)), np.bool_)
+    saturated = np.zeros_like(valid)
+    hot = ~merged.valid & ~merged.saturated
+    for i in range(count):
+        inside = spots.mask(i, shape)
+        beside = _beside(spots, i, shape) & merged.valid
+        for c, color in enumerate(colors):
+            pixels = inside & color
+            number = int(pixels.sum())
+            full = pixels & merged.saturated
+            filled = pixels & hot
+            saturated[i, c] = bool(full.any())
+            gaps = int(filled.sum())
+            valid[i, c] = number > 0 and not saturated[i, c] and gaps <= MOST_FILLED * number
+            if not valid[i, c]:
+                continue
+            measured = pixels & ~filled
+            signal[i, c] = merged.rate[measured].sum() + merged.smooth[filled].sum()
+            # a neighbor's noise in place of a pixel's own, and how unlike neighbors are
+            spread = merged.variance[measured]
+            variance[i, c] = spread.sum() + gaps * spread.mean()
+            variance[i, c] += FILL_STDERR**2 * float((merged.smooth[filled] ** 2).sum())
+            level = beside & color
+            if (seen := int(level.sum())) >= LEAST_AROUND:
+                around[i, c] = merged.rate[level].mean()
+                signal[i, c] -= number * around[i, c]
+                variance[i, c] += number**2 * float(merged.variance[level].sum()) / seen**2
+    return FibreReadings(
+        spots.names, signal, variance, valid, saturated, around, merged.exposures_s, noise.origin
+    )
+
+
+def _beside(spots: FibreSpots, fibre: int, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return the pixels above and below the row, near one spot."""
+    height, width = shape[:2]
+    center = spots.center_px[fibre]
+    gaps = np.linalg.norm(np.diff(spots.center_px, axis=0), axis=1)
+    reach = COLUMNS_PITCH * (float(np.median(gaps)) if len(gaps) else 40.0)
+    mask = np.zeros((height, width), np.bool_)
+    left, right = max(int(center[0] - reach), 0), min(int(center[0] + reach) + 1, width)
+    near = np.abs(spots.center_px[:, 0] - center[0]) <= reach + spots.aperture_px
+    clear = spots.aperture_px + GUARD_PX
+    top = int(np.floor(spots.center_px[near, 1].min() - clear))
+    bottom = int(np.ceil(spots.center_px[near, 1].max() + clear)) + 1
+    mask[: max(top, 0), left:right] = True
+    mask[bottom:, left:right] = True
+    return mask

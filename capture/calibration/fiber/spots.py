@@ -1,0 +1,371 @@
+"""The ends of the detection fibres in the camera's image: found, measured, put in order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration.fiber.discs import DiscFit, candidates, distinct, fit_disc, gray_image
+from capture.calibration.fiber.merge import MergedSeries
+from capture.calibration.record import CalibrationError
+
+__all__ = ["FibreSpots", "SpotError", "find_fibre_spots"]
+
+FloatArray = NDArray[np.float64]
+GATE_PITCH: Final = 0.35
+"""How far a spot may lie from its place in the row."""
+SHIFT_PITCH: Final = 0.5
+"""Beyond half a distance between neighbors nobody can tell whose a spot is."""
+LEAST_SHARE: Final = 0.5
+"""Of the fibres must show, or the image is not one of this probe."""
+EDGES: Final = 2.5
+"""Widths of the blurred edge that an aperture reaches beyond the radius."""
+
+
+class SpotError(CalibrationError):
+    """Spots in the image that are not those of the probe's fibres."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FibreSpots:
+    """Where each fibre ends in the image.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the F fibres, in the probe's order.
+    center_px, center_stderr_px : ndarray of float64, shape (F, 2)
+        x right, y down, pixel (0, 0)'s centre at (0, 0). Of a fibre that was not found: where
+        the others say that it ends.
+    radius_px, radius_stderr_px : ndarray of float64, shape (F,)
+        Where the brightness has fallen to half; the mean of the others where not found.
+    edge_px : ndarray of float64, shape (F,)
+        Standard deviation of the edge's blur.
+    found : ndarray of bool, shape (F,)
+    aperture_px : float
+        Radius of the disc that a spot's light is summed over, one for all.
+    shift_px : tuple of (float, float)
+        Mean of the places less the nominal ones.
+    rotation_rad : float
+        Of the row, from x to y.
+    findings : tuple of str
+        What is wrong: fibres that are dark, spots that overlap.
+    """
+
+    names: tuple[str, ...]
+    center_px: FloatArray
+    center_stderr_px: FloatArray
+    radius_px: FloatArray
+    radius_stderr_px: FloatArray
+    edge_px: FloatArray
+    found: NDArray[np.bool_]
+    aperture_px: float
+    shift_px: tuple[float, float] = (0.0, 0.0)
+    rotation_rad: float = 0.0
+    findings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Convert and check the arrays against each other."""
+        count = len(self.names)
+        for name in ("center_px", "center_stderr_px"):
+            _freeze(self, name, (count, 2), np.float64)
+        for name in ("radius_px", "radius_stderr_px", "edge_px"):
+            _freeze(self, name, (count,), np.float64)
+        _freeze(self, "found", (count,), np.bool_)
+        if not (self.aperture_px > 0 and (self.radius_px > 0).all()):
+            raise ValueError("FibreSpots: got a radius or an aperture <= 0, expected pixels > 0")
+
+    @property
+    def overlapping(self) -> NDArray[np.bool_]:
+        """Where a fibre's aperture meets that of another, shape (F,)."""
+        apart = np.linalg.norm(self.center_px[:, None] - self.center_px[None], axis=-1)
+        np.fill_diagonal(apart, np.inf)
+        return np.asarray(apart.min(axis=1) < 2.0 * self.aperture_px)
+
+    def mask(self, fibre: int, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+        """Return the pixels whose centres lie in a fibre's aperture, shape (H, W)."""
+        return _within(shape, self.center_px[fibre], self.aperture_px)
+
+    def moved(self, merged: MergedSeries, pattern: str) -> tuple[FibreSpots, FloatArray]:
+        """Return the spots where they lie in another series, and how far they went.
+
+        Parameters
+        ----------
+        merged : MergedSeries
+            A later series; half the row or more shall give light.
+        pattern : str
+            Color filter pattern.
+
+        Returns
+        -------
+        spots : FibreSpots
+            Shifted as one, by the mean of the spots that stand out, weighed by their errors.
+        shift_px : ndarray of float64, shape (2,)
+            0 where too few stand out to tell.
+        """
+        image = gray_image(merged, pattern)
+        pitch = _pitch(self.center_px)
+        away, errors = [], []
+        for i in np.flatnonzero(self.found & ~self.overlapping):
+            fit = fit_disc(merged, image, pattern, self.center_px[i], pitch)
+            if fit is not None and np.hypot(*(fit[0][:2] - self.center_px[i])) < 0.5 * pitch:
+                away.append(fit[0][:2] - self.center_px[i])
+                errors.append(max(float(fit[1][:2].max()), 0.02))
+        if len(away) < 3:
+            return self, np.zeros(2)
+        weight = 1.0 / np.array(errors) ** 2
+        shift = (weight[:, None] * np.array(away)).sum(axis=0) / weight.sum()
+        return replace(self, center_px=self.center_px + shift), shift
+
+
+def find_fibre_spots(
+    merged: MergedSeries,
+    nominal_px: NDArray[np.floating],
+    *,
+    names: Sequence[str],
+    pattern: str,
+    masks: Mapping[int, MergedSeries] | None = None,
+) -> FibreSpots:
+    """Find the fibres' ends in the image of a bright target.
+
+    Parameters
+    ----------
+    merged : MergedSeries
+        Of the phantom, all fibres uncovered.
+    nominal_px : array_like, shape (F, 2)
+        Nominal places, in the probe's order; the row as a whole may lie up to half the distance
+        between neighbors away, and turned a little.
+    names : sequence of F str
+    pattern : str
+        Color filter pattern.
+    masks : mapping of int to MergedSeries, optional
+        Series with one fibre uncovered, by its number: they tell fibres whose spots touch, and
+        check the order.
+
+    Returns
+    -------
+    FibreSpots
+        Fibres without a spot are reported, not an error.
+
+    Raises
+    ------
+    SpotError
+        Where there are more spots than fibres, spots at places of no fibre, or fewer than half.
+    """
+    nominal = np.asarray(nominal_px, np.float64)
+    count = len(nominal)
+    pitch = _pitch(nominal)
+    image = gray_image(merged, pattern)
+    fits = []
+    for place in candidates(image, pitch):
+        fit = fit_disc(merged, image, pattern, place, pitch)
+        if fit is not None:
+            fits.append(fit)
+    fits = distinct(fits, 0.25 * pitch)
+    if not fits:
+        raise SpotError(
+            f"fibre spots: found none in the image, expected {count} in a row {pitch:.0f} px apart;"
+            " check that the light was on, the head on the phantom, and the exposures"
+        )
+    typical = float(np.median([fit[2] for fit in fits]))
+    whole = [fit for fit in fits if 0.5 * typical < fit[2] < 2.5 * typical]
+    places = np.array([fit[0][:2] for fit in whole])
+    spot, model = _assign(places, nominal, pitch)
+    between = _between(places, spot, model, pitch)
+    stray = [k for k in range(len(whole)) if k not in spot and k not in between]
+    if stray:
+        where = "; ".join(f"x {places[k][0]:.0f}, y {places[k][1]:.0f} px" for k in stray[:6])
+        raise SpotError(
+            f"fibre spots: found {len(whole)} spots, of which {len(stray)} lie where none of the"
+            f" {count} fibres ends ({where}); check which way round the image is, that nothing else"
+            " shines into the camera, and the places in the rig's file"
+        )
+    found = spot >= 0
+    if found.sum() < max(LEAST_SHARE * count, 2):
+        where = ", ".join(f"{x:.0f}" for x in sorted(places[:, 0]))
+        raise SpotError(
+            f"fibre spots: found {int(found.sum())} (at x {where} px), expected {count}, at least"
+            f" {int(np.ceil(LEAST_SHARE * count))}; check the phantom's contact, the light and the"
+            " exposures"
+        )
+    best: list[DiscFit | None] = [whole[k] if k >= 0 else None for k in spot]
+    findings = [
+        f"{names[i]} and {names[j]} end in one spot, x {places[k][0]:.0f}, y {places[k][1]:.0f} px"
+        for k, (i, j) in between.items()
+    ]
+    _consult_masks(best, masks or {}, model, names, pattern, pitch, findings)
+    return _table(best, model, nominal, names, findings)
+
+
+def _consult_masks(
+    best: list[DiscFit | None],
+    masks: Mapping[int, MergedSeries],
+    model: FloatArray,
+    names: Sequence[str],
+    pattern: str,
+    pitch: float,
+    findings: list[str],
+) -> None:
+    """Measure in their own frames the fibres that touch or are missing, and check the order."""
+    known = np.array([model[i] if fit is None else fit[0][:2] for i, fit in enumerate(best)])
+    size = float(np.median([fit[2] for fit in best if fit is not None]))
+    apart = np.linalg.norm(known[:, None] - known[None], axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    for i in sorted(masks):
+        series = masks[i]
+        fit = best[i]
+        doubtful = fit is None or apart[i].min() < 2.2 * size or not 0.8 < fit[2] / size < 1.25
+        image = gray_image(series, pattern)
+        alone = candidates(image, pitch)
+        if len(alone) == 0:
+            continue  # too faint to tell
+        brightest = alone[0]
+        nearest = int(np.argmin(np.linalg.norm(model - brightest, axis=1)))
+        if nearest != i and np.linalg.norm(model[nearest] - brightest) < GATE_PITCH * pitch:
+            if best[i] is None:
+                continue  # dark: what shows is a neighbor's leak
+            raise SpotError(
+                f"fibre spots: with only {names[i]} uncovered the brightest spot is that of"
+                f" {names[nearest]} (x {brightest[0]:.0f}, y {brightest[1]:.0f} px); check the"
+                " cover, and the order of the fibres in the rig's file"
+            )
+        fit = fit_disc(series, image, pattern, brightest, pitch) if doubtful else None
+        if fit is not None and np.linalg.norm(fit[0][:2] - model[i]) < 0.5 * pitch:
+            best[i] = fit
+            findings.append(f"{names[i]}: its place is from the frames with it alone uncovered")
+
+
+def _table(
+    best: list[DiscFit | None],
+    model: FloatArray,
+    nominal: FloatArray,
+    names: Sequence[str],
+    findings: list[str],
+) -> FibreSpots:
+    found = np.array([fit is not None for fit in best])
+    fits = [fit for fit in best if fit is not None]
+    size, edge = (float(np.median([fit[0][k] for fit in fits])) for k in (2, 3))
+    scatter = float(
+        np.median(
+            [np.hypot(*(fit[0][:2] - model[i])) for i, fit in enumerate(best) if fit is not None]
+        )
+    )
+    value = np.array(
+        [[*model[i], size, edge] if fit is None else fit[0] for i, fit in enumerate(best)]
+    )
+    error = np.array(
+        [
+            [max(scatter, 0.1), max(scatter, 0.1), 0.1 * size, 0.0] if fit is None else fit[1]
+            for fit in best
+        ]
+    )
+    radius = np.where(found, value[:, 2], size)
+    pitch = _pitch(value[:, :2])
+    reach = size + EDGES * edge
+    aperture = min(reach, 0.5 * pitch)
+    touching = " ".join(findings)
+    for i in np.flatnonzero(~found).tolist():
+        if names[i] in touching:
+            continue
+        findings.append(
+            f"{names[i]}: no spot at x {model[i, 0]:.0f}, y {model[i, 1]:.0f} px: the fibre is"
+            " dark, or its light too faint"
+        )
+    shift = (value[found, :2] - nominal[found]).mean(axis=0)
+    turn = np.polyfit(value[found, 0], value[found, 1] - nominal[found, 1], 1)[0]
+    table = FibreSpots(
+        tuple(names), value[:, :2], error[:, :2], radius, error[:, 2], value[:, 3], found,
+        float(aperture), (float(shift[0]), float(shift[1])), float(np.arctan(turn)),
+    )  # fmt: skip
+    for i in np.flatnonzero(table.overlapping).tolist():
+        gaps = np.linalg.norm(table.center_px - table.center_px[i], axis=1)
+        gaps[i] = np.inf
+        other = int(np.argmin(gaps))
+        if other > i:
+            findings.append(
+                f"{names[i]} and {names[other]}: their spots overlap, {gaps[other]:.1f} px apart"
+            )
+    return replace(table, findings=tuple(findings))
+
+
+def _assign(
+    places: FloatArray, nominal: FloatArray, pitch: float
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return the spot of each fibre (-1: none), and where each fibre should end."""
+    offset = (places[:, None] - nominal[None]).reshape(-1, 2)
+    offset = offset[(np.abs(offset) <= SHIFT_PITCH * pitch).all(axis=1)]
+    spot = np.full(len(nominal), -1)
+    if len(offset) == 0:
+        return spot, nominal.copy()
+    near = np.linalg.norm(offset[:, None] - offset[None], axis=-1) < 0.15 * pitch
+    # the shift that most agree to; the smaller of two
+    votes = near.sum(axis=1) - 1e-3 * np.linalg.norm(offset, axis=1) / pitch
+    model = nominal + offset[near[int(np.argmax(votes))]].mean(axis=0)
+    for _ in range(4):
+        distance = np.linalg.norm(places[:, None] - model[None], axis=-1)
+        spot = np.full(len(nominal), -1)
+        for i in range(len(nominal)):
+            k = int(np.argmin(distance[:, i]))
+            if distance[k, i] < GATE_PITCH * pitch and int(np.argmin(distance[k])) == i:
+                spot[i] = k
+        seen = np.flatnonzero(spot >= 0)
+        if len(seen) < 4:
+            break
+        model = _similar(nominal, seen, places[spot[seen]])
+    return spot, model
+
+
+def _between(
+    places: FloatArray, spot: NDArray[np.int64], model: FloatArray, pitch: float
+) -> dict[int, tuple[int, int]]:
+    """Return the spots that lie between two neighbors of which neither has one of its own."""
+    found = {}
+    for k in set(range(len(places))) - set(spot.tolist()):
+        for i in np.flatnonzero((spot[:-1] < 0) & (spot[1:] < 0)).tolist():
+            if np.linalg.norm(0.5 * (model[i] + model[i + 1]) - places[k]) < 0.3 * pitch:
+                found[k] = (i, i + 1)
+    return found
+
+
+def _similar(nominal: FloatArray, seen: NDArray[np.int64], found: FloatArray) -> FloatArray:
+    """Return the nominal places turned, scaled and shifted onto those found (least squares)."""
+    one, two = nominal[seen] @ np.array([1, 1j]), found @ np.array([1, 1j])
+    centered = one - one.mean()
+    factor = (centered.conj() @ (two - two.mean())) / (centered.conj() @ centered)
+    every = factor * (nominal @ np.array([1, 1j]) - one.mean()) + two.mean()
+    return np.stack([every.real, every.imag], axis=1)
+
+
+def _pitch(places: FloatArray) -> float:
+    """Return the usual distance of neighbors, px."""
+    if len(places) < 2:
+        return 40.0
+    return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+
+
+def _within(shape: tuple[int, ...], center: FloatArray, radius: float) -> NDArray[np.bool_]:
+    mask = np.zeros(shape[:2], np.bool_)
+    low = np.maximum(np.floor(center - radius).astype(int), 0)
+    high = np.minimum(np.ceil(center + radius).astype(int) + 1, [shape[1], shape[0]])
+    if (high <= low).any():
+        return mask
+    y, x = np.mgrid[low[1] : high[1], low[0] : high[0]]
+    mask[low[1] : high[1], low[0] : high[0]] = (x - center[0]) ** 2 + (
+        y - center[1]
+    ) ** 2 <= radius**2
+    return mask
+
+
+def _freeze(row: Any, name: str, shape: tuple[int, ...], kind: Any) -> None:
+    array = np.array(getattr(row, name), dtype=kind)
+    if array.shape != shape or (kind is np.float64 and not np.isfinite(array).all()):
+        raise ValueError(
+            f"{type(row).__name__}.{name}: got shape {array.shape}, expected finite numbers of"
+            f" shape {shape}"
+        )
+    array.setflags(write=False)
+    object.__setattr__(row, name, array)

@@ -1,0 +1,1 @@
+"""Calibration of the gradient rig's LED sphere: lights, survey and polarizers."""

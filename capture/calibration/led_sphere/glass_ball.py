@@ -1,0 +1,484 @@
+"""A small ball of black glass in a sphere of lights: its place, and what its spots say of them.
+
+The ball is black on black, so that its outline shows nothing: its place follows from the pattern of
+the spots in which it mirrors the lights, whose places are known to a few millimetres. All lights
+together tell the ball's place much better than one light's place is known, and from then on each
+spot tells its own light's direction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.spatial import cKDTree
+
+from capture.calibration.geometry import CameraPose
+from capture.calibration.lights.mirror_sphere import reflect, reflection_pixels, reflection_points
+from capture.calibration.record import CalibrationError
+
+__all__ = [
+    "Ball",
+    "BallError",
+    "BallFit",
+    "LightDirections",
+    "Mirrored",
+    "find_spots",
+    "light_directions",
+    "locate_ball",
+    "mirrored",
+]
+
+FloatArray = NDArray[np.float64]
+
+NOISE_SIGMAS = 7.0  # of the smoothed image: none of 4 million pixels of noise gets there
+SMOOTH_MM = 0.012
+APART_MM = 0.06  # two spots closer than this are one
+MOST_SPOTS = 600
+REACH_MM = 4.0  # how far the ball may lie from the rig's origin
+VOTE_MM = 0.06
+GATE_MM = 0.3  # of a spot from its predicted place, at first; spots lie 0.4 mm apart or more
+LEAST_SPOTS = 12
+LEAST_SHARE = 0.5  # of the lights: with fewer, the nominal places do not hold the ball's
+HUBER = 2.5
+STEPS = 12
+DERIVATIVE_MM = 0.01
+MEDIAN_CHI2_2 = 1.3863  # median of chi-square with two degrees of freedom, 2 ln 2
+
+
+class BallError(CalibrationError):
+    """Photographs of the ball that tell nothing; the message says why and what to change."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ball:
+    """Where the ball is.
+
+    Attributes
+    ----------
+    center_mm : ndarray of float64, shape (3,)
+        Rig frame.
+    radius_mm : float
+    covariance_mm2 : ndarray of float64, shape (4, 4)
+        Of centre and radius.
+    """
+
+    center_mm: FloatArray
+    radius_mm: float
+    covariance_mm2: FloatArray
+
+    def __post_init__(self) -> None:
+        """Convert to float64 and refuse what is no ball."""
+        center = np.array(self.center_mm, np.float64)
+        covariance = np.array(self.covariance_mm2, np.float64)
+        if center.shape != (3,) or not np.isfinite(center).all():
+            raise ValueError(f"Ball.center_mm: got {center.tolist()}, expected three numbers")
+        if not 0 < self.radius_mm < np.inf:
+            raise ValueError(f"Ball.radius_mm: got {self.radius_mm}, expected > 0")
+        if covariance.shape != (4, 4) or not np.isfinite(covariance).all():
+            raise ValueError(f"Ball.covariance_mm2: got shape {covariance.shape}, expected (4, 4)")
+        object.__setattr__(self, "center_mm", center)
+        object.__setattr__(self, "covariance_mm2", covariance)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mirrored:
+    """How a ball shows lights to a camera.
+
+    Attributes
+    ----------
+    pixels : ndarray of float64, shape (L, 2)
+        Column and row, px; NaN where the ball does not show the light.
+    to_light, to_camera, normal : ndarray of float64, shape (L, 3)
+        Unit vectors at the mirroring point of the ball.
+    px_per_mm : ndarray of float64, shape (L, 2, 2)
+        How the spot moves with the light, along two directions across the line to it.
+    across : ndarray of float64, shape (L, 2, 3)
+        These directions, unit vectors.
+    """
+
+    pixels: FloatArray
+    to_light: FloatArray
+    to_camera: FloatArray
+    normal: FloatArray
+    px_per_mm: FloatArray
+    across: FloatArray
+
+    @property
+    def magnification_px2(self) -> FloatArray:
+        """Area of the image of 1 mm^2 of a light that faces the ball, px^2, shape (L,)."""
+        return np.abs(np.linalg.det(self.px_per_mm))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BallFit:
+    """The ball's place, and which spot is which light's.
+
+    Attributes
+    ----------
+    ball : Ball
+    spot : ndarray of int64, shape (L,)
+        Index of each light's spot; -1: none.
+    in_field : ndarray of bool, shape (L,)
+        Where a spot is expected whole within the image.
+    stray : ndarray of int64
+        Spots that are no light's.
+    light_scatter_mm : float
+        Standard deviation of the lights about their nominal places, along an axis.
+    """
+
+    ball: Ball
+    spot: NDArray[np.int64]
+    in_field: NDArray[np.bool_]
+    stray: NDArray[np.int64]
+    light_scatter_mm: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightDirections:
+    """Directions from the rig's origin to lights.
+
+    Attributes
+    ----------
+    direction : ndarray of float64, shape (L, 3)
+        Unit vectors; NaN where there is no spot.
+    covariance : ndarray of float64, shape (L, 3, 3)
+        Of each, with what all have in common: the error of the ball's place.
+    """
+
+    direction: FloatArray
+    covariance: FloatArray
+
+    @property
+    def stderr(self) -> FloatArray:
+        """Standard errors of the components, shape (L, 3)."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+
+def find_spots(image: NDArray, *, pixel_mm: float, noise: float | None = None) -> FloatArray:
+    """Find small bright spots.
+
+    Parameters
+    ----------
+    image : ndarray of float, shape (H, W)
+        Linear, dark subtracted.
+    pixel_mm : float
+        Size of a pixel at the ball, mm, > 0.
+    noise : float, optional
+        Standard deviation of a dark pixel; None: from the image, most of which is dark.
+
+    Returns
+    -------
+    ndarray of float64, shape (n, 2)
+        Column and row of their brightest places, brightest first, n <= 600.
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[:60, :80]
+    >>> spot = np.exp(-((x - 30.0) ** 2 + (y - 20.0) ** 2) / 8.0)
+    >>> find_spots(spot, pixel_mm=0.006, noise=1e-3).tolist()
+    [[30.0, 20.0]]
+    """
+    smooth = gaussian_filter(np.asarray(image, np.float32), max(SMOOTH_MM / pixel_mm, 0.5))
+    usual = float(np.median(smooth))
+    if noise is None:
+        sigma = 1.4826 * float(np.median(np.abs(smooth - usual)))
+    else:
+        sigma = noise / (2 * np.sqrt(np.pi) * max(SMOOTH_MM / pixel_mm, 0.5))
+    apart = 2 * round(APART_MM / pixel_mm / 2) + 1
+    top = smooth == maximum_filter(smooth, max(apart, 3))
+    rows, columns = np.nonzero(top & (smooth - usual > max(NOISE_SIGMAS * sigma, 1e-12)))
+    order = np.argsort(-smooth[rows, columns], kind="stable")[:MOST_SPOTS]
+    return np.stack([columns, rows], axis=1)[order].astype(np.float64)
+
+
+def mirrored(
+    camera: CameraPose, center_mm: FloatArray, radius_mm: float, lights_mm: FloatArray
+) -> Mirrored:
+    """Return where and how a ball mirrors lights into a camera.
+
+    Parameters
+    ----------
+    camera : CameraPose
+    center_mm, radius_mm
+        The ball.
+    lights_mm : ndarray of float64, shape (L, 3)
+        Places of the lights, outside the ball.
+    """
+    lights = np.asarray(lights_mm, np.float64)
+    eyes = np.broadcast_to(camera.center_mm, lights.shape)
+    centers = np.broadcast_to(np.asarray(center_mm, np.float64), lights.shape)
+    point, seen = reflection_points(eyes, centers, radius_mm, lights)
+    to_light, to_camera = _unit(lights - point), _unit(eyes - point)
+    first = np.cross(to_light, _least_axis(to_light))
+    first = _unit(first)
+    across = np.stack([first, np.cross(to_light, first)], axis=1)
+    columns = []
+    for j in range(2):
+        step = DERIVATIVE_MM * across[:, j]
+        ends = [reflection_pixels(camera, center_mm, radius_mm, lights + s * step) for s in (1, -1)]
+        columns.append((ends[0] - ends[1]) / (2 * DERIVATIVE_MM))
+    return Mirrored(
+        np.where(seen[:, None], camera.project(point), np.nan),
+        to_light,
+        to_camera,
+        (point - centers) / radius_mm,
+        np.stack(columns, axis=-1),
+        across,
+    )
+
+
+def locate_ball(
+    spots: FloatArray,
+    camera: CameraPose,
+    lights_mm: FloatArray,
+    *,
+    center_mm: ArrayLike = (0.0, 0.0, 0.0),
+    radius_mm: float = 6.0,
+    radius_stderr_mm: float = 0.02,
+    depth_stderr_mm: float = 1.0,
+    margin_mm: float = 0.1,
+    noise_px: float = 0.5,
+    lit: NDArray[np.bool_] | None = None,
+) -> BallFit:
+    """Find the ball by its spots and tell which light made each.
+
+    Parameters
+    ----------
+    spots : ndarray of float64, shape (n, 2)
+        Column and row of each spot, px.
+    camera : CameraPose
+    lights_mm : ndarray of float64, shape (L, 3)
+        Nominal places of the lights; what they have wrong in common becomes the ball's.
+    center_mm : array_like, shape (3,)
+        About where the ball's middle stands, rig frame.
+    radius_mm, radius_stderr_mm : float
+        The ball's, and how well it is known.
+    depth_stderr_mm : float
+        How well the ball's middle stands there along the camera's axis.
+    margin_mm : float
+        A spot's own size: closer to the image's border it is not whole.
+    noise_px : float
+        Standard error of a spot's coordinate; half a pixel for brightest pixels.
+    lit : ndarray of bool, shape (L,), optional
+        Lights that can be expected to show; None: all.
+
+    Returns
+    -------
+    BallFit
+
+    Raises
+    ------
+    BallError
+        If there are no spots, if they do not match the lights, or if the field shows too little of
+        the ball.
+    """
+    lights = np.asarray(lights_mm, np.float64)
+    found = np.asarray(spots, np.float64).reshape(-1, 2)
+    shows = np.ones(len(lights), bool) if lit is None else lit
+    pixel_mm = float(np.linalg.norm(camera.center_mm)) / float(camera.matrix[0, 0])
+    about = np.array(center_mm, np.float64)
+    nominal = reflection_pixels(camera, about, radius_mm, lights)
+    _require_field(nominal[shows], camera, pixel_mm, radius_mm)
+    if len(found) == 0:
+        raise BallError(
+            "ball: no spot stands out of the dark; check that the lights were on, that the ball"
+            " lies in the middle of the field, and the exposure"
+        )
+    shift, votes = _vote(found, nominal[shows], pixel_mm)
+    if votes < LEAST_SPOTS:
+        raise BallError(
+            f"ball: {len(found)} spots, at most {votes} of which fit the lights' pattern at one"
+            f" place of the ball, expected {LEAST_SPOTS} or more; check the target, its radius"
+            f" ({radius_mm:g} mm), the exposure, and that the ball lies within {REACH_MM:g} mm of"
+            " the middle"
+        )
+    right, down = camera.rotation[0], camera.rotation[1]
+    start = about + pixel_mm * (shift[0] * right + shift[1] * down)
+    return _refine(
+        found, camera, lights, shows, np.append(start, radius_mm), pixel_mm,
+        expected=np.append(about, radius_mm),
+        prior=np.array([REACH_MM, REACH_MM, depth_stderr_mm, radius_stderr_mm]),
+        margin_px=margin_mm / pixel_mm,
+        noise_px=noise_px,
+    )  # fmt: skip
+
+
+def light_directions(
+    camera: CameraPose,
+    ball: Ball,
+    pixels: FloatArray,
+    pixel_stderr: FloatArray,
+    distance_mm: FloatArray,
+) -> LightDirections:
+    """Return the directions of lights from their spots.
+
+    Parameters
+    ----------
+    camera : CameraPose
+    ball : Ball
+    pixels : ndarray of float64, shape (L, 2)
+        Middle of each light's spot, px; NaN: none.
+    pixel_stderr : ndarray of float64, shape (L,)
+        Standard error of each coordinate, px.
+    distance_mm : ndarray of float64, shape (L,)
+        Nominal distances of the lights from the rig's origin.
+    """
+
+    def direct(px: FloatArray, place: FloatArray) -> FloatArray:
+        point, way, hit = reflect(camera, px, place[:3], float(place[3]))
+        along = np.sum(point * way, axis=1)
+        inside = along**2 + distance_mm**2 - np.sum(point**2, axis=1)
+        far = point + (np.sqrt(np.where(hit, inside, np.nan)) - along)[:, None] * way
+        return far / np.linalg.norm(far, axis=1, keepdims=True)
+
+    place = np.append(ball.center_mm, ball.radius_mm)
+    direction = direct(pixels, place)
+    by_pixel = np.stack(
+        [(direct(pixels + h, place) - direct(pixels - h, place)) / 0.02 for h in 0.01 * np.eye(2)],
+        axis=-1,
+    )
+    by_place = np.stack(
+        [
+            (direct(pixels, place + h) - direct(pixels, place - h)) / 0.002
+            for h in 0.001 * np.eye(4)
+        ],
+        axis=-1,
+    )
+    covariance = pixel_stderr[:, None, None] ** 2 * (by_pixel @ by_pixel.transpose(0, 2, 1))
+    covariance = covariance + by_place @ ball.covariance_mm2 @ by_place.transpose(0, 2, 1)
+    return LightDirections(direction, covariance)
+
+
+def _require_field(
+    nominal: FloatArray, camera: CameraPose, pixel_mm: float, radius_mm: float
+) -> None:
+    inside = _inside(nominal, camera, 0.0)
+    if inside.sum() < max(LEAST_SHARE * len(nominal), 1):
+        width, height = (side * pixel_mm for side in camera.image_size)
+        raise BallError(
+            f"ball: the field of {width:.1f} mm x {height:.1f} mm can show only"
+            f" {int(inside.sum())} of {len(nominal)} lights in a ball of radius {radius_mm:g} mm,"
+            f" expected {LEAST_SHARE:.0%} or more; photograph it with the whole sensor"
+        )
+
+
+def _vote(found: FloatArray, nominal: FloatArray, pixel_mm: float) -> tuple[FloatArray, int]:
+    """Return the shift of the pattern, px, that most spots agree to, and how many do."""
+    expected = nominal[np.isfinite(nominal).all(axis=1)]
+    offset = (found[:, None] - expected[None]).reshape(-1, 2)
+    reach = REACH_MM / pixel_mm
+    offset = offset[(np.abs(offset) < reach).all(axis=1)]
+    cells = int(np.ceil(2 * REACH_MM / VOTE_MM))
+    table, *_ = np.histogram2d(
+        offset[:, 1], offset[:, 0], bins=cells, range=[[-reach, reach], [-reach, reach]]
+    )
+    around = np.pad(table, 1)
+    total = sum(around[i : i + cells, j : j + cells] for i in range(3) for j in range(3))
+    best = int(np.argmax(total))
+    row, column = divmod(best, cells)
+    size = 2 * reach / cells
+    middle = (np.array([column, row]) + 0.5) * size - reach
+    near = (np.abs(offset - middle) <= 1.5 * size).all(axis=1)
+    if not near.any():
+        return middle, 0
+    return np.median(offset[near], axis=0), int(near.sum())
+
+
+def _refine(
+    found: FloatArray,
+    camera: CameraPose,
+    lights: FloatArray,
+    shows: NDArray[np.bool_],
+    place: FloatArray,
+    pixel_mm: float,
+    *,
+    expected: FloatArray,
+    prior: FloatArray,
+    margin_px: float,
+    noise_px: float,
+) -> BallFit:
+    """Fit centre and radius by Gauss and Newton, each light free about its nominal place."""
+    tree = cKDTree(found)
+    scatter_mm, gate_px = 2.0, GATE_MM / pixel_mm
+    spot = np.full(len(lights), -1)
+    covariance = np.diag(prior**2)
+    for step in range(STEPS):
+        seen = mirrored(camera, place[:3], float(place[3]), lights)
+        spot = _match(tree, found, np.where(shows[:, None], seen.pixels, np.nan), gate_px)
+        used = np.flatnonzero(spot >= 0)
+        if len(used) < LEAST_SPOTS:
+            raise BallError(
+                f"ball: only {len(used)} spots fit the lights' pattern, expected {LEAST_SPOTS} or"
+                " more; check the target, its radius and the exposure"
+            )
+        slopes = []
+        for h in DERIVATIVE_MM * np.eye(4):
+            ends = [
+                reflection_pixels(camera, at[:3], float(at[3]), lights[used])
+                for at in (place + h, place - h)
+            ]
+            slopes.append((ends[0] - ends[1]) / (2 * DERIVATIVE_MM))
+        slope = np.stack(slopes, axis=-1)
+        miss = found[spot[used]] - seen.pixels[used]
+        moved = seen.px_per_mm[used]
+        noise = noise_px**2 * np.eye(2)
+        spread = scatter_mm**2 * (moved @ moved.transpose(0, 2, 1)) + noise
+        weight = np.linalg.inv(spread)
+        distance2 = np.einsum("ki,kij,kj->k", miss, weight, miss)
+        robust = np.minimum(1.0, HUBER / np.sqrt(np.maximum(distance2, 1e-12)))
+        weight *= robust[:, None, None]
+        normal = np.einsum("kia,kij,kjb->ab", slope, weight, slope) + np.diag(prior**-2)
+        right = np.einsum("kia,kij,kj->a", slope, weight, miss) + (expected - place) / prior**2
+        covariance = np.linalg.inv(normal)
+        change = covariance @ right
+        place = place + change
+        # lights' own scatter, by the median so that a light put far away does not widen it
+        wide = float(np.median(distance2)) / MEDIAN_CHI2_2
+        scatter_mm = float(np.clip(scatter_mm * np.sqrt(wide), 0.02, 20.0))
+        if step >= 2:
+            gate_px = np.clip(6 * scatter_mm * np.abs(moved).max(), 6.0, GATE_MM / pixel_mm)
+        if step >= 4 and float(change @ normal @ change) < 1e-6:
+            break
+    in_field = _inside(seen.pixels, camera, margin_px)
+    if in_field[shows].sum() < LEAST_SHARE * shows.sum():
+        raise BallError(
+            f"ball: {place[0]:+.2f} mm, {place[1]:+.2f} mm from the middle, only"
+            f" {int(in_field[shows].sum())} of {int(shows.sum())} spots lie in the field, expected"
+            f" {LEAST_SHARE:.0%} or more; centre it"
+        )
+    stray = np.setdiff1d(np.arange(len(found)), spot)
+    return BallFit(Ball(place[:3], float(place[3]), covariance), spot, in_field, stray, scatter_mm)
+
+
+def _match(
+    tree: cKDTree, found: FloatArray, expected: FloatArray, gate_px: float
+) -> NDArray[np.int64]:
+    """Return each light's spot where both are each other's nearest within the gate, else -1."""
+    spot = np.full(len(expected), -1)
+    known = np.flatnonzero(np.isfinite(expected).all(axis=1))
+    distance, nearest = tree.query(expected[known], distance_upper_bound=float(gate_px))
+    _, back = cKDTree(expected[known]).query(found)
+    near = np.isfinite(distance)
+    mutual = near.copy()
+    mutual[near] = back[nearest[near]] == np.flatnonzero(near)
+    spot[known[mutual]] = nearest[mutual]
+    return spot
+
+
+def _inside(pixels: FloatArray, camera: CameraPose, margin: float) -> NDArray[np.bool_]:
+    width, height = camera.image_size
+    x, y = pixels[:, 0], pixels[:, 1]
+    with np.errstate(invalid="ignore"):
+        return (x > margin) & (y > margin) & (x < width - 1 - margin) & (y < height - 1 - margin)
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def _least_axis(vectors: FloatArray) -> FloatArray:
+    """Return the coordinate axis that each vector is least along."""
+    return np.eye(3)[np.argmin(np.abs(vectors), axis=-1)]

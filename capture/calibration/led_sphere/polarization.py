@@ -1,0 +1,432 @@
+"""The films of a polarized sphere of lights, from what a glass ball reflects of each.
+
+Glass reflects along and across the plane of incidence by Fresnel's amplitudes, which turns the
+polarization of each light by a known angle. What passes the analyser at two or more readings then
+tells three causes of leakage apart: the analyser's zero, the same for all; the films' extinction;
+and each light's own axis. From the causes follows what another surface, skin, leaks from each
+direction, which is not what the glass leaks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.calibration.polarization import PolarizationError
+from capture.calibration.polarization.polarized_reflection import Reflection
+
+__all__ = ["FilmFit", "fit_films", "leakage"]
+
+FloatArray = NDArray[np.float64]
+
+WIDEST_ZERO_DEG = 30  # of the analyser, searched
+USUAL_LEAK = 3e-4  # of film, its extinction 1e3 to 1e4
+LEAK_SCATTER = 1.5  # of its logarithm
+USUAL_TURN_RAD = np.radians(1.0)
+TURN_RANGE_RAD = (np.radians(0.02), np.radians(5.0))
+FREEDOM = 4.0  # of Student's t that the lights' own axes scatter by: some may be far off
+STEPS = 60
+STOP = 1e-6
+DERIVATIVE = 1e-5
+MODES_REACH = 6.0  # widths of the axes' scatter within which a light may have a second answer
+MODES_FAR_RAD = np.radians(30.0)
+MODES_GRID = 41
+MODES_ROUNDS = 5
+SAME_RAD = np.radians(0.01)
+LEAST_LIGHTS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilmFit:
+    """The films, as the spots of all lights and readings say.
+
+    Attributes
+    ----------
+    strength, strength_stderr : ndarray of float64, shape (L,)
+        Flux of each light at an ideal mirror without an analyser, per second at level 1.
+    turn_rad, turn_stderr_rad : ndarray of float64, shape (L,)
+        How far each light's axis is off; where the readings leave its sign open it is drawn to 0.
+    zero_rad, zero_stderr_rad : float
+        What the analyser's reading lacks to its true angle.
+    light_leak, analyser_leak : float
+        Inverse extinction ratios.
+    covariance : ndarray of float64, shape (L, 4, 4)
+        Of turn, zero and the logarithms of both leaks, for each light.
+    turn_scatter_rad : float
+        Of the lights' axes about their nominal angles.
+    chi2_per_dof : float
+        Above 1 the errors have been widened.
+    """
+
+    strength: FloatArray
+    strength_stderr: FloatArray
+    turn_rad: FloatArray
+    turn_stderr_rad: FloatArray
+    zero_rad: float
+    zero_stderr_rad: float
+    light_leak: float
+    analyser_leak: float
+    covariance: FloatArray
+    turn_scatter_rad: float
+    chi2_per_dof: float
+
+    @property
+    def leak_stderr(self) -> tuple[float, float]:
+        """Standard errors of the lights' and of the analyser's leak."""
+        a, b = np.sqrt(self.covariance[0, 2, 2]), np.sqrt(self.covariance[0, 3, 3])
+        return float(self.light_leak * a), float(self.analyser_leak * b)
+
+
+def fit_films(
+    readings_rad: ArrayLike,
+    rates: FloatArray,
+    variance: FloatArray,
+    good: NDArray[np.bool_],
+    reflection: Reflection,
+) -> FilmFit:
+    """Fit the films and the strengths of the lights to the spots' fluxes.
+
+    Parameters
+    ----------
+    readings_rad : array_like, shape (E,)
+        Reading of the analyser in each exposure; at least two that differ modulo pi.
+    rates, variance : ndarray of float64, shape (E, L)
+        Flux of each spot, per second at level 1, and its variance.
+    good : ndarray of bool, shape (E, L)
+        False where it must not be used (saturated, not whole).
+    reflection : Reflection
+        By the ball's glass.
+
+    Returns
+    -------
+    FilmFit
+        Lights without two good readings have strength, turn 0 with the errors of the prior.
+
+    Raises
+    ------
+    PolarizationError
+        If the readings or the lights do not suffice.
+
+    Notes
+    -----
+    Least squares with what is known beforehand: lights' axes scatter about their nominal angles by
+    Student's t (4 degrees of freedom) of a width that is fitted, and film leaks 1e-5 to 1e-2. With
+    readings 0 and 90 only, the sign of a light's own turn follows from the turn that glass itself
+    gives to its polarization, and is open where that is smaller; readings on both sides of 90
+    settle it.
+    """
+    readings = np.asarray(readings_rad, np.float64)
+    if len(np.unique(np.round(np.exp(2j * readings), 6))) < 2:
+        raise PolarizationError(
+            f"analyser: got readings {np.degrees(readings).round(2).tolist()} degrees, expected two"
+            " that differ, parallel and crossed"
+        )
+    seen = np.array([len(np.unique(np.round(np.exp(2j * readings[ok]), 6))) >= 2 for ok in good.T])
+    if seen.sum() < LEAST_LIGHTS:
+        raise PolarizationError(
+            f"films: {int(seen.sum())} lights have two readings that are not saturated, expected"
+            f" {LEAST_LIGHTS} or more; add a shorter exposure"
+        )
+    weight = np.where(good & seen, 1.0 / np.where(variance > 0, variance, 1.0), 0.0)
+    values = np.where(weight > 0, rates, 0.0)
+    fits = [
+        _Films(readings, values, weight, reflection, zero).settle()
+        for zero in _starts(readings, values, weight, reflection)
+    ]
+    return min(fits, key=lambda fit: fit.cost).result(seen)
+
+
+def leakage(fit: FilmFit, reflection: Reflection) -> tuple[FloatArray, FloatArray]:
+    """Return how much of a mirror reflection passes crossed, over parallel, with standard errors.
+
+    Parameters
+    ----------
+    fit : FilmFit
+    reflection : Reflection
+        Of the surface in question, skin for example, by facets that mirror each light into the
+        camera.
+
+    Returns
+    -------
+    leakage, stderr : ndarray of float64, shape (L,)
+        Readings 90 over 0. Its mean over the errors of the films, not its value at the best films:
+        it is a square, and errors of angles of either sign add to it.
+    """
+    count = len(fit.turn_rad)
+    at = np.stack(
+        [
+            fit.turn_rad,
+            np.full(count, fit.zero_rad),
+            np.full(count, np.log(fit.light_leak)),
+            np.full(count, np.log(fit.analyser_leak)),
+        ],
+        axis=-1,
+    )
+    root = np.linalg.cholesky(fit.covariance + 1e-18 * np.eye(4))
+    values = []
+    # cubature of third degree: 2 n points at sqrt(n) standard deviations
+    for column in range(4):
+        for sign in (2.0, -2.0):
+            turn, zero, light, analyser = (at + sign * root[:, :, column]).T
+            both = reflection.through([0.0, np.pi / 2], turn, zero, np.exp(light), np.exp(analyser))
+            values.append(both[1] / both[0])
+    table = np.array(values)
+    return table.mean(axis=0), table.std(axis=0, ddof=1)
+
+
+def _starts(
+    readings: FloatArray, values: FloatArray, weight: FloatArray, reflection: Reflection
+) -> list[float]:
+    """Return the two best zeros of the analyser if the lights stood as drawn, rad."""
+    # lights' own axes are off: their spots differ from this by some thousandths of their light
+    slack = (3e-3 * np.abs(values).max(axis=0)) ** 2
+    soft = np.where(weight > 0, weight / (1.0 + weight * slack), 0.0)
+    zeros = np.radians(np.arange(-WIDEST_ZERO_DEG, WIDEST_ZERO_DEG + 1.0, 1.0))
+    cost = []
+    for zero in zeros:
+        u = reflection.through(readings, 0.0, zero, USUAL_LEAK, USUAL_LEAK)
+        power = np.sum(soft * u**2, axis=0)
+        strength = np.sum(soft * u * values, axis=0) / np.where(power > 0, power, 1.0)
+        cost.append(float(np.sum(soft * (values - strength * u) ** 2)))
+    padded = np.pad(cost, 1, constant_values=np.inf)
+    least = [i for i in range(len(cost)) if padded[i] > cost[i] <= padded[i + 2]]
+    return [float(zeros[i]) for i in sorted(least, key=lambda i: cost[i])[:2]]
+
+
+class _Films:
+    """One descent: strengths and turns of the lights, and three numbers that all share.
+
+    The normal equations are an arrow: a 2 x 2 block for each light, and a border of three.
+    """
+
+    def __init__(
+        self,
+        readings: FloatArray,
+        values: FloatArray,
+        weight: FloatArray,
+        reflection: Reflection,
+        zero: float,
+    ) -> None:
+        self.readings, self.values, self.weight = readings, values, weight
+        self.reflection = reflection
+        self.lit = (weight > 0).any(axis=0)
+        count = values.shape[1]
+        self.turn = np.zeros(count)
+        self.shared = np.array([zero, np.log(USUAL_LEAK), np.log(USUAL_LEAK)])
+        self.scatter = float(USUAL_TURN_RAD)
+        self.pull = np.ones(count)  # weight of each light's turn among all, from Student's t
+        u = self._through(self.turn, self.shared)
+        power = np.sum(weight * u**2, axis=0)
+        self.strength = np.sum(weight * u * values, axis=0) / np.where(power > 0, power, 1.0)
+
+    def _through(self, turn: FloatArray, shared: FloatArray) -> FloatArray:
+        zero, light, analyser = shared
+        return self.reflection.through(self.readings, turn, zero, np.exp(light), np.exp(analyser))
+
+    def _objective(self, strength: FloatArray, turn: FloatArray, shared: FloatArray) -> float:
+        miss = self.values - strength * self._through(turn, shared)
+        beyond = (shared[1:] - np.log(USUAL_LEAK)) / LEAK_SCATTER
+        return float(
+            np.sum(self.weight * miss**2)
+            + np.sum(self.pull * turn**2) / self.scatter**2
+            + np.sum(beyond**2)
+        )
+
+    @property
+    def cost(self) -> float:
+        """Minus twice the logarithm of the posterior, up to a constant."""
+        data = self._objective(self.strength, self.turn, self.shared)
+        data -= float(np.sum(self.pull * self.turn**2)) / self.scatter**2
+        tails = np.log1p(self.turn[self.lit] ** 2 / (FREEDOM * self.scatter**2))
+        return data + float((FREEDOM + 1) * tails.sum() + 2 * self.lit.sum() * np.log(self.scatter))
+
+    def _normal(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return blocks (L, 2, 2), borders (L, 2, 3), corner (3, 3), and both right sides."""
+        h = DERIVATIVE
+        u = self._through(self.turn, self.shared)
+        by_turn = self._through(self.turn + h, self.shared)
+        by_turn = (by_turn - self._through(self.turn - h, self.shared)) / (2 * h)
+        by_shared = [
+            (self._through(self.turn, self.shared + e) - self._through(self.turn, self.shared - e))
+            / (2 * h)
+            for e in h * np.eye(3)
+        ]
+        local = np.stack([u, self.strength * by_turn], axis=-1)  # (E, L, 2)
+        shared = self.strength[:, None] * np.stack(by_shared, axis=-1)  # (E, L, 3)
+        miss = self.values - self.strength * u
+        w = self.weight
+        block = np.einsum("ek,eki,ekj->kij", w, local, local)
+        border = np.einsum("ek,eki,ekj->kij", w, local, shared)
+        corner = np.einsum("ek,eki,ekj->ij", w, shared, shared)
+        one = np.einsum("ek,eki,ek->ki", w, local, miss)
+        other = np.einsum("ek,eki,ek->i", w, shared, miss)
+        block[:, 1, 1] += self.pull / self.scatter**2
+        one[:, 1] -= self.pull * self.turn / self.scatter**2
+        block[~self.lit, 0, 0] = 1.0
+        corner[1:, 1:] += np.eye(2) / LEAK_SCATTER**2
+        other[1:] -= (self.shared[1:] - np.log(USUAL_LEAK)) / LEAK_SCATTER**2
+        return block, border, corner, one, other
+
+    def solve(self) -> _Films:
+        """Descend, with Marquardt's damping; between steps fit the scatter of the axes."""
+        damping = 1e-3
+        now = self._objective(self.strength, self.turn, self.shared)
+        for _ in range(STEPS):
+            block, border, corner, one, other = self._normal()
+            while True:
+                local, shared = _solve_arrow(block, border, corner, one, other, damping)
+                trial = (
+                    self.strength + local[:, 0],
+                    self.turn + np.clip(local[:, 1], -0.1, 0.1),
+                    self.shared + np.clip(shared, -0.5, 0.5),
+                )
+                cost = self._objective(*trial)
+                if cost <= now or damping > 1e8:
+                    break
+                damping *= 10
+            gain = now - cost
+            if gain >= 0:
+                self.strength, self.turn, self.shared = trial
+            damping = max(damping / 10, 1e-9)
+            wider = self._scatter(_solve_arrow_covariance(block, border, corner)[0][:, 1, 1])
+            self.pull = np.where(
+                self.lit, (FREEDOM + 1) / (FREEDOM + (self.turn / wider) ** 2), 1.0
+            )
+            settled = abs(wider / self.scatter - 1) < 1e-3
+            self.scatter = wider
+            now = self._objective(self.strength, self.turn, self.shared)
+            if settled and gain < STOP:
+                break
+        return self
+
+    def settle(self) -> _Films:
+        """Descend, and again from where single lights have a better answer on another side."""
+        self.solve()
+        for _ in range(6):
+            modes, cost = self._modes()
+            better = self.lit & (cost[0] < self._light_cost(self.turn)[0] - 1e-2)
+            if not better.any():
+                break
+            self.turn = np.where(better, modes[0], self.turn)
+            self.strength = np.where(better, self._light_cost(self.turn)[1], self.strength)
+            self.solve()
+        return self
+
+    def _light_cost(self, turn: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return each light's own part of the cost at its best strength, and that strength."""
+        u = self._through(turn, self.shared)
+        power = np.sum(self.weight * u**2, axis=0)
+        strength = np.sum(self.weight * u * self.values, axis=0) / np.where(power > 0, power, 1.0)
+        miss = np.sum(self.weight * (self.values - strength * u) ** 2, axis=0)
+        tail = (FREEDOM + 1) * np.log1p(turn**2 / (FREEDOM * self.scatter**2))
+        return miss + tail, strength
+
+    def _modes(self) -> tuple[FloatArray, FloatArray]:
+        """Return the two best answers for each light's turn and their costs, shapes (2, L)."""
+        even = np.linspace(-1.0, 1.0, MODES_GRID)
+        # closely where most axes are, coarsely where one far off may be
+        grid = np.unique(np.append(MODES_REACH * self.scatter * even, MODES_FAR_RAD * even))
+        steps = np.maximum(np.diff(grid, prepend=grid[0]), np.diff(grid, append=grid[-1]))
+        cost = np.array([self._light_cost(np.full_like(self.turn, g))[0] for g in grid])
+        padded = np.pad(cost, ((1, 1), (0, 0)), constant_values=np.inf)
+        valley = (padded[:-2] > cost) & (cost <= padded[2:])
+        order = np.argsort(np.where(valley, cost, np.inf), axis=0)[:2]
+        found = []
+        for turn, width in zip(grid[order], steps[order], strict=True):
+            at = turn
+            for _ in range(MODES_ROUNDS):
+                near = at + width * np.linspace(-1, 1, 9)[:, None]
+                costs = np.array([self._light_cost(t)[0] for t in near])
+                best = np.argmin(costs, axis=0)
+                at = np.take_along_axis(near, best[None], axis=0)[0]
+                width = width / 4
+            found.append((at, self._light_cost(at)[0]))
+        modes, costs = (np.array(part) for part in zip(*found, strict=True))
+        first = np.argsort(costs, axis=0)
+        modes, costs = (np.take_along_axis(part, first, axis=0) for part in (modes, costs))
+        # one valley only, or both descents into the same
+        single = (valley.sum(axis=0) < 2) | (np.abs(modes[0] - modes[1]) < SAME_RAD)
+        costs[1, single] = np.inf
+        return modes, costs
+
+    def _scatter(self, variance: FloatArray) -> float:
+        """Return the width of the axes' scatter: one step of expectation and maximization."""
+        square = (self.pull * (self.turn**2 + variance))[self.lit].mean()
+        return float(np.clip(np.sqrt(square), *TURN_RANGE_RAD))
+
+    def result(self, seen: NDArray[np.bool_]) -> FilmFit:
+        """Return the fit, with errors widened where the residuals are larger than the noise."""
+        # how much the scattered axes tell: slope and spread of their pull (a sandwich), since
+        # weights that follow the residuals would count their own scatter as knowledge
+        z = self.turn[self.lit] / self.scatter
+        slope = ((FREEDOM + 1) * (FREEDOM - z**2) / (FREEDOM + z**2) ** 2).sum()
+        spread = ((self.pull[self.lit] * z) ** 2).sum()
+        known = np.clip(slope**2 / max(spread, 1e-9) / len(z), 0.2, 1.0)
+        self.pull = np.full_like(self.pull, known)
+        block, border, corner, *_ = self._normal()
+        local, both, shared = _solve_arrow_covariance(block, border, corner)
+        u = self._through(self.turn, self.shared)
+        chi2 = float(np.sum(self.weight * (self.values - self.strength * u) ** 2))
+        told = 1.0 - self.pull * local[:, 1, 1] / self.scatter**2  # share that the data tell
+        free = float(np.sum(self.weight > 0) - self.lit.sum() - told[self.lit].sum() - 3)
+        per_dof = chi2 / max(free, 1.0)
+        wide = max(per_dof, 1.0)
+        # the same crossed light may come from a turn to the other side: how likely is that?
+        modes, costs = self._modes()
+        other = np.exp(-0.5 * np.clip(costs[1] - costs[0], 0.0, 700.0))
+        other = np.where(self.lit, other / (1.0 + other), 0.0)
+        doubt = other * (1.0 - other)
+        apart = np.where(doubt > 0, modes[1] - modes[0], 0.0)
+        local[:, 1, 1] += doubt * apart**2 / wide
+        shared[0, 0] += 4 * doubt[self.lit].mean() * self.scatter**2 / wide
+        count = len(self.turn)
+        covariance = np.empty((count, 4, 4))
+        covariance[:, 0, 0] = local[:, 1, 1]
+        covariance[:, 0, 1:] = covariance[:, 1:, 0] = both[:, 1]
+        covariance[:, 1:, 1:] = shared
+        covariance *= wide
+        return FilmFit(
+            strength=np.where(seen, self.strength, 0.0),
+            strength_stderr=np.where(seen, np.sqrt(wide * local[:, 0, 0]), 0.0),
+            turn_rad=self.turn,
+            turn_stderr_rad=np.sqrt(covariance[:, 0, 0]),
+            zero_rad=float(self.shared[0]),
+            zero_stderr_rad=float(np.sqrt(covariance[0, 1, 1])),
+            light_leak=float(np.exp(self.shared[1])),
+            analyser_leak=float(np.exp(self.shared[2])),
+            covariance=covariance,
+            turn_scatter_rad=self.scatter,
+            chi2_per_dof=per_dof,
+        )
+
+
+def _solve_arrow(
+    block: FloatArray,
+    border: FloatArray,
+    corner: FloatArray,
+    one: FloatArray,
+    other: FloatArray,
+    damping: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Solve arrow-shaped normal equations with a damped diagonal."""
+    damped = block + damping * block * np.eye(2)
+    inverse = np.linalg.inv(damped)
+    through = inverse @ border
+    schur = corner + damping * np.diag(np.diag(corner))
+    schur = schur - np.einsum("kia,kib->ab", border, through)
+    local = np.einsum("kij,kj->ki", inverse, one)
+    shared = np.linalg.solve(schur, other - np.einsum("kia,ki->a", border, local))
+    return local - through @ shared, shared
+
+
+def _solve_arrow_covariance(
+    block: FloatArray, border: FloatArray, corner: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return covariances of each light's two numbers, with the shared ones, and of those."""
+    inverse = np.linalg.inv(block)
+    through = inverse @ border
+    shared = np.linalg.inv(corner - np.einsum("kia,kib->ab", border, through))
+    both = -through @ shared
+    return inverse - both @ through.transpose(0, 2, 1), both, shared

@@ -1,0 +1,438 @@
+"""Intensities and lobes of the lights, gains and vignetting of the cameras, from a white plate.
+
+The logarithm of what a part of the plate shows is a sum: of the light's intensity, its lobe there,
+the cosine of incidence, the distance, the camera's gain and its vignetting. All frames together are
+fitted by a few Gauss-Newton steps, which also turn the plate at each pose by the little that its
+markers leave open, and give each of its parts the little slope that a flat plate may have. Before
+that, each light is asked whether the shading it makes is its own: the plate's parts, its poses and
+the frames without light tell where a light stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from capture.calibration.geometry import CameraPose
+from capture.calibration.lights.light_list import CameraResponse, LightTable
+from capture.calibration.lights.white_plate import PlateSamples, WhitePlate
+from capture.calibration.record import CalibrationError
+
+__all__ = ["LightFit", "LightFitError", "check_order", "fit_lights"]
+
+FloatArray = NDArray[np.float64]
+
+LIGHT, CAMERA, POSE = 6, 5, 2  # numbers of a light (intensities, exponent, tilt), camera, pose
+LEAST_COSINE = 0.25  # of incidence: flatter light shows the plate's waves
+STEPS = 6
+TILT_PRIOR_RAD = 0.05  # how far an LED may point past the rig's origin
+EXPONENT_PRIOR = 1.0
+NORMAL_PRIOR_RAD = 2e-3  # of the plate's normal as its markers show it
+GAIN_PRIOR = 0.2  # relative, of a camera's response
+VIGNETTING_PRIOR = 0.4
+FRAME_STDERR = 3e-3  # relative, of all parts of a frame: the LED's pulses, the plate's place
+PART_STDERR = (
+    3e-3  # relative, of a part's mean: responses of pixels, form of the vignetting, cleanness
+)
+DEAD_SHARE = 0.02  # of the usual brightness: a light below is dead
+DEAD_SIGMAS = 5.0
+SHADING_LIMIT = 3e-3  # part of a light's energy over all frames that its own shading may leave
+SHADING_RATIO = 5.0  # how much better another light's shading must fit
+
+
+class LightFitError(CalibrationError):
+    """Frames of a white plate from which lights cannot be calibrated."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightFit:
+    """What a white plate says of lights and cameras.
+
+    Attributes
+    ----------
+    table : LightTable
+        With intensities, lobes, axes and camera responses; dead lights and those that answer for
+        others are not valid there.
+    dead : tuple of str
+        Lights that were on and gave no light.
+    answers : dict of str to str
+        Lights whose shading is that of another: by the name that was on, the name of the light
+        that seems to have shone.
+    unseen : tuple of str
+        Lights of which no frame is usable (the plate never faced them).
+    residual : float
+        Root mean square relative residual of the parts.
+    frames : int
+        How many frames were used.
+    """
+
+    table: LightTable
+    dead: tuple[str, ...]
+    answers: dict[str, str]
+    unseen: tuple[str, ...]
+    residual: float
+    frames: int
+
+
+def check_order(
+    samples: Sequence[PlateSamples], table: LightTable
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Say which lights' frames show another light's shading, and which show none.
+
+    Parameters
+    ----------
+    samples : sequence of PlateSamples
+        Frames lit by one light each, at several poses of the plate; frames that the light cannot
+        reach belong to them.
+    table : LightTable
+        Where the lights should be.
+
+    Returns
+    -------
+    answers : dict of str to str
+        By the light that was on, the light whose place explains the frames.
+    dead : tuple of str
+        Lights whose frames are dark although they should not be.
+    """
+    by_light: dict[str, list[PlateSamples]] = {}
+    for row in samples:
+        by_light.setdefault(row.light, []).append(row)
+    names = [name for name in table.names if name in by_light]
+    level, best = {}, {}
+    for name in names:
+        rows = by_light[name]
+        points = np.concatenate([row.points_mm for row in rows])
+        if not len(points):
+            continue
+        normals = np.concatenate([np.tile(row.normal, (len(row.points_mm), 1)) for row in rows])
+        seen = np.concatenate([row.signal.mean(axis=1) / row.on_s for row in rows])
+        noise = np.concatenate([row.variance.mean(axis=1) / 3 / row.on_s**2 for row in rows])
+        shapes = _shapes(table, points, normals)  # (L, n)
+        own = shapes[table.names.index(name)]
+        bright = own > 0.3 * own.max(initial=0.0)
+        if not bright.any() or own.max() <= 0:
+            continue
+        error = np.sqrt(noise[bright].sum()) / bright.sum()
+        level[name] = (seen[bright].mean() / own[bright].mean(), seen[bright].mean() / error)
+        energy = float(seen @ seen)
+        power = np.sum(shapes**2, axis=1)
+        match = np.clip(shapes @ seen, 0, None)
+        left = 1 - match**2 / np.where(power > 0, power, np.inf) / max(energy, 1e-300)
+        best[name] = (left[table.names.index(name)], int(np.argmin(left)), float(left.min()))
+    usual = float(np.median([share for share, _ in level.values()])) if level else 0.0
+    dead = tuple(
+        name
+        for name, (share, sigmas) in level.items()
+        if share < DEAD_SHARE * usual and (sigmas < DEAD_SIGMAS or best[name][0] > 0.5)
+    )
+    answers = {
+        name: table.names[other]
+        for name, (own_left, other, other_left) in best.items()
+        if name not in dead
+        and table.names[other] != name
+        and own_left > max(SHADING_LIMIT, SHADING_RATIO * other_left)
+    }
+    # a light that shines elsewhere leaves its own place dark, too: it is not dead
+    dark_but_elsewhere = {n for n in dead if best[n][2] < 0.05 and level[n][1] > DEAD_SIGMAS}
+    answers.update({n: table.names[best[n][1]] for n in dark_but_elsewhere})
+    return answers, tuple(n for n in dead if n not in dark_but_elsewhere)
+
+
+def fit_lights(
+    samples: Sequence[PlateSamples],
+    table: LightTable,
+    cameras: Mapping[str, CameraPose],
+    *,
+    plate: WhitePlate | None = None,
+) -> LightFit:
+    """Fit intensities, lobes, gains and vignetting to frames of a white plate.
+
+    Parameters
+    ----------
+    samples : sequence of PlateSamples
+        Frames lit by one light each.
+    table : LightTable
+        Calibrated positions, nominal axes and exponents; its intensities are not used.
+    cameras : mapping of str to CameraPose
+        Calibrated, by view name.
+    plate : WhitePlate, optional
+        Its reflectance and flatness.
+
+    Returns
+    -------
+    LightFit
+        The cameras' gains have a geometric mean of 1 in each channel; the plate's common error of
+        reflectance is not in the standard errors.
+
+    Raises
+    ------
+    LightFitError
+        If no frame is usable.
+    """
+    target = plate or WhitePlate()
+    answers, dead = check_order(samples, table)
+    skipped = set(dead) | set(answers)
+    frames = []
+    poses: dict[bytes, int] = {}
+    for row in samples:
+        if row.light not in skipped and row.light in table.names:
+            pose = poses.setdefault(row.normal.tobytes(), len(poses))
+            frame = _frame(row, table, cameras, target, pose)
+            if frame is not None:
+                frames.append(frame)
+    if not frames:
+        raise LightFitError(
+            f"samples: none of {len(samples)} frames shows the plate lit from its front, neither"
+            " dark nor saturated; check exposure, order of the lights and the plate's places"
+        )
+    with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
+        numbers, covariance, residual = _solve(frames, table, sorted(cameras), target.slope_rad)
+    return _result(
+        numbers, covariance, residual, frames, table, cameras, dead=dead, answers=answers
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Frame:
+    """A frame's parts with all that does not change while fitting."""
+
+    light: int
+    view: str
+    pose: int
+    part: NDArray[np.int64]  # (n,)
+    turns: FloatArray  # how the log follows small slopes of the plate along its axes, (n, 2)
+    known: FloatArray  # log of white, cosine, distance, (n,)
+    direction: FloatArray  # unit vectors from the light to the parts, (n, 3)
+    r2: FloatArray  # squared distance from the image's middle, 1 in the corner
+    log_signal: FloatArray  # (n, 3)
+    relative: FloatArray  # relative variance, (n, 3)
+
+
+def _frame(
+    row: PlateSamples,
+    table: LightTable,
+    cameras: Mapping[str, CameraPose],
+    plate: WhitePlate,
+    pose: int,
+) -> _Frame | None:
+    light = table.names.index(row.light)
+    to_light = table.position_mm[light] - row.points_mm
+    distance = np.linalg.norm(to_light, axis=1)
+    cosine = to_light @ row.normal / distance
+    signal = row.signal / row.on_s
+    good = (cosine > LEAST_COSINE) & (row.signal > 20 * np.sqrt(row.variance)).all(axis=1)
+    if np.count_nonzero(good) < 4:
+        return None
+    size = np.array(cameras[row.view].image_size, float)
+    r2 = np.sum((row.pixels - (size - 1) / 2) ** 2, axis=1) / np.sum((size / 2) ** 2)
+    known = np.log(plate.reflectance * cosine[good] / distance[good] ** 2)
+    toward = to_light[good] / distance[good, None]
+    turns = toward @ row.rotation[:, :2] / cosine[good, None]
+    return _Frame(
+        light,
+        row.view,
+        pose,
+        row.part[good],
+        turns,
+        known,
+        -toward,
+        r2[good],
+        np.log(signal[good]),
+        row.variance[good] / row.signal[good] ** 2 + PART_STDERR**2,
+    )
+
+
+def _solve(
+    frames: Sequence[_Frame], table: LightTable, views: list[str], slope_rad: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return all numbers, their covariance and the rms residual."""
+    lights = len(table.names)
+    poses = 1 + max(f.pose for f in frames)
+    last = LIGHT * lights + CAMERA * len(views)
+    relief = last + POSE * poses
+    parts = 1 + max(int(f.part.max()) for f in frames)
+    total = relief + POSE * parts
+    numbers = np.zeros(total)
+    numbers[3 : LIGHT * lights : LIGHT] = table.exponent
+    side, across = _sides(table.axis)
+    prior = np.zeros(total)
+    for offset, sigma in ((3, EXPONENT_PRIOR), (4, TILT_PRIOR_RAD), (5, TILT_PRIOR_RAD)):
+        prior[offset : LIGHT * lights : LIGHT] = 1 / sigma**2
+    prior[last:relief] = 1 / NORMAL_PRIOR_RAD**2
+    prior[relief:] = 1 / slope_rad**2
+    prior[LIGHT * lights : last] = np.tile(
+        [1 / GAIN_PRIOR**2] * 3 + [1 / VIGNETTING_PRIOR**2] * 2, len(views)
+    )
+    middle = np.zeros(total)
+    middle[3 : LIGHT * lights : LIGHT] = table.exponent
+    used = np.zeros(total, bool)
+    gauge = np.zeros((3, total))
+    for c in range(len(views)):
+        first = LIGHT * lights + CAMERA * c
+        gauge[np.arange(3), first + np.arange(3)] = 1.0
+    # start each intensity at the mean of its frames: the lobe is near 1
+    for k in range(lights):
+        mine = [f.log_signal - f.known[:, None] for f in frames if f.light == k]
+        if mine:
+            numbers[LIGHT * k : LIGHT * k + 3] = np.concatenate(mine).mean(axis=0)
+    covariance, square, count = np.eye(total), 0.0, 1
+    for _ in range(STEPS):
+        H, g = np.diag(prior) + 1e6 * gauge.T @ gauge, prior * (numbers - middle)
+        g += 1e6 * gauge.T @ (gauge @ numbers)
+        square, count = 0.0, 0
+        for f in frames:
+            at = slice(LIGHT * f.light, LIGHT * (f.light + 1))
+            c = LIGHT * lights + CAMERA * views.index(f.view)
+            to = slice(c, c + CAMERA)
+            by = slice(last + POSE * f.pose, last + POSE * (f.pose + 1))
+            r, A, B = _rows(f, table, numbers[at], numbers[to], side, across)
+            turns = np.repeat(f.turns, 3, axis=0)
+            bumps = np.zeros((len(r), POSE * len(f.part)))
+            row = np.arange(len(r))[:, None]
+            bumps[row, POSE * (row // 3) + [0, 1]] = turns
+            bump_at = (relief + POSE * f.part[:, None] + [0, 1]).ravel()
+            r = r + turns @ numbers[by] + bumps @ numbers[bump_at]
+            J = np.concatenate([A, B, turns, bumps], axis=1)
+            w = 1 / f.relative.ravel()
+            JW = J * w[:, None]
+            # parts of a frame share an error: Woodbury's formula
+            ones = JW.sum(axis=0)
+            share = FRAME_STDERR**2 / (1 + FRAME_STDERR**2 * w.sum())
+            block = JW.T @ J - share * np.outer(ones, ones)
+            slope = JW.T @ r - share * ones * (w @ r)
+            columns = np.r_[at, to, by, bump_at]
+            H[np.ix_(columns, columns)] += block
+            g[columns] += slope
+            used[columns] = True
+            square += float(r @ r)
+            count += len(r)
+        free = np.ix_(used, used)
+        covariance = np.zeros((total, total))
+        covariance[free] = np.linalg.inv(H[free])
+        step = -covariance @ np.where(used, g, 0.0)
+        numbers = numbers + step
+        if np.abs(step).max() < 1e-8:
+            break
+    return numbers, covariance, float(np.sqrt(square / max(count, 1)))
+
+
+def _rows(
+    f: _Frame,
+    table: LightTable,
+    light: FloatArray,
+    camera: FloatArray,
+    side: FloatArray,
+    across: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return model minus data (3 n,), and derivatives by the light (6) and the camera (5)."""
+    n = len(f.known)
+    axis, by_side, by_across = _tilted(table, f.light, light[4:6], side, across)
+    cosine = np.clip(f.direction @ axis, 1e-6, None)
+    lobe = light[3] * np.log(cosine)
+    vignetting = 1 + camera[3] * f.r2 + camera[4] * f.r2**2
+    vignetting = np.clip(vignetting, 0.05, None)
+    common = f.known + lobe + np.log(vignetting)
+    model = common[:, None] + light[:3] + camera[:3]
+    A = np.zeros((n, 3, LIGHT))
+    A[:, np.arange(3), np.arange(3)] = 1.0
+    A[:, :, 3] = np.log(cosine)[:, None]
+    A[:, :, 4] = (light[3] * (f.direction @ by_side) / cosine)[:, None]
+    A[:, :, 5] = (light[3] * (f.direction @ by_across) / cosine)[:, None]
+    B = np.zeros((n, 3, CAMERA))
+    B[:, np.arange(3), np.arange(3)] = 1.0
+    B[:, :, 3] = (f.r2 / vignetting)[:, None]
+    B[:, :, 4] = (f.r2**2 / vignetting)[:, None]
+    return (model - f.log_signal).ravel(), A.reshape(-1, LIGHT), B.reshape(-1, CAMERA)
+
+
+def _tilted(
+    table: LightTable, light: int, tilt: FloatArray, side: FloatArray, across: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a light's tilted axis and how it follows the two tilts."""
+    raw = table.axis[light] + tilt[0] * side[light] + tilt[1] * across[light]
+    length = np.linalg.norm(raw)
+    axis = raw / length
+    return (
+        axis,
+        (side[light] - (side[light] @ axis) * axis) / length,
+        (across[light] - (across[light] @ axis) * axis) / length,
+    )
+
+
+def _sides(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return two unit vectors across each axis."""
+    helper = np.where(np.abs(axis[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    side = np.cross(axis, helper)
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    return side, np.cross(axis, side)
+
+
+def _shapes(table: LightTable, points: FloatArray, normals: FloatArray) -> FloatArray:
+    """Return what each light of intensity 1 gives to points with normals, shape (L, n)."""
+    to_light = table.position_mm[:, None] - points
+    distance = np.linalg.norm(to_light, axis=-1)
+    cosine = np.clip(np.sum(to_light * normals, axis=-1) / distance, 0.0, None)
+    off = np.clip(-np.einsum("lnk,lk->ln", to_light, table.axis) / distance, 1e-9, None)
+    return np.asarray(off ** table.exponent[:, None] * cosine / distance**2)
+
+
+def _result(
+    numbers: FloatArray,
+    covariance: FloatArray,
+    residual: float,
+    frames: Sequence[_Frame],
+    table: LightTable,
+    cameras: Mapping[str, CameraPose],
+    *,
+    dead: tuple[str, ...],
+    answers: dict[str, str],
+) -> LightFit:
+    lights = len(table.names)
+    rows = numbers[: LIGHT * lights].reshape(lights, LIGHT)
+    errors = np.sqrt(np.clip(np.diag(covariance), 0, None))
+    light_errors = errors[: LIGHT * lights].reshape(lights, LIGHT)
+    seen = np.zeros(lights, bool)
+    seen[[f.light for f in frames]] = True
+    unseen = tuple(
+        name
+        for k, name in enumerate(table.names)
+        if not seen[k] and name not in dead and name not in answers
+    )
+    side, across = _sides(table.axis)
+    axis = np.array([
+        _tilted(table, k, rows[k, 4:6] if seen[k] else np.zeros(2), side, across)[0]
+        for k in range(lights)
+    ])  # fmt: skip
+    intensity = np.where(seen[:, None], np.exp(rows[:, :3]), 0.0)
+    responses = {}
+    for c, view in enumerate(sorted(cameras)):
+        first = LIGHT * lights + CAMERA * c
+        mine, error = numbers[first : first + CAMERA], errors[first : first + CAMERA]
+        if any(f.view == view for f in frames):
+            gain = np.exp(mine[:3])
+            responses[cameras[view].serial] = CameraResponse(
+                gain, mine[3:].copy(), gain * error[:3], error[3:].copy()
+            )
+    return LightFit(
+        LightTable(
+            table.position_mm,
+            intensity,
+            np.clip(np.where(seen, rows[:, 3], table.exponent), 0.0, None),
+            table.names,
+            axis,
+            table.valid & seen,
+            table.position_stderr_mm,
+            intensity * light_errors[:, :3],
+            np.where(seen, light_errors[:, 3], 0.0),
+            responses,
+        ),
+        dead,
+        answers,
+        unseen,
+        residual,
+        len(frames),
+    )

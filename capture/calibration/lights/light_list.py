@@ -1,0 +1,322 @@
+"""What the rig's lights give where: positions, intensities, lobes, and the cameras' response."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import date
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.calibration.lights.chrome_ball import directions_from_chrome_ball
+from capture.calibration.record import Calibration, Quantity, Source, default_validity
+from capture.rig import Rig
+
+__all__ = ["CameraResponse", "LightTable", "directions_from_chrome_ball"]
+
+FloatArray = NDArray[np.float64]
+
+_LEFT_OUT: Any = None  # __post_init__ puts an array in its place
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraResponse:
+    """How strongly a camera answers, relative to the mean of the rig's cameras.
+
+    Attributes
+    ----------
+    gain : ndarray of float64, shape (3,)
+        Per channel, 1 for the mean camera.
+    vignetting : ndarray of float64, shape (2,)
+        Response at distance r from the image's middle, r = 1 in the corner, is
+        ``gain (1 + v0 r^2 + v1 r^4)``.
+    gain_stderr, vignetting_stderr : ndarray of float64, shapes (3,) and (2,)
+        Standard errors.
+    """
+
+    gain: FloatArray = field(default_factory=lambda: np.ones(3))
+    vignetting: FloatArray = field(default_factory=lambda: np.zeros(2))
+    gain_stderr: FloatArray = field(default_factory=lambda: np.zeros(3))
+    vignetting_stderr: FloatArray = field(default_factory=lambda: np.zeros(2))
+
+    def __post_init__(self) -> None:
+        """Convert to float64 and refuse what is no response."""
+        for name, n in (("gain", 3), ("vignetting", 2)):
+            for full in (name, f"{name}_stderr"):
+                object.__setattr__(self, full, _array("CameraResponse", full, self, (n,)))
+        if (self.gain <= 0).any() or 1 + self.vignetting.sum() <= 0:
+            raise ValueError(
+                f"CameraResponse: got gain {self.gain.tolist()} and vignetting"
+                f" {self.vignetting.tolist()}, expected a positive response everywhere"
+            )
+
+    def at(self, pixels: ArrayLike, image_size: tuple[int, int]) -> FloatArray:
+        """Return the response at pixels, shape (..., 3).
+
+        Parameters
+        ----------
+        pixels : array_like, shape (..., 2)
+            Column and row in px.
+        image_size : tuple of int
+            Columns and rows of the image.
+
+        Examples
+        --------
+        >>> dim = CameraResponse(vignetting=np.array([-0.3, 0.05]))
+        >>> dim.at([[49.5, 39.5], [-0.5, -0.5]], (100, 80)).round(3).tolist()
+        [[1.0, 1.0, 1.0], [0.75, 0.75, 0.75]]
+        """
+        size = np.array(image_size, dtype=np.float64)
+        offset = np.asarray(pixels, dtype=np.float64) - (size - 1) / 2
+        r2 = np.sum(offset**2, axis=-1) / np.sum((size / 2) ** 2)
+        falloff = 1.0 + self.vignetting[0] * r2 + self.vignetting[1] * r2**2
+        return falloff[..., None] * self.gain
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightTable:
+    """The lights of a rig as the reconstruction needs them.
+
+    A perfect Lambertian white at distance d from light l, its normal turned by theta from the
+    direction to the light, at phi off the light's axis, gives
+    ``signal = intensity[l] cos(phi)**exponent[l] cos(theta) / d**2`` in camera RGB (fraction of
+    full scale per second of light at level 1) to a camera of response 1.
+
+    Attributes
+    ----------
+    position_mm : ndarray of float64, shape (L, 3)
+        Rig frame.
+    intensity : ndarray of float64, shape (L, 3)
+        Camera RGB, fraction of full scale per second x mm^2, >= 0.
+    exponent : ndarray of float64, shape (L,)
+        Of the lobe, >= 0; 0: the same in all directions.
+    names : tuple of str
+        Names of the lights, one each.
+    axis : ndarray of float64, shape (L, 3)
+        Unit vectors in which the lights point; by default at the rig's origin.
+    valid : ndarray of bool, shape (L,)
+        False for lights that must not be used (dead, or their place unknown).
+    position_stderr_mm, intensity_stderr, exponent_stderr : ndarray of float64
+        Standard errors, shapes as the values; 0: nominal.
+    cameras : mapping of str to CameraResponse
+        By serial; a camera that is not named has response 1.
+    """
+
+    position_mm: FloatArray
+    intensity: FloatArray
+    exponent: FloatArray
+    names: tuple[str, ...]
+    axis: FloatArray = _LEFT_OUT
+    valid: NDArray[np.bool_] = _LEFT_OUT
+    position_stderr_mm: FloatArray = _LEFT_OUT
+    intensity_stderr: FloatArray = _LEFT_OUT
+    exponent_stderr: FloatArray = _LEFT_OUT
+    cameras: Mapping[str, CameraResponse] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Convert to float64 and check the arrays against each other."""
+        n = len(self.names)
+        if len(set(self.names)) != n or not n:
+            raise ValueError(f"LightTable.names: got {self.names}, expected names that differ")
+        shapes = {
+            "position_mm": (n, 3),
+            "intensity": (n, 3),
+            "exponent": (n,),
+            "position_stderr_mm": (n, 3),
+            "intensity_stderr": (n, 3),
+            "exponent_stderr": (n,),
+        }
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, _array("LightTable", name, self, shape))
+        if (self.intensity < 0).any() or (self.exponent < 0).any():
+            raise ValueError("LightTable: got a negative intensity or exponent, expected >= 0")
+        axis = self.axis if self.axis is not None else -self.position_mm
+        object.__setattr__(self, "axis", axis)
+        axis = _array("LightTable", "axis", self, (n, 3))
+        length = np.linalg.norm(axis, axis=-1, keepdims=True)
+        if (length == 0).any():
+            raise ValueError("LightTable.axis: got a zero vector, expected directions")
+        axis = axis / length
+        axis.setflags(write=False)
+        object.__setattr__(self, "axis", axis)
+        valid = np.ones(n, bool) if self.valid is None else np.array(self.valid)
+        if valid.shape != (n,) or valid.dtype != bool:
+            raise ValueError(
+                f"LightTable.valid: got {valid.dtype} of shape {valid.shape}, expected bool of"
+                f" shape {(n,)}"
+            )
+        valid.setflags(write=False)
+        object.__setattr__(self, "valid", valid)
+
+    @classmethod
+    def nominal(cls, rig: Rig, *, white_per_s: float = 1.0) -> LightTable:
+        """Return the lights as the rig's file describes them.
+
+        Parameters
+        ----------
+        rig : Rig
+            With LEDs; a flash counts by its energy.
+        white_per_s : float
+            Signal per second of a perfect white at the rig's origin that faces a light of 1 W:
+            the file does not say it, so that nominal intensities are relative. > 0.
+
+        Examples
+        --------
+        >>> from capture.rig import load_rig
+        >>> table = LightTable.nominal(load_rig("dome"))
+        >>> to_light, white = table.irradiance([[0.0, 0.0, 0.0]])
+        >>> to_light.shape, white[0, 0].round(9).tolist()
+        ((150, 1, 3), [1.0, 1.0, 1.0])
+        """
+        if not white_per_s > 0:
+            raise ValueError(f"white_per_s: got {white_per_s}, expected > 0")
+        position = np.array([light.position_mm for light in rig.lights])
+        strength = np.array([light.power_w or light.energy_ws for light in rig.lights], np.float64)
+        intensity = white_per_s * strength * np.sum(position**2, axis=-1)
+        exponent = [
+            0.0
+            if light.half_intensity_deg is None
+            else math.log(0.5) / math.log(math.cos(math.radians(light.half_intensity_deg)))
+            for light in rig.lights
+        ]
+        return cls(
+            position,
+            np.repeat(intensity[:, None], 3, axis=1),
+            np.array(exponent),
+            tuple(light.name for light in rig.lights),
+        )
+
+    def irradiance(self, points_mm: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return the directions to the lights and the signal of a white that faces them.
+
+        Parameters
+        ----------
+        points_mm : array_like, shape (P, 3)
+            Rig frame, mm.
+
+        Returns
+        -------
+        direction : ndarray of float64, shape (L, P, 3)
+            Unit vectors from the points to the lights.
+        normal_irradiance : ndarray of float64, shape (L, P, 3)
+            ``intensity lobe / d^2``: the irradiance across the direction to the light over pi, in
+            the unit of the signal. 0 behind a light.
+
+        Raises
+        ------
+        ValueError
+            If a point lies in a light.
+        """
+        points = np.atleast_2d(np.asarray(points_mm, dtype=np.float64))
+        to_light = self.position_mm[:, None] - points[None]
+        distance = np.linalg.norm(to_light, axis=-1, keepdims=True)
+        if (distance == 0).any():
+            raise ValueError("points_mm: got a point at a light, expected points elsewhere")
+        direction = to_light / distance
+        cosine = np.clip(-np.einsum("lpk,lk->lp", direction, self.axis), 0.0, None)
+        lobe = cosine ** self.exponent[:, None]
+        lobe[cosine == 0] = 0.0
+        return direction, self.intensity[:, None] * (lobe[..., None] / distance**2)
+
+    def response(self, serial: str, pixels: ArrayLike, image_size: tuple[int, int]) -> FloatArray:
+        """Return a camera's response at pixels, shape (..., 3); see `CameraResponse.at`."""
+        return self.cameras.get(serial, CameraResponse()).at(pixels, image_size)
+
+    def to_calibration(
+        self,
+        *,
+        rig: str,
+        source: Source,
+        created: date,
+        valid_until: date | None = None,
+        notes: Mapping[str, str] | None = None,
+        inputs: Mapping[str, str] | None = None,
+        versions: Mapping[str, str] | None = None,
+    ) -> Calibration:
+        """Return this as a `Calibration` of kind "lights", keyed by light and camera serial."""
+        values: dict[str, dict[str, Quantity]] = {}
+        for i, name in enumerate(self.names):
+            values[name] = {
+                "position_mm": Quantity(self.position_mm[i], self.position_stderr_mm[i]),
+                "axis": Quantity(self.axis[i]),
+                "intensity": Quantity(self.intensity[i], self.intensity_stderr[i]),
+                "exponent": Quantity(self.exponent[i], self.exponent_stderr[i]),
+                "valid": Quantity(np.array(float(self.valid[i]))),
+            }
+        for serial, camera in self.cameras.items():
+            values[serial] = {
+                "gain": Quantity(camera.gain, camera.gain_stderr),
+                "vignetting": Quantity(camera.vignetting, camera.vignetting_stderr),
+            }
+        return Calibration(
+            kind="lights",
+            rig=rig,
+            serials=tuple(values),
+            created=created,
+            valid_until=valid_until or default_validity(created),
+            source=source,
+            values=values,
+            notes={
+                "unit": "intensity: fraction of full scale per second x mm^2 for a perfect white",
+                **(notes or {}),
+            },
+            inputs=dict(inputs or {}),
+            versions=dict(versions or {}),
+        )
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration, rig: Rig) -> LightTable:
+        """Return the calibrated lights of a rig, in the rig's order.
+
+        Raises
+        ------
+        CalibrationMismatch
+            If the calibration lacks a light of the rig.
+        """
+
+        def of(name: str) -> list[Quantity]:
+            return [calibration.quantity(light.name, name) for light in rig.lights]
+
+        def errors(name: str) -> FloatArray:
+            return np.array(
+                [np.zeros_like(q.value) if q.stderr is None else q.stderr for q in of(name)]
+            )
+
+        cameras = {}
+        for view in rig.views:
+            if view.serial in calibration.values:
+                gain = calibration.quantity(view.serial, "gain")
+                vignetting = calibration.quantity(view.serial, "vignetting")
+                cameras[view.serial] = CameraResponse(
+                    gain.value,
+                    vignetting.value,
+                    np.zeros(3) if gain.stderr is None else gain.stderr,
+                    np.zeros(2) if vignetting.stderr is None else vignetting.stderr,
+                )
+        return cls(
+            np.array([q.value for q in of("position_mm")]),
+            np.array([q.value for q in of("intensity")]),
+            np.array([q.value for q in of("exponent")]),
+            tuple(light.name for light in rig.lights),
+            np.array([q.value for q in of("axis")]),
+            np.array([bool(q.value) for q in of("valid")]),
+            errors("position_mm"),
+            errors("intensity"),
+            errors("exponent"),
+            cameras,
+        )
+
+
+def _array(owner: str, name: str, row: object, shape: tuple[int, ...]) -> FloatArray:
+    """Return a field as a read-only float64 array of a shape; None becomes zeros."""
+    given = getattr(row, name)
+    array = np.array(np.zeros(shape) if given is None else given, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(
+            f"{owner}.{name}: got shape {array.shape}, expected finite numbers of shape {shape}"
+        )
+    array.setflags(write=False)
+    return array

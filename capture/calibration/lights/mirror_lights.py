@@ -1,0 +1,450 @@
+"""Places of lights from their highlights on mirror spheres, seen by several cameras.
+
+Every highlight says: a light lies on this reflected ray. All highlights together place the lights,
+and correct the spheres' centres within the errors that their outlines left.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, label
+from scipy.optimize import linear_sum_assignment
+from threadpoolctl import threadpool_limits
+
+from capture.calibration.geometry import CameraPose
+from capture.calibration.lights.mirror_sphere import (
+    SphereError,
+    SpherePlace,
+    contour,
+    reflect,
+    reflection_pixels,
+    reflection_points,
+)
+
+__all__ = ["Highlights", "LightPlaces", "SphereWindow", "find_highlights", "locate_lights"]
+
+FloatArray = NDArray[np.float64]
+
+RIM_PX = 1.5  # highlights closer to the outline are left alone
+NOISE_SIGMAS = 8.0  # above the median in the sphere
+LEAST_PEAK = 0.02  # of the brightest pixel in the sphere: fainter spots are reflections of spots
+GATE_MM = 60.0  # how far a light may be from a reflected ray to be the one that made it
+HUBER = 2.5
+LEAST_CAMERAS = 2
+LEAST_HIGHLIGHTS = 3
+FLOOR_PX = 0.03  # of a highlight's middle, whatever its size: noise, the surface's polish
+MAX_STEPS = 25
+STOP = 1e-3  # square of the last step over its standard errors, all numbers together
+DERIVATIVE_MM = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SphereWindow:
+    """The part of an image that shows a sphere; made once for a camera and a sphere.
+
+    Attributes
+    ----------
+    rows, columns : slice
+        Smallest box around it.
+    inside : ndarray of bool
+        Pixels of the box well inside the outline.
+    """
+
+    rows: slice
+    columns: slice
+    inside: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, camera: CameraPose, place: SpherePlace) -> SphereWindow:
+        """Return the window of a sphere in a camera."""
+        outline = contour(camera, place.center_mm, place.radius_mm, 90)
+        size = np.array(camera.image_size)
+        if not np.isfinite(outline).all():
+            raise SphereError(f"sphere at {place.center_mm.tolist()}: behind {camera.serial}")
+        low = np.clip(np.floor(outline.min(axis=0)), 0, size).astype(int)
+        high = np.clip(np.ceil(outline.max(axis=0)) + 1, 0, size).astype(int)
+        x, y = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+        if not x.size:
+            empty = np.zeros((0, 0), bool)
+            return cls(slice(0, 0), slice(0, 0), empty)
+        rays = camera.rays(np.stack([x, y], axis=-1).astype(float))
+        offset = place.center_mm - camera.center_mm
+        distance = float(np.linalg.norm(offset))
+        angle = np.arccos(np.clip(rays @ offset / distance, -1, 1))
+        limit = np.arcsin(place.radius_mm / distance) - RIM_PX / camera.matrix[0, 0]
+        rows, columns = slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
+        return cls(rows, columns, angle < limit)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Highlights:
+    """Bright spots that one camera saw in one sphere while some lights were on.
+
+    Attributes
+    ----------
+    view : str
+        Name of the camera.
+    sphere : int
+        Number of the sphere's place.
+    lit : tuple of str
+        Names of the lights that were on.
+    pixels : ndarray of float64, shape (n, 2)
+        Column and row of each spot, px.
+    flux : ndarray of float64, shape (n,)
+        Sum of its pixels above the background, unit of the image.
+    """
+
+    view: str
+    sphere: int
+    lit: tuple[str, ...]
+    pixels: FloatArray
+    flux: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightPlaces:
+    """Where the lights are.
+
+    Attributes
+    ----------
+    names : tuple of str
+    position_mm : ndarray of float64, shape (L, 3)
+        Rig frame; the nominal place where not `valid`.
+    stderr_mm : ndarray of float64, shape (L, 3)
+        Standard errors; 0 where not `valid`.
+    covariance_mm2 : ndarray of float64, shape (L, 3, 3)
+    cameras, highlights : ndarray of int64, shape (L,)
+        How many cameras and highlights placed each light.
+    valid : ndarray of bool, shape (L,)
+        At least 2 cameras and 3 highlights.
+    unseen : tuple of str
+        Lights that were on and should have been seen, but never were: dead or not connected.
+    answers : dict of str to str
+        Lights at whose place another one shone: by the name that was switched on, the name of the
+        light whose nominal place was seen. Their positions are those seen.
+    spheres_mm : ndarray of float64, shape (S, 3)
+        The spheres' centres after the adjustment.
+    sigma_px : float
+        Noise of a highlight's coordinate that the residuals show.
+    """
+
+    names: tuple[str, ...]
+    position_mm: FloatArray
+    stderr_mm: FloatArray
+    covariance_mm2: FloatArray
+    cameras: NDArray[np.int64]
+    highlights: NDArray[np.int64]
+    valid: NDArray[np.bool_]
+    unseen: tuple[str, ...]
+    answers: dict[str, str]
+    spheres_mm: FloatArray
+    sigma_px: float
+
+
+def find_highlights(image: NDArray, window: SphereWindow) -> tuple[FloatArray, FloatArray]:
+    """Find the bright spots in a sphere.
+
+    Parameters
+    ----------
+    image : ndarray of float, shape (H, W)
+        Gray, linear, full resolution; saturated pixels hold what they read.
+    window : SphereWindow
+
+    Returns
+    -------
+    pixels : ndarray of float64, shape (n, 2)
+        Intensity-weighted middle of each spot, brightest first.
+    flux : ndarray of float64, shape (n,)
+    """
+    part = np.asarray(image[window.rows, window.columns], np.float64)
+    values = part[window.inside]
+    if values.size < 9:
+        return np.zeros((0, 2)), np.zeros(0)
+    usual = float(np.median(values))
+    # the median deviation of a few levels of the converter may be 0
+    quiet = values[np.abs(values - usual) <= np.quantile(np.abs(values - usual), 0.98)]
+    sigma = max(1.4826 * float(np.median(np.abs(values - usual))), float(quiet.std()))
+    above = np.where(window.inside, part - usual, 0.0)
+    limit = max(NOISE_SIGMAS * sigma, LEAST_PEAK * float(above.max()), 1e-12)
+    spots, count = label(above > limit, structure=np.ones((3, 3)))
+    pixels, flux = [], []
+    for k in range(1, count + 1):
+        # its faint border belongs to a spot, too: without it the middle leans to bright pixels
+        spot = binary_dilation(spots == k) & ((spots == k) | (spots == 0))
+        rows, columns = np.nonzero(spot)
+        weight = np.clip(above[rows, columns], 0.0, None)
+        flux.append(weight.sum())
+        pixels.append([columns @ weight / weight.sum(), rows @ weight / weight.sum()])
+    order = np.argsort(flux)[::-1]
+    corner = np.array([window.columns.start, window.rows.start])
+    found = np.array(pixels).reshape(-1, 2) + corner
+    return found[order], np.array(flux)[order]
+
+
+def locate_lights(
+    seen: Sequence[Highlights],
+    cameras: Mapping[str, CameraPose],
+    spheres: Mapping[int, SpherePlace],
+    nominal: Mapping[str, FloatArray],
+    *,
+    light_radius_mm: float = 10.0,
+    nominal_stderr_mm: float | None = None,
+    gate_mm: float = GATE_MM,
+) -> LightPlaces:
+    """Place lights by their highlights.
+
+    Parameters
+    ----------
+    seen : sequence of Highlights
+        Of all cameras, spheres and groups of lights.
+    cameras : mapping of str to CameraPose
+        Calibrated, by view name.
+    spheres : mapping of int to SpherePlace
+    nominal : mapping of str to array_like, shape (3,)
+        Where each light should be, mm; it tells highlights apart and starts the fit.
+    light_radius_mm : float
+        Radius of the lights' discs, mm, >= 0; it tells how wide their images are.
+    nominal_stderr_mm : float, optional
+        Standard deviation of the lights about their nominal places, mm: what few highlights leave
+        open follows the drawing. None takes nothing from the drawing.
+    gate_mm : float
+        A light farther than this from a reflected ray did not make it.
+
+    Returns
+    -------
+    LightPlaces
+
+    Raises
+    ------
+    SphereError
+        If no highlight belongs to any light.
+    """
+    names = tuple(nominal)
+    start = np.array([np.asarray(nominal[name], float) for name in names])
+    matched, answers, unseen = _match(seen, cameras, spheres, names, start, gate_mm)
+    if not matched:
+        raise SphereError(
+            f"highlights: none of {sum(len(s.pixels) for s in seen)} spots lies where one of the"
+            f" {len(names)} lights would show; check the spheres, the cameras and the exposure"
+        )
+    for name, other in answers.items():
+        start[names.index(name)] = nominal[other]
+    count = np.zeros(len(names), np.int64)
+    views: list[set[str]] = [set() for _ in names]
+    for light, view, _, _ in matched:
+        count[light] += 1
+        views[light].add(view)
+    by = np.array([len(v) for v in views], np.int64)
+    valid = (count >= LEAST_HIGHLIGHTS) & (by >= LEAST_CAMERAS)
+    used = [m for m in matched if valid[m[0]]]
+    if not used:
+        raise SphereError(
+            f"highlights: no light was seen by {LEAST_CAMERAS} cameras in {LEAST_HIGHLIGHTS}"
+            " images; show the sphere at more places, to more cameras"
+        )
+    with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
+        position, centers, covariance, sigma = _adjust(
+            used, cameras, spheres, start, valid, light_radius_mm, nominal_stderr_mm
+        )
+    position[~valid] = np.array([np.asarray(nominal[name], float) for name in names])[~valid]
+    return LightPlaces(
+        names,
+        position,
+        np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0, None)),
+        covariance,
+        by,
+        count,
+        valid,
+        unseen,
+        answers,
+        centers,
+        sigma,
+    )
+
+
+Matched = tuple[int, str, int, FloatArray]  # light, view, sphere, pixel
+
+
+def _match(
+    seen: Sequence[Highlights],
+    cameras: Mapping[str, CameraPose],
+    spheres: Mapping[int, SpherePlace],
+    names: tuple[str, ...],
+    start: FloatArray,
+    gate_mm: float,
+) -> tuple[list[Matched], dict[str, str], tuple[str, ...]]:
+    """Say which light made which spot; lights that answer for others; lights never seen."""
+    matched: list[Matched] = []
+    expected: Counter[int] = Counter()
+    found: Counter[int] = Counter()
+    instead: Counter[tuple[int, int]] = Counter()
+    strange: list[tuple[int, int, str, int, FloatArray]] = []
+    for shot in seen:
+        camera, sphere = cameras[shot.view], spheres[shot.sphere]
+        lit = [names.index(name) for name in shot.lit]
+        where = reflection_pixels(camera, sphere.center_mm, sphere.radius_mm, start[lit])
+        # lights well in view: their highlight is not squeezed at the rim
+        visible = _clear_of_rim(camera, sphere, where) if len(lit) else np.zeros(0, bool)
+        expected.update(k for k, ok in zip(lit, visible, strict=True) if ok)
+        if not len(shot.pixels):
+            continue
+        miss = _miss_mm(camera, sphere, shot.pixels, start)
+        rows, columns = linear_sum_assignment(np.minimum(miss[:, lit], 10 * gate_mm))
+        free_spots = set(range(len(shot.pixels)))
+        free_lights = set(lit)
+        for spot, column in zip(rows, columns, strict=True):
+            if miss[spot, lit[column]] < gate_mm:
+                matched.append((lit[column], shot.view, shot.sphere, shot.pixels[spot]))
+                found[lit[column]] += 1
+                free_spots.discard(spot)
+                free_lights.discard(lit[column])
+        missing = [k for k in free_lights if visible[lit.index(k)]]
+        if len(missing) == 1:
+            for spot in free_spots:
+                other = int(np.argmin(miss[spot]))
+                if miss[spot, other] < gate_mm and other not in lit:
+                    instead[missing[0], other] += 1
+                    strange.append((missing[0], other, shot.view, shot.sphere, shot.pixels[spot]))
+    answers: dict[str, str] = {}
+    for (light, other), times in instead.most_common():
+        if times > found[light] and times > 0.5 * expected[light]:
+            answers.setdefault(names[light], names[other])
+    for light, other, view, number, pixel in strange:
+        if answers.get(names[light]) == names[other]:
+            matched.append((light, view, number, pixel))
+    unseen = tuple(
+        names[k]
+        for k in range(len(names))
+        if expected[k] >= LEAST_HIGHLIGHTS and not found[k] and names[k] not in answers
+    )
+    return matched, answers, unseen
+
+
+def _clear_of_rim(camera: CameraPose, sphere: SpherePlace, pixels: FloatArray) -> NDArray[np.bool_]:
+    """Return which pixels lie in the inner nine tenths of a sphere and in the image."""
+    inside = np.zeros(len(pixels), bool)
+    good = np.isfinite(pixels).all(axis=1)
+    good &= (pixels > 1).all(axis=1) & (pixels < np.array(camera.image_size) - 2).all(axis=1)
+    if good.any():
+        offset = sphere.center_mm - camera.center_mm
+        distance = float(np.linalg.norm(offset))
+        cosine = camera.rays(pixels[good]) @ offset / distance
+        limit = np.cos(0.9 * np.arcsin(sphere.radius_mm / distance))
+        inside[good] = cosine > limit
+    return inside
+
+
+def _miss_mm(
+    camera: CameraPose, sphere: SpherePlace, pixels: FloatArray, lights_mm: FloatArray
+) -> FloatArray:
+    """Return how far each light is from each reflected ray, mm, shape (spots, lights)."""
+    point, direction, hit = reflect(camera, pixels, sphere.center_mm, sphere.radius_mm)
+    to_light = lights_mm[None] - point[:, None]
+    along = np.einsum("slk,sk->sl", to_light, direction)
+    gap = np.linalg.norm(to_light - along[..., None] * direction[:, None], axis=-1)
+    return np.asarray(np.where(hit[:, None] & (along > 0), gap, np.inf).clip(max=1e9))
+
+
+def _adjust(
+    matched: Sequence[Matched],
+    cameras: Mapping[str, CameraPose],
+    spheres: Mapping[int, SpherePlace],
+    start: FloatArray,
+    valid: NDArray[np.bool_],
+    light_radius_mm: float,
+    nominal_stderr_mm: float | None,
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return lights, centres, the lights' covariances and the noise, by Gauss-Newton steps."""
+    numbers = sorted(spheres)
+    lights = np.nonzero(valid)[0]
+    place_of = {int(light): 3 * k for k, light in enumerate(lights)}
+    base = 3 * len(lights)
+    total = base + 3 * len(numbers)
+    position = start.copy()
+    centers = np.array([spheres[n].center_mm for n in numbers])
+    outline = [np.linalg.inv(spheres[n].covariance_mm2 + 1e-12 * np.eye(3)) for n in numbers]
+    light_of = np.array([m[0] for m in matched])
+    pixels = np.array([m[3] for m in matched])
+    sphere_of = np.array([numbers.index(m[2]) for m in matched])
+    views = np.array([m[1] for m in matched])
+    radius = next(iter(spheres.values())).radius_mm
+    to = 3 * np.array([place_of[int(light)] // 3 for light in light_of])
+    H, r, robust, count = np.eye(total), np.zeros((1, 2)), np.ones(1), 1.0
+    for _ in range(MAX_STEPS):
+        r, J = _highlight_rows(
+            cameras, views, centers[sphere_of], radius, position[light_of], pixels
+        )
+        # a spot narrower than a pixel hides where in the pixel it is
+        width = 2 * light_radius_mm * np.linalg.norm(J[:, :, :3], axis=2)
+        usual = np.sqrt(FLOOR_PX**2 + np.clip(1 - width, 0, None) ** 3 / 12)
+        z = r / usual
+        sigma = max(1.4826 * float(np.median(np.abs(z))), 1e-6)
+        size = np.linalg.norm(z, axis=1) / sigma
+        robust = np.where(size > HUBER, HUBER / np.maximum(size, HUBER), 1.0)
+        count = 2 * robust.sum() - total
+        scale = np.sqrt((robust[:, None] * z**2).sum() / max(float(count), 1.0))
+        w = robust[:, None] / (scale * usual) ** 2
+        columns = np.concatenate(
+            [to[:, None] + np.arange(3), base + 3 * sphere_of[:, None] + np.arange(3)], axis=1
+        )
+        H, g = np.zeros((total, total)), np.zeros(total)
+        blocks = np.einsum("ni,nij,nik->njk", w, J, J)
+        np.add.at(H, (columns[:, :, None], columns[:, None, :]), blocks)
+        np.add.at(g, columns, np.einsum("ni,nij,ni->nj", w, J, r))
+        for s, number in enumerate(numbers):
+            at = slice(base + 3 * s, base + 3 * s + 3)
+            H[at, at] += outline[s]
+            g[at] += outline[s] @ (centers[s] - spheres[number].center_mm)
+        if nominal_stderr_mm is not None:
+            H[np.arange(base), np.arange(base)] += 1 / nominal_stderr_mm**2
+            g[:base] += (position - start)[lights].ravel() / nominal_stderr_mm**2
+        step = -np.linalg.solve(H, g)
+        position[lights] += step[:base].reshape(-1, 3)
+        centers += step[base:].reshape(-1, 3)
+        if step @ H @ step < STOP:
+            break
+    inverse = np.linalg.inv(H)
+    covariance = np.zeros((len(start), 3, 3))
+    for light, k in place_of.items():
+        covariance[light] = inverse[k : k + 3, k : k + 3]
+    rms = float(np.sqrt((robust[:, None] * r**2).sum() / max(float(count), 1.0)))
+    return position, centers, covariance, rms
+
+
+def _highlight_rows(
+    cameras: Mapping[str, CameraPose],
+    views: NDArray,
+    centers_mm: FloatArray,
+    radius_mm: float,
+    lights_mm: FloatArray,
+    pixels: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return residuals (n, 2) and their derivatives (n, 2, 6) by light and by centre.
+
+    A light that the sphere cannot show any more (beyond its rim) has residual and derivative 0.
+    """
+    steps = DERIVATIVE_MM * np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])[:, None]
+    names = sorted(set(views))
+    eyes = np.array([cameras[name].center_mm for name in names])[np.searchsorted(names, views)]
+    lights, centers = lights_mm + steps[..., :3], centers_mm + steps[..., 3:]
+    point, seen = reflection_points(
+        np.broadcast_to(eyes, lights.shape).reshape(-1, 3),
+        centers.reshape(-1, 3),
+        radius_mm,
+        lights.reshape(-1, 3),
+    )
+    point, seen = point.reshape(lights.shape), seen.reshape(lights.shape[:2])
+    found = np.empty((*lights.shape[:2], 2))
+    for name in names:
+        mine = views == name
+        found[:, mine] = cameras[name].project(point[:, mine])
+    residual = found[0] - pixels
+    J = np.moveaxis((found[1:7] - found[7:]) / (2 * DERIVATIVE_MM), 0, -1)
+    lost = ~(seen.all(axis=0) & np.isfinite(found).all(axis=(0, 2)))
+    residual[lost], J[lost] = 0.0, 0.0
+    return residual, J

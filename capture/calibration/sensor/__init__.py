@@ -1,0 +1,11 @@
+"""Sensor calibration: dark frames, flat field, linearity and photon transfer."""
+
+from capture.calibration.sensor.noise_model import SensorCalibration, photon_transfer
+from capture.calibration.sensor.transfer_curve import FlatPair, PhotonTransferError
+
+__all__ = [
+    "FlatPair",
+    "PhotonTransferError",
+    "SensorCalibration",
+    "photon_transfer",
+]

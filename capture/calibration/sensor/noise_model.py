@@ -1,0 +1,425 @@
+"""Sensor calibration: black, gain, read noise, saturation, linearity, pixel response, flat field.
+
+Everything is estimated from darks and from pairs of flats at several amounts of light, per CFA
+color, with standard errors; see `capture.calibration.sensor.transfer_curve` for the curve itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration.record import Calibration, Provenance, Quantity, of_one_device
+from capture.calibration.sensor.darks import Darks, pool, reduce_darks
+from capture.calibration.sensor.flat_field import SmoothField, fit_smooth_field, pixel_response
+from capture.calibration.sensor.linearity import fit_linearity
+from capture.calibration.sensor.transfer_curve import (
+    CurveFit,
+    FlatPair,
+    PhotonTransferError,
+    block_statistics,
+    block_sums,
+    cfa_planes,
+    fit_curve,
+    plane,
+)
+
+__all__ = ["FlatPair", "PhotonTransferError", "SensorCalibration", "photon_transfer"]
+
+Float = NDArray[np.float64]
+
+QUANTIZATION_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
+FLAT_BLOCKS = 16  # samples of the flat field along the shorter side
+
+
+@dataclass(frozen=True, slots=True)
+class SensorCalibration:
+    """What is known of one sensor; arrays are per color, in the order of ``colors``.
+
+    Attributes
+    ----------
+    pattern : str
+        CFA pattern, row-major, or "MONO".
+    colors : tuple of str
+        ("R", "G", "B") or ("MONO",).
+    white_dn : int
+        White level the frames were made with, DN.
+    black_dn : Quantity, shape (C,)
+        Mean of the darks, DN.
+    gain_e_per_dn : Quantity, shape (C,)
+        Electrons per DN.
+    read_noise_e : Quantity, shape (C,)
+        Temporal noise without light and without the rounding to whole DN, electrons.
+    saturation_dn : Quantity, shape (C,)
+        Raw level at which pixels saturate, DN (a bound where `saturated_by` is "not reached").
+    full_well_e : Quantity, shape (C,)
+        Electrons at that level: the full well, or a lower bound of it where `saturated_by` is not
+        "full well".
+    saturated_by : tuple of str
+        "full well", "white level" or "not reached", per color.
+    nonlinearity : Quantity, shape (C,)
+        Relative change of the response between no light and the most light used. What the light
+        source does between its power settings cannot be told apart from it.
+    linearity_deviation : Quantity, shape (C,)
+        Largest relative deviation of one level from a straight line through zero.
+    prnu : Quantity, shape (C,)
+        Relative pixel-to-pixel spread of sensitivity (standard deviation).
+    dsnu_dn : Quantity, shape (C,)
+        Pixel-to-pixel spread of the dark level, DN.
+    dark_e_per_s : Quantity or None
+        Dark current, shape (C,); None where all darks have one exposure time.
+    flat : tuple of SmoothField
+        Shading of the flat target as seen by this camera (vignetting times uneven light), per
+        color, 1 at the center.
+    chi2_per_dof : tuple of float
+        Scatter around the photon transfer line over its expectation; near 1 when the model holds.
+    hot_pixels : int
+        Pixels left out.
+    """
+
+    pattern: str
+    colors: tuple[str, ...]
+    white_dn: int
+    black_dn: Quantity
+    gain_e_per_dn: Quantity
+    read_noise_e: Quantity
+    saturation_dn: Quantity
+    full_well_e: Quantity
+    saturated_by: tuple[str, ...]
+    nonlinearity: Quantity
+    linearity_deviation: Quantity
+    prnu: Quantity
+    dsnu_dn: Quantity
+    dark_e_per_s: Quantity | None
+    flat: tuple[SmoothField, ...]
+    chi2_per_dof: tuple[float, ...]
+    hot_pixels: int
+
+    def mean_gain_e_per_dn(self) -> Quantity:
+        """Return the gain averaged over colors with inverse-variance weights."""
+        return _combine(self.gain_e_per_dn)
+
+    def mean_read_noise_e(self) -> Quantity:
+        """Return the read noise averaged over colors with inverse-variance weights."""
+        return _combine(self.read_noise_e)
+
+    def noise_profile(self) -> tuple[float, float]:
+        """Return (scale, offset) of the variance in units of the range, as in a DNG NoiseProfile.
+
+        ``variance = scale * x + offset`` with x in [0, 1] between the black and the white level.
+        """
+        span = self.white_dn - float(self.black_dn.value.mean())
+        gain = float(self.mean_gain_e_per_dn().value)
+        offset = (float(self.mean_read_noise_e().value) / gain) ** 2 + QUANTIZATION_DN2
+        return 1.0 / (gain * span), offset / span**2
+
+    def flat_mosaic(self, height: int, width: int) -> Float:
+        """Return the flat field on the CFA, shape (H, W), 1 at the center of each color."""
+        mosaic = np.empty((height, width))
+        step = 1 if self.pattern == "MONO" else 2
+        for field, positions in zip(self.flat, cfa_planes(self.pattern).values(), strict=True):
+            full = field.evaluate(height, width)
+            for row, column in positions:
+                mosaic[row::step, column::step] = full[row::step, column::step]
+        return mosaic
+
+    def to_calibration(
+        self,
+        **about: Unpack[Provenance],
+    ) -> Calibration:
+        """Return this as a `Calibration` of kind "sensor" for one camera."""
+        values: dict[str, Quantity] = {name: getattr(self, name) for name in _PER_COLOR}
+        if self.dark_e_per_s is not None:
+            values["dark_e_per_s"] = self.dark_e_per_s
+        values["white_dn"] = Quantity(np.array(float(self.white_dn)))
+        values["hot_pixels"] = Quantity(np.array(float(self.hot_pixels)))
+        values["chi2_per_dof"] = Quantity(np.array(self.chi2_per_dof))
+        values["flat_coefficients"] = Quantity(
+            np.stack([f.coefficients for f in self.flat]), np.stack([f.stderr for f in self.flat])
+        )
+        values["flat_residual"] = Quantity(np.array([f.residual for f in self.flat]))
+        return of_one_device(
+            "sensor",
+            values,
+            notes={
+                "pattern": self.pattern,
+                "colors": " ".join(self.colors),
+                "saturated_by": ", ".join(self.saturated_by),
+            },
+            **about,
+        )
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration, serial: str) -> "SensorCalibration":
+        """Return the sensor calibration of one camera from a loaded `Calibration`."""
+        get = calibration.quantity
+        coefficients = get(serial, "flat_coefficients")
+        errors = coefficients.stderr
+        if errors is None:
+            errors = np.zeros_like(coefficients.value)
+        residuals = get(serial, "flat_residual").value
+        has_dark = "dark_e_per_s" in calibration.values[serial]
+        return cls(
+            pattern=calibration.notes["pattern"],
+            colors=tuple(calibration.notes["colors"].split()),
+            white_dn=int(get(serial, "white_dn").value),
+            saturated_by=tuple(calibration.notes["saturated_by"].split(", ")),
+            dark_e_per_s=get(serial, "dark_e_per_s") if has_dark else None,
+            flat=tuple(
+                SmoothField(c, np.diag(e**2), float(r))
+                for c, e, r in zip(coefficients.value, errors, residuals, strict=True)
+            ),
+            chi2_per_dof=tuple(float(v) for v in get(serial, "chi2_per_dof").value),
+            hot_pixels=int(get(serial, "hot_pixels").value),
+            **{name: get(serial, name) for name in _PER_COLOR},
+        )
+
+
+_PER_COLOR = (
+    "black_dn",
+    "gain_e_per_dn",
+    "read_noise_e",
+    "saturation_dn",
+    "full_well_e",
+    "nonlinearity",
+    "linearity_deviation",
+    "prnu",
+    "dsnu_dn",
+)
+
+
+def photon_transfer(
+    pairs: Sequence[FlatPair],
+    darks: Sequence[NDArray[np.uint16]],
+    *,
+    white_dn: int,
+    pattern: str = "RGGB",
+    dark_exposures_s: Sequence[float] | None = None,
+    block: int = 16,
+    flat_degree: int = 4,
+) -> SensorCalibration:
+    """Calibrate a sensor from pairs of flats at several amounts of light and darks.
+
+    Parameters
+    ----------
+    pairs : sequence of FlatPair
+        At least three amounts of light, better eight, from 5 % to 90 % of the range or beyond.
+    darks : sequence of ndarray of uint16, shape (H, W)
+        At least two frames without light at the flats' exposure time, DN.
+    white_dn : int
+        White level, DN.
+    pattern : str
+        CFA pattern or "MONO".
+    dark_exposures_s : sequence of float, optional
+        Exposure time of each dark, seconds; with two different times the dark current is found.
+    block : int
+        Side of the blocks the variance is taken over, in pixels of one CFA position.
+    flat_degree : int
+        Degree of the polynomial that describes the flat field.
+
+    Returns
+    -------
+    SensorCalibration
+
+    Raises
+    ------
+    PhotonTransferError
+        If the frames do not allow it.
+
+    Notes
+    -----
+    Assumes uncompressed, linear raw data and one gain for all pixels of a color. The curve:
+    Janesick, Photon Transfer, SPIE Press 2007, doi 10.1117/3.725073.
+    """
+    shape = _check_frames(pairs, darks, dark_exposures_s)
+    colors = cfa_planes(pattern)
+    fits: list[CurveFit] = []
+    dark_fits: list[Darks] = []
+    linear: list[tuple[float, float, float, float]] = []
+    prnu: list[tuple[float, float]] = []
+    flats: list[SmoothField] = []
+    for positions in colors.values():
+        dark = reduce_darks(darks, dark_exposures_s, positions, pattern)
+        levels = [
+            [
+                block_statistics(
+                    plane(pair.first, position, pattern),
+                    plane(pair.second, position, pattern),
+                    black_dn=black,
+                    white_dn=white_dn,
+                    good=good,
+                    block=block,
+                )
+                for position, black, good in zip(positions, dark.black_dn, dark.good, strict=True)
+            ]
+            for pair in pairs
+        ]
+        black = float(np.mean(dark.black_dn))
+        fit = fit_curve(
+            [blocks for level in levels for blocks in level],
+            dark_variance_dn2=dark.variance_dn2,
+            dark_dof=dark.dof,
+            range_dn=white_dn - black,
+        )
+        room = 6.0 * np.sqrt(fit.offset_dn2 + fit.slope_dn * fit.saturation_dn)
+        unsaturated = [
+            max(float(b.signal.max()) for b in level) * 1.05 + room < fit.saturation_dn
+            and not any(b.clipped.any() for b in level)
+            for level in levels
+        ]
+        usable = [pair for pair, ok in zip(pairs, unsaturated, strict=True) if ok]
+        if len({pair.light for pair in usable}) < 3:
+            raise PhotonTransferError(
+                f"photon transfer: {len(usable)} pairs lie below saturation everywhere, expected at"
+                " least three amounts of light; take darker flats"
+            )
+        fits.append(fit)
+        dark_fits.append(dark)
+        linear.append(fit_linearity(usable, positions, pattern, dark))
+        spread, field = _fixed_pattern(
+            usable, positions, pattern, dark, block=block, degree=flat_degree, shape=shape
+        )
+        prnu.append(spread)
+        flats.append(field)
+    return _assemble(pattern, tuple(colors), white_dn, fits, dark_fits, linear, prnu, tuple(flats))
+
+
+def _check_frames(
+    pairs: Sequence[FlatPair],
+    darks: Sequence[NDArray[np.uint16]],
+    dark_exposures_s: Sequence[float] | None,
+) -> tuple[int, int]:
+    if len({pair.light for pair in pairs}) < 3:
+        raise PhotonTransferError(
+            f"photon transfer: got {len({p.light for p in pairs})} amounts of light, expected at"
+            " least 3 (better 8)"
+        )
+    if len(darks) < 2:
+        raise PhotonTransferError(f"photon transfer: got {len(darks)} darks, expected at least 2")
+    shapes = {pair.first.shape for pair in pairs} | {dark.shape for dark in darks}
+    if len(shapes) != 1:
+        raise PhotonTransferError(
+            f"photon transfer: frames have shapes {sorted(shapes)}, expected one shape"
+        )
+    if dark_exposures_s is not None and len(dark_exposures_s) != len(darks):
+        raise PhotonTransferError(
+            f"dark_exposures_s: got {len(dark_exposures_s)} times for {len(darks)} darks"
+        )
+    height, width = darks[0].shape
+    return height, width
+
+
+def _fixed_pattern(
+    pairs: Sequence[FlatPair],
+    positions: tuple[tuple[int, int], ...],
+    pattern: str,
+    dark: Darks,
+    *,
+    block: int,
+    degree: int,
+    shape: tuple[int, int],
+) -> tuple[tuple[float, float], SmoothField]:
+    """Pixel response and flat field from the sums of all first and all second frames."""
+    step = 1 if pattern == "MONO" else 2
+    spreads, values, rows, columns = [], [], [], []
+    for position, black, good in zip(positions, dark.black_dn, dark.good, strict=True):
+        sums = [
+            np.where(
+                good,
+                np.sum([plane(f, position, pattern) - black for f in frames], axis=0),
+                np.nan,
+            )
+            for frames in ([p.first for p in pairs], [p.second for p in pairs])
+        ]
+        spreads.append(pixel_response(sums[0], sums[1], block=block))
+        total = np.where(good, sums[0] + sums[1], 0.0)
+        side = max(min(total.shape) // FLAT_BLOCKS, 1)
+        count = block_sums(good.astype(np.float64), side)
+        r, c = np.nonzero(count >= side * side / 2)
+        values.append(block_sums(total, side)[r, c] / count[r, c])
+        rows.append(position[0] + step * (r * side + (side - 1) / 2))
+        columns.append(position[1] + step * (c * side + (side - 1) / 2))
+    field = fit_smooth_field(
+        np.concatenate(values),
+        np.concatenate(rows),
+        np.concatenate(columns),
+        shape=shape,
+        degree=degree,
+    )
+    return pool(spreads), field
+
+
+def _assemble(
+    pattern: str,
+    colors: tuple[str, ...],
+    white_dn: int,
+    fits: Sequence[CurveFit],
+    darks: Sequence[Darks],
+    linear: Sequence[tuple[float, float, float, float]],
+    prnu: Sequence[tuple[float, float]],
+    flats: tuple[SmoothField, ...],
+) -> SensorCalibration:
+    gain, read, well, saturation, current = [], [], [], [], []
+    for fit, dark in zip(fits, darks, strict=True):
+        g = 1.0 / fit.slope_dn
+        g_error = float(np.sqrt(fit.covariance[1, 1])) * g**2
+        gain.append((g, g_error))
+        read.append(_read_noise(fit))
+        black = float(np.mean(dark.black_dn))
+        saturation_error = float(np.sqrt(fit.offset_dn2))  # pixels differ; of the order of noise
+        saturation.append((black + fit.saturation_dn, saturation_error))
+        well.append(
+            (
+                fit.saturation_dn * g,
+                float(np.hypot(fit.saturation_dn * g_error, saturation_error * g)),
+            )
+        )
+        if dark.slope_dn_per_s is not None:
+            rate, rate_error = dark.slope_dn_per_s
+            current.append((rate * g, float(np.hypot(rate_error * g, rate * g_error))))
+    return SensorCalibration(
+        pattern=pattern,
+        colors=colors,
+        white_dn=white_dn,
+        black_dn=_quantity([(float(np.mean(d.black_dn)), d.black_stderr) for d in darks]),
+        gain_e_per_dn=_quantity(gain),
+        read_noise_e=_quantity(read),
+        saturation_dn=_quantity(saturation),
+        full_well_e=_quantity(well),
+        saturated_by=tuple(fit.saturated_by for fit in fits),
+        nonlinearity=_quantity([(row[0], row[1]) for row in linear]),
+        linearity_deviation=_quantity([(row[2], row[3]) for row in linear]),
+        prnu=_quantity(prnu),
+        dsnu_dn=_quantity([d.dsnu_dn for d in darks]),
+        dark_e_per_s=_quantity(current) if current else None,
+        flat=flats,
+        chi2_per_dof=tuple(fit.chi2_per_dof for fit in fits),
+        hot_pixels=sum(int((~ok).sum()) for d in darks for ok in d.good),
+    )
+
+
+def _read_noise(fit: CurveFit) -> tuple[float, float]:
+    """Read noise in electrons: sqrt(V0 - 1/12) / K, with the error of both."""
+    variance = fit.offset_dn2 - QUANTIZATION_DN2
+    error = float(np.sqrt(fit.covariance[0, 0]))
+    if variance <= 0:
+        return 0.0, float(np.sqrt(max(error, -variance))) / fit.slope_dn
+    noise = float(np.sqrt(variance)) / fit.slope_dn
+    gradient = np.array([noise / (2.0 * variance), -noise / fit.slope_dn])
+    return noise, float(np.sqrt(gradient @ fit.covariance @ gradient))
+
+
+def _quantity(rows: Sequence[tuple[float, float]]) -> Quantity:
+    value, stderr = np.array(rows, dtype=np.float64).T
+    return Quantity(value, stderr)
+
+
+def _combine(quantity: Quantity) -> Quantity:
+    if quantity.stderr is None or not (quantity.stderr > 0).all():
+        return Quantity(np.array(quantity.value.mean()))
+    weight = quantity.stderr**-2
+    return Quantity(
+        np.array((weight * quantity.value).sum() / weight.sum()), np.array(weight.sum() ** -0.5)
+    )

@@ -1,0 +1,1 @@
+"""Camera back ends: GenICam, gphoto2, hot folder and remote cameras."""

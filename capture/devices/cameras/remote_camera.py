@@ -1,0 +1,180 @@
+"""A camera behind a TCP port: ``tcp://HOST:PORT/VIEW``, as ``skinrig serve`` prints it.
+
+Another program can serve its cameras in the same way: see `capture.devices.cameras.camera_wire`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from typing import Any
+
+from capture.devices.camera import (
+    Camera,
+    CameraBusy,
+    CameraError,
+    CameraInfo,
+    CameraUrlError,
+    Exposure,
+    Frame,
+    FrameRefused,
+    FrameTimeout,
+    Trigger,
+)
+from capture.devices.cameras import camera_wire
+from capture.devices.cameras.camera_wire import BadMessage
+from capture.devices.port import LinkLost
+
+__all__ = ["RemoteCamera", "open_camera"]
+
+ANSWER_TIMEOUT_S = 5.0
+"""How long an answer may take beyond what was asked for, s."""
+DEVELOP_TIMEOUT_S = 300.0
+"""How long a frame may take from its arrival until its pixels are sent, s."""
+_KINDS = {"FrameTimeout": FrameTimeout, "CameraBusy": CameraBusy}
+
+
+def open_camera(rest: str) -> Camera:
+    """Open ``tcp://HOST:PORT/VIEW``."""
+    address, slash, view = rest.partition("/")
+    host, colon, port = address.rpartition(":")
+    if not (slash and view and colon and host and port.isdecimal() and 0 < int(port) < 65_536):
+        raise CameraUrlError(f"tcp://{rest}: got {rest!r}, expected HOST:PORT/VIEW")
+    return RemoteCamera(host, int(port), view)
+
+
+class RemoteCamera:
+    """Camera that another program serves.
+
+    Parameters
+    ----------
+    host, port
+        Where it is served.
+    view
+        Which of the cameras there.
+
+    Raises
+    ------
+    LinkLost
+        When nothing answers there.
+    CameraError
+        When no such camera is served there (`CameraBusy`: another program has it).
+    """
+
+    def __init__(self, host: str, port: int, view: str) -> None:
+        self._url = f"tcp://{host}:{port}/{view}"
+        self._id = 0
+        self._received = bytearray()
+        try:
+            self._socket: socket.socket | None = socket.create_connection(
+                (host, port), timeout=ANSWER_TIMEOUT_S
+            )
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except OSError as exc:
+            raise LinkLost(f"cannot open {self._url}: {exc}; is it being served?") from exc
+        try:
+            answer = self._ask("open", version=camera_wire.VERSION, view=view)
+            with self._understood():
+                self._info = camera_wire.info_from_json(answer["info"])
+        except BaseException:
+            self._drop()
+            raise
+
+    @property
+    def info(self) -> CameraInfo:
+        """What it is."""
+        return self._info
+
+    def clock_s(self) -> float:
+        """Return the time on the clock that stamps its frames, s."""
+        with self._understood():
+            return float(self._ask("clock")["clock_s"])
+
+    def configure(self, want: Exposure) -> Exposure:
+        """Set an exposure and return what was really set."""
+        answer = self._ask("configure", exposure_s=want.exposure_s, iso=want.iso)
+        with self._understood():
+            return Exposure(float(answer["exposure_s"]), int(answer["iso"]))
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        """Make ready for `count` frames; frames waiting from before are dropped."""
+        self._ask("arm", count=count, trigger=str(trigger))
+
+    def fire(self) -> None:
+        """Start one exposure."""
+        self._ask("fire")
+
+    def frame(self, timeout_s: float) -> Frame:
+        """Return the next frame, or raise `FrameTimeout`; a damaged one is `FrameRefused`."""
+        answer = self._ask("frame", patience_s=timeout_s, timeout_s=timeout_s)
+        try:
+            camera_wire.check_blob(answer, answer["blob"])
+            return camera_wire.frame_from_message(answer["frame"], answer["blob"])
+        except (BadMessage, KeyError, TypeError) as exc:
+            raise FrameRefused(f"{self._url}: a frame was damaged on its way: {exc!r}") from exc
+
+    def abort(self) -> None:
+        """Give up what was armed."""
+        self._ask("abort")
+
+    def close(self) -> None:
+        """Let go of the camera; doing so twice is allowed."""
+        self._drop()
+
+    def _drop(self) -> None:
+        connection, self._socket = self._socket, None
+        if connection is not None:
+            with contextlib.suppress(OSError):
+                connection.close()
+
+    @contextlib.contextmanager
+    def _understood(self) -> Any:
+        try:
+            yield
+        except (BadMessage, KeyError, TypeError, ValueError) as exc:
+            self._drop()
+            raise CameraError(f"{self._url}: an answer made no sense: {exc!r}") from exc
+
+    def _ask(self, what: str, *, patience_s: float = 0.0, **fields: Any) -> dict[str, Any]:
+        """Send one request and return the fields of its answer, its bytes under ``blob``."""
+        connection = self._socket
+        if connection is None:
+            raise LinkLost(f"{self._url}: the connection is closed; open the camera again")
+        self._id += 1
+        try:
+            connection.settimeout(ANSWER_TIMEOUT_S + patience_s)
+            connection.sendall(camera_wire.encode_message({"id": self._id, "do": what, **fields}))
+            while True:
+                answer = self._message(connection)
+                if answer.get("id") != self._id:
+                    continue
+                if not answer.get("developing"):
+                    break
+                connection.settimeout(DEVELOP_TIMEOUT_S)
+        except (OSError, BadMessage) as exc:
+            self._drop()
+            raise LinkLost(f"{self._url}: the link was lost in {what!r} ({exc})") from exc
+        if answer.get("ok") is not True:
+            kind = _KINDS.get(str(answer.get("error")), CameraError)
+            raise kind(f"{self._url}: {answer.get('text', 'refused without a reason')}")
+        return answer
+
+    def _message(self, connection: socket.socket) -> dict[str, Any]:
+        while (end := self._received.find(b"\n")) < 0:
+            if len(self._received) > camera_wire.MAX_HEADER_BYTES:
+                raise BadMessage("header: too long")
+            self._receive(connection)
+        fields = camera_wire.decode_header(bytes(self._received[:end]))
+        del self._received[: end + 1]
+        size = camera_wire.blob_size(fields)
+        while len(self._received) < size:
+            self._receive(connection)
+        fields["blob"] = bytes(self._received[:size])
+        del self._received[:size]
+        return fields
+
+    def _receive(self, connection: socket.socket) -> None:
+        data = connection.recv(1 << 16)
+        if not data:
+            raise ConnectionResetError("the other end closed the connection")
+        self._received += data
