@@ -19,9 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model import brdf_tables, fresnel, translucency_population
-from model.brdf_tables import BrdfBasis
-from model.dipole_maps import DipoleMaps
+from model import fresnel, translucency_population
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import BrdfBasis
+from model.dipole.maps import DipoleMaps
 from model.skin import SkinAppearance, SkinMap
 
 FloatArray = NDArray[np.float64]

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
-from model.brdf_tables import BrdfBasis
+from model.brdf.tables import BrdfBasis
 from reconstruction import boundary_kernels
 from reconstruction.nnls_kernels import fit_points
 
@@ -195,7 +195,7 @@ def fit_weights(
     samples
         See :func:`surface_samples`; give large sets in chunks of some thousand points.
     basis
-        Materials; see :mod:`model.brdf_tables`.
+        Materials; see :mod:`model.brdf.tables`.
     compress
         "cbrt": misfits count as differences of cube roots, as far as they exceed the noise.
         "none": plain least squares, weighted by the variances where these are known.

@@ -19,8 +19,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.brdf_tables import BrdfBasis
-from model.reduced_spaces import mixture_coordinates
+from model.brdf.tables import BrdfBasis
+from model.traits.reduced_spaces import mixture_coordinates
 from reconstruction import brdf_basis
 
 FloatArray = NDArray[np.float64]

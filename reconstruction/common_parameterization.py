@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_closing, map_coordinates, maximum_filter
 
-from model.texture_masks import fill_smoothly
+from model.texture_statistics.masks import fill_smoothly
 from reconstruction import landmark_field
 from reconstruction.landmark_field import LandmarkField, LandmarkFieldError
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from model import color_table
 from model.facial_color import HemoglobinRig
 from model.skin import UNITS, SkinMap
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import (
     expression_alignment,
     misplacement,

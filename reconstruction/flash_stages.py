@@ -20,7 +20,7 @@ from capture.calibration.sensor.noise_model import QUANTIZATION_DN2
 from capture.session import FrameRecord, Session
 from model import color_table
 from model.skin import UNITS, SkinMap
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import (
     chromophore_posterior,
     dark_spots,

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import spline_filter
 
-from model import fresnel, microfacet
+from model import fresnel
+from model.brdf import microfacet
 
 Floats = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from model.brdf_tables import BrdfBasis
+from model.brdf.tables import BrdfBasis
 from reconstruction import boundary_kernels, mixture_kernels
 from reconstruction.lumitexels import Lumitexels
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, types, uint64
 
-NODES_D, NODES_PHI, NODES_H = 32, 12, 90  # of model.brdf_tables; its tests hold them equal
+NODES_D, NODES_PHI, NODES_H = 32, 12, 90  # of model.brdf.tables; its tests hold them equal
 MOST = 32
 """Most columns in a working set; when it is full, the unused ones leave it."""
 JOIN = 4

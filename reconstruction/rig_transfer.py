@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from model.coarse_maps import Cells
 from model.facial_color import HemoglobinRig, StateMaps
+from model.facial_color.coarse_maps import Cells
 from reconstruction import landmark_field
 
 Floats = NDArray[np.float64]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from model import color_table
 from model.color_table import ColorTable
 from model.skin import SkinMap
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import flash_stages, model_error, shading_prior, shared_melanin
 from reconstruction.perfusion_curves import DiscMeans, disc_means, disc_pixels
 from reconstruction.shading_prior import ShadingPrior

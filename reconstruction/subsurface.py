@@ -129,7 +129,7 @@ def invert(
 
     Examples
     --------
-    >>> from model import dipole
+    >>> from model.dipole import profile as dipole
     >>> r = np.linspace(0.3, 7.05, 28)
     >>> fit = invert(r, dipole.reflectance(r, 0.04, 1.5, 1.4), method="dipole")
     >>> float(fit.sigma_a_per_mm.round(6)), float(fit.sigma_s_prime_per_mm.round(6))
@@ -200,7 +200,7 @@ def nearest_medium(
 
     Examples
     --------
-    >>> from model import photon_table
+    >>> from model.photon_table import table as photon_table
     >>> r = np.linspace(0.3, 7.05, 28)
     >>> profile = 0.5 * photon_table.reflectance(r, 0.1, 2.0, collection="fibre", core_mm=0.2)
     >>> fit = nearest_medium(r, profile, variance=(0.01 * profile) ** 2, core_mm=0.2)
@@ -247,7 +247,7 @@ def fit_dipole(
 
     Examples
     --------
-    >>> from model import dipole
+    >>> from model.dipole import profile as dipole
     >>> r = np.linspace(0.3, 7.05, 28)
     >>> fit = fit_dipole(r, dipole.reflectance(r, 0.25, 2.0, 1.4))
     >>> bool(abs(fit.sigma_tr_per_mm / dipole.effective_transport(0.25, 2.0) - 1.0) < 1e-6)

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from model import diffusion, fresnel, photon_table
+from model import fresnel
+from model.dipole import kienle_patterson as diffusion
+from model.photon_table import table as photon_table
 from reconstruction import subsurface_kernels as kernels
 
 Floats = NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import fresnel
-from model.brdf_tables import BrdfBasis
+from model.brdf.tables import BrdfBasis
 from reconstruction import (
     boundary_kernels,
     brdf_basis,

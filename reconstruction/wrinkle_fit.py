@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model import texture_resampling as resampling
-from model.wrinkle_expressions import CLAMPS, JIMENEZ2011, Clamp, ExpressionTable
-from model.wrinkle_model import WrinkleModel
 from model.wrinkles import Layer, Masks, WrinkleError, mask_stack
+from model.wrinkles.evaluation import WrinkleModel
+from model.wrinkles.expressions import CLAMPS, JIMENEZ2011, Clamp, ExpressionTable
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.wrinkle_texels import (
     TOLERANCE,

@@ -3,7 +3,7 @@
 The half that faces +z and a margin are one chart, by stereographic projection from -z, which keeps
 angles: x of the texture is x in space, and its rows go down with y. Relief is a map on that chart,
 from noise in space (top row of the figure) or grown from patches (bottom row), and follows the
-strain of the sphere's mesh like any other (`model.mesh_strain`, `model.microstructure`).
+strain of the sphere's mesh like any other (`model.microstructure.mesh_strain`, `model.microstructure`).
 
 References
 ----------
@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
-from model import displacement_synthesis, microstructure, strain_fields
-from model.microstructure import FOREHEAD, KernelTable
-from model.volume_noise import VolumeNoise
+from model import microstructure
+from model.displacement_synthesis import growth as displacement_synthesis
+from model.displacement_synthesis.volume_noise import VolumeNoise
+from model.microstructure import FOREHEAD, KernelTable, strain_fields
 
 Floats = NDArray[np.float64]
 Float32Array = NDArray[np.float32]

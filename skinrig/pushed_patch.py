@@ -24,8 +24,8 @@ import scipy.sparse as sparse
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import splu
 
-from model import microstructure, strain_fields
-from model.microstructure import FOREHEAD, KernelTable, MeshStrain
+from model import microstructure
+from model.microstructure import FOREHEAD, KernelTable, MeshStrain, strain_fields
 from skinrig.errors import MissingExtra
 
 Floats = NDArray[np.float64]
@@ -153,7 +153,7 @@ class PushedPatch:
         Returns
         -------
         height_um : ndarray of float32, shape (N, N)
-        strain : model.strain_fields.TextureStrain
+        strain : model.microstructure.strain_fields.TextureStrain
             Ratios and axes at its pixels.
         """
         height = np.asarray(height_um, np.float32)

@@ -29,7 +29,7 @@ from scipy.optimize import brentq, minimize
 from capture import raw
 from capture.rig import load_rig
 from model import color_table
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import model_error
 from rigsim.scenes.flash import FlashScene
 from rigsim.subject import make_subject

@@ -50,8 +50,8 @@ import numpy as np
 from numba import njit
 from scipy.interpolate import BSpline
 
-from model import photon_kernels as kernels
-from model.photon_medium import asymptotic_decay, root_spline_matrix
+from model.photon_table import kernels
+from model.photon_table.medium import asymptotic_decay, root_spline_matrix
 
 ETAS = np.array([1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6])
 NUMERICAL_APERTURE = 0.22

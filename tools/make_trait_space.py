@@ -30,10 +30,10 @@ from pathlib import Path
 
 import numpy as np
 
-from model import brdf_tables
-from model.texture_space import TextureSpace
-from model.trait_storage import PACKAGED, TraitLibrary, from_bytes
+from model.brdf import tables as brdf_tables
+from model.texture_statistics.space import TextureSpace
 from model.traits import TraitSpace, cosine
+from model.traits.storage import PACKAGED, TraitLibrary, from_bytes
 from reconstruction import brdf_basis, common_regions
 from rigsim.population import Member, shifted, table_1
 from rigsim.skin_conditions import CONDITIONS

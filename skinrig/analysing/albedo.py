@@ -17,9 +17,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from model import texture_histograms
-from model.texture_histograms import GroupHistograms
-from model.texture_space import TextureSpace
+from model.texture_statistics import histograms as texture_histograms
+from model.texture_statistics.histograms import GroupHistograms
+from model.texture_statistics.space import TextureSpace
 from reconstruction import common_regions
 from skinrig import consent, face_textures
 from skinrig.fitting import traits

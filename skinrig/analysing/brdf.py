@@ -15,8 +15,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from model import brdf_tables, store
-from model.brdf_tables import BrdfBasis
+from model import store
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import BrdfBasis
 from model.skin import SkinMap
 from reconstruction import brdf_space
 from reconstruction.brdf_space import SpaceCurve

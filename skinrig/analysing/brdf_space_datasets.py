@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.rig import load_rig
-from model import brdf_tables, fresnel
+from model import fresnel
+from model.brdf import tables as brdf_tables
 from reconstruction import brdf_basis, brdf_space, diffuse_albedo
 from rigsim import surface_brdf
 from rigsim.mesh import Float32Array

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from model.brdf_tables import BrdfBasis
+from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis
 from reconstruction.brdf_space import SpaceCurve
 

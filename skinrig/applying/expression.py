@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from model import color_table, facial_color, store
+from model import color_table, store
 from model.facial_color import HemoglobinRig
+from model.facial_color import rig as facial_color
 from model.skin import UNITS, SkinAppearance, SkinMap
-from model.tissue_optics import ANISOTROPY_SKIN
-from model.wrinkle_expressions import ROW_OF_STATE, Clamp
-from model.wrinkle_model import FILE as WRINKLE_FILE
-from model.wrinkle_model import WrinkleModel
+from model.tissue_optics.layers import ANISOTROPY_SKIN
+from model.wrinkles.evaluation import FILE as WRINKLE_FILE
+from model.wrinkles.evaluation import WrinkleModel
+from model.wrinkles.expressions import ROW_OF_STATE, Clamp
 from skinrig import consent, dynamic_appearance
 from skinrig.dynamic_appearance import FACIAL_COLOR, PARTS, WRINKLES
 from skinrig.errors import UsageError
@@ -264,7 +265,7 @@ def _source(appearance: SkinAppearance, expression: Expression) -> str:
 
 def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
     """Return the hemoglobin rig that an appearance holds."""
-    from model.facial_color_document import DOCUMENT, from_maps_and_document
+    from model.facial_color.document import DOCUMENT, from_maps_and_document
 
     return from_maps_and_document(appearance.maps, appearance.files[DOCUMENT])
 

@@ -15,16 +15,11 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from model.displacement_convolution import (
-    LineKernels,
-    Sampling,
-    Window,
-    convolve_tiled,
-    tiles_of,
-)
-from model.mesh_strain import MeshStrain, strain
 from model.microstructure import ALPHA_LIMITS, FOREHEAD, KernelTable
-from model.strain_fields import KernelRegions, rasterize, regional_kernels
+from model.microstructure.convolution import LineKernels, Sampling, convolve_tiled, tiles_of
+from model.microstructure.map_windows import Window
+from model.microstructure.mesh_strain import MeshStrain, strain
+from model.microstructure.strain_fields import KernelRegions, rasterize, regional_kernels
 from skinrig.blend_shapes import BlendShapeMesh
 
 Float32 = NDArray[np.float32]
@@ -65,7 +60,7 @@ class MicrostructureReport:
     clipped_share : float
         Of the vertices: an alpha that the table's lines have beyond [-2, 1].
     invalid_share, degenerate_share, uv_degenerate_share, uv_turned_share : float
-        Of the vertices: without strain. Of the triangles: as in `model.mesh_strain.MeshStrain`.
+        Of the vertices: without strain. Of the triangles: as in `model.microstructure.mesh_strain.MeshStrain`.
     covered_share : float
         Of the pixels: within a triangle of the texture. Others keep the neutral relief.
     changed_share : float
@@ -156,7 +151,7 @@ def apply_microstructure(
     extrapolate : {"hold", "formula"}
         Beyond the table's range: see `model.microstructure.kernel_parameters`.
     sampling : {"cubic", "linear"}
-        As of `model.displacement_convolution.convolve`.
+        As of `model.microstructure.convolution.convolve`.
     tile : int
         Pixels a side that are computed at a time; the result does not depend on it.
     out : path, optional

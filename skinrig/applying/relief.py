@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from model import displacement_synthesis
+from model.displacement_synthesis import growth as displacement_synthesis
+from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import KernelTable
+from model.microstructure.strain_fields import KernelRegions
 from model.skin import SkinAppearance, SkinMap
-from model.strain_fields import KernelRegions
-from model.volume_noise import VolumeNoise
 from skinrig import blend_shapes
 from skinrig.applying.expression import Applied, ApplyError
 from skinrig.applying.microstructure import apply_microstructure

@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 from model import color_table
 from model.color_table import ColorTable
 from model.facial_color import HemoglobinRig
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import expression_alignment
 from rigsim.subject import Subject, make_subject
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from model import brdf_tables, microfacet
-from model.brdf_tables import BrdfBasis
+from model.brdf import microfacet
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
 from skinrig import brdf_truth
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, Timing, measure, once

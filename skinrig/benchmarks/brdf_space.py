@@ -7,7 +7,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from model import brdf_tables
+from model.brdf import tables as brdf_tables
 from reconstruction import brdf_space
 from skinrig.analysing import brdf_space_datasets
 from skinrig.analysing.brdf_space_datasets import Dataset

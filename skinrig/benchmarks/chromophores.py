@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from model import color_table, metrics
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import median_error

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import color_table, fresnel, photon_table
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import (
     chromophores,
     diffuse_albedo,

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from model import blood_errors, disc_statistics, histogram_matching, metrics
-from model.facial_color import HemoglobinRig
+from model import metrics
+from model.facial_color import HemoglobinRig, blood_errors, disc_statistics, histogram_matching
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure
 
 Floats = NDArray[np.float64]

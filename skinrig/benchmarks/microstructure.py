@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from model.displacement_convolution import (
+from model.microstructure import FOREHEAD, KernelTable, kernel_parameters
+from model.microstructure.convolution import (
     LineKernels,
     Sampling,
-    Window,
     convolve,
     convolve_tiled,
     tiles_of,
 )
-from model.mesh_strain import strain
-from model.microstructure import FOREHEAD, KernelTable, kernel_parameters
-from model.strain_fields import rasterize
+from model.microstructure.map_windows import Window
+from model.microstructure.mesh_strain import strain
+from model.microstructure.strain_fields import rasterize
 from reconstruction import kernel_fit, kernel_table, normal_histogram, relief_slopes
 from rigsim.microrelief import MicroSkin, make_micro_skin
 from rigsim.skin_stretch import StretchedSkin, deform

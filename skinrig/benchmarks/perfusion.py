@@ -13,7 +13,7 @@ from scipy.optimize import OptimizeWarning, curve_fit
 from capture.plan.multiplexed import multiplexed_plan, phases
 from capture.rig import load_rig
 from model import color_table
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.perfusion_curves import FALSE_ALARM, transition
 from reconstruction.perfusion_fit import RelaxationFit, fit_cycle
 from rigsim.perfusion_course import PromptedCourse

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.rig import load_rig
-from model import brdf_tables, skin_reflectance
-from model.brdf_tables import BrdfBasis
+from model import skin_reflectance
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, diffuse_albedo
 from reconstruction.brdf_basis import SurfaceSamples
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure

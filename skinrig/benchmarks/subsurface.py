@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from model import diffusion
+from model.dipole import kienle_patterson as diffusion
 from reconstruction import subsurface
 from reconstruction.subsurface_models import Method
 from rigsim.fibre_profile import fibre_profile

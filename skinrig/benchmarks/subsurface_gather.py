@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from model import dipole_sum
-from model.dipole_gather import TOLERANCE, SourceTree, gather
-from model.dipole_sum import Media, exitance_directly
+from model.dipole import direct_sum as dipole_sum
+from model.dipole.direct_sum import Media, exitance_directly
+from model.dipole.gather import TOLERANCE, SourceTree, gather
 from model.fresnel import ETA_SKIN
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, Timing, measure
 from skinrig.skin_bands import MELANIN_BANDS

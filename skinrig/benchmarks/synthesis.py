@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import ndtri
 
-from model import displacement_synthesis
+from model.displacement_synthesis import growth as displacement_synthesis
 from reconstruction import normal_histogram, relief_slopes
 from rigsim.microrelief import make_micro_skin
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure

@@ -10,10 +10,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model import steerable_pyramid
-from model.texture_histograms import distance
-from model.texture_space import TextureSpace
-from model.texture_statistics import describe, match
+from model.texture_statistics import describe, match, steerable_pyramid
+from model.texture_statistics.histograms import distance
+from model.texture_statistics.space import TextureSpace
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure
 
 Floats = NDArray[np.float64]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from model import color_table, metrics, spectra, tissue_optics
+from model import color_table, metrics, spectra
+from model.tissue_optics import layers as tissue_optics
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import median_error
 from skinrig.skin_bands import MELANIN_BANDS, melanin_band

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model import brdf_tables, lobe_edits, reduced_spaces
-from model.reduced_spaces import SpaceKind
-from model.traits import TraitSpace, cosine
+from model.brdf import tables as brdf_tables
+from model.traits import TraitSpace, cosine, lobe_edits, reduced_spaces
+from model.traits.reduced_spaces import SpaceKind
 from reconstruction import brdf_basis, common_regions
 from rigsim.population import Member, shifted, table_1
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from model import metrics, wrinkle_differences, wrinkle_storage, wrinkles
+from model import metrics, wrinkles
 from model import texture_resampling as resampling
 from model.wrinkles import JIMENEZ2011, Layer
+from model.wrinkles import differences as wrinkle_differences
+from model.wrinkles import storage as wrinkle_storage
 from reconstruction import wrinkle_fit, wrinkle_texels, wrinkle_weights
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure, once
 

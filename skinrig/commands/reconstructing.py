@@ -81,7 +81,7 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
     if rank is None or (basis is not None and not basis.is_dir()):
         return
     if basis is None:
-        from model import brdf_recipe
+        from model.brdf import recipe as brdf_recipe
 
         most = sum(1 for _ in brdf_recipe.materials())
     else:

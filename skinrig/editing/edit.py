@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from model.trait_storage import TraitLibrary
-from model.trait_vectors import DOUBTFUL_P, TraitVector
+from model.traits.storage import TraitLibrary
+from model.traits.vectors import DOUBTFUL_P, TraitVector
 from reconstruction import common_regions
 from skinrig import consent, face_textures
 from skinrig.editing import albedo as editing_albedo

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from model import color_table
 from model.color_table import ColorTable
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]

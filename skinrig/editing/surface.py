@@ -1,4 +1,4 @@
-"""Lobes with more or less of some traits: `model.lobe_edits` on an appearance's maps."""
+"""Lobes with more or less of some traits: `model.traits.lobe_edits` on an appearance's maps."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model import lobe_edits
 from model.skin import SkinMap
-from model.traits import TraitSpace
+from model.traits import TraitSpace, lobe_edits
 from skinrig.editing.surface_mixtures import SurfaceMixtures
 
 Floats = NDArray[np.float64]
@@ -58,7 +57,7 @@ def edit_surface(
 
     Raises
     ------
-    model.trait_vectors.TraitError
+    model.traits.vectors.TraitError
         For other materials, and more than 15 lobes.
     """
     weights = source.weights()

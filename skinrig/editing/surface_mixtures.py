@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from model import brdf_tables
-from model.brdf_tables import BrdfBasis
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import BASIS_FILE, WEIGHT
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import metrics
-from model.facial_color import NEUTRAL, HemoglobinRig
+from model.facial_color import HemoglobinRig
+from model.facial_color.rig import NEUTRAL
 from model.skin import SkinAppearance, SkinMap
 
 Map = NDArray[np.floating[Any]]

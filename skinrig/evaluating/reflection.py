@@ -10,8 +10,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from model import brdf_tables, metrics
-from model.brdf_tables import BrdfBasis
+from model import metrics
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance
 from reconstruction import brdf_basis
 from reconstruction.dome_stages import BASIS_FILE, weight_names

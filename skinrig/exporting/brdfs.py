@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from model import fresnel, merl, rgl, skin_reflectance
-from model.brdf_tables import BrdfBasis
+from model import fresnel, merl, skin_reflectance
+from model.brdf import rgl
+from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance
 from skinrig.errors import UsageError
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from model import wrinkles
 from model.skin import SkinAppearance
 from model.texture_resampling import resampled
-from model.wrinkle_model import FILE as WRINKLE_FILE
-from model.wrinkle_model import WrinkleModel
+from model.wrinkles.evaluation import FILE as WRINKLE_FILE
+from model.wrinkles.evaluation import WrinkleModel
 from skinrig import dynamic_appearance
 from skinrig.dynamic_appearance import FACIAL_COLOR, MICROSTRUCTURE, WRINKLES
 from skinrig.exporting import color_deltas, detail_maps

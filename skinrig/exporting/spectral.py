@@ -115,7 +115,7 @@ def band_means_nm(camera: str, illuminant: str) -> NDArray[np.float64]:
 
 def _reflectance(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
     from model import color_table, spectra
-    from model.tissue_optics import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
+    from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 
     melanin, blood = appearance.maps["melanin"], appearance.maps["hemoglobin"]
     if melanin.values.shape != blood.values.shape:

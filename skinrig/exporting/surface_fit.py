@@ -14,8 +14,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model import brdf_tables, merl, microfacet
-from model.brdf_tables import BrdfBasis
+from model import merl
+from model.brdf import microfacet
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import BrdfBasis
 
 Floats = NDArray[np.float64]
 

@@ -88,7 +88,8 @@ def _each_refused(calls: list[tuple[str, Callable[[float], object]]]) -> str:
 
 
 def _no_numbers_in_media(real: Real) -> str:
-    from model import diffusion, dipole, tissue_optics
+    from model import dipole, tissue_optics
+    from model.dipole import kienle_patterson as diffusion
 
     def stack(value: float) -> object:
         return tissue_optics.layer_stack_reflectance(
@@ -176,7 +177,7 @@ def _mirror_and_chalk(real: Real) -> str:
 
 
 def _conditions(real: Real) -> str:
-    from model import reduced_spaces
+    from model.traits import reduced_spaces
 
     rng = np.random.default_rng(0)
     one = rng.random(20)

@@ -100,7 +100,7 @@ def _profile_beyond_numbers(real: Real) -> str:
 
 
 def _layers_of_no_medium(real: Real) -> str:
-    from model import adding_doubling, layered_diffusion
+    from model.tissue_optics import adding_doubling, layered_diffusion
 
     told = 0
     for solver in (adding_doubling, layered_diffusion):
@@ -115,7 +115,7 @@ def _layers_of_no_medium(real: Real) -> str:
 
 
 def _nothing_to_continue(real: Real) -> str:
-    from model import texture_masks
+    from model.texture_statistics import masks as texture_masks
 
     image = as_real(np.full((7, 5, 3), 0.4), real)
     refused(lambda: texture_masks.fill_smoothly(image, np.zeros((7, 5), bool)), ValueError, "valid")

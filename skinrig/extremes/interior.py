@@ -30,7 +30,7 @@ def _patch(real: Real, *, step_mm: float = 0.5, count: int = 20):  # type: ignor
 
 
 def _even(real: Real) -> str:
-    from model.dipole_gather import exitance
+    from model.dipole.gather import exitance
 
     place, area = _patch(real)
     light = as_real(np.full((len(area), 3), 3.0), real)
@@ -44,7 +44,7 @@ def _even(real: Real) -> str:
 
 
 def _coarse(real: Real) -> str:
-    from model.dipole_gather import exitance
+    from model.dipole.gather import exitance
 
     place, area = _patch(real, step_mm=5.0)
     light = as_real(1.0 + np.sin(place.astype(np.float64)), real)
@@ -53,8 +53,8 @@ def _coarse(real: Real) -> str:
 
 
 def _above_one(real: Real) -> str:
-    from model.dipole_gather import exitance
-    from model.dipole_maps import DipoleMaps
+    from model.dipole.gather import exitance
+    from model.dipole.maps import DipoleMaps
 
     found = DipoleMaps.of(as_real([[[1.2, 1.0, 0.5]]], real), as_real(2.0, real), eta=1.4)
     if found.outlier.tolist() != [[[True, False, False]]]:
@@ -66,7 +66,7 @@ def _above_one(real: Real) -> str:
 
 
 def _inverse(real: Real) -> str:
-    from model.dipole_maps import DipoleMaps
+    from model.dipole.maps import DipoleMaps
 
     lost = np.geomspace(1e-9 if real is np.float64 else 1e-6, 0.999999, 60)
     found = DipoleMaps.of((1.0 - as_real(lost, real))[:, None], [1.0], eta=1.4)
@@ -75,7 +75,7 @@ def _inverse(real: Real) -> str:
 
 
 def _single(real: Real) -> str:
-    from model.dipole_gather import exitance
+    from model.dipole.gather import exitance
 
     one = as_real([[1.0, 2.0, 3.0]], real)
     return near(exitance(one, as_real([0.1], real), one, one, 0.5, 1.0), [[0.5, 1.0, 1.5]],
@@ -83,8 +83,8 @@ def _single(real: Real) -> str:
 
 
 def _empty(real: Real) -> str:
-    from model.dipole_gather import exitance
-    from model.dipole_maps import DipoleMaps
+    from model.dipole.gather import exitance
+    from model.dipole.maps import DipoleMaps
 
     shape = (2, 2, 3)
     found = DipoleMaps.of(
@@ -97,7 +97,7 @@ def _empty(real: Real) -> str:
 
 
 def _folded(real: Real) -> str:
-    from model.dipole_gather import exitance
+    from model.dipole.gather import exitance
 
     place, area = _patch(real)
     both = np.concatenate([place, place + as_real([0.0, 0.0, 1e-3], real)])
@@ -108,7 +108,7 @@ def _folded(real: Real) -> str:
 
 
 def _opaque(real: Real) -> str:
-    from model.dipole_gather import GatherError, exitance
+    from model.dipole.gather import GatherError, exitance
 
     place, area = _patch(real)
     light = as_real(np.ones((len(area), 3)), real)

@@ -24,7 +24,7 @@ def _samples(value, real: Real, *, points: int = 3, count: int = 40):  # type: i
 
 
 def _dark_surface(real: Real) -> str:
-    from model import brdf_tables
+    from model.brdf import tables as brdf_tables
     from reconstruction import brdf_basis
 
     found = brdf_basis.fit_weights(
@@ -34,7 +34,7 @@ def _dark_surface(real: Real) -> str:
 
 
 def _negative_surface(real: Real) -> str:
-    from model import brdf_tables
+    from model.brdf import tables as brdf_tables
     from reconstruction import brdf_basis
 
     found = brdf_basis.fit_weights(
@@ -44,7 +44,7 @@ def _negative_surface(real: Real) -> str:
 
 
 def _twins(real: Real) -> str:
-    from model import brdf_tables
+    from model.brdf import tables as brdf_tables
     from reconstruction import brdf_basis
 
     basis = brdf_tables.default()
@@ -61,7 +61,7 @@ def _twins(real: Real) -> str:
 
 
 def _ill_conditioned(real: Real) -> str:
-    from model import brdf_tables
+    from model.brdf import tables as brdf_tables
     from reconstruction import brdf_basis
 
     basis = brdf_tables.default()
@@ -81,7 +81,7 @@ def _ill_conditioned(real: Real) -> str:
 
 
 def _no_samples(real: Real) -> str:
-    from model import brdf_tables
+    from model.brdf import tables as brdf_tables
     from reconstruction import brdf_basis
 
     samples = _samples(lambda light, view: np.full(light.shape[:-1], np.nan), real)
@@ -137,7 +137,7 @@ def _conditions(real: Real) -> str:
 
 
 def _mirror_like(real: Real) -> str:
-    from model import brdf_tables
+    from model.brdf import tables as brdf_tables
 
     basis = brdf_tables.default(0.0)
     up = as_real([0.0, 0.0, 1.0], real)

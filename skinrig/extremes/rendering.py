@@ -127,7 +127,7 @@ def _tilted(degrees: float) -> NDArray[np.float64]:
 
 
 def _grazing(real: Real) -> str:
-    from model import microfacet
+    from model.brdf import microfacet
 
     values = [_surface(_tilted(d), 0.3, real)[0] for d in (0.0, 60.0, 89.0, 89.9)]
     cosine = math.cos(math.radians(89.9))
@@ -147,7 +147,7 @@ def _grazing(real: Real) -> str:
 
 
 def _roughness_ends(real: Real) -> str:
-    from model import microfacet
+    from model.brdf import microfacet
 
     sharp = microfacet.brdf(
         real(1.0), real(1.0), real(1.0), real(1.0), roughness=0.01, eta=1.4, kind="ggx"

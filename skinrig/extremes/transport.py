@@ -92,7 +92,8 @@ def _black_medium(real: Real) -> str:
 
 
 def _radius_ends(real: Real) -> str:
-    from model import diffusion, dipole
+    from model import dipole
+    from model.dipole import kienle_patterson as diffusion
 
     r = as_real([0.0, 1e-9, 1e-3, 1e2, 1e4], real)
     one = dipole.reflectance(r, real(0.02), real(1.0), 1.4)

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from model import facial_color_document, store
+from model import store
 from model.facial_color import FacialColorError
+from model.facial_color import document as facial_color_document
 from model.skin import SkinMap
 from reconstruction import facial_color_fit, landmark_table, state_images
 from reconstruction.facial_color_fit import FacialColorFit, UnknownBloodError

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import store
-from model.texture_space import TextureSpace
-from model.trait_storage import TraitLibrary
-from model.trait_vectors import Contrast
+from model.texture_statistics.space import TextureSpace
 from model.traits import TraitSpace
+from model.traits.storage import TraitLibrary
+from model.traits.vectors import Contrast
 from reconstruction import brdf_basis, common_regions
 from reconstruction.common_parameterization import CommonFrame
 from skinrig import consent, face_textures

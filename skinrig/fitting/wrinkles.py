@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from model import store
 from model.skin import SkinAppearance
-from model.wrinkle_model import FILE as WRINKLE_FILE
+from model.wrinkles.evaluation import FILE as WRINKLE_FILE
 from reconstruction.dome_stages import MESH_FILE
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.tangent_space import SMOOTHING_MM, tangent_normals

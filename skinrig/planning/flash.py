@@ -107,7 +107,7 @@ def sight(rig: Rig, subject: str, *, seed: int = 0, width_px: int = WIDTH_PX) ->
         Pixels across; fewer see the same face with the same noise a pixel.
     """
     from model import color_table
-    from model.tissue_optics import ANISOTROPY_SKIN
+    from model.tissue_optics.layers import ANISOTROPY_SKIN
     from rigsim import subject_file
     from rigsim.scenes.flash import FlashScene
     from rigsim.sensor import sensor_of, vignetting_map

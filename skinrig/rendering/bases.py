@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from model.brdf_tables import BrdfBasis
+from model.brdf.tables import BrdfBasis
 from model.skin_reflectance import SkinReflectance
 from reconstruction import brdf_basis
 

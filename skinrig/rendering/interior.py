@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model import dipole_gather
-from model.dipole_gather import SourceTree
+from model.dipole import gather as dipole_gather
+from model.dipole.gather import SourceTree
 from model.skin_reflectance import transmitted
 from rigsim.atlas import unwrap
 from rigsim.mesh import Float32Array

@@ -20,7 +20,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from model.dipole_gather import TOLERANCE
+from model.dipole.gather import TOLERANCE
 from model.skin_reflectance import SkinReflectance, lobe_brdf, transmitted
 from rigsim.mesh import Float32Array, Mesh, build_mesh
 from rigsim.render import Caster, GBuffer, trace

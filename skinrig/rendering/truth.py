@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from model import brdf_tables
-from model.brdf_tables import BrdfBasis
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import BrdfBasis
 from model.skin_reflectance import SkinReflectance
 from rigsim import surface_brdf
 from rigsim.atlas import spread

@@ -168,7 +168,7 @@ def identifiability(appearances: Iterable[SkinAppearance]) -> str:
 
 def _of_table(camera: str, illuminant: str) -> str:
     from model import color_table
-    from model.tissue_optics import ANISOTROPY_SKIN
+    from model.tissue_optics.layers import ANISOTROPY_SKIN
     from reconstruction import chromophores, model_error
 
     table = color_table.build(camera, illuminant, anisotropy=ANISOTROPY_SKIN)

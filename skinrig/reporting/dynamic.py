@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from model import microstructure
 from model.microstructure import KernelTable
 from model.skin import SkinAppearance, SkinMap
-from model.wrinkle_expressions import clamped, zone_sums
-from model.wrinkle_model import FILE as WRINKLE_FILE
-from model.wrinkle_model import WrinkleModel
+from model.wrinkles.evaluation import FILE as WRINKLE_FILE
+from model.wrinkles.evaluation import WrinkleModel
+from model.wrinkles.expressions import clamped, zone_sums
 from skinrig.dynamic_appearance import FACIAL_COLOR, KIND, MICROSTRUCTURE, WRINKLES, parts_of
 from skinrig.reporting import facial_color, figures, map_pictures, page
 

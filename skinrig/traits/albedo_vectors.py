@@ -15,11 +15,11 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model import histogram_transport, texture_statistics
-from model.feasible_sets import Free, Histograms
-from model.texture_space import TextureSpace
-from model.trait_vectors import Contrast
-from model.traits import TraitSpace
+from model import texture_statistics
+from model.texture_statistics.space import TextureSpace
+from model.traits import TraitSpace, histogram_transport
+from model.traits.feasible_sets import Free, Histograms
+from model.traits.vectors import Contrast
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]

@@ -12,10 +12,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from model import trait_storage
-from model.texture_space import TextureError, TextureSpace
-from model.trait_storage import TraitLibrary
+from model.texture_statistics.space import TextureError, TextureSpace
 from model.traits import TraitSpace
+from model.traits import storage as trait_storage
+from model.traits.storage import TraitLibrary
 from reconstruction import common_regions
 from reconstruction.common_parameterization import CommonFrame
 from skinrig.traits.albedo_vectors import KINDS, AlbedoTraits, VectorKind

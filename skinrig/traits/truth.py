@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.brdf_tables import BrdfBasis
+from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis, common_parameterization, diffuse_albedo
 from reconstruction.common_parameterization import Chart, CommonFrame
 from rigsim import skin_conditions, surface_brdf

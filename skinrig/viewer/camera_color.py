@@ -113,7 +113,7 @@ def _tabulated(appearance: SkinAppearance, path: Path) -> CameraColor | None:
     """Return a matrix between colors of skin, where a session beside names sensor and light."""
     from capture.session import Session, SessionError
     from model import color_table, spectra
-    from model.tissue_optics import ANISOTROPY_SKIN
+    from model.tissue_optics.layers import ANISOTROPY_SKIN
 
     name: Any = appearance.parameters.get("session")
     if not isinstance(name, str):

@@ -20,8 +20,9 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from model import brdf_tables, merl
-from model.brdf_tables import NODES_D, NODES_H, NODES_PHI, BrdfBasis
+from model import merl
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import NODES_D, NODES_H, NODES_PHI, BrdfBasis
 
 FloatArray = NDArray[np.float64]
 Form = Literal["table", "factors", "log factors"]
@@ -47,7 +48,7 @@ class CompactBrdf:
     detail : int
         Slabs of phi_d, or rank.
     table : ndarray of float64, shape (32, 12, 90, K)
-        1/sr, what a page reads back at the nodes of `model.brdf_tables`.
+        1/sr, what a page reads back at the nodes of `model.brdf.tables`.
     numbers : int
         Stored values, of 16 bits each.
     lookups : int

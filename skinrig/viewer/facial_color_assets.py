@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import color_table, spectra
-from model.facial_color import GLOBAL_GAINS, NEUTRAL, HemoglobinRig
-from model.tissue_optics import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
+from model.facial_color import HemoglobinRig
+from model.facial_color.rig import GLOBAL_GAINS, NEUTRAL
+from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from skinrig.dynamic_appearance import FACIAL_COLOR, parts_of
 from skinrig.viewer import camera_color
 from skinrig.viewer.camera_color import CameraColor

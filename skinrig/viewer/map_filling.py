@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from model.coarse_maps import Cells, fitting
+from model.facial_color.coarse_maps import Cells, fitting
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -214,7 +214,7 @@ def with_displacement(
 
 def px_per_mm(mesh: ViewerMesh) -> Floats:
     """Return texture units per mm of skin at the vertices of a mesh, by the root of areas."""
-    from model.mesh_strain import strain
+    from model.microstructure.mesh_strain import strain
 
     rest = mesh.positions.astype(np.float64)
     found = strain(rest, rest, mesh.faces, mesh.uv)

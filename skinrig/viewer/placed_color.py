@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from model.coarse_maps import fitting
-from model.facial_color import NEUTRAL, HemoglobinRig
-from model.facial_color_document import DOCUMENT
+from model.facial_color import HemoglobinRig
+from model.facial_color.coarse_maps import fitting
+from model.facial_color.document import DOCUMENT
+from model.facial_color.rig import NEUTRAL
 from skinrig.dynamic_appearance import FACIAL_COLOR, parts_of
 from skinrig.viewer import placing
 from skinrig.viewer.facial_color_assets import RIG_SIZE, FaceColor, Floats

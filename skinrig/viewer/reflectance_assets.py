@@ -13,11 +13,13 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from model import brdf_tables, color_table, skin_reflectance, spectra, trait_storage
-from model.brdf_tables import BrdfBasis
+from model import color_table, skin_reflectance, spectra
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import TRANSLUCENCY
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
+from model.traits import storage as trait_storage
 from reconstruction import texture_fill
 from skinrig.viewer import compact_brdf, gaussian_profiles
 from skinrig.viewer.compact_brdf import LANES, CompactBrdf

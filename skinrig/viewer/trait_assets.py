@@ -1,7 +1,7 @@
 """Trait sliders for the page: changes of lobe shares, and factors of the albedo.
 
 Surface traits move shares of few lobes to the nearest ones of at least 0, which the page finds
-itself. What its way leaves out is measured against `model.lobe_edits` and told:
+itself. What its way leaves out is measured against `model.traits.lobe_edits` and told:
 `LobeTraits.held_error`. Traits of the albedo are in `albedo_trait_assets`.
 
 References
@@ -19,10 +19,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from model import brdf_tables, lobe_edits, reduced_spaces, trait_storage
-from model.brdf_tables import BrdfBasis
-from model.trait_vectors import DOUBTFUL_P, TraitVector
-from model.traits import TraitSpace
+from model.brdf import tables as brdf_tables
+from model.brdf.tables import BrdfBasis
+from model.traits import TraitSpace, lobe_edits, reduced_spaces
+from model.traits import storage as trait_storage
+from model.traits.vectors import DOUBTFUL_P, TraitVector
 from skinrig.viewer.compact_brdf import LANES
 from skinrig.viewer.reflectance_assets import PageLobes
 

@@ -1,6 +1,6 @@
 """What the page needs to wrinkle: base derivatives, wrinkle maps, zones, and who moves them.
 
-Maps are those of `model.wrinkle_model`: fitted (`skinrig fit wrinkles`) where a folder has them,
+Maps are those of `model.wrinkles.evaluation`: fitted (`skinrig fit wrinkles`) where a folder has them,
 otherwise fitted to the simulated person's own expressions. The page adds them as
 `model.wrinkles.combine_layers` does.
 """
@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.texture_resampling import resampled
-from model.wrinkle_expressions import as_table
-from model.wrinkle_model import FILE, WrinkleModel
 from model.wrinkles import Layer, decode, encode, mask_textures
+from model.wrinkles.evaluation import FILE, WrinkleModel
+from model.wrinkles.expressions import as_table
 from skinrig.viewer.map_filling import filled
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 

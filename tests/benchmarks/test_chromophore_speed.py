@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from model import color_table
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import invert
 
 

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from model.displacement_convolution import LineKernels, Window, convolve
-from model.mesh_strain import MeshStrain, strain
 from model.microstructure import FOREHEAD
-from model.strain_fields import TextureStrain, line_kernels, rasterize
+from model.microstructure.convolution import LineKernels, convolve
+from model.microstructure.map_windows import Window
+from model.microstructure.mesh_strain import MeshStrain, strain
+from model.microstructure.strain_fields import TextureStrain, line_kernels, rasterize
 from skinrig.viewer.packing import as_packed
 from skinrig.viewer.relief_growth import GrownRelief
 

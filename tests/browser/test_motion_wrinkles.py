@@ -10,9 +10,9 @@ import pytest
 from scipy import ndimage
 
 from model import wrinkles
-from model.wrinkle_expressions import ExpressionTable
-from model.wrinkle_model import WrinkleModel
 from model.wrinkles import Layer
+from model.wrinkles.evaluation import WrinkleModel
+from model.wrinkles.expressions import ExpressionTable
 from skinrig.viewer import page, wrinkle_assets
 from skinrig.viewer.packing import as_packed
 

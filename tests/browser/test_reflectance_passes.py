@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from model import brdf_tables, skin_reflectance
+from model import skin_reflectance
+from model.brdf import tables as brdf_tables
 from skinrig.viewer import reflectance_assets, trait_assets
 from skinrig.viewer.albedo_trait_assets import AlbedoTraits
 from skinrig.viewer.packing import as_packed

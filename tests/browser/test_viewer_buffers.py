@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model import color_table, facial_specular, screen_scattering, spectra, tone_mapping
-from model.facial_color import GLOBAL_GAINS, HemoglobinRig, StateMaps
-from model.tissue_optics import ANISOTROPY_SKIN
+from model import color_table, spectra
+from model.facial_color import HemoglobinRig, StateMaps
+from model.facial_color.rig import GLOBAL_GAINS
+from model.real_time import facial_specular, screen_scattering, tone_mapping
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from skinrig.viewer import packing, page
 from skinrig.viewer.scene import Texture
 

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from model import color_table, merl, metrics, microfacet, skin_reflectance, spectra
-from model.tissue_optics import ANISOTROPY_SKIN
+from model import color_table, merl, metrics, skin_reflectance, spectra
+from model.brdf import microfacet
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import (
     chromophore_posterior,
     chromophores,

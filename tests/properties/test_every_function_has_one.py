@@ -31,14 +31,14 @@ NOT_DRIVEN = {
         (
             FILES,
             {
-                "model.brdf_tables": "load",
-                "model.facial_color_document": "from_maps_and_document to_maps",
+                "model.brdf.tables": "load",
+                "model.facial_color.document": "from_maps_and_document to_maps",
                 "model.merl": "read read_mean write",
-                "model.rgl": "read write",
+                "model.brdf.rgl": "read write",
                 "model.store": "read read_document read_exr require_free write write_exr",
-                "model.tensor_file": "read write",
-                "model.trait_storage": "from_bytes load",
-                "model.wrinkle_expressions": "read_table",
+                "model.brdf.tensor_file": "read write",
+                "model.traits.storage": "from_bytes load",
+                "model.wrinkles.expressions": "read_table",
                 "reconstruction.expression_alignment": "read_landmarks",
                 "reconstruction.landmark_table": "read",
                 "reconstruction.scan_mesh": "load_ply",
@@ -100,9 +100,9 @@ NOT_DRIVEN = {
         (
             FITTED,
             {
-                "model.brdf_tables": "of_merl",
-                "model.displacement_synthesis": "grow lay_out",
-                "model.rgl": "of_brdf",
+                "model.brdf.tables": "of_merl",
+                "model.displacement_synthesis.growth": "grow lay_out",
+                "model.brdf.rgl": "of_brdf",
                 "reconstruction.brdf_space": "curve",
                 "reconstruction.chromophore_reference": "fit weigh",
                 "reconstruction.kernel_errors": (
@@ -132,9 +132,9 @@ NOT_DRIVEN = {
         (
             INNER,
             {
-                "model.brdf_recipe": "materials",
-                "model.facial_color_basis": "fitted transferred",
-                "model.texture_space": "weight_of",
+                "model.brdf.recipe": "materials",
+                "model.facial_color.basis": "fitted transferred",
+                "model.texture_statistics.space": "weight_of",
                 "reconstruction.chromophore_lines": "lines_of",
                 "reconstruction.chromophore_start": "start_for",
                 "reconstruction.nearest_medium": "fit_nearest",
@@ -147,16 +147,16 @@ NOT_DRIVEN = {
         (
             WORDS,
             {
-                "model.brdf_tables": "default nodes",
-                "model.facial_color": "check_name",
-                "model.microstructure": "forehead_points",
-                "model.photon_medium": "root_spline_matrix",
+                "model.brdf.tables": "default nodes",
+                "model.facial_color.rig": "check_name",
+                "model.microstructure.kernel_table": "forehead_points",
+                "model.photon_table.medium": "root_spline_matrix",
                 "model.skin_reflectance": "population_mean_mm",
-                "model.trait_storage": "default",
-                "model.trait_vectors": "doubts",
+                "model.traits.storage": "default",
+                "model.traits.vectors": "doubts",
                 "model.translucency_population": "weyrich_2005",
-                "model.wrinkle_expressions": "as_table",
-                "model.wrinkle_storage": "paper_footprint",
+                "model.wrinkles.expressions": "as_table",
+                "model.wrinkles.storage": "paper_footprint",
                 "reconstruction.model_error": "identity load shading_histogram",
             },
         ),
@@ -244,7 +244,7 @@ def test_no_reason_is_given_for_what_is_driven_or_gone():
     assert not stale, "\n".join(sorted(stale))
 
 
-@pytest.mark.parametrize("name", ["model.dipole.reflectance", "model.fresnel.reflectance"])
+@pytest.mark.parametrize("name", ["model.dipole.profile.reflectance", "model.fresnel.reflectance"])
 def test_a_function_that_a_test_is_parametrized_with_counts_as_driven(name):
     assert name in driven()
 

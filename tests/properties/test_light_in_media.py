@@ -5,20 +5,14 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from model import (
-    adding_doubling,
-    diffusion,
-    dipole,
-    dipole_gather,
-    dipole_sum,
-    disc_distances,
-    fresnel,
-    layered_diffusion,
-    photon_medium,
-    photon_table,
-    spectra,
-    tissue_optics,
-)
+from model import dipole, fresnel, spectra, tissue_optics
+from model.dipole import direct_sum as dipole_sum
+from model.dipole import gather as dipole_gather
+from model.dipole import kienle_patterson as diffusion
+from model.photon_table import disc_distances
+from model.photon_table import medium as photon_medium
+from model.photon_table import table as photon_table
+from model.tissue_optics import adding_doubling, layered_diffusion
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=40, database=None)
 FEW = settings(CHEAP, max_examples=10)

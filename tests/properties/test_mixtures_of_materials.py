@@ -7,16 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model import (
-    brdf_tables,
-    color_table,
-    facial_color_basis,
-    lobe_edits,
-    skin_reflectance,
-    texture_space,
-    trait_vectors,
-    traits,
-)
+from model import color_table, skin_reflectance, traits
+from model.brdf import tables as brdf_tables
+from model.facial_color import basis as facial_color_basis
+from model.texture_statistics import space as texture_space
+from model.traits import lobe_edits
+from model.traits import vectors as trait_vectors
 from reconstruction import (
     brdf_basis,
     brdf_space,

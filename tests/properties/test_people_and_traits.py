@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model import reduced_spaces, trait_vectors, translucency_population
+from model import translucency_population
+from model.traits import reduced_spaces
+from model.traits import vectors as trait_vectors
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=30, database=None)
 FEW = settings(CHEAP, max_examples=10)

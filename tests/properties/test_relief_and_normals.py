@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model import mesh_strain, microstructure, profile_length
+from model import microstructure
+from model.microstructure import mesh_strain, profile_length
 from reconstruction import (
     gradient_patterns,
     gradient_wiener,

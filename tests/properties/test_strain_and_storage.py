@@ -7,16 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model import (
-    mesh_strain,
-    microstructure,
-    strain_fields,
-    synthesis_sources,
-    wrinkle_expressions,
-    wrinkle_storage,
-    wrinkles,
-)
-from model.displacement_convolution import Window
+from model import microstructure, wrinkles
+from model.displacement_synthesis import sources as synthesis_sources
+from model.microstructure import mesh_strain, strain_fields
+from model.microstructure.map_windows import Window
+from model.wrinkles import expressions as wrinkle_expressions
+from model.wrinkles import storage as wrinkle_storage
 from reconstruction import gradient_patterns, kernel_table
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=30, database=None)

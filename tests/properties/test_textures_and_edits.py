@@ -6,34 +6,34 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from model import (
-    block_compression,
+    facial_color,
+    texture_resampling,
+    texture_statistics,
+    traits,
+    translucency_population,
+    wrinkles,
+)
+from model.displacement_synthesis import regions as synthesis_regions
+from model.displacement_synthesis import sources as synthesis_sources
+from model.facial_color import (
     blood_errors,
     coarse_maps,
     deviation_ratio,
     disc_statistics,
-    displacement_convolution,
-    facial_color,
-    feasible_sets,
     histogram_matching,
-    histogram_transport,
-    reduced_spaces,
-    steerable_pyramid,
-    synthesis_regions,
-    synthesis_sources,
-    texture_bins,
-    texture_histograms,
-    texture_masks,
-    texture_resampling,
-    texture_statistics,
-    trait_vectors,
-    traits,
-    translucency_population,
-    wrinkle_differences,
-    wrinkle_expressions,
-    wrinkle_masks,
-    wrinkle_storage,
-    wrinkles,
 )
+from model.microstructure import convolution as displacement_convolution
+from model.texture_statistics import bins as texture_bins
+from model.texture_statistics import histograms as texture_histograms
+from model.texture_statistics import masks as texture_masks
+from model.texture_statistics import steerable_pyramid
+from model.traits import feasible_sets, histogram_transport, reduced_spaces
+from model.traits import vectors as trait_vectors
+from model.wrinkles import block_compression
+from model.wrinkles import differences as wrinkle_differences
+from model.wrinkles import expressions as wrinkle_expressions
+from model.wrinkles import masks as wrinkle_masks
+from model.wrinkles import storage as wrinkle_storage
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=30, database=None)
 FEW = settings(CHEAP, max_examples=8)

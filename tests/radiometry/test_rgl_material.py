@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from model import brdf_recipe, rgl
+from model.brdf import recipe as brdf_recipe
+from model.brdf import rgl
 from rigsim import render
 from rigsim.variant import choose_variant
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model import color_table, store
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophore_posterior, pipeline, shading_prior
 from reconstruction.facial_color_fit import UnknownBloodError
 from skinrig.applying.expression import hemoglobin_rig

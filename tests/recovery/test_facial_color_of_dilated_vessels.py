@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from model import blood_errors
-from model.facial_color import HemoglobinRig
+from model.facial_color import HemoglobinRig, blood_errors
 from rigsim import subject
 
 STATES = ("smile", "anger", "exercise")

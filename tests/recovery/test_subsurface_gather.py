@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from model import dipole
-from model.dipole_gather import exitance
+from model.dipole.gather import exitance
 from model.fresnel import normal_reflectance
 from rigsim.tissue_mc import Layer, LayerStack, escape_paths
 

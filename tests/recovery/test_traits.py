@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from model import brdf_tables
+from model.brdf import tables as brdf_tables
 from model.traits import TraitSpace
 from reconstruction import brdf_basis
 from rigsim.population import shifted, table_1

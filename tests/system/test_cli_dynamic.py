@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from model import facial_color_document, store
+from model import store
 from model.facial_color import HemoglobinRig
+from model.facial_color import document as facial_color_document
 from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig import dynamic_appearance as dynamic
 from skinrig.cli import main

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from model import brdf_recipe, brdf_tables, store
+from model import store
+from model.brdf import recipe as brdf_recipe
+from model.brdf import tables as brdf_tables
 from model.skin import UNITS, SkinAppearance, SkinMap
 from reconstruction.dome_stages import BASIS_FILE, _basis_bytes
 from rigsim.atlas import unwrap

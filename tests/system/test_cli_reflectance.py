@@ -6,7 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from model import brdf_tables, skin_reflectance, store
+from model import skin_reflectance, store
+from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
 from skinrig.cli import main
 

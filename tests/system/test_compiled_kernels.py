@@ -42,7 +42,11 @@ def test_a_kernel_that_does_not_fit_is_counted_and_left_to_its_first_call(tool):
         ("rigsim.atlas", "no_such", good),
         ("rigsim.atlas", "sample", good),  # no kernel
         ("rigsim.head", "_distance", text),
-        ("model.photon_kernels", "evaluate", good),  # has types of its own, and takes no other
+        (
+            "model.photon_table.kernels",
+            "evaluate",
+            good,
+        ),  # has types of its own, and takes no other
         ("reconstruction.photometric_kernels", "fit_points", "unicode_type"),  # makes no such one
         ("rigsim.head", "_distance", "(Array(float64"),
         ("rigsim.head", "_distance", "__import__('os')"),
@@ -54,7 +58,7 @@ def test_a_kernel_that_does_not_fit_is_counted_and_left_to_its_first_call(tool):
     ("module", "function"),
     [
         ("rigsim.atlas", "_rasterize"),
-        ("model.photon_kernels", "evaluate"),  # compiled as it is imported
+        ("model.photon_table.kernels", "evaluate"),  # compiled as it is imported
         ("reconstruction.photometric_kernels", "fit_points"),  # made by a cached function
     ],
 )
@@ -79,7 +83,7 @@ def test_kernels_are_listed_under_the_name_that_compiles_them(tool):
 
 def test_arrays_that_cannot_be_written_or_lie_otherwise_cost_no_compilation(rng):
     """Statistics in discs and filled textures: 10 s and 13 s each time, before."""
-    from model import disc_kernels, disc_statistics
+    from model.facial_color import disc_kernels, disc_statistics
     from reconstruction import texture_fill
 
     height, weight = rng.normal(size=(9, 12)), rng.random((9, 12)).astype(np.float32)

@@ -6,7 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from model import brdf_tables, store
+from model import store
+from model.brdf import tables as brdf_tables
 from model.skin import UNITS, SkinAppearance, SkinMap
 from skinrig.cli import main
 from skinrig.rendering import camera as rendering_camera

@@ -1,7 +1,7 @@
 // Strain of the moved mesh (Nagano 2015, eqs. 10 to 13): a tensor at each vertex, in float64 on the
 // processor and only where weights changed; its principal axes at each pixel are the shader's.
 //
-// The definition is model/mesh_strain.py's, whose kernels this follows step by step: the right
+// The definition is model/microstructure/mesh_strain.py's, whose kernels this follows step by step: the right
 // stretch tensor less 1 of each triangle, turned into the vertex's plane, averaged by rest areas;
 // and the symmetric part of the map from skin to texture.
 V.strain = {SLIVER: 1e-6, FINE: 0, DEGENERATE: 1, NO_TEXTURE: 2};

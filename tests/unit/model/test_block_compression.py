@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from model import block_compression as bc
+from model.wrinkles import block_compression as bc
 
 
 def test_a_block_of_eight_values_decodes_by_the_format_s_ramp():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from model.blood_errors import compare
+from model.facial_color.blood_errors import compare
 
 
 def test_one_gain_is_the_best_single_factor(rng):

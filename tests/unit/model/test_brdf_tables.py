@@ -5,7 +5,9 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from model import brdf_recipe, brdf_tables, fresnel, merl
+from model import fresnel, merl
+from model.brdf import recipe as brdf_recipe
+from model.brdf import tables as brdf_tables
 from reconstruction import nnls_kernels
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from model import color_table, spectra
 from model.color_table import ColorTable, ColorTableError
-from model.tissue_optics import C_HD_MAX, C_M_MAX, two_layer_reflectance
+from model.tissue_optics.layers import C_HD_MAX, C_M_MAX, two_layer_reflectance
 
 
 @pytest.fixture(scope="module")

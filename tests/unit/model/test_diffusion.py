@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from model import diffusion, dipole, fresnel, photon_table
+from model import fresnel, photon_table
+from model.dipole import kienle_patterson as diffusion
+from model.dipole import profile as dipole
 
 RADII = np.arange(0.3, 7.2, 0.25)
 

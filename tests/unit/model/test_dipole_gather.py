@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from model import dipole, dipole_gather, dipole_sum, source_tree_kernels
-from model.dipole_gather import GatherError, SourceTree, exitance, gather
-from model.dipole_sum import Media, exitance_directly
+from model import dipole
+from model.dipole import direct_sum as dipole_sum
+from model.dipole import gather as dipole_gather
+from model.dipole import source_tree_kernels
+from model.dipole.direct_sum import Media, exitance_directly
+from model.dipole.gather import GatherError, SourceTree, exitance, gather
 from model.fresnel import ETA_SKIN
 
 R_D = np.array([0.55, 0.35, 0.2])

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from model import disc_statistics, facial_color
-from model.disc_statistics import DiscStatisticsError, measure
+from model import facial_color
+from model.facial_color import disc_statistics
+from model.facial_color.disc_statistics import DiscStatisticsError, measure
 
 RADII_PX = (0.0, 1.0, 1.5, 2.9, 7.3, 16.0, 40.0)
 

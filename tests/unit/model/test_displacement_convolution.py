@@ -2,15 +2,15 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d, map_coordinates
 
-from model.convolution_kernels import distance_to_invalid
-from model.displacement_convolution import (
+from model.microstructure.convolution import (
     ConvolutionError,
     LineKernels,
-    Window,
     convolve,
     convolve_tiled,
     tiles_of,
 )
+from model.microstructure.convolution_kernels import distance_to_invalid
+from model.microstructure.map_windows import Window
 
 X, Y = (1.0, 0.0), (0.0, 1.0)
 

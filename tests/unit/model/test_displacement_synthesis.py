@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from model import displacement_synthesis as synthesis
-from model import synthesis_kernels as kernels
-from model.synthesis_sources import filled
+from model.displacement_synthesis import growth as synthesis
+from model.displacement_synthesis import kernels
+from model.displacement_synthesis.sources import filled
 from reconstruction import normal_histogram
 from rigsim.microrelief import make_micro_skin
 
@@ -102,7 +102,7 @@ def test_threads_and_parts_do_not_change_a_byte(foreheads):
 def test_tiles_meet_within_a_thousandth_of_a_step(foreheads, monkeypatch):
     rng = np.random.default_rng
     whole = synthesis.grow(foreheads, SIDE, rng=rng(5), **knobs())
-    monkeypatch.setattr("model.synthesis_layout.TILE_PX", 256)
+    monkeypatch.setattr("model.displacement_synthesis.layout.TILE_PX", 256)
     parts = synthesis.grow(foreheads, SIDE, rng=rng(5), **knobs())
     assert np.abs(whole - parts).max() < 1e-3 * np.std(foreheads)
 

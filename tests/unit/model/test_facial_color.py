@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from model import store
-from model.facial_color import GLOBAL_GAINS, FacialColorError, HemoglobinRig, local_statistics
+from model.facial_color.rig import GLOBAL_GAINS, FacialColorError, HemoglobinRig, local_statistics
 from model.skin import SkinAppearance
 
 RADIUS_PX = 8.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model import fresnel
-from model.facial_specular import F0, kelemen, schlick
+from model.real_time.facial_specular import F0, kelemen, schlick
 
 
 def _hemisphere(cosines=64, turns=128):

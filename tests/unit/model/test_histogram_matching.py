@@ -6,8 +6,8 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter
 
 from model import facial_color
-from model.disc_statistics import DiscStatisticsError
-from model.histogram_matching import match, match_sliding
+from model.facial_color.disc_statistics import DiscStatisticsError
+from model.facial_color.histogram_matching import match, match_sliding
 
 
 def texture(rng, shape=(70, 60)):

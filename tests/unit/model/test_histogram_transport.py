@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from model import histogram_transport as transport
+from model.traits import histogram_transport as transport
 
 EDGES = np.linspace(-4.0, 4.0, 257)
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model import fresnel
-from model.tissue_optics import TissueError, layer_stack_reflectance
+from model.tissue_optics.layers import TissueError, layer_stack_reflectance
 
 TIERS = ["adding_doubling", "diffusion"]
 

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 
-from model import reduced_spaces
-from model.lobe_edits import edit_weights
-from model.traits import TraitError, TraitSpace
+from model.traits import reduced_spaces
+from model.traits.lobe_edits import edit_weights
+from model.traits.space import TraitSpace
+from model.traits.vectors import TraitError
 
 COUNT = 12
 

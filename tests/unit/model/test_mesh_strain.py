@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from model.mesh_strain import StrainError, places_of, strain
+from model.microstructure.mesh_strain import StrainError, places_of, strain
 
 
 def sheet(n=6, size_mm=10.0):

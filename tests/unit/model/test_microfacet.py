@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from model import fresnel, microfacet
+from model import fresnel
+from model.brdf import microfacet
 
 KINDS = ["ggx", "beckmann", "blinn"]
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from model.microstructure import (
+from model.microstructure.kernel_table import (
     FOREHEAD,
     KernelTable,
     KernelTableError,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model import adding_doubling
+from model.tissue_optics import adding_doubling
 
 pytestmark = pytest.mark.long  # compiles the walk
 PATH = Path(__file__).parents[3] / "tools" / "make_photon_table.py"

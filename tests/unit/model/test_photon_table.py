@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from model import adding_doubling, dipole, photon_medium, photon_table
-from model import photon_kernels as kernels
-from model.disc_distances import distance_rule
+from model import dipole, photon_table
+from model.photon_table import kernels
+from model.photon_table import medium as photon_medium
+from model.photon_table.disc_distances import distance_rule
+from model.tissue_optics import adding_doubling
 from rigsim.fibre_profile import fibre_profile
 from rigsim.tissue_mc import Layer, LayerStack, transport
 

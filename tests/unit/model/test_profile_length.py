@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.special import ellipe
 
-from model import microstructure, profile_length
-from model.profile_length import ProfileError
+from model import microstructure
+from model.microstructure import profile_length
+from model.microstructure.profile_length import ProfileError
 from rigsim.microrelief import make_micro_skin
 
 SPACING_UM = 5.0

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from model import brdf_recipe, rgl, tensor_file
-from model.rgl import RglFileError
-from model.tensor_file import TensorFileError
+from model.brdf import recipe as brdf_recipe
+from model.brdf import rgl, tensor_file
+from model.brdf.rgl import RglFileError
+from model.brdf.tensor_file import TensorFileError
 
 
 def directions(rng, count, *, lowest=0.1):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from model import screen_scattering
-from model.screen_scattering import ScreenScatteringError, scatter
+from model.real_time import screen_scattering
+from model.real_time.screen_scattering import ScreenScatteringError, scatter
 
 DEPTH_MM = 500.0
 VARIANCES = (0.05, 0.4, 3.0)

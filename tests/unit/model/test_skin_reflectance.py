@@ -5,8 +5,10 @@ import io
 import numpy as np
 import pytest
 
-from model import brdf_recipe, brdf_tables, dipole, fresnel, skin_reflectance
-from model.dipole_maps import DipoleMaps
+from model import dipole, fresnel, skin_reflectance
+from model.brdf import recipe as brdf_recipe
+from model.brdf import tables as brdf_tables
+from model.dipole.maps import DipoleMaps
 from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import SkinReflectance, SkinReflectanceError, assemble
 

@@ -3,8 +3,14 @@ import math
 import numpy as np
 import pytest
 
-from model import pyramid_kernels, steerable_pyramid
-from model.steerable_pyramid import PyramidError, Responses, analyze, level_sizes, synthesize
+from model.texture_statistics import pyramid_kernels, steerable_pyramid
+from model.texture_statistics.steerable_pyramid import (
+    PyramidError,
+    Responses,
+    analyze,
+    level_sizes,
+    synthesize,
+)
 
 ODD_SIZES = [(1, 1), (1, 7), (2, 2), (8, 5), (4096, 1), (33, 70), (101, 97), (128, 128), (96, 200)]
 

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from model.displacement_convolution import Window
-from model.mesh_strain import StrainError, strain
-from model.microstructure import FOREHEAD, kernel_parameters
-from model.strain_fields import line_kernels, rasterize
+from model.microstructure.kernel_table import FOREHEAD, kernel_parameters
+from model.microstructure.map_windows import Window
+from model.microstructure.mesh_strain import StrainError, strain
+from model.microstructure.strain_fields import line_kernels, rasterize
 
 POINTS = np.array([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0.0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])

@@ -5,8 +5,8 @@ import struct
 import numpy as np
 import pytest
 
-from model import tensor_file
-from model.tensor_file import TensorFileError
+from model.brdf import tensor_file
+from model.brdf.tensor_file import TensorFileError
 
 
 @pytest.fixture

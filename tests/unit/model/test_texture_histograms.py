@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from model import histogram_kernels
-from model.texture_histograms import (
+from model.texture_statistics import histogram_kernels
+from model.texture_statistics.histograms import (
     BINS,
     Bins,
     HistogramError,

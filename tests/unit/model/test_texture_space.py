@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from model.texture_masks import fill_smoothly, response_weights
-from model.texture_space import TextureError, TextureSpace
-from model.texture_statistics import statistics
+from model.texture_statistics.description import statistics
+from model.texture_statistics.masks import fill_smoothly, response_weights
+from model.texture_statistics.space import TextureError, TextureSpace
 
 SPREAD = np.diag([0.1, 0.03, 0.01])
 

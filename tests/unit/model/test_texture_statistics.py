@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from model.texture_histograms import distance, project_to_histograms
-from model.texture_space import TextureError, TextureSpace
-from model.texture_statistics import describe, match, statistics
+from model.texture_statistics.description import describe, match, statistics
+from model.texture_statistics.histograms import distance, project_to_histograms
+from model.texture_statistics.space import TextureError, TextureSpace
 
 
 def texture(side, rng, *, angle_rad=0.0, strength=0.05, color=(0.55, 0.38, 0.28)):

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from model import spectra
-from model.tissue_optics import (
+from model.tissue_optics.layers import (
     C_HD_MAX,
     C_M_MAX,
     TissueError,

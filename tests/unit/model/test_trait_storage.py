@@ -6,10 +6,11 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from model import trait_storage
-from model.feasible_sets import Histograms, NonNegative
-from model.trait_storage import TraitFileError, TraitLibrary
-from model.traits import TraitError, TraitSpace
+from model.traits import storage as trait_storage
+from model.traits.feasible_sets import Histograms, NonNegative
+from model.traits.space import TraitSpace
+from model.traits.storage import TraitFileError, TraitLibrary
+from model.traits.vectors import TraitError
 
 
 @pytest.fixture(scope="module")

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from model import feasible_sets, nonnegative_kernels, reduced_spaces
-from model.feasible_sets import Free, Histograms, NonNegative
-from model.traits import TraitError, TraitSpace, cosine
+from model.traits import feasible_sets, nonnegative_kernels, reduced_spaces
+from model.traits.feasible_sets import Free, Histograms, NonNegative
+from model.traits.space import TraitSpace, cosine
+from model.traits.vectors import TraitError
 
 
 @pytest.fixture

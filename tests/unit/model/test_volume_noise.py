@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from model.volume_noise import VolumeNoise, VolumeNoiseError, _sum_of_waves
+from model.displacement_synthesis.volume_noise import VolumeNoise, VolumeNoiseError, _sum_of_waves
 
 
 def noise(seed=0, **changes):

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from model import metrics, wrinkle_differences, wrinkles
-from model.wrinkles import WrinkleError
+from model import metrics, wrinkles
+from model.wrinkles import differences as wrinkle_differences
+from model.wrinkles.expressions import WrinkleError
 
 ONE = np.ones((1, 1, 1))
 

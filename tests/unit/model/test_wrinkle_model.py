@@ -8,9 +8,9 @@ import pytest
 
 from model import store, wrinkles
 from model.skin import SkinAppearance
-from model.wrinkle_expressions import ExpressionTable
-from model.wrinkle_model import FILE, WrinkleModel
-from model.wrinkles import JIMENEZ2011, Layer, WrinkleError
+from model.wrinkles.evaluation import FILE, WrinkleModel
+from model.wrinkles.expressions import JIMENEZ2011, ExpressionTable, WrinkleError
+from model.wrinkles.partial_derivatives import Layer
 
 
 @pytest.fixture

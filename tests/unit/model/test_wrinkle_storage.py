@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from model import wrinkle_storage as storage
 from model import wrinkles
-from model.wrinkles import Layer, WrinkleError
+from model.wrinkles import storage
+from model.wrinkles.expressions import WrinkleError
+from model.wrinkles.partial_derivatives import Layer
 
 
 def furrows(side, rng):

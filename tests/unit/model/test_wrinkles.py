@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from model import texture_resampling, wrinkles
-from model.wrinkle_expressions import (
+from model.wrinkles.expressions import (
     JIMENEZ2011,
     ROW_OF_STATE,
     ExpressionTable,
+    WrinkleError,
     clamped,
     read_table,
     zone_sums,
 )
-from model.wrinkles import WrinkleError
 
 FOREHEAD = {"red": 0, "green": 1, "blue": 2, "brown": 3}
 

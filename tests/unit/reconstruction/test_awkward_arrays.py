@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from model import deviation_ratio, histogram_matching
+from model.facial_color import deviation_ratio, histogram_matching
 from reconstruction import (
     affine_fit,
     half_vector_normals,

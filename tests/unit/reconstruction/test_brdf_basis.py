@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from model import brdf_tables, fresnel
+from model import fresnel
+from model.brdf import tables as brdf_tables
 from reconstruction import brdf_basis
 from skinrig import brdf_truth
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from model import brdf_tables
+from model.brdf import tables as brdf_tables
 from reconstruction import brdf_basis, brdf_space
 from reconstruction.brdf_space import SpaceError
 

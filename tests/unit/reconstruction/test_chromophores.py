@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model import color_table
-from model.tissue_optics import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
+from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from reconstruction import chromophore_reference, chromophores
 from reconstruction.chromophores import ChromophoreError, identifiability, invert
 

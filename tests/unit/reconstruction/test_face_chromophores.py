@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model import color_table
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophore_posterior, chromophore_reference, shading_prior
 from reconstruction.chromophore_posterior import weigh
 from reconstruction.chromophore_start import LOWEST

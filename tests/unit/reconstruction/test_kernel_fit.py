@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
-from model.microstructure import gaussian_weights
+from model.microstructure.kernel_table import gaussian_weights
 from reconstruction import kernel_fit_kernels as kernels
 from reconstruction import kernel_search as ks
 from reconstruction import normal_histogram as nh

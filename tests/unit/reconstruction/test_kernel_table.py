@@ -1,7 +1,12 @@
 import numpy as np
 import pytest
 
-from model.microstructure import FOREHEAD, KernelTable, forehead_points, kernel_parameters
+from model.microstructure.kernel_table import (
+    FOREHEAD,
+    KernelTable,
+    forehead_points,
+    kernel_parameters,
+)
 from reconstruction.kernel_table import (
     KernelTableFitError,
     alpha_rms,

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates, shift
 
 from model import color_table
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import dense_flow, misplacement, shading_prior, shared_melanin
 from reconstruction.expression_alignment import Alignment
 

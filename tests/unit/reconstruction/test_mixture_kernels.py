@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from model import brdf_tables
+from model.brdf import tables as brdf_tables
 from reconstruction import brdf_basis, mixture_kernels
 
 

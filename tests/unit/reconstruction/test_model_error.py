@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model import color_table
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import model_error
 from reconstruction.chromophore_posterior import weigh
 from reconstruction.chromophores import ChromophoreError

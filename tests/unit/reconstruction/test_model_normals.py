@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from model import brdf_tables, fresnel
+from model import fresnel
+from model.brdf import tables as brdf_tables
 from model.metrics import angular_error_rad
 from reconstruction import model_normals
 from reconstruction.lumitexels import Lumitexels

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from model.facial_color import HemoglobinRig
+from model.facial_color.rig import HemoglobinRig
 from reconstruction.rig_transfer import RigTransferError, carried
 
 SHAPE = (96, 80)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from model import diffusion, dipole, photon_table
+from model import dipole, photon_table
+from model.dipole import kienle_patterson as diffusion
 from reconstruction import subsurface
 from reconstruction.subsurface import Outcome, SubsurfaceError
 from reconstruction.subsurface_models import DIFFUSE_FROM, DIFFUSE_RATIO, profile_model

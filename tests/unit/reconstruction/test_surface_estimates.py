@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from model import brdf_tables, fresnel
+from model import fresnel
+from model.brdf import tables as brdf_tables
 from reconstruction import diffuse_albedo
 from reconstruction import surface_estimates as estimates
 from reconstruction.lumitexels import Lumitexels

@@ -3,7 +3,7 @@ import pytest
 from scipy import integrate
 
 from model import color_table
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.tsumura import UnmixingError, tsumura_ica
 
 SHAPE = (60, 80)

@@ -7,7 +7,8 @@ from scipy.ndimage import gaussian_filter
 
 from model import texture_resampling as resampling
 from model import wrinkles
-from model.wrinkles import JIMENEZ2011, Layer, WrinkleError
+from model.wrinkles.expressions import JIMENEZ2011, WrinkleError
+from model.wrinkles.partial_derivatives import Layer
 from reconstruction import wrinkle_fit, wrinkle_texels, wrinkle_weights
 from reconstruction.normal_maps import NormalMaps
 

@@ -5,7 +5,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from model import wrinkles
-from model.wrinkles import JIMENEZ2011, Layer, WrinkleError
+from model.wrinkles.expressions import JIMENEZ2011, WrinkleError
+from model.wrinkles.partial_derivatives import Layer
 from reconstruction import wrinkle_fit, wrinkle_texels, wrinkle_zones
 
 SIDE, TEXELS = 128, 16

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from model import brdf_tables, store
+from model import store
+from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
 
 SIZE = 64

@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from model import brdf_tables, store
+from model import store
+from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
 from reconstruction import brdf_basis, diffuse_albedo
 from rigsim import population

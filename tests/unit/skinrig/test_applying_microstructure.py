@@ -3,10 +3,10 @@ import json
 import numpy as np
 import pytest
 
-from model.displacement_convolution import convolve
-from model.mesh_strain import StrainError
-from model.microstructure import FOREHEAD, KernelTable, kernel_parameters
-from model.strain_fields import KernelRegions
+from model.microstructure.convolution import convolve
+from model.microstructure.kernel_table import FOREHEAD, KernelTable, kernel_parameters
+from model.microstructure.mesh_strain import StrainError
+from model.microstructure.strain_fields import KernelRegions
 from skinrig.applying.microstructure import ApplyMicrostructureError, apply_microstructure
 from skinrig.blend_shapes import BlendShapeMesh
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model import store
-from model.microstructure import FOREHEAD
+from model.microstructure.kernel_table import FOREHEAD
 from model.skin import SkinMap
 from skinrig import dynamic_appearance as dynamic
 from skinrig.applying.expression import ApplyError, Expression, apply_expression

@@ -3,7 +3,7 @@ import sys
 import numpy as np
 import pytest
 
-from model.steerable_pyramid import analyze
+from model.texture_statistics.steerable_pyramid import analyze
 from skinrig.benchmarks import texture
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.mesh_strain import strain
+from model.microstructure.mesh_strain import strain
 from skinrig.blend_shapes import BlendShapeError, BlendShapeFileError, load
 
 ICT = Path(__file__).parents[4] / "shared/data/ict_face.npz"

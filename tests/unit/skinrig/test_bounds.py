@@ -3,7 +3,7 @@ import pytest
 
 from model import color_table
 from model.skin import UNITS, SkinAppearance, SkinMap
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import model_error, shading_prior
 from reconstruction.chromophores import identifiability
 from skinrig.bounds import cramer_rao, relative_bounds

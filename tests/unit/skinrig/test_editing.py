@@ -9,7 +9,7 @@ import pytest
 from model import store
 from model.skin import SkinMap
 from model.skin_reflectance import lobes_of
-from model.trait_storage import load
+from model.traits.storage import load
 from skinrig import face_textures
 from skinrig.cli import main
 from skinrig.editing import edit as editing

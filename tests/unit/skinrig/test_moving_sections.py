@@ -4,12 +4,13 @@ import json
 
 import numpy as np
 
-from model import facial_color_document, store
-from model.facial_color import HemoglobinRig
+from model import store
+from model.facial_color import document as facial_color_document
+from model.facial_color.rig import HemoglobinRig
 from model.skin import UNITS, SkinAppearance, SkinMap
-from model.wrinkle_model import FILE as WRINKLE_FILE
-from model.wrinkle_model import WrinkleModel
-from model.wrinkles import Layer
+from model.wrinkles.evaluation import FILE as WRINKLE_FILE
+from model.wrinkles.evaluation import WrinkleModel
+from model.wrinkles.partial_derivatives import Layer
 from skinrig import dynamic_appearance as dynamic
 from skinrig import report
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from model import brdf_tables
+from model.brdf import tables as brdf_tables
 from model.skin_reflectance import SkinReflectance, lobe_brdf
 from rigsim.mesh import build_mesh
 from skinrig import skin_bands

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from model import brdf_tables, fresnel
+from model import fresnel
+from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.dome_stages import BASIS_FILE, RANK, WEIGHTS, _basis_bytes
 from skinrig.evaluating import reflection as evaluation

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from model import brdf_tables, microfacet
+from model.brdf import microfacet
+from model.brdf import tables as brdf_tables
 from model.skin_reflectance import SkinReflectance, transmitted
 from rigsim.atlas import spread, unwrap
 from rigsim.mesh import build_mesh

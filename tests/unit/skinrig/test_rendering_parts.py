@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from model import brdf_tables, microfacet
+from model.brdf import microfacet
+from model.brdf import tables as brdf_tables
 from model.skin_reflectance import SkinReflectance
 from rigsim.mesh import build_mesh
 from skinrig.rendering import folder, shadow

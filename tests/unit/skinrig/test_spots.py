@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model.color_table import build
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import common_parameterization, common_regions
 from reconstruction.common_parameterization import Correspondence, find_cylinder
 from skinrig.editing import pigment_spots, spot_removal

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from model import brdf_tables
+from model.brdf import tables as brdf_tables
 from rigsim.population import table_1
 from skinrig.traits import truth as trait_truth
 from skinrig.traits.truth import CommonFaces

@@ -5,7 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from model import brdf_recipe, brdf_tables, store
+from model import store
+from model.brdf import recipe as brdf_recipe
+from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.dome_stages import BASIS_FILE, _basis_bytes
 from rigsim.atlas import unwrap

@@ -196,7 +196,7 @@ def test_a_fitted_model_bears_the_consent_of_what_it_is_made_of(measured, tmp_pa
 
 
 def test_an_expression_bears_the_consent_of_both_faces(tmp_path, rng):
-    from model.facial_color import HemoglobinRig
+    from model.facial_color.rig import HemoglobinRig
     from skinrig.applying import expression as applying
 
     neutral = 0.05 + 0.01 * rng.random((16, 16))

@@ -5,7 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from model import brdf_tables, fresnel, merl, rgl, store
+from model import fresnel, merl, store
+from model.brdf import rgl
+from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.dome_stages import BASIS_FILE, _basis_bytes
 from skinrig.cli import main

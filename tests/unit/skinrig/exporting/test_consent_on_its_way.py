@@ -10,7 +10,7 @@ import pytest
 from capture.session import ConsentError, Session, Subject
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from model.trait_storage import load
+from model.traits.storage import load
 from skinrig import consent, report
 from skinrig.cli import main
 from skinrig.dynamic_appearance import parts_of

@@ -8,11 +8,11 @@ import OpenEXR
 import pytest
 
 from model import store, wrinkles
-from model.facial_color import HemoglobinRig
+from model.facial_color.rig import HemoglobinRig
 from model.skin import UNITS, SkinAppearance, SkinMap
 from model.texture_resampling import resampled
-from model.wrinkle_expressions import ExpressionTable
-from model.wrinkle_model import FILE, WrinkleModel
+from model.wrinkles.evaluation import FILE, WrinkleModel
+from model.wrinkles.expressions import ExpressionTable
 from skinrig.applying import expression
 from skinrig.exporting import color_deltas, delta_maps
 from skinrig.exporting.options import Delivery

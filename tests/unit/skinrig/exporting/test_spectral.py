@@ -9,7 +9,7 @@ import pytest
 
 from model import color_table, spectra
 from model.skin import UNITS, SkinAppearance, SkinMap
-from model.tissue_optics import ANISOTROPY_SKIN, two_layer_reflectance
+from model.tissue_optics.layers import ANISOTROPY_SKIN, two_layer_reflectance
 from skinrig.exporting import spectral
 from skinrig.exporting.options import Delivery
 from skinrig.exporting.sealing import ExportError

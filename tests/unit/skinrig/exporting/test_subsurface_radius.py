@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from model.tissue_optics import layer_stack_reflectance
+from model.tissue_optics.layers import layer_stack_reflectance
 from skinrig.exporting.material import deficit_of
 from skinrig.exporting.subsurface_radius import (
     decay,

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from model import brdf_recipe, brdf_tables
+from model.brdf import recipe as brdf_recipe
+from model.brdf import tables as brdf_tables
 from skinrig.exporting.surface_fit import fit
 
 

@@ -12,7 +12,7 @@ from capture.calibration.color import matrix as color
 from capture.calibration.record import Quantity
 from model import color_table, spectra
 from model.skin import SkinAppearance, SkinMap
-from model.tissue_optics import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from skinrig.viewer import camera_color
 from skinrig.viewer.scene import SceneSource, ViewerMesh
 

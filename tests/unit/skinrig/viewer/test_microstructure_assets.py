@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from model.microstructure import FOREHEAD, KernelTable, convolve, kernel_parameters
+from model.microstructure.convolution import convolve
+from model.microstructure.kernel_table import FOREHEAD, KernelTable, kernel_parameters
 from skinrig.viewer import micro_relief, slope_variances
 from skinrig.viewer import microstructure_assets as assets
 from skinrig.viewer.micro_relief import MicroRelief, MicrostructureAssetError

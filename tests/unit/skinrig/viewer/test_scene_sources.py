@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import griddata
 
 from model import store
-from model.facial_color import HemoglobinRig
+from model.facial_color.rig import HemoglobinRig
 from model.skin import UNITS, SkinMap
 from rigsim.landmarks import find
 from rigsim.subject import make_subject

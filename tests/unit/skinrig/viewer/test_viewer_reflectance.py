@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from model import brdf_tables, dipole, fresnel, lobe_edits, trait_storage
+from model import dipole, fresnel
+from model.brdf import tables as brdf_tables
+from model.traits import lobe_edits
+from model.traits import storage as trait_storage
 from skinrig.viewer import (
     compact_brdf,
     gaussian_profiles,

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from model.wrinkle_expressions import ExpressionTable
-from model.wrinkle_model import WrinkleModel
-from model.wrinkles import Layer
+from model.wrinkles.evaluation import WrinkleModel
+from model.wrinkles.expressions import ExpressionTable
+from model.wrinkles.partial_derivatives import Layer
 from skinrig.viewer import wrinkle_assets
 from skinrig.viewer.wrinkle_assets import WrinkleAssetError
 
@@ -93,7 +93,7 @@ def test_more_maps_or_zones_than_the_shader_holds_are_refused():
 
 @pytest.mark.long
 def test_wrinkles_of_a_simulated_person_explain_its_own_expressions():
-    from model.wrinkles import encode
+    from model.wrinkles.partial_derivatives import encode
     from rigsim.subject import make_subject
 
     person = make_subject("III", seed=0, size=256)

@@ -1,0 +1,1 @@
+"""Tabulated BRDFs: table layouts, recipes, microfacet lobes and files."""

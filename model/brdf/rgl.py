@@ -1,0 +1,333 @@
+"""Isotropic BRDFs as RGL's measured materials (.bsdf), which Mitsuba's ``measured`` evaluates.
+
+For each of some view elevations a file holds, over the unit square, f_r times the cosine of the
+light, times 4 sigma(view) / ndf(half). The square is that of the half vector, (sqrt(2 theta / pi),
+(phi + pi) / 2 pi) with phi from the view's azimuth, flattened by the inverse of the sampling of a
+tabulated density ("vndf"). Everything is interpolated linearly.
+
+What is written here has a constant density, ndf = 1 and sigma = 1/4: the square is that of the half
+vector and the values are f_r times the cosine, in readers that heed the file's ``jacobian`` and in
+those that do not. ``luminance`` is the density that light directions are drawn from.
+
+References
+----------
+Dupuy and Jakob 2018, doi:10.1145/3272127.3275059.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.brdf import tensor_file
+
+FloatArray = NDArray[np.float64]
+Grid = NDArray[np.float32]
+
+ELEVATIONS = 45
+SIDE = 90
+LAST_RAD = np.deg2rad(89.0)
+"""View elevation of the last table; lower views take it."""
+_LEAST_JACOBIAN = 1e-6  # as the readers have it, at the pole of the half vector
+_LEAST_SHARE = 1e-3  # of the mean density: no direction is without
+
+
+class RglFileError(ValueError):
+    """A tensor file that is no isotropic measured material."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RglTable:
+    """An isotropic material.
+
+    Attributes
+    ----------
+    theta_i
+        View elevations, rad, growing, shape (T,).
+    ndf, sigma
+        Density of facets over the half vector's square and projected area over the view's, (Y, X).
+    vndf
+        Density whose sampling flattens the half vector's square, (T, Y, X), at least 0.
+    luminance
+        Density to draw from over the flattened square, (T, N, N).
+    values
+        f_r times the cosine of the light times 4 sigma / ndf, (T, C, N, N); NaN: unknown.
+    wavelengths_nm
+        Of the C channels; empty: red, green and blue.
+    description
+        Text.
+    """
+
+    theta_i: Grid
+    ndf: Grid
+    sigma: Grid
+    vndf: Grid
+    luminance: Grid
+    values: Grid
+    wavelengths_nm: Grid
+    description: str
+
+    def __post_init__(self) -> None:
+        """Check the shapes, and the densities."""
+        count = len(self.theta_i)
+        channels = len(self.wavelengths_nm) or 3
+        side = self.values.shape[-1]
+        for name, got, expected in (
+            ("values", self.values.shape, (count, channels, side, side)),
+            ("luminance", self.luminance.shape, (count, side, side)),
+            ("vndf", self.vndf.shape, (count, *self.vndf.shape[-2:])),
+        ):
+            if got != expected:
+                raise RglFileError(f"{name}: got shape {got}, expected {expected}")
+        if not (np.all(np.diff(self.theta_i) > 0) and np.all(np.isfinite(self.theta_i))):
+            raise RglFileError("theta_i: got elevations that do not grow")
+        for name in ("ndf", "sigma", "vndf", "luminance"):
+            grid = getattr(self, name)
+            if min(grid.shape[-2:]) < 2 or not np.all((grid >= 0.0) & np.isfinite(grid)):
+                raise RglFileError(
+                    f"{name}: got shape {grid.shape} or values below 0, expected densities on at "
+                    "least 2 x 2 nodes"
+                )
+        if not np.all(self.vndf.sum((1, 2)) > 0.0):
+            raise RglFileError("vndf: got an elevation without any density")
+
+    def evaluate(self, light_dir: ArrayLike, view_dir: ArrayLike) -> FloatArray:
+        """Return the BRDF.
+
+        Parameters
+        ----------
+        light_dir, view_dir
+            Unit vectors (..., 3) away from the surface, whose normal is +z.
+
+        Returns
+        -------
+        ndarray, shape (..., C)
+            1/sr, without the cosine; 0 where light or view are below the horizon. Interpolated
+            together with the cosine, so with a growing relative error towards the horizon.
+        """
+        light, view = np.broadcast_arrays(
+            *(np.asarray(v, dtype=np.float64) for v in (light_dir, view_dir))
+        )
+        above = (light[..., 2] > 0.0) & (view[..., 2] > 0.0)
+        to, at = light[above], view[above]
+        half = to + at
+        half /= np.linalg.norm(half, axis=-1, keepdims=True)
+        turn = np.arctan2(half[:, 1], half[:, 0]) - np.arctan2(at[:, 1], at[:, 0])
+        square = np.stack(
+            [np.sqrt(_elevation(half) * (2.0 / np.pi)), np.mod(turn / (2.0 * np.pi) + 0.5, 1.0)], -1
+        )
+        slices = _Slices.of(self.theta_i.astype(np.float64), _elevation(at))
+        found = slices.bilinear(self.values, _flattened(self.vndf, slices, square))
+        own = np.stack([np.sqrt(_elevation(at) * (2.0 / np.pi)), np.zeros(len(at))], -1)
+        first = _Slices(*(np.zeros(len(at), np.intp),) * 2, np.zeros(len(at)))
+        # +x of the view's azimuth; an isotropic material's area depends on the elevation alone
+        scale = first.bilinear(self.ndf[None, None], square) / (
+            4.0 * first.bilinear(self.sigma[None, None], own)
+        )
+        out = np.zeros((*above.shape, self.values.shape[1]))
+        out[above] = found * scale / to[:, 2:]
+        return out
+
+
+def of_brdf(
+    brdf: Callable[[FloatArray, FloatArray], FloatArray], *, description: str, side: int = SIDE
+) -> RglTable:
+    """Tabulate a BRDF.
+
+    Parameters
+    ----------
+    brdf
+        Takes light and view, unit vectors (n, 3) where +z is the normal; gives 1/sr, (n,) or
+        (n, 3), finite, at least 0.
+    description
+        Text for the file.
+    side
+        Nodes along the half vector's angle (even in its square root; 90 are the nodes of
+        :class:`model.brdf.tables.BrdfBasis`) and its azimuth.
+
+    Raises
+    ------
+    ValueError
+        When the BRDF is negative or not finite somewhere.
+    """
+    theta_i = np.linspace(0.0, LAST_RAD, ELEVATIONS)
+    u, v = np.meshgrid(np.linspace(0.0, 1.0, side), np.linspace(0.0, 1.0, side))
+    theta, phi = u**2 * (np.pi / 2.0), (2.0 * v - 1.0) * np.pi
+    half = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+    values = np.zeros((ELEVATIONS, 3, side, side), np.float32)
+    luminance = np.zeros((ELEVATIONS, side, side), np.float32)
+    for k, elevation in enumerate(theta_i):
+        view = np.array([np.sin(elevation), 0.0, np.cos(elevation)])
+        along = half @ view
+        light = 2.0 * along[..., None] * half - view
+        seen = (along > 0.0) & (light[..., 2] > 0.0)
+        to = light[seen] / np.linalg.norm(light[seen], axis=-1, keepdims=True)
+        found = np.asarray(brdf(to, np.broadcast_to(view, to.shape)), np.float64)
+        if not np.all((found >= 0.0) & (found < np.inf)):
+            raise ValueError("brdf: got negative or non-finite values, expected 1/sr")
+        rgb = np.broadcast_to(found.reshape(len(to), -1), (len(to), 3)) * to[:, 2:]
+        values[k][:, seen] = rgb.T
+        jacobian = np.maximum(2.0 * np.pi**2 * u * np.sin(theta), _LEAST_JACOBIAN) * 4.0 * along
+        density = np.where(seen, values[k].mean(0) * jacobian, 0.0)
+        luminance[k] = density + (_LEAST_SHARE * density.mean() or 1.0)
+    flat = np.ones((2, 2), np.float32)
+    return RglTable(
+        theta_i.astype(np.float32), flat, 0.25 * flat, np.ones((ELEVATIONS, 2, 2), np.float32),
+        luminance, values, np.zeros(0, np.float32), description,
+    )  # fmt: skip
+
+
+def read(path: str | os.PathLike[str]) -> RglTable:
+    """Read an isotropic .bsdf, RGB or spectral.
+
+    Raises
+    ------
+    model.brdf.tensor_file.TensorFileError
+        When it is no tensor file, or truncated.
+    RglFileError
+        When a field is missing or of another shape, or the material is anisotropic.
+    """
+    fields = tensor_file.read(path)
+    spectral = "wavelengths" in fields
+    data = "spectra" if spectral else "rgb"
+    missing = [
+        name
+        for name in ("theta_i", "phi_i", "ndf", "sigma", "vndf", "luminance", data)
+        if name not in fields
+    ]
+    if missing:
+        raise RglFileError(
+            f"{path}: has no field {missing[0]}; it has {', '.join(fields) or 'none'}"
+        )
+    azimuths = fields["phi_i"].size
+    if azimuths > 2:
+        raise RglFileError(
+            f"{path}: got an anisotropic material ({azimuths} azimuths), expected an isotropic one"
+        )
+    for name, dimensions in (("theta_i", 1), ("ndf", 2), ("sigma", 2), ("vndf", 4),
+                             ("luminance", 4), (data, 5)):  # fmt: skip
+        if fields[name].ndim != dimensions:
+            raise RglFileError(
+                f"{path}: {name}: got {fields[name].ndim} dimensions, expected {dimensions}"
+            )
+    grids = {name: np.asarray(array, np.float32) for name, array in fields.items() if array.size}
+    scaled = bool(fields["jacobian"][0]) if "jacobian" in fields else True
+    text = fields.get("description", np.zeros(0, np.uint8))
+    try:
+        return RglTable(
+            grids["theta_i"],
+            grids["ndf"] if scaled else np.ones((2, 2), np.float32),
+            grids["sigma"] if scaled else np.full((2, 2), 0.25, np.float32),
+            grids["vndf"][0],
+            grids["luminance"][0],
+            grids[data][0],
+            grids["wavelengths"] if spectral else np.zeros(0, np.float32),
+            text.astype(np.uint8).tobytes().decode("utf-8", "replace").rstrip("\0"),
+        )
+    except (KeyError, RglFileError) as error:
+        raise RglFileError(f"{path}: {error}") from error
+
+
+def write(path: str | os.PathLike[str], table: RglTable) -> None:
+    """Write a .bsdf."""
+    spectral = len(table.wavelengths_nm) > 0
+    fields: dict[str, NDArray[Any]] = {
+        "description": np.frombuffer(table.description.encode() or b" ", np.uint8),
+        "jacobian": np.ones(1, np.uint8),
+        "phi_i": np.zeros(1, np.float32),
+        "theta_i": table.theta_i,
+        "ndf": table.ndf,
+        "sigma": table.sigma,
+        "vndf": table.vndf[None],
+        "luminance": table.luminance[None],
+        "spectra" if spectral else "rgb": table.values[None],
+    }
+    if spectral:
+        fields["wavelengths"] = table.wavelengths_nm
+    tensor_file.write(Path(path), fields)
+
+
+def _elevation(unit: FloatArray) -> FloatArray:
+    """Return the angle to +z, rad, without loss of digits near it."""
+    apart = np.linalg.norm(unit - [0.0, 0.0, 1.0], axis=-1)
+    return np.asarray(2.0 * np.arcsin(np.minimum(0.5 * apart, 1.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Slices:
+    """Between which two tables each sample lies, and where."""
+
+    low: NDArray[np.intp]
+    high: NDArray[np.intp]
+    share: FloatArray
+
+    @classmethod
+    def of(cls, nodes: FloatArray, at: FloatArray) -> _Slices:
+        if len(nodes) == 1:
+            zero = np.zeros(len(at), np.intp)
+            return cls(zero, zero, np.zeros(len(at)))
+        low = np.clip(np.searchsorted(nodes, at) - 1, 0, len(nodes) - 2)
+        share = np.clip((at - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0, 1.0)
+        return cls(low, low + 1, share)
+
+    def take(self, grids: FloatArray, *index: NDArray[np.intp]) -> FloatArray:
+        """Return elements of (T, ...), mixed from two tables."""
+        low, high = grids[(self.low, *index)], grids[(self.high, *index)]
+        return np.asarray((1.0 - self.share) * low + self.share * high)
+
+    def bilinear(self, grids: Grid, square: FloatArray) -> FloatArray:
+        """Return (n, C) of (T, C, Y, X) at places (n, 2), x first."""
+        (x, y), (fx, fy) = _cells(square, grids.shape[-1], grids.shape[-2])
+        out = np.zeros((len(square), grids.shape[1]))
+        for table, part in ((self.low, 1.0 - self.share), (self.high, self.share)):
+            for dy in (0, 1):
+                for dx in (0, 1):
+                    weight = part * (fy if dy else 1.0 - fy) * (fx if dx else 1.0 - fx)
+                    out += weight[:, None] * grids[table, :, y + dy, x + dx]
+        return out
+
+
+def _cells(
+    square: FloatArray, width: int, height: int
+) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], tuple[FloatArray, FloatArray]]:
+    x, y = square[:, 0] * (width - 1), square[:, 1] * (height - 1)
+    column = np.clip(x.astype(np.intp), 0, width - 2)
+    row = np.clip(y.astype(np.intp), 0, height - 2)
+    return (column, row), (x - column, y - row)
+
+
+def _flattened(vndf: Grid, slices: _Slices, square: FloatArray) -> FloatArray:
+    """Return where sampling of a piecewise bilinear density would have come from, (n, 2).
+
+    Rows first by the marginal density, then columns within the row: shares of the mass below.
+    """
+    density = vndf.astype(np.float64)
+    _, height, width = density.shape
+    along = np.zeros_like(density)  # mass left of a node in its row
+    along[..., 1:] = np.cumsum(0.5 * (density[..., 1:] + density[..., :-1]), axis=-1)
+    rows = along[..., -1]
+    below = np.zeros_like(rows)  # mass of the rows below
+    below[:, 1:] = np.cumsum(0.5 * (rows[:, 1:] + rows[:, :-1]), axis=-1)
+    total = below[:, -1:].copy()
+    along, below, rows = along / total[..., None], below / total, rows / total
+    density = density / total[..., None]
+    (column, row), (fx, fy) = _cells(square, width, height)
+
+    def at(grids: FloatArray, *index: NDArray[np.intp]) -> FloatArray:
+        return slices.take(grids, *index)
+
+    left = (1.0 - fy) * at(density, row, column) + fy * at(density, row + 1, column)
+    right = (1.0 - fy) * at(density, row, column + 1) + fy * at(density, row + 1, column + 1)
+    first, second = at(rows, row), at(rows, row + 1)
+    passed = (1.0 - fy) * at(along, row, column) + fy * at(along, row + 1, column)
+    whole = (1.0 - fy) * first + fy * second
+    x = passed + fx * (left + 0.5 * fx * (right - left))
+    y = at(below, row) + fy * (first + 0.5 * fy * (second - first))
+    x = np.divide(x, whole, out=fx.copy(), where=whole > 0.0)
+    return np.stack([np.clip(x, 0.0, 1.0), np.clip(y, 0.0, 1.0)], -1)

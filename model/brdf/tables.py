@@ -1,0 +1,309 @@
+"""Bases of tabulated isotropic BRDFs: the grid, lookups, and where the tables come from.
+
+A table holds BRDFs in 1/sr over MERL's half/difference angles, coarser than MERL's files and
+interpolated, each convolved with the solid angle of a light. Fresnel reflection is inside a table
+(as it is in measured ones): whoever evaluates it multiplies by nothing but the cosine of the light.
+
+References
+----------
+Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 7.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt
+
+from model import merl
+from model.brdf import recipe as brdf_recipe
+
+FloatArray = NDArray[np.float64]
+Brdf = Callable[[FloatArray, FloatArray], FloatArray]
+"""Takes light and view, unit vectors (..., 3) where +z is the normal; gives 1/sr, NaN: unknown."""
+
+NODES_D, NODES_PHI, NODES_H = 32, 12, 90
+LANES = 16  # materials are padded to full vectors of float32
+LEAST = 1e-20
+"""Values below this are stored as 0: a sum of denormal numbers is nine times as slow."""
+LED_RADIUS_RAD = 10.0 / 700.0
+"""Angular radius of the dome's lights (10 mm at 700 mm) seen from its centre."""
+_HALF_PI = 0.5 * np.pi
+
+
+class BasisError(ValueError):
+    """A folder or a set of tables that makes no basis."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BrdfBasis:
+    """BRDFs of K materials on one grid.
+
+    Attributes
+    ----------
+    table : ndarray of float32, shape (32, 12, 90, L)
+        1/sr at nodes of theta_d (even over [0, pi/2]), phi_d (even over [0, pi/2], folded by
+        reciprocity and mirror symmetry) and theta_h (even in its square root over [0, pi/2]).
+        L is K rounded up to a multiple of 16; columns from K on are 0.
+    names : tuple of str
+        The K materials.
+    light_radius_rad : float
+        Angular radius of the light the tables are convolved with; 0: a point.
+    """
+
+    table: NDArray[np.float32]
+    names: tuple[str, ...]
+    light_radius_rad: float
+
+    def __post_init__(self) -> None:
+        """Check shapes and values."""
+        lanes = -(-len(self.names) // LANES) * LANES
+        expected = (NODES_D, NODES_PHI, NODES_H, lanes)
+        if not self.names or self.table.shape != expected or self.table.dtype != np.float32:
+            raise BasisError(
+                f"BrdfBasis.table: got {self.table.dtype} {self.table.shape} for "
+                f"{len(self.names)} names, expected float32 {expected} and at least one name"
+            )
+        if not np.all((self.table >= 0.0) & (self.table < np.inf)):
+            raise BasisError("BrdfBasis.table: got negative or non-finite values")
+
+    @property
+    def size(self) -> int:
+        """Number of materials."""
+        return len(self.names)
+
+    def evaluate(self, light_dir: ArrayLike, view_dir: ArrayLike, normal: ArrayLike) -> FloatArray:
+        """Return each material's BRDF: linear in theta_d and theta_h, at the nearest phi_d.
+
+        Parameters
+        ----------
+        light_dir, view_dir, normal
+            Unit vectors (..., 3) in one frame, away from the surface; broadcast together.
+
+        Returns
+        -------
+        ndarray, shape (..., K)
+            1/sr; 0 where light or view are below the horizon.
+        """
+        light, view, n = (np.asarray(v, dtype=np.float64) for v in (light_dir, view_dir, normal))
+        mu_l, mu_v = np.sum(light * n, axis=-1), np.sum(view * n, axis=-1)
+        (i_d, i_phi, i_h), (d, h) = _place(mu_l, mu_v, np.sum(light * view, axis=-1))
+        found = np.zeros(())
+        for up_d in (0, 1):
+            for up_h in (0, 1):
+                weight = (d if up_d else 1.0 - d) * (h if up_h else 1.0 - h)
+                found = found + weight[..., None] * self.table[i_d + up_d, i_phi, i_h + up_h]
+        above = (mu_l > 0.0) & (mu_v > 0.0)
+        return np.asarray(np.where(above[..., None], found, 0.0)[..., : self.size])
+
+    def strength(self) -> FloatArray:
+        """Return each material's RMS over the grid, (K,), 1/sr; nodes count by solid angle."""
+        return np.asarray(np.sqrt(np.diag(_gram(self))))
+
+    def kinship(self) -> FloatArray:
+        """Return the cosines between the materials, (K, K): 1 for one of the same shape."""
+        gram = _gram(self)
+        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        return np.ascontiguousarray(gram / size / size[:, None])
+
+    def mixed(self, mix: ArrayLike) -> BrdfBasis:
+        """Return the basis whose R materials are the rows of `mix`, (R, K), at least 0."""
+        rows = np.asarray(mix, dtype=np.float64)
+        if rows.ndim != 2 or rows.shape[1] != self.size or not np.all(rows >= 0.0):
+            raise BasisError(
+                f"mix: got shape {rows.shape}, expected (R, {self.size}) of values at least 0"
+            )
+        table = self.table[..., : self.size].astype(np.float64) @ rows.T
+        return _padded(table, [f"mix {i}" for i in range(len(rows))], self.light_radius_rad)
+
+
+@lru_cache(maxsize=4)
+def default(light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
+    """Return the 59 dielectrics of :mod:`model.brdf.recipe`, made on first use (2 s).
+
+    Parameters
+    ----------
+    light_radius_rad
+        Angular radius of the light to convolve with, rad, in [0, 0.5].
+    """
+    return tabulate(dict(brdf_recipe.materials()), light_radius_rad=light_radius_rad)
+
+
+def tabulate(materials: dict[str, Brdf], *, light_radius_rad: float = 0.0) -> BrdfBasis:
+    """Return a basis of BRDFs given as functions.
+
+    Parameters
+    ----------
+    materials
+        Name to function; see :data:`Brdf`. Where a function gives NaN, the nearest known node
+        stands in; values below 0 count as 0.
+    light_radius_rad
+        Angular radius of the light to convolve with, rad, in [0, 0.5].
+    """
+    columns = [_convolved(brdf, light_radius_rad) for brdf in materials.values()]
+    if not columns:
+        raise BasisError("materials: got none, expected at least one")
+    return _padded(np.stack(columns, axis=-1), list(materials), light_radius_rad)
+
+
+def of_columns(
+    columns: FloatArray | NDArray[np.float32], names: Sequence[str], *, light_radius_rad: float
+) -> BrdfBasis:
+    """Return the basis whose table, without its padding, was kept.
+
+    Parameters
+    ----------
+    columns
+        BRDFs at the nodes, 1/sr, shape (32, N_phi, 90, K); see `BrdfBasis.table`. Values below 0
+        count as 0.
+    names
+        Of the K materials.
+    light_radius_rad
+        Of the light that they are convolved with.
+    """
+    return _padded(np.asarray(columns, np.float64), names, light_radius_rad)
+
+
+def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS_RAD) -> BrdfBasis:
+    """Return a basis of the MERL files in a folder, their channels averaged to one.
+
+    Parameters
+    ----------
+    folder
+        Its .binary files, however that is spelt, are taken in the order of their names; other
+        files are left alone. One file is in memory at a time.
+    light_radius_rad
+        Angular radius of the light to convolve with, rad, in [0, 0.5].
+
+    Raises
+    ------
+    BasisError
+        When the folder is missing or holds no .binary file, or one of them reflects nothing
+        anywhere.
+    model.merl.MerlFileError
+        When one of them is no MERL table.
+    """
+    place = Path(folder)
+    found = place.iterdir() if place.is_dir() else []
+    paths = sorted((p for p in found if p.suffix.lower() == ".binary"), key=lambda p: p.name)
+    if not paths:
+        raise BasisError(f"{folder}: got no .binary files, expected MERL tables")
+    columns = [_of_file(path, light_radius_rad) for path in paths]
+    return _padded(np.stack(columns, -1), [path.stem for path in paths], light_radius_rad)
+
+
+def _of_file(path: Path, light_radius_rad: float) -> NDArray[np.float32]:
+    mean = merl.read_mean(path)
+    if not np.nanmax(mean, initial=0.0) > 0.0:
+        raise BasisError(f"{path}: got no value above 0, expected a material that reflects")
+    if not np.nanmax(mean) < np.finfo(np.float32).max:
+        raise BasisError(f"{path}: got {np.nanmax(mean):.3g} 1/sr, expected less than 3e38")
+    return _convolved(_nearest_bin(mean), light_radius_rad).astype(np.float32)
+
+
+def of_merl(table: merl.MerlTable) -> Brdf:
+    """Return a MERL table as a function, the mean of its channels, NaN where not measured."""
+    mean = np.where(table.measured, np.tensordot(merl.SCALE, table.stored, 1) / 3.0, np.nan)
+    return _nearest_bin(mean)
+
+
+def _nearest_bin(mean: FloatArray) -> Brdf:
+    def brdf(light: FloatArray, view: FloatArray) -> FloatArray:
+        h, d, phi = merl.to_angles(light, view, [0.0, 0.0, 1.0])
+        return np.asarray(mean[merl.bins(np.minimum(h, _HALF_PI), d, phi)])
+
+    return brdf
+
+
+def nodes() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return theta_d, phi_d and theta_h of the grid's nodes, rad."""
+    return (
+        np.linspace(0.0, _HALF_PI, NODES_D),
+        np.linspace(0.0, _HALF_PI, NODES_PHI),
+        np.linspace(0.0, 1.0, NODES_H) ** 2 * _HALF_PI,
+    )
+
+
+@lru_cache(maxsize=4)
+def _gram(basis: BrdfBasis) -> FloatArray:
+    """Return the products of the materials over the grid, nodes counting by solid angle."""
+    d, _, h = nodes()
+    solid = np.sin(2.0 * d)[:, None] * (np.sin(h) * np.gradient(h))
+    weight = np.sqrt(np.broadcast_to((solid / solid.sum())[:, None], basis.table.shape[:3]))
+    scaled = basis.table[..., : basis.size] * weight[..., None].astype(np.float32)
+    flat = scaled.reshape(-1, basis.size)
+    return np.asarray(flat.T @ flat, dtype=np.float64) / NODES_PHI
+
+
+def _convolved(brdf: Brdf, radius_rad: float) -> FloatArray:
+    """Return a BRDF at the nodes, averaged with the cosine over a disc of light directions."""
+    if not 0.0 <= radius_rad <= 0.5:
+        raise BasisError(f"light_radius_rad: got {radius_rad}, expected 0 to 0.5 rad")
+    d, phi, h = np.meshgrid(*nodes(), indexing="ij")
+    light, view = merl.to_directions(h, d, phi)
+    if radius_rad == 0.0:
+        return _filled(np.asarray(brdf(light, view)))
+    # Seven points: exact on a disc for polynomials of degree 5 (Stroud 1971, S2 5-1).
+    helper = np.where(np.abs(light[..., 1:2]) < 0.9, [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
+    u = np.cross(helper, light)
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    v = np.cross(light, u)
+    total = np.zeros(d.shape)
+    weight = np.zeros(d.shape)
+    for point in range(7):
+        turn = point * np.pi / 3.0
+        reach = 0.0 if point == 6 else np.tan(radius_rad) * np.sqrt(2.0 / 3.0)
+        to = light + reach * (np.cos(turn) * u + np.sin(turn) * v)
+        to /= np.linalg.norm(to, axis=-1, keepdims=True)
+        value = np.asarray(brdf(to, view))
+        share = (0.25 if point == 6 else 0.125) * np.maximum(to[..., 2], 1e-3)
+        known = np.isfinite(value)
+        total += np.where(known, share * np.where(known, value, 0.0), 0.0)
+        weight += np.where(known, share, 0.0)
+    with np.errstate(invalid="ignore"):
+        return _filled(total / weight)
+
+
+def _filled(values: FloatArray) -> FloatArray:
+    """Put the nearest known node where a value is unknown, and 0 where it is below 0."""
+    unknown = ~np.isfinite(values)
+    if np.all(unknown):
+        raise BasisError("table: got no known value")
+    if np.any(unknown):
+        nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+        values = values[tuple(nearest)]
+    return np.maximum(values, 0.0)
+
+
+def _padded(columns: FloatArray, names: Sequence[str], light_radius_rad: float) -> BrdfBasis:
+    lanes = -(-len(names) // LANES) * LANES
+    table = np.zeros((*columns.shape[:3], lanes), dtype=np.float32)
+    table[..., : len(names)] = np.where(columns < LEAST, 0.0, columns)
+    return BrdfBasis(table, tuple(names), light_radius_rad)
+
+
+def _place(
+    mu_l: FloatArray, mu_v: FloatArray, between: FloatArray
+) -> tuple[tuple[NDArray[np.intp], ...], tuple[FloatArray, FloatArray]]:
+    """Return the cell along theta_d, phi_d, theta_h and the place in it, from cosines alone."""
+    cos_d = np.sqrt(np.clip(0.5 * (1.0 + between), 0.0, 1.0))
+    sin_d = np.sqrt(np.clip(0.5 * (1.0 - between), 0.0, 1.0))
+    cos_h = np.clip((mu_l + mu_v) / np.maximum(2.0 * cos_d, 1e-9), 0.0, 1.0)
+    sin_h = np.sqrt(1.0 - cos_h**2)
+    # mu_v - mu_l = 2 sin_d sin_h cos(phi_d); the sign falls with the folding
+    cos_phi = np.minimum(np.abs(mu_v - mu_l) / np.maximum(2.0 * sin_d * sin_h, 1e-9), 1.0)
+    place = (
+        np.arctan2(sin_d, cos_d) / _HALF_PI * (NODES_D - 1),
+        np.arccos(cos_phi) / _HALF_PI * (NODES_PHI - 1),
+        np.sqrt(np.arccos(cos_h) / _HALF_PI) * (NODES_H - 1),
+    )
+    d, phi, h = place
+    i_d = np.minimum(d.astype(np.intp), NODES_D - 2)
+    i_h = np.minimum(h.astype(np.intp), NODES_H - 2)
+    return (i_d, (phi + 0.5).astype(np.intp), i_h), (d - i_d, h - i_h)

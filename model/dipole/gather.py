@@ -1,0 +1,285 @@
+"""Light that entered skin at many points, gathered where it leaves: the dipole over a tree.
+
+Each source of light stands for an area of the surface; distant ones are taken together, as far as
+a bound on the error allows. A node of the tree counts with its light, the first moments of the
+light and its area, so that what is left out are second derivatives of the dipole times second
+moments of the node: that product, from the node's nearest point on, is the bound.
+
+Albedo measured from pictures holds the scattering already. So the light that the dipole brings
+together is divided by what even light would bring (post-scatter normalization): under even light
+exactly R_d times what entered leaves again, on curved, folded and bounded surfaces as on a plane.
+The sum without this division is there too: it falls off towards holes and edges, where light would
+be lost, and grows in folds, where the dipole of a plane counts both sides.
+
+References
+----------
+Jensen and Buhler 2002, doi:10.1145/566570.566619.
+Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 9 (the dome of 2005).
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model import fresnel
+from model.dipole import gather_kernels as dipole_gather_kernels
+from model.dipole import source_tree_kernels
+from model.dipole.direct_sum import REACH, Media
+
+FloatArray = NDArray[np.float64]
+
+TOLERANCE = 0.1
+"""Largest error that exit points may have over the brightest light that entered, if all nodes erred
+to the same side by as much as they can. Measured errors are a hundred times smaller."""
+NODES = 30.0
+"""Nodes that share the tolerance: so many come near their bounds."""
+_CHUNK = 1 << 14
+
+
+class GatherError(ValueError):
+    """Sources or exit points that light cannot be gathered from or at."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SourceTree:
+    """Points of a surface in a tree, for any light that enters there.
+
+    Attributes
+    ----------
+    center_mm : ndarray, shape (3,)
+        Origin of the tree's own coordinates.
+    order : ndarray of int
+        Sources in the tree's order; those without area are left out.
+    place, reach, area : ndarray of float32
+        (S, 3), (S,), (S,): mm, mm, mm^2, in the tree's order.
+    seen, low, high, skip : ndarray
+        Nodes; see `model.dipole.source_tree_kernels`.
+    size : int
+        Number of sources given.
+    """
+
+    center_mm: FloatArray
+    order: NDArray[np.intp]
+    place: NDArray[np.float32]
+    reach: NDArray[np.float32]
+    area: NDArray[np.float32]
+    seen: NDArray[np.float32]
+    low: NDArray[np.int32]
+    high: NDArray[np.int32]
+    skip: NDArray[np.int32]
+    size: int
+
+    @staticmethod
+    def of(source_mm: ArrayLike, source_area_mm2: ArrayLike) -> SourceTree:
+        """Build the tree.
+
+        Parameters
+        ----------
+        source_mm
+            Points of the surface, (S, 3), mm.
+        source_area_mm2
+            Area that each stands for, (S,), mm^2, at least 0.
+
+        Raises
+        ------
+        GatherError
+            For other shapes, a place that is not finite or an area that is negative.
+        """
+        place = np.asarray(source_mm, np.float64)
+        area = np.asarray(source_area_mm2, np.float64)
+        _expect("source_mm", place, (len(place), 3))
+        _expect("source_area_mm2", area, (len(place),))
+        if np.any(area < 0.0):
+            raise GatherError("source_area_mm2: got negative values, expected at least 0")
+        # an area that float32 does not hold sends nothing
+        size, some = len(place), np.flatnonzero(area.astype(np.float32) > 0.0)
+        place, area = place[some], area[some]
+        center = place.mean(axis=0) if len(some) else np.zeros(3)
+        near = (place - center).astype(np.float32)
+        if not len(some):
+            none = np.zeros(0, np.int32)
+            seen = np.zeros((0, source_tree_kernels.VISITED), np.float32)
+            empty = np.zeros(0, np.float32)
+            return SourceTree(center, some, near, empty, empty, seen, none, none, none, size)
+        order, low, high, skip = source_tree_kernels.split(near, source_tree_kernels.LEAF)
+        near, area = near[order], area[order].astype(np.float32)
+        reach = (REACH * np.sqrt(area)).astype(np.float32)
+        seen = source_tree_kernels.summarize(near, area, reach, low, high)
+        return SourceTree(center, some[order], near, reach, area, seen, low, high, skip, size)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gathered:
+    """What leaves at exit points.
+
+    Attributes
+    ----------
+    exitance : ndarray of float64, shape (Q, 3)
+        In the unit of what entered.
+    bound : ndarray of float32, shape (Q,)
+        No more than this, over the brightest light that entered and R_d, the tree adds to the
+        error of light and of mass.
+    work : ndarray of int32, shape (Q,)
+        Nodes and sources that were summed.
+    """
+
+    exitance: FloatArray
+    bound: NDArray[np.float32]
+    work: NDArray[np.int32]
+
+
+def exitance(
+    source_mm: ArrayLike,
+    source_area_mm2: ArrayLike,
+    entered: ArrayLike,
+    at_mm: ArrayLike,
+    r_d: ArrayLike,
+    translucency_mm: ArrayLike,
+    *,
+    eta: float = fresnel.ETA_SKIN,
+    normalize: bool = True,
+    tolerance: float = TOLERANCE,
+    entered_at: ArrayLike | None = None,
+    workers: int = 1,
+) -> FloatArray:
+    """Return the radiant exitance below the surface at points, from light that entered at others.
+
+    Parameters
+    ----------
+    source_mm
+        Points of the surface, (S, 3), mm, e.g. texels.
+    source_area_mm2
+        Area that each stands for, (S,), mm^2; 0: none, the source is left out.
+    entered
+        Irradiance times F_t of its direction, (S, 3), W/mm^2: what passed the surface. Its largest
+        is 0 or at least 1e-30: the tree holds single precision.
+    at_mm
+        Exit points, (Q, 3), mm, on the same surface.
+    r_d, translucency_mm
+        R_d and 1/sigma_tr, mm, at the exit points, broadcast to (Q, 3). R_d above 1, which no
+        medium has, scales light that does not spread; nothing is clamped.
+    eta
+        Refractive index of the skin over that of air.
+    normalize
+        Divide by what even light would bring: see above.
+    tolerance
+        Worst error over the brightest light that entered, see `TOLERANCE`, above 0.
+    entered_at
+        What enters at the exit points themselves, (Q, 3): taken for the light that comes out
+        nearer than the sources can tell. None: what enters at the sources near by.
+    workers
+        Threads.
+
+    Returns
+    -------
+    ndarray of float64, shape (Q, 3)
+        W/mm^2, before F_t of the view. Without any source: 0.
+
+    Raises
+    ------
+    GatherError
+        For shapes that do not fit, values that are not finite, a translucency or tolerance that
+        is not above 0.
+
+    Examples
+    --------
+    >>> grid = np.arange(-9.5, 10.0)
+    >>> points = np.stack([*np.meshgrid(grid, grid), np.zeros((20, 20))], axis=-1).reshape(-1, 3)
+    >>> light = np.full((400, 3), 2.0)
+    >>> out = exitance(points, np.ones(400), light, points[:5], (0.6, 0.3, 0.2), (2.0, 1.0, 0.5))
+    >>> out[0].round(5).tolist()
+    [1.2, 0.6, 0.4]
+    """
+    return gather(
+        SourceTree.of(source_mm, source_area_mm2), entered, at_mm, r_d, translucency_mm, eta=eta,
+        normalize=normalize, tolerance=tolerance, entered_at=entered_at, workers=workers,
+    ).exitance  # fmt: skip
+
+
+def gather(
+    tree: SourceTree,
+    entered: ArrayLike,
+    at_mm: ArrayLike,
+    r_d: ArrayLike,
+    translucency_mm: ArrayLike,
+    *,
+    eta: float = fresnel.ETA_SKIN,
+    normalize: bool = True,
+    tolerance: float = TOLERANCE,
+    entered_at: ArrayLike | None = None,
+    workers: int = 1,
+) -> Gathered:
+    """Return what leaves, as `exitance`, for a tree that is used for several lights or views."""
+    light = np.asarray(entered, np.float64)
+    at = np.asarray(at_mm, np.float64)
+    _expect("entered", light, (tree.size, 3))
+    _expect("at_mm", at, (len(at), 3))
+    albedo, length = (
+        _spread("r_d", r_d, len(at)),
+        _spread("translucency_mm", translucency_mm, len(at)),
+    )
+    own = np.full((1, 3), np.nan)
+    if entered_at is not None:
+        own = np.asarray(entered_at, np.float64)
+        _expect("entered_at", own, at.shape)
+    if not tolerance > 0.0:
+        raise GatherError(f"tolerance: got {tolerance}, expected above 0")
+    if np.any(length <= 0.0):
+        raise GatherError("translucency_mm: got values of 0 or below, expected above 0")
+    if workers < 1:
+        raise GatherError(f"workers: got {workers}, expected at least 1")
+    found = np.zeros((len(at), 3))
+    bound, work = np.zeros(len(at), np.float32), np.zeros(len(at), np.int32)
+    if not len(tree.order):
+        return Gathered(found, bound, work)
+    light = light[tree.order]
+    moments = source_tree_kernels.light_moments(
+        tree.place, tree.area, light, tree.low, tree.high, tree.seen
+    )
+    own = np.broadcast_to(own, at.shape)
+
+    def one(start: int) -> None:
+        part = slice(start, start + _CHUNK)
+        media = Media.of(albedo[part], length[part], eta=eta)
+        here = np.ascontiguousarray(own[part]).view()
+        here.flags.writeable = False  # what may be written would have the kernel compiled anew
+        dipole_gather_kernels.gather(
+            (at[part] - tree.center_mm).astype(np.float32), media.sigma_tr_per_mm,
+            media.depth_mm, media.height_mm, media.scale, here,
+            tolerance / NODES, normalize, tree.place, tree.reach, tree.area, light, tree.seen,
+            moments, tree.low, tree.high, tree.skip, found[part], bound[part], work[part],
+        )  # fmt: skip
+        found[part] *= albedo[part]
+
+    starts = range(0, len(at), _CHUNK)
+    if workers == 1:
+        for start in starts:
+            one(start)
+    else:
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(one, starts))
+    return Gathered(found, bound, work)
+
+
+def _expect(name: str, values: FloatArray, shape: tuple[int, ...]) -> None:
+    if values.shape != shape:
+        raise GatherError(f"{name}: got shape {values.shape}, expected {shape}")
+    if not np.isfinite(values).all():
+        raise GatherError(f"{name}: got NaN or infinity, expected finite; leave such points out")
+
+
+def _spread(name: str, given: ArrayLike, count: int) -> FloatArray:
+    values = np.asarray(given, np.float64)
+    try:
+        spread = np.broadcast_to(values, (count, 3))
+    except ValueError as error:
+        raise GatherError(
+            f"{name}: got shape {values.shape}, expected one that broadcasts to ({count}, 3)"
+        ) from error
+    if not np.isfinite(values).all():
+        raise GatherError(f"{name}: got NaN or infinity, expected finite; leave such points out")
+    return spread

@@ -1,0 +1,1 @@
+"""Displacement synthesis: texture growth of skin microstructure."""

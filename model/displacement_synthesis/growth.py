@@ -1,0 +1,354 @@
+"""Grow measured patches of skin to displacement maps of any size, by their own pixels.
+
+A map is a grid of cells. Each gets a window of a patch, the one out of some drawn at random that
+can be cut most cheaply against its neighbours (image quilting: Efros and Freeman 2001,
+doi:10.1145/383259.383296), so furrows go on across cells and slopes keep their distribution. Cells
+are chosen in four groups by the parity of row and column, cuts are made cell by cell, and steps of
+height that are left at cuts are spread over a neighbourhood by a screened Poisson equation, which
+keeps the slopes of both sides. All of that is local, and chance is a hash of place and seed: the
+same seed gives the same bytes, whatever the number of threads, the tiles or their order.
+
+Sites are blended with weights divided by the root of their sum of squares: the sum of
+uncorrelated reliefs so keeps a variance between theirs (Heitz and Neyret 2018,
+doi:10.1145/3233304, section 2).
+
+Nagano et al. 2015 (doi:10.1145/2766894) cover faces by the synthesis of Graham et al. 2013
+(doi:10.1111/cgf.12053), which is constrained by a coarser scan; this one is not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.displacement_synthesis import kernels
+from model.displacement_synthesis.layout import CellGrid, Layout, SiteLayout
+from model.displacement_synthesis.regions import coarse_weights, interpolated
+from model.displacement_synthesis.sources import Sources, SynthesisError, gather, leveled
+
+__all__ = ["Layout", "SynthesisError", "grow", "lay_out", "leveled"]
+
+Float32Array = NDArray[np.float32]
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Wrap: TypeAlias = Literal["none", "u", "both"]
+Patches: TypeAlias = Sequence[ArrayLike] | Mapping[str, Sequence[ArrayLike]]
+
+MAX_SIDE_PX = 65_536
+MOST_FILLED = 0.1
+"""Share of a window's pixels that may be without a measured height."""
+SCALE_STEP = 1.04
+"""Scales of one map are whole powers of this, so that features are at most 2 % off their size."""
+
+
+def grow(
+    patches: Patches,
+    size_px: int | tuple[int, int],
+    *,
+    rng: np.random.Generator,
+    regions: ArrayLike | None = None,
+    out: NDArray[np.float32] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    threads: int = 1,
+    **knobs: Any,
+) -> Float32Array:
+    """Grow patches to a displacement map without seams.
+
+    Parameters
+    ----------
+    patches : sequence of (H, W), or mapping of sites to such sequences
+        Heights about zero, um (see :func:`leveled`); NaN: hole.
+    size_px : int or (int, int)
+        Rows and columns of the map, up to 65,536.
+    rng
+        Draws the seed: one number.
+    regions : array_like, optional
+        For patches by site: which one is where, (h, w) integers into the sites' order, -1: any;
+        or weights (R, h, w) >= 0. Row 0 is row 0 of the map; any resolution.
+    out : ndarray of float32, optional
+        Where the map is written tile by tile, such as ``numpy.lib.format.open_memmap``'s;
+        a map of 16,384 x 16,384 has 1 GB.
+    progress : callable, optional
+        Called with (tiles done, tiles in all).
+    threads : int
+        Threads to use, 1 to 64; they do not change the result.
+    **knobs
+        Of :func:`lay_out`: ``pixel_um``, ``patch_pixel_um``, ``wrap``, ``cell_px``,
+        ``overlap_px``, ``candidates``, ``range_px``, ``transition_px``.
+
+    Returns
+    -------
+    ndarray of float32, shape ``size_px``
+        Heights, um; ``out`` if it was given.
+
+    Raises
+    ------
+    SynthesisError
+        For patches, sizes, regions or knobs that nothing can be grown from.
+
+    Notes
+    -----
+    A map knows nothing of an atlas' islands: where two of them meet on the skin, what they show
+    does not (`model.displacement_synthesis.volume_noise` has no such edges).
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> patch = np.sin(np.arange(128.0) / 3.0)[:, None] + 0.1 * rng.standard_normal((128, 128))
+    >>> grow([patch], 200, rng=rng).shape
+    (200, 200)
+    """
+    layout = lay_out(patches, size_px, rng=rng, regions=regions, threads=threads, **knobs)
+    target = np.empty(layout.shape, np.float32) if out is None else out
+    if target.shape != layout.shape or target.dtype != np.float32:
+        raise SynthesisError(
+            f"out: got {target.dtype} {target.shape}, expected float32 {layout.shape}"
+        )
+
+    def draw(place: tuple[int, int]) -> None:
+        tile = layout.tile(*place)
+        top, left = place
+        target[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
+
+    places = list(layout.tiles())
+    with ThreadPoolExecutor(threads) as pool:
+        for done, _ in enumerate(pool.map(draw, places), 1):
+            if progress is not None:
+                progress(done, len(places))
+    return target
+
+
+def lay_out(
+    patches: Patches,
+    size_px: int | tuple[int, int],
+    *,
+    rng: np.random.Generator,
+    regions: ArrayLike | None = None,
+    pixel_um: float | ArrayLike = 10.0,
+    patch_pixel_um: float = 10.0,
+    wrap: Wrap = "none",
+    cell_px: int | None = None,
+    overlap_px: int | None = None,
+    candidates: int = 16,
+    range_px: float | None = None,
+    transition_px: float = 256.0,
+    threads: int = 1,
+) -> Layout:
+    """Choose what each place of a map shows, without drawing it.
+
+    Parameters
+    ----------
+    patches, size_px, rng, regions, threads
+        As of :func:`grow`.
+    pixel_um : float or array_like, shape (h, w)
+        Side of the map's pixels on the skin, um: one number, or a map of any resolution where it
+        varies, as over an atlas; features then keep their size on the skin to 2 %, and heights
+        stay as they are.
+    patch_pixel_um : float
+        Side of the patches' pixels, um.
+    wrap : {"none", "u", "both"}
+        Where the map goes on at its other side: nowhere, left and right, or also above and below.
+    cell_px, overlap_px : int, optional
+        Distance of cells, and how much neighbours share, even, at most ``cell_px``, px of the
+        map. By default a quarter and a twelfth of the smallest patch, at most 192 and 64.
+    candidates : int
+        Windows tried a cell, >= 1. More make better cuts, and a map of what is cut best.
+    range_px : float, optional
+        Distance over which steps at cuts are spread; three eighths of the overlap by default.
+    transition_px : float
+        Width of the transition between sites, px; coarser regions blend over their own pixels.
+
+    Returns
+    -------
+    Layout
+
+    Raises
+    ------
+    SynthesisError
+        As of :func:`grow`.
+    """
+    shape = _shape(size_px)
+    if wrap not in ("none", "u", "both"):
+        raise SynthesisError(f'wrap: got {wrap!r}, expected "none", "u" or "both"')
+    if candidates < 1 or not 1 <= threads <= 64:
+        raise SynthesisError(
+            f"candidates, threads: got {candidates}, {threads}, expected >= 1 and 1...64"
+        )
+    for name, value in (("patch_pixel_um", patch_pixel_um), ("transition_px", transition_px)):
+        if not (math.isfinite(value) and value > 0):
+            raise SynthesisError(f"{name}: got {value}, expected a finite number above 0")
+    by_site = dict(patches) if isinstance(patches, Mapping) else {"patches": patches}
+    if not by_site:
+        raise SynthesisError("patches: got no site")
+    scales = np.asarray(pixel_um, np.float64)
+    if scales.ndim not in (0, 2) or not (np.isfinite(scales).all() and (scales > 0).all()):
+        raise SynthesisError("pixel_um: expected one number or a map, finite and above 0")
+    sides = [min(np.shape(p), default=0) for each in by_site.values() for p in each]
+    smallest = int(min(sides, default=0) * patch_pixel_um / scales.max())
+    grid = _grid(shape, smallest, cell_px, overlap_px, wrap)
+    levels, zooms = _levels(scales, patch_pixel_um, grid)
+    range_px = 0.375 * grid.overlap if range_px is None else float(range_px)
+    if not 0.5 <= range_px <= 512.0:
+        raise SynthesisError(f"range_px: got {range_px}, expected 0.5...512")
+    if regions is None and len(by_site) > 1:
+        raise SynthesisError(f"regions: got None, expected where each of {len(by_site)} sites is")
+    weights = None
+    if regions is not None:
+        weights = coarse_weights(regions, len(by_site), shape, transition_px=transition_px)
+    seed = int(rng.integers(2**62))
+    sites = []
+    for number, (name, each) in enumerate(by_site.items()):
+        sources = gather(each, zooms, window=grid.window, name=f"patches of {name}")
+        needed = None if weights is None else _needed(weights[number], grid)
+        knobs = (candidates, np.float32(0.25 / range_px**2), np.uint64(seed + 7919 * number))
+        sites.append(_choose(sources, grid, levels, needed, knobs, threads))
+    return Layout(grid=grid, sites=tuple(sites), weights=weights, range_px=range_px)
+
+
+def _shape(size_px: int | tuple[int, int]) -> tuple[int, int]:
+    size = (size_px, size_px) if isinstance(size_px, (int, np.integer)) else tuple(size_px)
+    if len(size) != 2 or not all(1 <= n <= MAX_SIDE_PX for n in size):
+        raise SynthesisError(f"size_px: got {size_px}, expected one or two of 1...{MAX_SIDE_PX}")
+    return int(size[0]), int(size[1])
+
+
+def _grid(
+    shape: tuple[int, int], smallest: int, cell_px: int | None, overlap_px: int | None, wrap: Wrap
+) -> CellGrid:
+    cell = max(8, min(192, smallest // 4)) if cell_px is None else int(cell_px)
+    overlap = max(4, min(64, cell // 3 // 2 * 2)) if overlap_px is None else int(overlap_px)
+    if not (4 <= overlap <= cell and overlap % 2 == 0):
+        raise SynthesisError(
+            f"overlap_px: got {overlap}, expected an even number from 4 to cell_px = {cell}"
+        )
+    wraps = (wrap == "both", wrap != "none")
+    lines = []
+    for size, around in zip(shape, wraps, strict=True):
+        count = max(1, size // cell)
+        if around:
+            count -= count % 2  # neighbours differ in parity, across the edge too
+            if count < 2:
+                raise SynthesisError(
+                    f"size_px: got {size}, expected at least two cells of {cell} px where it wraps"
+                )
+        lines.append(np.asarray(np.arange(count + 1) * size // count, np.int64))
+    longest = max(int(np.diff(line).max()) for line in lines)
+    return CellGrid(lines[0], lines[1], overlap, longest + overlap, wraps)
+
+
+def _levels(scales: Floats, patch_pixel_um: float, grid: CellGrid) -> tuple[Integers, list[float]]:
+    """Return the scale of each cell, and pixels of the map per pixel of a patch of each scale."""
+    counts = (grid.lines_y.size - 1, grid.lines_x.size - 1)
+    if scales.ndim == 0:
+        return np.zeros(counts, np.int64), [patch_pixel_um / float(scales)]
+    middles = [0.5 * (line[1:] + line[:-1]) / line[-1] for line in (grid.lines_y, grid.lines_x)]
+    at = [
+        np.minimum((m * n).astype(int), n - 1) for m, n in zip(middles, scales.shape, strict=True)
+    ]
+    powers = np.rint(np.log(scales[np.ix_(*at)]) / math.log(SCALE_STEP)).astype(np.int64)
+    used, levels = np.unique(powers, return_inverse=True)
+    zooms = [patch_pixel_um / SCALE_STEP ** float(power) for power in used]
+    return levels.reshape(counts).astype(np.int64), zooms
+
+
+def _needed(weights: Floats, grid: CellGrid) -> NDArray[np.bool_]:
+    """Return which cells show a site at all, with a margin of a cell."""
+    shape = (int(grid.lines_y[-1]), int(grid.lines_x[-1]))
+    found = np.empty((grid.lines_y.size - 1, grid.lines_x.size - 1), bool)
+    for row in range(found.shape[0]):
+        part = (int(grid.lines_y[row]), int(grid.lines_y[row + 1]))
+        share = interpolated(weights, shape, part, (0, shape[1]), wrap=grid.wrap)
+        found[row] = np.maximum.reduceat(share.max(axis=0), grid.lines_x[:-1]) > 0
+    for axis in (0, 1):
+        found = found | np.roll(found, 1, axis) | np.roll(found, -1, axis)
+    return found
+
+
+def _choose(
+    sources: Sources,
+    grid: CellGrid,
+    levels: Integers,
+    needed: NDArray[np.bool_] | None,
+    knobs: tuple[int, np.float32, np.uint64],
+    threads: int,
+) -> SiteLayout:
+    """Choose windows in four groups and cut between them."""
+    candidates, per_step, seed = knobs
+    wrap_y, wrap_x = grid.wrap
+    ny, nx = levels.shape
+    cells = np.full((ny, nx, 4), -1, np.int64)
+    if needed is not None:
+        cells[~needed, 0] = -2
+    across = np.full((ny, nx, grid.window), grid.overlap // 2, np.int16)
+    down = np.full((ny, int(grid.lines_x[-1])), grid.overlap // 2, np.int16)
+    allowed = _allowance(sources, grid.window)
+
+    def choose(row: int, first: int, beside: bool, above: bool) -> None:
+        kernels.choose_windows(
+            row, first, cells, grid.lines_y, grid.lines_x, beside, above, wrap_x, wrap_y,
+            grid.window, grid.overlap, levels, sources.level_first, sources.table,
+            sources.heights, sources.turned, sources.filled, allowed, candidates, seed, per_step,
+        )  # fmt: skip
+
+    def cut_columns(row: int) -> None:
+        kernels.cut_columns(
+            row, cells, grid.lines_x, wrap_x, grid.window, grid.overlap, sources.table,
+            sources.heights, per_step, across,
+        )  # fmt: skip
+
+    def cut_rows(line: int) -> None:
+        kernels.cut_rows(
+            line, cells, grid.lines_y, grid.lines_x, wrap_x, grid.overlap, sources.table,
+            sources.heights, per_step, across, down,
+        )  # fmt: skip
+
+    with ThreadPoolExecutor(threads) as pool:
+        for parity, first, beside, above in (
+            (0, 0, False, False),
+            (0, 1, True, False),
+            (1, 0, False, True),
+            (1, 1, True, True),
+        ):
+            rows = range(parity, ny, 2)
+            list(pool.map(choose, rows, *([v] * len(rows) for v in (first, beside, above))))
+        if (cells[..., 0] == -1).any():
+            raise SynthesisError(
+                f"patches: got no window with at most {allowed} filled pixels in "
+                f"{candidates * kernels.TRIES} draws, expected fewer holes or more candidates"
+            )
+        list(pool.map(cut_columns, range(ny)))
+        list(pool.map(cut_rows, range(0 if wrap_y else 1, ny)))
+    return SiteLayout(sources, cells, across, down)
+
+
+def _allowance(sources: Sources, window: int) -> int:
+    """Return how many filled pixels windows may have: what a twentieth of all windows keep to.
+
+    Raises
+    ------
+    SynthesisError
+        When that is more than `MOST_FILLED` of a window.
+    """
+    most = 0
+    for level in range(sources.level_first.size - 1):
+        counts = []
+        for _, high, wide, first, _ in sources.table[
+            sources.level_first[level] : sources.level_first[level + 1]
+        ]:
+            sums = sources.filled[first : first + (high + 1) * (wide + 1)]
+            s = sums.reshape(high + 1, wide + 1)
+            inside = s[window:, window:] - s[:-window, window:] - s[window:, :-window]
+            counts.append((inside + s[:-window, :-window]).reshape(-1))
+        most = max(most, int(np.quantile(np.concatenate(counts), 0.05)))
+    if most > MOST_FILLED * window**2:
+        raise SynthesisError(
+            f"patches: got holes of {100 * most / window**2:.0f} % of a window of {window} px even "
+            f"in its best places, expected at most {100 * MOST_FILLED:.0f} %: give patches with "
+            "larger whole parts, or smaller cell_px, overlap_px"
+        )
+    return most

@@ -1,0 +1,326 @@
+"""Scale and bias maps of a hemoglobin rig: from measured maps, and for another face."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.facial_color import coarse_maps, deviation_ratio, disc_statistics
+from model.facial_color.deviation_ratio import ROUNDING
+from model.facial_color.disc_statistics import DiscStatistics
+from model.facial_color.rig import (
+    GLOBAL_STATES,
+    NEUTRAL,
+    FacialColorError,
+    HemoglobinRig,
+    StateMaps,
+    check_name,
+)
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TRANSFERS = ("ratio", "difference", "absolute")
+_LINES = 256
+"""Rows and columns that the size of a map's texture is taken from."""
+
+
+def fitted(
+    neutral: ArrayLike,
+    states: Mapping[str, ArrayLike],
+    *,
+    radius_px: float,
+    valid: Mask | Mapping[str, Mask] | None,
+    stderr: Mapping[str, ArrayLike],
+    global_states: Iterable[str] | None,
+    stored_size: int | None,
+) -> HemoglobinRig:
+    """Do the work of `HemoglobinRig.from_maps`."""
+    if not states:
+        raise FacialColorError("states: got none, expected at least one beside the neutral")
+    for name in states:
+        check_name(name)
+    base = _image(NEUTRAL, neutral)
+    shape = base.shape
+    images = {NEUTRAL: base} | {n: _image(n, m, shape) for n, m in states.items()}
+    masks = _masks(valid, images)
+    errors = _errors(stderr, images)
+    held = masks[NEUTRAL]
+    if not held.any():
+        raise FacialColorError(f"{NEUTRAL}: no pixel is valid, expected some")
+    cells = coarse_maps.fitting(shape, stored_size)
+    own = disc_statistics.measure(base, radius_px, valid=held)
+    texture_px = texture_area_px(base - own.mean, held)
+    mean, _ = cells.coarsen(own.mean, held)
+    made = {
+        name: _state(
+            images[name], base, own, held, masks[name], errors[name], errors[NEUTRAL],
+            radius_px=radius_px, cells=cells, texture_px=texture_px,
+        )
+        for name in states
+    }  # fmt: skip
+    listed = [n for n in GLOBAL_STATES if n in states] if global_states is None else global_states
+    return HemoglobinRig(
+        neutral=np.where(held, base, base.dtype.type(0)),
+        valid=held,
+        neutral_stderr=np.where(held, errors[NEUTRAL], 0.0).astype(base.dtype),
+        neutral_mean=mean,
+        states=made,
+        radius_px=float(radius_px),
+        global_states=tuple(listed),
+    )
+
+
+def _state(
+    image: NDArray[np.floating],
+    neutral: NDArray[np.floating],
+    own: DiscStatistics,
+    held: Mask,
+    mask: Mask,
+    error: Floats,
+    neutral_error: Floats,
+    *,
+    radius_px: float,
+    cells: coarse_maps.Cells,
+    texture_px: float,
+) -> StateMaps:
+    """Compare one state with the neutral map over the pixels that both have."""
+    both = held & mask
+    alike = bool((both == held).all())
+    rest = own if alike else disc_statistics.measure(neutral, radius_px, valid=both)
+    seen = disc_statistics.measure(image, radius_px, valid=both)
+    total = disc_statistics.measure(
+        np.where(both, image, 0).astype(np.float64) + np.where(both, neutral, 0), radius_px,
+        valid=both,
+    )  # fmt: skip
+    where = held & seen.valid
+    covariance = 0.5 * (total.deviation**2 - seen.deviation**2 - rest.deviation**2)
+    product = seen.deviation * rest.deviation
+    with np.errstate(invalid="ignore", divide="ignore"):
+        alikeness = np.where(product > 0.0, np.clip(covariance / product, -1.0, 1.0), 0.0)
+        draws = np.maximum(seen.count / texture_px, 1.0)
+    # The sampling error of a ratio of deviations of correlated pairs, at fixed denominator
+    sampled = seen.deviation**2 * (1.0 - alikeness**2) / draws
+    measured = [
+        _deviation_variance(
+            stats, disc_statistics.measure(e.astype(np.float32), radius_px, valid=both), draws
+        )
+        for stats, e in ((seen, error), (rest, neutral_error))
+    ]
+    ratio = deviation_ratio.estimate(
+        seen.deviation, rest.deviation, sampled + measured[0] + measured[1], where
+    )
+    s = ratio.value
+    # eq. (5); where masks differ, mu_n of the shared pixels is not mu_n of all
+    bias = seen.mean if alike else seen.mean + s * (own.mean - rest.mean)
+    misfit = np.sqrt(
+        np.maximum(seen.deviation**2 - 2.0 * s * covariance + (s * rest.deviation) ** 2, 0.0)
+    )
+    shared = _mean_in_disc(error, radius_px, both)
+    bias_stderr = np.sqrt(misfit**2 / draws + shared**2)
+    stored = {}
+    few: Mask = np.ones(cells.stored, np.bool_)
+    for name, full in (
+        ("scale", s), ("bias", bias), ("scale_stderr", ratio.stderr),
+        ("bias_stderr", bias_stderr), ("misfit", misfit),
+    ):  # fmt: skip
+        stored[name], few = cells.coarsen(full, where)
+    exact = bias + s * (neutral - own.mean)
+    mean, _ = cells.coarsen(own.mean, where)
+    up = cells.refine(stored["scale"], stored["bias"], mean, valid=few)
+    lost = (up[1] + up[0] * (neutral - up[2]) - exact)[where]
+    return StateMaps(
+        **stored,
+        valid=few,
+        prior=ratio.prior,
+        storage_rms=float(np.sqrt(np.mean(lost**2))) if lost.size else 0.0,
+        storage_largest=float(np.abs(lost).max()) if lost.size else 0.0,
+    )
+
+
+def _mean_in_disc(error: Floats, radius_px: float, valid: Mask) -> Floats:
+    if not error.any():
+        return np.zeros(error.shape)
+    found = disc_statistics.measure(error.astype(np.float32), radius_px, valid=valid)
+    return np.where(found.valid, found.mean, 0.0)
+
+
+def _deviation_variance(stats: DiscStatistics, error: DiscStatistics, draws: Floats) -> Floats:
+    """Return the variance of a measured deviation from the errors of the pixels it is of.
+
+    An error e of the pixels adds up to e^2 to the square of a deviation, and 2 sigma e/sqrt(n)
+    more by chance. Nothing is known worse than to its own size, nor better than float32 rounds.
+    """
+    sigma = np.where(stats.valid, stats.deviation, 0.0)
+    e2 = np.where(error.valid, error.mean**2 + error.deviation**2, 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        own = np.where(sigma > 0.0, (0.5 * e2 / np.where(sigma > 0.0, sigma, 1.0)) ** 2, 0.0)
+    own += e2 / draws
+    return np.minimum(own, sigma**2) + (ROUNDING * np.where(stats.valid, stats.mean, 0.0)) ** 2
+
+
+def texture_area_px(base: Floats, valid: Mask) -> float:
+    """Return the area over which a texture repeats itself, px: the sum of its squared correlation.
+
+    A disc of n pixels knows a deviation as well as n/area independent ones. The correlation is
+    taken along rows and columns and multiplied.
+
+    Parameters
+    ----------
+    base
+        Map without its local mean, (H, W).
+    valid
+        (H, W).
+
+    Returns
+    -------
+    float
+        At least 1.
+    """
+    area = 1.0
+    values = np.where(valid, base, 0.0)
+    for lines, mask in ((values, valid), (values.T, valid.T)):
+        step = max(lines.shape[0] // _LINES, 1)
+        z, v = lines[::step], mask[::step].astype(np.float64)
+        power = float(np.sum(z * z)) / max(float(v.sum()), 1.0)
+        length = 1.0
+        for lag in range(1, z.shape[1]):
+            pairs = float(np.sum(v[:, lag:] * v[:, :-lag]))
+            if power <= 0.0 or pairs <= 0.0:
+                break
+            rho = float(np.sum(z[:, lag:] * z[:, :-lag])) / pairs / power
+            if rho < 0.1:
+                break
+            length += 2.0 * min(rho, 1.0) ** 2
+        area *= length
+    return area
+
+
+def transferred(
+    rig: HemoglobinRig,
+    neutral: ArrayLike,
+    *,
+    valid: Mask | None,
+    stderr: ArrayLike | None,
+    transfer: str,
+) -> HemoglobinRig:
+    """Do the work of `HemoglobinRig.applied_to`."""
+    if transfer not in TRANSFERS:
+        raise FacialColorError(f"transfer: got {transfer!r}, expected one of {TRANSFERS}")
+    base = _image(NEUTRAL, neutral)
+    images = {NEUTRAL: base}
+    held = _masks(valid, images)[NEUTRAL]
+    if not held.any():
+        raise FacialColorError(f"{NEUTRAL}: no pixel is valid, expected some")
+    error = _errors({} if stderr is None else {NEUTRAL: stderr}, images)[NEUTRAL]
+    size = rig.neutral_mean.shape
+    stored = (min(size[0], base.shape[0]), min(size[1], base.shape[1]))
+    cells = coarse_maps.Cells((base.shape[0], base.shape[1]), stored)
+    growth = np.sqrt(base.size / rig.neutral.size)
+    radius_px = float(rig.radius_px * growth)
+    own = disc_statistics.measure(base, radius_px, valid=held)
+    mean, here = cells.coarsen(own.mean, held)
+    source_mean, source_valid = _resampled(rig.neutral_mean, rig.neutral_mean_valid, stored)
+    made = {}
+    for name, state in rig.states.items():
+        maps = {
+            field: _resampled(getattr(state, field), state.valid, stored)[0]
+            for field in ("scale", "bias", "scale_stderr", "bias_stderr", "misfit")
+        }
+        both = _resampled(state.bias, state.valid, stored)[1] & source_valid & here
+        if transfer == "difference":
+            maps["bias"] = mean + maps["bias"] - source_mean
+        elif transfer == "ratio":
+            variance = maps["bias_stderr"] ** 2 + (ROUNDING * maps["bias"]) ** 2
+            change = deviation_ratio.estimate(maps["bias"], source_mean, variance, both)
+            known = both & (source_mean > 0.0)
+            maps["bias"] = mean * change.value
+            maps["bias_stderr"] = np.abs(mean) * change.stderr
+            per = np.where(known, mean / np.where(known, source_mean, 1.0), 1.0)
+            maps["misfit"] = maps["misfit"] * np.abs(per)
+        made[name] = StateMaps(
+            **{field: np.where(both, values, 0.0) for field, values in maps.items()},
+            valid=both, prior=state.prior, storage_rms=state.storage_rms,
+            storage_largest=state.storage_largest,
+        )  # fmt: skip
+    return HemoglobinRig(
+        neutral=np.where(held, base, base.dtype.type(0)),
+        valid=held,
+        neutral_stderr=np.where(held, error, 0.0).astype(base.dtype),
+        neutral_mean=mean,
+        states=made,
+        radius_px=radius_px,
+        global_states=rig.global_states,
+    )
+
+
+def _resampled(values: Floats, valid: Mask, shape: tuple[int, int]) -> tuple[Floats, Mask]:
+    """Return a stored map at another size, and where it holds something."""
+    if values.shape == shape:
+        return values, valid
+    few = (min(values.shape[0], shape[0]), min(values.shape[1], shape[1]))
+    if few != values.shape:
+        values, valid = coarse_maps.Cells((values.shape[0], values.shape[1]), few).coarsen(
+            values, valid
+        )
+    if few != shape:
+        (values,) = coarse_maps.Cells(shape, few).refine(values, valid=valid)
+        valid = np.isfinite(values)
+    return np.where(valid, values, 0.0), valid
+
+
+def _image(
+    name: str, image: ArrayLike, shape: tuple[int, ...] | None = None
+) -> NDArray[np.floating]:
+    values = np.asarray(image)
+    if values.dtype != np.float32:
+        values = values.astype(np.float64)
+    if values.ndim != 2 or not values.size:
+        raise FacialColorError(f"{name}: got shape {values.shape}, expected (H, W) with pixels")
+    if shape is not None and values.shape != shape:
+        raise FacialColorError(f"{name}: got shape {values.shape}, expected {shape} as the neutral")
+    return values
+
+
+def _masks(
+    valid: Mask | Mapping[str, Mask] | None, images: Mapping[str, NDArray[np.floating]]
+) -> dict[str, Mask]:
+    given = valid if isinstance(valid, Mapping) else dict.fromkeys(images, valid)
+    for name in given:
+        if name not in images:
+            raise FacialColorError(f"valid: {name!r} is none of the maps {', '.join(images)}")
+    masks = {}
+    for name, image in images.items():
+        mask = given.get(name)
+        finite = np.isfinite(image)
+        if mask is not None:
+            mask = np.asarray(mask)
+            if mask.dtype != np.bool_ or mask.shape != image.shape:
+                raise FacialColorError(
+                    f"valid of {name}: got {mask.dtype} {mask.shape}, expected bool {image.shape}"
+                )
+            finite &= mask
+        masks[name] = finite
+    return masks
+
+
+def _errors(
+    stderr: Mapping[str, ArrayLike], images: Mapping[str, NDArray[np.floating]]
+) -> dict[str, Floats]:
+    for name in stderr:
+        if name not in images:
+            raise FacialColorError(f"stderr: {name!r} is none of the maps {', '.join(images)}")
+    errors = {}
+    for name, image in images.items():
+        error = np.asarray(stderr.get(name, np.zeros(image.shape)), np.float64)
+        if error.shape != image.shape:
+            raise FacialColorError(
+                f"stderr of {name}: got shape {error.shape}, expected {image.shape}"
+            )
+        known = np.isfinite(error)
+        if (error[known] < 0.0).any():
+            raise FacialColorError(f"stderr of {name}: got negative values, expected >= 0")
+        errors[name] = np.where(known, error, 0.0)
+    return errors

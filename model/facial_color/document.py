@@ -1,0 +1,174 @@
+"""A hemoglobin rig as maps of an APPEARANCE/ folder with one JSON document, and back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.facial_color.rig import NEUTRAL, FacialColorError, HemoglobinRig, StateMaps
+from model.skin import UNITS, SkinMap
+
+SCHEMA: Final = "skinrig.facial-color/1"
+DOCUMENT: Final = "facial_color.json"
+_BLOOD: Final = UNITS["hemoglobin"]
+_KEYS: Final = {"schema", "radius_px", "shape", "stored", "global_states", "states"}
+_STATE_KEYS: Final = {"prior", "storage_rms", "storage_largest"}
+
+
+def to_maps(rig: HemoglobinRig) -> tuple[dict[str, SkinMap], bytes]:
+    """Return a rig's maps by name, and its document."""
+    maps = {
+        "hemoglobin": SkinMap(
+            _single(rig.neutral), _BLOOD, _single(rig.neutral_stderr), rig.valid,
+            "neutral state; linear volume fraction",
+        ),
+        f"bias_{NEUTRAL}": SkinMap(
+            _single(rig.neutral_mean), _BLOOD, None, rig.neutral_mean_valid,
+            "mean of the neutral state in a disc",
+        ),
+    }  # fmt: skip
+    states: dict[str, Any] = {}
+    for name, state in rig.states.items():
+        maps[f"scale_{name}"] = SkinMap(
+            _single(state.scale), "1", _single(state.scale_stderr), state.valid,
+            "deviation in a disc over that of the neutral state",
+        )  # fmt: skip
+        maps[f"bias_{name}"] = SkinMap(
+            _single(state.bias), _BLOOD, _single(state.bias_stderr), state.valid,
+            "mean in a disc",
+        )  # fmt: skip
+        maps[f"misfit_{name}"] = SkinMap(
+            _single(state.misfit), _BLOOD, None, state.valid,
+            "deviation in a disc of the measured state from scale and bias",
+        )  # fmt: skip
+        states[name] = {
+            "prior": state.prior,
+            "storage_rms": state.storage_rms,
+            "storage_largest": state.storage_largest,
+        }
+    document = {
+        "schema": SCHEMA,
+        "radius_px": rig.radius_px,
+        "shape": list(rig.neutral.shape),
+        "stored": list(rig.neutral_mean.shape),
+        "global_states": list(rig.global_states),
+        "states": states,
+    }
+    return maps, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode("utf-8")
+
+
+def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> HemoglobinRig:
+    """Return the rig of `to_maps`; maps of other names are not looked at.
+
+    Raises
+    ------
+    FacialColorError
+        Naming what is missing, unknown, of another schema or of another shape.
+    """
+    try:
+        loaded = json.loads(document)
+    except ValueError as error:
+        raise FacialColorError(f"{DOCUMENT}: is not JSON ({error})") from error
+    version = loaded.get("schema") if isinstance(loaded, dict) else None
+    if version != SCHEMA:
+        raise FacialColorError(f"{DOCUMENT}: got schema {version!r}, expected {SCHEMA!r}")
+    _exactly("", loaded, _KEYS)
+    shape, stored = (_size(key, loaded[key]) for key in ("shape", "stored"))
+    radius = _number("radius_px", loaded["radius_px"])
+    listed = loaded["global_states"]
+    if not (isinstance(listed, list) and all(isinstance(name, str) for name in listed)):
+        raise FacialColorError(f"{DOCUMENT}: global_states: got {listed!r}, expected names")
+    if not isinstance(loaded["states"], dict):
+        raise FacialColorError(f"{DOCUMENT}: states: expected an object by name")
+    neutral = _map(maps, "hemoglobin", shape, _BLOOD)
+    states = {}
+    for name, entry in loaded["states"].items():
+        if not isinstance(entry, dict):
+            raise FacialColorError(f"{DOCUMENT}: states.{name}: expected an object")
+        _exactly(f"states.{name}.", entry, _STATE_KEYS)
+        number = {key: _number(f"states.{name}.{key}", entry[key]) for key in _STATE_KEYS}
+        scale, bias, misfit = (
+            _map(maps, f"{kind}_{name}", stored, unit)
+            for kind, unit in (("scale", "1"), ("bias", _BLOOD), ("misfit", _BLOOD))
+        )
+        valid = _valid(scale)
+        states[name] = StateMaps(
+            scale=_double(scale.values, valid),
+            bias=_double(bias.values, valid),
+            scale_stderr=_double(_stderr(scale), valid),
+            bias_stderr=_double(_stderr(bias), valid),
+            misfit=_double(misfit.values, valid),
+            valid=valid,
+            prior=number["prior"],
+            storage_rms=number["storage_rms"],
+            storage_largest=number["storage_largest"],
+        )
+    mean = _map(maps, f"bias_{NEUTRAL}", stored, _BLOOD)
+    held = _valid(neutral)
+    return HemoglobinRig(
+        neutral=np.where(held, neutral.values, np.float32(0)),
+        valid=held,
+        neutral_stderr=np.where(held, _stderr(neutral), np.float32(0)),
+        neutral_mean=_double(mean.values, _valid(mean)),
+        states=states,
+        radius_px=radius,
+        global_states=tuple(listed),
+    )
+
+
+def _single(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    return values.astype(np.float32)
+
+
+def _double(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    return np.where(valid, values, 0.0).astype(np.float64)
+
+
+def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+    if skin_map.valid is None:
+        return np.ones(skin_map.values.shape, np.bool_)
+    return skin_map.valid
+
+
+def _stderr(skin_map: SkinMap) -> NDArray[np.float32]:
+    if skin_map.stderr is None:
+        return np.zeros(skin_map.values.shape, np.float32)
+    return skin_map.stderr
+
+
+def _map(maps: Mapping[str, SkinMap], name: str, shape: tuple[int, int], unit: str) -> SkinMap:
+    if name not in maps:
+        raise FacialColorError(f"maps: {name!r} is missing, which {DOCUMENT} needs")
+    found = maps[name]
+    if found.values.shape != shape:
+        raise FacialColorError(f"{name}: got shape {found.values.shape}, expected {shape}")
+    if found.unit != unit:
+        raise FacialColorError(f"{name}: got unit {found.unit!r}, expected {unit!r}")
+    return found
+
+
+def _exactly(where: str, got: Mapping[str, Any], expected: set[str]) -> None:
+    for key in sorted(expected - set(got)):
+        raise FacialColorError(f"{DOCUMENT}: {where}{key} is missing")
+    for key in sorted(set(got) - expected):
+        raise FacialColorError(f"{DOCUMENT}: {where}{key} is unknown")
+
+
+def _number(where: str, got: object) -> float:
+    if isinstance(got, bool) or not isinstance(got, int | float) or not np.isfinite(got):
+        raise FacialColorError(f"{DOCUMENT}: {where}: got {got!r}, expected a finite number")
+    return float(got)
+
+
+def _size(where: str, got: object) -> tuple[int, int]:
+    if (
+        isinstance(got, list)
+        and len(got) == 2
+        and all(isinstance(n, int) and not isinstance(n, bool) and n >= 1 for n in got)
+    ):
+        return got[0], got[1]
+    raise FacialColorError(f"{DOCUMENT}: {where}: got {got!r}, expected two numbers of pixels")

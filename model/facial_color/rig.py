@@ -1,0 +1,459 @@
+"""The hemoglobin rig: blood of a face in any mixture of states (Jimenez 2010, eqs. 1 to 6).
+
+A state is a scale and a bias of the neutral map, smooth enough to be stored small; a blend is an
+affine combination of them. Expressions and global states (exercise, alcohol) are states alike.
+
+References
+----------
+Jimenez et al. 2010, A Practical Appearance Model for Dynamic Facial Color, ACM Trans. Graph.
+29(6), 141. doi:10.1145/1866158.1866167
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.facial_color import disc_statistics
+from model.facial_color.coarse_maps import Cells
+from model.facial_color.deviation_ratio import ROUNDING
+from model.skin import SkinMap
+from model.tissue_optics.layers import C_HD_MAX
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.floating[Any]]
+Mask = NDArray[np.bool_]
+
+NEUTRAL: Final = "neutral"
+STORED_SIZE: Final = 256
+"""Cells a side of the stored scale and bias maps (Jimenez2010, section 6)."""
+LIMITS: Final = (0.0, C_HD_MAX)
+"""Volume fractions of blood that exist, Jimenez2010, Table 1."""
+GLOBAL_GAINS: Final[Mapping[str, float]] = MappingProxyType({"anger": 1.27, "fear": 0.81})
+"""Factors of all blood at full emotion, beside the expression (Jimenez2010, section 7)."""
+GLOBAL_STATES: Final = ("exercise", "alcohol")
+"""States of the whole body: nothing of the face moves."""
+
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,57}")
+_SUM_ERROR = 1e-6
+
+
+class FacialColorError(ValueError):
+    """Maps that make no rig, or weights that make no blend."""
+
+
+def local_statistics(
+    h: ArrayLike, radius_px: float, *, valid: Mask | None = None
+) -> tuple[Image, Image]:
+    """Return mean and deviation of a map in a disc about each pixel, eq. (1).
+
+    Parameters
+    ----------
+    h
+        Shape (..., H, W); what is not finite counts as missing.
+    radius_px
+        Radius of the disc, px, >= 0, need not be whole.
+    valid
+        Shape of the map, or one that broadcasts to it, bool: pixels that count; None: all that
+        are finite.
+
+    Returns
+    -------
+    mu, sigma : ndarray
+        Shape of the map, over the valid pixels of each disc within the map; NaN where it holds
+        none. float32 for float32 and float16 maps, float64 otherwise.
+        `model.facial_color.disc_statistics.measure` tells how many pixels they are of, and gives float64.
+
+    Raises
+    ------
+    model.facial_color.disc_statistics.DiscStatisticsError
+        For a map, mask or radius that is none.
+
+    Examples
+    --------
+    >>> mu, sigma = local_statistics(np.tile([0.1, 0.3], (4, 2)), 10.0)
+    >>> round(float(mu[0, 0]), 6), round(float(sigma[0, 0]), 6)
+    (0.2, 0.1)
+    """
+    image = np.asarray(h)
+    kind = np.float32 if image.dtype in (np.float16, np.float32) else np.float64
+    found = disc_statistics.measure(image, radius_px, valid=valid)
+    return found.mean.astype(kind, copy=False), found.deviation.astype(kind, copy=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StateMaps:
+    """One state as the rig stores it: arrays (h, w), 0 outside ``valid``."""
+
+    scale: Floats
+    """sigma_i/sigma_n under the prior, eq. (5)."""
+    bias: Floats
+    """mu_i, volume fraction."""
+    scale_stderr: Floats
+    """Standard error of the scale."""
+    bias_stderr: Floats
+    """Standard error of the bias, volume fraction."""
+    misfit: Floats
+    """Deviation of the measured state from scale and bias of the neutral map, within a disc,
+    volume fraction: what the state's own pattern, misalignment and noise leave."""
+    valid: Mask
+    """Cells that hold something."""
+    prior: float
+    """Scale that was expected before a place was looked at: sigma_i/sigma_n of the whole map; of
+    a transferred rig, that of its source."""
+    storage_rms: float
+    """Root mean square of what storing small changes in the state, volume fraction."""
+    storage_largest: float
+    """Largest such change."""
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that differ and numbers that are none."""
+        shape = self.valid.shape
+        for name in ("scale", "bias", "scale_stderr", "bias_stderr", "misfit"):
+            values = getattr(self, name)
+            if values.shape != shape:
+                raise FacialColorError(f"{name}: got shape {values.shape}, expected {shape}")
+            if not np.isfinite(values).all():
+                raise FacialColorError(f"{name}: got NaN or infinity, expected finite values")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HemoglobinBlend:
+    """A face's blood in a mixture of states, arrays (H, W)."""
+
+    hemoglobin: Image
+    """Volume fraction within the limits; NaN outside ``valid``."""
+    valid: Mask
+    """Where the neutral map and all states of the mixture are known."""
+    clipped_fraction: float
+    """Part of the valid pixels that lay outside the limits."""
+    stderr: Image
+    """Standard error: of neutral map, scales, biases, and of what eq. (6) leaves out. Stated
+    errors of the maps are taken as shared by a disc, which is the worst case for a bias."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HemoglobinRig:
+    """Blood of one face in any affine mixture of the states it was measured in."""
+
+    neutral: Image
+    """Volume fraction in the neutral state, (H, W), float32 or float64; 0 outside ``valid``."""
+    valid: Mask
+    """(H, W)."""
+    neutral_stderr: Image
+    """Standard error of the neutral map, (H, W); 0 where none was stated."""
+    neutral_mean: Floats
+    """mu_n as stored, (h, w), volume fraction; bias of the neutral state."""
+    states: Mapping[str, StateMaps]
+    """By name, all but the neutral."""
+    radius_px: float
+    """Radius of the disc, px of the neutral map."""
+    global_states: tuple[str, ...] = ()
+    """Which of the states are of the whole body."""
+
+    def __post_init__(self) -> None:
+        """Refuse what does not fit together."""
+        shape = self.neutral.shape
+        if self.neutral.ndim != 2 or self.valid.shape != shape:
+            raise FacialColorError(
+                f"neutral: got {shape}, valid {self.valid.shape}, expected (H, W)"
+            )
+        if self.neutral_stderr.shape != shape:
+            raise FacialColorError(f"neutral_stderr: got {self.neutral_stderr.shape}, not {shape}")
+        for name, state in self.states.items():
+            check_name(name)
+            if state.valid.shape != self.neutral_mean.shape:
+                raise FacialColorError(
+                    f"{name}: got shape {state.valid.shape}, expected {self.neutral_mean.shape}"
+                )
+        for name in self.global_states:
+            if name not in self.states:
+                raise FacialColorError(f"global_states: {name!r} is no state of this rig")
+        object.__setattr__(self, "states", MappingProxyType(dict(self.states)))
+
+    @classmethod
+    def from_maps(
+        cls,
+        neutral: ArrayLike,
+        states: Mapping[str, ArrayLike],
+        *,
+        radius_px: float,
+        valid: Mask | Mapping[str, Mask] | None = None,
+        stderr: Mapping[str, ArrayLike] | None = None,
+        global_states: Iterable[str] | None = None,
+        stored_size: int | None = STORED_SIZE,
+    ) -> HemoglobinRig:
+        """Make a rig from measured maps.
+
+        Parameters
+        ----------
+        neutral
+            Volume fraction of blood in the neutral state, (H, W).
+        states
+            The other states by name, (H, W) each, aligned to the neutral map (a few pixels,
+            little against the radius, do not matter). A name is lower case, e.g. one of
+            `rigsim.perfusion.STATES`.
+        radius_px
+            Radius of the disc of eq. (1), px.
+        valid
+            (H, W) bool for all maps, or by name, "neutral" among them; what is not finite is
+            not valid in any case.
+        stderr
+            Standard errors by name, (H, W); a map without is trusted to float32's rounding.
+        global_states
+            States of the whole body; None: those of `GLOBAL_STATES` that there are.
+        stored_size
+            Cells a side of the stored maps, or less when the map has less; None: as the map.
+
+        Returns
+        -------
+        HemoglobinRig
+
+        Raises
+        ------
+        FacialColorError, model.facial_color.disc_statistics.DiscStatisticsError
+            For maps, masks, names or a radius that fit nothing.
+
+        Notes
+        -----
+        A state's statistics are compared with those of the neutral map over the same pixels. The
+        scale is sigma_i/sigma_n under the prior of `model.facial_color.deviation_ratio`, which bounds it where
+        the neutral map is constant.
+        """
+        from model.facial_color.basis import fitted
+
+        return fitted(
+            neutral, states, radius_px=radius_px, valid=valid, stderr=stderr or {},
+            global_states=global_states, stored_size=stored_size,
+        )  # fmt: skip
+
+    @classmethod
+    def from_maps_and_document(cls, maps: Mapping[str, SkinMap], document: bytes) -> HemoglobinRig:
+        """Read a rig from the maps of an appearance and its ``facial_color.json``.
+
+        Raises
+        ------
+        FacialColorError
+            Naming what is missing, unknown, of another schema or of another shape.
+        """
+        from model.facial_color.document import from_maps_and_document
+
+        return from_maps_and_document(maps, document)
+
+    def to_maps(self) -> tuple[dict[str, SkinMap], bytes]:
+        """Return the rig as maps of an appearance, and the bytes of ``facial_color.json``.
+
+        Maps: ``hemoglobin``, ``bias_neutral``, and ``scale_<state>``, ``bias_<state>``,
+        ``misfit_<state>`` of each state, in float32.
+        """
+        from model.facial_color.document import to_maps
+
+        return to_maps(self)
+
+    @property
+    def cells(self) -> Cells:
+        """How the stored maps lie on the neutral map."""
+        rows, columns = self.neutral.shape
+        return Cells((rows, columns), (self.neutral_mean.shape[0], self.neutral_mean.shape[1]))
+
+    @property
+    def neutral_mean_valid(self) -> Mask:
+        """Cells of ``neutral_mean`` that hold something, (h, w)."""
+        return self.cells.coarsen(np.zeros(self.neutral.shape), self.valid)[1]
+
+    @property
+    def base(self) -> Floats:
+        """H_0 of eq. (4), (H, W): neutral map less its stored mean; NaN outside ``valid``.
+
+        Since the stored mean is taken off, not the exact one, the neutral state comes back
+        exactly: what storing small loses of mu_n stays in H_0.
+        """
+        (mean,) = self.cells.refine(self.neutral_mean, valid=self.neutral_mean_valid)
+        return np.where(self.valid, self.neutral - mean, np.nan)
+
+    @property
+    def scale(self) -> Mapping[str, Floats]:
+        """Stored scale maps by name, (h, w); 1 for the neutral state."""
+        return {NEUTRAL: np.ones_like(self.neutral_mean)} | {
+            name: state.scale for name, state in self.states.items()
+        }
+
+    @property
+    def bias(self) -> Mapping[str, Floats]:
+        """Stored bias maps by name, (h, w), volume fraction."""
+        return {NEUTRAL: self.neutral_mean} | {
+            name: state.bias for name, state in self.states.items()
+        }
+
+    def storage_error(self) -> Mapping[str, tuple[float, float]]:
+        """Return what storing small changes in each state: rms and largest, volume fraction."""
+        return {n: (s.storage_rms, s.storage_largest) for n, s in self.states.items()}
+
+    def weights_of(
+        self, weights: Mapping[str, float], *, normalize: bool = False
+    ) -> dict[str, float]:
+        """Return checked weights that sum to one.
+
+        Raises
+        ------
+        FacialColorError
+            For an unknown state, a weight that is not finite, or another sum.
+        """
+        names = (NEUTRAL, *self.states)
+        for name, weight in weights.items():
+            if name not in names:
+                near = difflib.get_close_matches(name, names, 1)
+                hint = f"; did you mean {near[0]!r}?" if near else ""
+                raise FacialColorError(
+                    f"weights: got state {name!r}, expected one of {', '.join(names)}{hint}"
+                )
+            if not math.isfinite(weight):
+                raise FacialColorError(f"weights: got {name} = {weight}, expected a finite number")
+        total = math.fsum(weights.values())
+        if normalize:
+            if abs(total) < _SUM_ERROR:
+                raise FacialColorError(f"weights: their sum is {total:g}: it cannot be made 1")
+            return {name: weight / total for name, weight in weights.items()}
+        if abs(total - 1.0) > _SUM_ERROR:
+            rest = float(weights.get(NEUTRAL, 0.0)) + 1.0 - total
+            raise FacialColorError(
+                f"weights: got a sum of {total:g}, expected 1; {NEUTRAL}={rest:.6g} (got "
+                f"{weights.get(NEUTRAL, 0.0):g}) makes it so, or normalize=True "
+                "(`--normalize`) divides by the sum"
+            )
+        return {name: float(weight) for name, weight in weights.items()}
+
+    def blend(self, weights: Mapping[str, float], *, normalize: bool = False) -> Image:
+        """Return the map of `evaluate`, (H, W), without its mask and errors."""
+        return self.evaluate(weights, normalize=normalize).hemoglobin
+
+    def evaluate(
+        self,
+        weights: Mapping[str, float],
+        *,
+        normalize: bool = False,
+        gains: Mapping[str, float] | None = None,
+        gain: float = 1.0,
+        limits: tuple[float, float] = LIMITS,
+    ) -> HemoglobinBlend:
+        """Blend states, eq. (6).
+
+        Parameters
+        ----------
+        weights
+            By name, "neutral" among them, summing to one; they may be negative or above one.
+            Several states at full strength are ``{"smile": 1, "exercise": 1, "neutral": -1}``.
+        normalize
+            Whether to divide the weights by their sum instead of refusing them.
+        gains
+            Factors of all blood that go with states, e.g. `GLOBAL_GAINS`; each acts in
+            proportion to its state's weight: the whole factor is 1 + sum of w_i (gain_i - 1).
+        gain
+            One more factor of all blood.
+        limits
+            Least and largest concentration.
+
+        Returns
+        -------
+        HemoglobinBlend
+
+        Raises
+        ------
+        FacialColorError
+            For weights that sum to something else, an unknown state, or a negative factor.
+        """
+        used = {n: w for n, w in self.weights_of(weights, normalize=normalize).items() if w != 0.0}
+        factor = gain * (
+            1.0 + math.fsum(w * ((gains or {}).get(n, 1.0) - 1.0) for n, w in used.items())
+        )
+        if not (math.isfinite(factor) and factor >= 0.0):
+            raise FacialColorError(f"gains: the factor of all blood is {factor:g}, expected >= 0")
+        if not limits[0] < limits[1]:
+            raise FacialColorError(f"limits: got {limits}, expected the least first")
+        few = self.neutral_mean_valid.copy()
+        scale, bias = np.zeros_like(self.neutral_mean), np.zeros_like(self.neutral_mean)
+        scale_variance, bias_variance, misfit = (np.zeros_like(scale) for _ in range(3))
+        for name, w in used.items():
+            if name == NEUTRAL:
+                scale += w
+                bias += w * self.neutral_mean
+                continue
+            state = self.states[name]
+            few &= state.valid
+            scale += w * state.scale
+            bias += w * state.bias
+            scale_variance += (w * state.scale_stderr) ** 2
+            bias_variance += w * w * (state.bias_stderr**2 + state.storage_rms**2)
+            misfit += (w * state.misfit) ** 2
+        up = self.cells.refine(
+            scale, bias, self.neutral_mean, scale_variance, bias_variance, misfit, valid=few
+        )
+        base = self.neutral - up[2]  # eq. (4), with the mean as it is stored
+        blood = factor * (up[1] + base * up[0])  # eq. (6)
+        # the misfit was seen with the noise of the maps in it
+        pixel = np.maximum(up[5], (up[0] * self.neutral_stderr) ** 2)
+        pixel += (ROUNDING * self.neutral) ** 2
+        error = factor * np.sqrt(pixel + up[4] + base * base * up[3])
+        valid = self.valid & np.isfinite(blood)
+        outside = valid & ((blood < limits[0]) | (blood > limits[1]))
+        kind = self.neutral.dtype
+        return HemoglobinBlend(
+            np.where(valid, np.clip(blood, *limits), np.nan).astype(kind),
+            valid,
+            int(outside.sum()) / max(int(valid.sum()), 1),
+            np.where(valid, error, np.nan).astype(kind),
+        )
+
+    def applied_to(
+        self,
+        neutral: ArrayLike,
+        *,
+        valid: Mask | None = None,
+        stderr: ArrayLike | None = None,
+        transfer: Literal["ratio", "difference", "absolute"] = "ratio",
+    ) -> HemoglobinRig:
+        """Return this rig's states for another neutral map, measured or painted.
+
+        Parameters
+        ----------
+        neutral
+            (H', W'), volume fraction, in the same map space (both unwrapped alike); of any size.
+        valid
+            (H', W') bool; a state is valid where both maps are.
+        stderr
+            Standard error of the new map.
+        transfer
+            What is kept of a bias. "ratio": mu_i/mu_n, since a vessel that dilates changes mean
+            and contrast by a factor, and so does the scale; "difference": mu_i - mu_n;
+            "absolute": mu_i as it is (the paper's stored maps), which gives the other face the
+            mean blood of this one as soon as a state is blended in.
+
+        Returns
+        -------
+        HemoglobinRig
+            The radius goes with the size of the map.
+
+        Raises
+        ------
+        FacialColorError
+            For a map or mask that fits nothing.
+        """
+        from model.facial_color.basis import transferred
+
+        return transferred(self, neutral, valid=valid, stderr=stderr, transfer=transfer)
+
+
+def check_name(name: str) -> None:
+    """Refuse a state's name that can be no map's."""
+    if name == NEUTRAL:
+        raise FacialColorError(f"states: {NEUTRAL!r} is the neutral map's own name")
+    if not _NAME.fullmatch(name):
+        raise FacialColorError(f"states: got name {name!r}, expected lower case, digits and _")

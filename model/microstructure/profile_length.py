@@ -1,0 +1,282 @@
+"""Length of the skin's surface along a profile, stretched and compressed (Nagano2015, fig. 4).
+
+Skin keeps a reserve of surface in its relief. A profile that is stretched or compressed without a
+change of its heights becomes longer or shorter along its surface, which would strain the skin;
+smoothing it under stretch and sharpening it under compression keeps the length. This module
+measures lengths, and finds how strong a kernel must be to keep one.
+
+The kernel is that of eq. (6), ``(1 - alpha) delta + alpha G(sigma)``, convolved before the profile
+is stretched, with sigma on the neutral profile as everywhere in `model.microstructure`. Beyond the
+ends of a profile its heights are mirrored.
+
+References
+----------
+Nagano et al. 2015, Skin Microstructure Deformation with Displacement Map Convolution, ACM Trans.
+Graph. 34(4), 109, section 3. doi:10.1145/2766894
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import correlate1d
+from scipy.optimize import brentq
+
+from model.microstructure.kernel_table import ALPHA_LIMITS, gaussian_weights
+
+Floats = NDArray[np.float64]
+
+FARTHEST_ALPHA = 1e3
+"""Strengths beyond this are not sought: the profile has nothing at sigma's scale to sharpen."""
+
+
+class ProfileError(ValueError):
+    """A profile, a stretch or a kernel that no length can be told of."""
+
+
+def surface_length(height_um: ArrayLike, *, spacing_um: float) -> Floats:
+    """Return the length of the polygon through a profile's heights.
+
+    Parameters
+    ----------
+    height_um : array_like, shape (..., N)
+        Heights at equal distances, um, N >= 2.
+    spacing_um : float
+        Distance of heights, um, > 0.
+
+    Returns
+    -------
+    ndarray of float64, shape (...)
+        um, at least ``(N - 1) * spacing_um``.
+
+    Raises
+    ------
+    ProfileError
+
+    Examples
+    --------
+    >>> float(surface_length([0.0, 3.0, 0.0], spacing_um=4.0))
+    10.0
+    """
+    height = _heights(height_um, spacing_um)
+    return np.asarray(np.hypot(np.diff(height, axis=-1), spacing_um).sum(axis=-1))
+
+
+def _heights(height_um: ArrayLike, spacing_um: float) -> Floats:
+    height = np.asarray(height_um, np.float64)
+    if height.ndim < 1 or height.shape[-1] < 2 or not np.isfinite(height).all():
+        raise ProfileError(
+            f"height_um: got shape {height.shape}, expected at least 2 finite heights (..., N)"
+        )
+    if not (math.isfinite(spacing_um) and spacing_um > 0):
+        raise ProfileError(f"spacing_um: got {spacing_um}, expected a finite number above 0")
+    return height
+
+
+def convolved(height_um: ArrayLike, alpha: float, sigma_um: float, *, spacing_um: float) -> Floats:
+    """Return profiles convolved with a kernel of eq. (6), mirrored at their ends.
+
+    Parameters
+    ----------
+    height_um : array_like, shape (..., N)
+        um.
+    alpha : float
+        Strength; above 0 smooths, below 0 sharpens.
+    sigma_um : float
+        Standard deviation, um, > 0.
+    spacing_um : float
+        Distance of heights, um, > 0.
+
+    Raises
+    ------
+    ProfileError
+        For heights, a strength or lengths that are not finite, or lengths that are not above 0.
+    """
+    height = _heights(height_um, spacing_um)
+    if not math.isfinite(alpha):
+        raise ProfileError(f"alpha: got {alpha}, expected a finite strength")
+    return height + alpha * _change(height, sigma_um, spacing_um)
+
+
+def _change(height: Floats, sigma_um: float, spacing_um: float) -> Floats:
+    """Return the blurred profile less itself: what one of alpha adds."""
+    if not (math.isfinite(sigma_um) and sigma_um > 0):
+        raise ProfileError(f"sigma_um: got {sigma_um}, expected a finite number above 0")
+    half = gaussian_weights(sigma_um / spacing_um)
+    weights = np.concatenate([half[:0:-1], half])
+    return np.asarray(correlate1d(height, weights, axis=-1, mode="reflect") - height)
+
+
+@dataclass(frozen=True, slots=True)
+class LengthChange:
+    """Lengths of a surface before and after a stretch; see :func:`length_change`."""
+
+    stretch: float
+    """Ratio r along the profile."""
+    neutral_um: float
+    """Length of the neutral surface, um."""
+    unchanged_um: float
+    """Length when the profile is stretched and its heights stay as they are, um."""
+    convolved_um: float
+    """Length when it is convolved with the kernel and stretched, um."""
+    alpha: float
+    """Strength of the kernel."""
+    sigma_um: float
+    """Standard deviation of the kernel on the neutral profile, um."""
+
+    @property
+    def unchanged_ratio(self) -> float:
+        """Length with unchanged heights over the neutral one."""
+        return self.unchanged_um / self.neutral_um
+
+    @property
+    def convolved_ratio(self) -> float:
+        """Length with the kernel over the neutral one; 1 where it keeps the length."""
+        return self.convolved_um / self.neutral_um
+
+
+def length_change(
+    height_um: ArrayLike, *, spacing_um: float, stretch: float, alpha: float, sigma_um: float
+) -> LengthChange:
+    """Return what a stretch and a kernel do to the length of a profile's surface.
+
+    Parameters
+    ----------
+    height_um : array_like, shape (N,)
+        Neutral heights, um.
+    spacing_um : float
+        Their distance, um.
+    stretch : float
+        Ratio r > 0 of lengths along the profile.
+    alpha, sigma_um : float
+        Kernel, such as `model.microstructure.kernel_parameters` gives for the stretch.
+
+    Returns
+    -------
+    LengthChange
+
+    Raises
+    ------
+    ProfileError
+
+    Examples
+    --------
+    >>> wave = 60.0 * np.sin(np.arange(600) / 10.0)
+    >>> change = length_change(wave, spacing_um=5.0, stretch=1.2, alpha=0.6, sigma_um=19.0)
+    >>> round(change.unchanged_ratio, 3), round(change.convolved_ratio, 3)
+    (1.125, 1.108)
+    """
+    height = _profile(height_um, spacing_um, stretch)
+    moved = convolved(height, alpha, sigma_um, spacing_um=spacing_um)
+    return LengthChange(
+        stretch=float(stretch),
+        neutral_um=float(surface_length(height, spacing_um=spacing_um)),
+        unchanged_um=float(surface_length(height, spacing_um=spacing_um * stretch)),
+        convolved_um=float(surface_length(moved, spacing_um=spacing_um * stretch)),
+        alpha=float(alpha),
+        sigma_um=float(sigma_um),
+    )
+
+
+def _profile(height_um: ArrayLike, spacing_um: float, stretch: float) -> Floats:
+    height = np.asarray(height_um, np.float64)
+    if height.ndim != 1:
+        raise ProfileError(f"height_um: got shape {height.shape}, expected (N,)")
+    surface_length(height, spacing_um=spacing_um)
+    if not (math.isfinite(stretch) and stretch > 0):
+        raise ProfileError(f"stretch: got {stretch}, expected a finite number above 0")
+    return height
+
+
+@dataclass(frozen=True, slots=True)
+class KeptLength:
+    """The kernel that keeps a profile's length; see :func:`keep_length`."""
+
+    change: LengthChange
+    """What that kernel, or the nearest one, does."""
+    kept: bool
+    """Whether the length is the neutral one."""
+    within_limits: bool
+    """Whether the strength lies in the kernel's range, -2 to 1."""
+
+
+def keep_length(
+    height_um: ArrayLike, *, spacing_um: float, stretch: float, sigma_um: float
+) -> KeptLength:
+    """Find the strength of a kernel that keeps the length of a profile's surface.
+
+    Parameters
+    ----------
+    height_um : array_like, shape (N,)
+        Neutral heights, um.
+    spacing_um : float
+        Their distance, um.
+    stretch : float
+        Ratio r > 0 of lengths along the profile.
+    sigma_um : float
+        Standard deviation of the kernel, um.
+
+    Returns
+    -------
+    KeptLength
+        Not ``kept`` when stretch uses up what relief the kernel can smooth away, or when a
+        compressed profile has nothing that it could sharpen: then with the strength that comes
+        nearest.
+
+    Raises
+    ------
+    ProfileError
+
+    Notes
+    -----
+    Slopes are linear in alpha, so the length is a convex function of it. At alpha = 0 a stretched
+    surface is too long, and the least alpha > 0 that keeps the length is sought up to the minimum;
+    a compressed one is too short, and the only alpha < 0 that lengthens it enough is sought.
+
+    Examples
+    --------
+    >>> wave = 60.0 * np.sin(np.arange(600) / 10.0)
+    >>> found = keep_length(wave, spacing_um=5.0, stretch=1.05, sigma_um=30.0)
+    >>> found.kept, round(found.change.alpha, 2), round(found.change.convolved_ratio, 6)
+    (True, 0.44, 1.0)
+    """
+    height = _profile(height_um, spacing_um, stretch)
+    change = _change(height, sigma_um, spacing_um)
+    a, b = np.diff(height), np.diff(change)
+    neutral = float(np.hypot(a, spacing_um).sum())
+    run = spacing_um * stretch
+
+    def excess(alpha: float) -> float:
+        return float(np.hypot(a + alpha * b, run).sum()) - neutral
+
+    def slope(alpha: float) -> float:
+        c = a + alpha * b
+        return float((c * b / np.hypot(c, run)).sum())
+
+    # Blurring lowers slopes, so the length falls at alpha = 0 unless there is nothing to blur.
+    alpha = 0.0
+    if abs(excess(0.0)) > 1e-12 * neutral and slope(0.0) < 0:
+        if excess(0.0) < 0:
+            alpha = -_crossing(lambda strength: excess(-strength), FARTHEST_ALPHA)
+        else:
+            shortest = _crossing(slope, FARTHEST_ALPHA)
+            alpha = _crossing(excess, shortest)
+    found = length_change(
+        height, spacing_um=spacing_um, stretch=stretch, alpha=alpha, sigma_um=sigma_um
+    )
+    return KeptLength(
+        change=found,
+        kept=abs(found.convolved_ratio - 1.0) < 1e-9,
+        within_limits=ALPHA_LIMITS[0] <= alpha <= ALPHA_LIMITS[1],
+    )
+
+
+def _crossing(function: Callable[[float], float], last: float) -> float:
+    """Return where a function changes its sign between 0 and ``last``; ``last`` if nowhere."""
+    if function(0.0) * function(last) > 0:
+        return last
+    return float(brentq(function, 0.0, last, xtol=1e-14, rtol=1e-13))

@@ -1,0 +1,162 @@
+"""One medium of the photon table, interpolated over eta and g, and its light's decay far away.
+
+See `model.photon_table` for what is stored.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh_tridiagonal
+
+from model.photon_table import kernels
+
+FloatArray = NDArray[np.float64]
+Collection = Literal["all", "fibre"]
+
+_MOMENTS = 600  # Legendre orders for kappa: exact to rounding up to g = 0.95 and beyond
+
+
+class TableDomainError(ValueError):
+    """A medium or a collection that the table does not hold."""
+
+
+@dataclass(frozen=True, slots=True)
+class Medium:
+    """One (eta, g, collection) of the table, ready for `model.photon_table.kernels.evaluate`."""
+
+    coefficients: FloatArray
+    """B-spline coefficients of ln of the reduced reflectance, shape (radii, roots)."""
+    decay: FloatArray
+    """B-spline coefficients of kappa/sqrt(sigma_a/sigma_s'), shape (roots,)."""
+    log_error: FloatArray
+    """ln of the relative standard error at every other knot, shape (radii/2, roots/2)."""
+
+
+def asymmetries() -> tuple[float, ...]:
+    """Return the values of g that the table holds, increasing; others between are interpolated.
+
+    Examples
+    --------
+    >>> 0.8 in asymmetries()
+    True
+    """
+    return tuple(float(x) for x in _stored()["g"])
+
+
+@lru_cache(maxsize=64)
+def prepare(eta: float, g: float, collection: Collection) -> Medium:
+    """Return one medium of the table, interpolated over eta and g.
+
+    Raises
+    ------
+    TableDomainError
+        For an eta, g or collection that the table does not hold.
+    """
+    stored = _stored()
+    if collection not in ("all", "fibre"):
+        raise TableDomainError(f'collection: got {collection!r}, expected "all" or "fibre"')
+    weight_g = _lagrange("g", stored["g"], float(g))
+    weight_eta = _lagrange("eta", stored["eta"], float(eta))
+    which = ("all", "fibre").index(collection)
+    weight = weight_g[:, None] * weight_eta
+    coefficients = np.einsum(
+        "ge,gexy->xy", weight, stored["coefficients"][:, which].astype(np.float64)
+    )
+    error = np.exp(stored["log_error"][:, which].astype(np.float64))
+    log_error = 0.5 * np.log(np.einsum("ge,gexy->xy", weight**2, error**2))
+    medium = Medium(np.ascontiguousarray(coefficients), decay_coefficients(float(g)), log_error)
+    for array in (medium.coefficients, medium.decay, medium.log_error):
+        array.flags.writeable = False
+    return medium
+
+
+def decay_coefficients(g: float) -> FloatArray:
+    """Return the B-spline coefficients of kappa/sqrt(sigma_a/sigma_s'), shape (ROOT_COUNT,)."""
+    root = kernels.ROOT_SCALE * np.expm1(kernels.ROOT_STEP * np.arange(kernels.ROOT_COUNT - 2))
+    ratio = np.array([np.sqrt(3.0), *(asymptotic_decay(u * u, g) / u for u in root[1:])])
+    return np.linalg.solve(root_spline_matrix(), np.append(ratio, (0.0, 0.0)))
+
+
+def asymptotic_decay(absorption_ratio: float, g: float) -> float:
+    """Return kappa/sigma_s' of the light far from any source, for sigma_a/sigma_s' > 0.
+
+    The largest eigenvalue 1/kappa of the equations of the Legendre moments of the radiance; it
+    tends to the diffusion's sqrt(3 sigma_a (sigma_a + sigma_s')) for weak absorption.
+
+    References
+    ----------
+    Case and Zweifel 1967, Linear Transport Theory, chapter 8.
+
+    Examples
+    --------
+    >>> round(float(asymptotic_decay(1e-6, 0.8) / np.sqrt(3e-6)), 5)
+    1.0
+    >>> k = asymptotic_decay(1.0, 0.0)  # isotropic: (c/2 k) ln((1 + k)/(1 - k)) = 1, c = 1/2
+    >>> round(float(0.25 / (k / 2) * np.log((1 + k / 2) / (1 - k / 2))), 9)
+    1.0
+
+    Raises
+    ------
+    ValueError
+        For a ratio outside 1e-100 to 1e100, or a g outside [0, 1).
+    """
+    if not 1e-100 <= absorption_ratio <= 1e100:
+        raise ValueError(f"absorption_ratio: got {absorption_ratio}, expected 1e-100 to 1e100")
+    if not 0.0 <= g < 1.0:
+        raise ValueError(f"g: got {g}, expected in [0, 1)")
+    order = np.arange(_MOMENTS)
+    removed = absorption_ratio + (1.0 - g**order) / (1.0 - g)
+    ell = order[1:]
+    off = ell / np.sqrt((2.0 * ell - 1.0) * (2.0 * ell + 1.0) * removed[:-1] * removed[1:])
+    largest = eigh_tridiagonal(
+        np.zeros(_MOMENTS),
+        off,
+        eigvals_only=True,
+        select="i",
+        select_range=(_MOMENTS - 1, _MOMENTS - 1),
+    )
+    return float(1.0 / largest[0])
+
+
+def root_spline_matrix() -> FloatArray:
+    """Return what makes B-spline coefficients over the roots from values at the knots and two 0s.
+
+    The last two rows: no slope at sigma_a = 0 (reflectance is even in the root up to its cube),
+    and one cubic over the last two intervals.
+    """
+    count = kernels.ROOT_COUNT
+    matrix = np.zeros((count, count))
+    for k in range(count - 2):
+        matrix[k, k : k + 3] = (1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0)
+    matrix[-2, :3] = (-0.5, 0.0, 0.5)
+    matrix[-1, -5:] = (1.0, -4.0, 6.0, -4.0, 1.0)
+    return matrix
+
+
+@lru_cache(maxsize=1)
+def _stored() -> dict[str, NDArray[np.generic]]:
+    with (files("model") / "data" / "photon_table.npz").open("rb") as stream:
+        with np.load(stream, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+
+
+def _lagrange(name: str, nodes: NDArray[np.generic], value: float) -> FloatArray:
+    """Return the weights of the (up to) four nearest nodes for cubic interpolation."""
+    x = nodes.astype(np.float64)
+    if not x[0] - 1e-9 <= value <= x[-1] + 1e-9:
+        raise TableDomainError(
+            f"{name}: got {value}, expected {x[0]:g} to {x[-1]:g}, which the photon table holds"
+        )
+    weight = np.zeros(x.size)
+    count = min(4, x.size)
+    first = min(max(int(np.searchsorted(x, value)) - count // 2, 0), x.size - count)
+    for k in range(first, first + count):
+        others = np.delete(x[first : first + count], k - first)
+        weight[k] = np.prod((value - others) / (x[k] - others))
+    return weight

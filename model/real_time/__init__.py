@@ -1,0 +1,1 @@
+"""NumPy twins of the viewer's shaders."""

@@ -1,0 +1,98 @@
+"""Color axes and bin edges that suit a population of textures.
+
+References
+----------
+Heeger, Bergen 1995, doi:10.1145/218380.218446, section 3.5 (decorrelated colors).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.texture_statistics.histograms import BINS
+
+Floats = NDArray[np.float64]
+
+OPPONENT = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0], [1.0, 1.0, -2.0]])
+"""Brightness, red less green, yellow less blue: the axes where colors do not vary."""
+OPPONENT /= np.linalg.norm(OPPONENT, axis=1, keepdims=True)
+_MARGIN = 0.05
+
+
+def principal_axes(covariance: Floats, unit: float) -> Floats:
+    """Return eigenvectors as rows by falling variance, well defined without variance too.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (C, C)
+    unit : float
+        Largest value of the colors, whose rounding is no variance.
+
+    Returns
+    -------
+    ndarray, shape (C, C)
+        Orthonormal rows; the largest component of each is positive.
+
+    Raises
+    ------
+    ValueError
+        For a covariance that is not square, or not finite.
+    """
+    C = len(covariance)
+    if covariance.shape != (C, C) or C < 1 or not np.isfinite(covariance).all():
+        raise ValueError(
+            f"covariance: got shape {covariance.shape}, expected (C, C) of finite values, C at "
+            "least 1"
+        )
+    preferred = OPPONENT if C == 3 else np.eye(C)
+    # orders directions without variance; about that of the rounding of float32
+    least = 1e-9 * np.trace(covariance) + 1e-13 * unit**2
+    ordered = covariance + least * preferred.T @ np.diag(np.arange(C, 0.0, -1.0)) @ preferred
+    axes = np.linalg.eigh(ordered)[1].T[::-1]
+    # of equal components the first decides the sign
+    largest = axes[np.arange(C), (np.abs(axes) - 1e-3 * np.arange(C)).argmax(axis=1)]
+    return np.ascontiguousarray(axes * np.sign(largest)[:, None])
+
+
+def uneven_edges(quantiles: ArrayLike, unit: float) -> Floats:
+    """Return 257 edges: half of the bins spread evenly, half by how often values occur.
+
+    Parameters
+    ----------
+    quantiles : array_like
+        Even quantiles of the values of every image; all count the same.
+    unit : float
+        Largest value of the images, above 0; a range far below it is widened.
+
+    Raises
+    ------
+    ValueError
+        For no values or some that are not finite, and for a `unit` that is not above 0.
+
+    Examples
+    --------
+    >>> edges = uneven_edges(np.linspace(0.0, 1.0, 1001), 1.0)
+    >>> edges[[0, 128, 256]].round(3).tolist()
+    [-0.05, 0.5, 1.05]
+    """
+    values = np.sort(np.asarray(quantiles, np.float64), axis=None)
+    if not (values.size and np.isfinite(values).all()):
+        raise ValueError(
+            f"quantiles: got {np.count_nonzero(~np.isfinite(values))} of {values.size} values that "
+            "are not finite, expected finite ones, at least one"
+        )
+    if not 0.0 < unit < np.inf:
+        raise ValueError(f"unit: got {unit}, expected a finite value above 0")
+    low, high = values[0], values[-1]
+    room = max(_MARGIN * (high - low), 0.5e-4 * unit)
+    low, high = low - room, high + room
+    at = np.concatenate([[low], values, [high]])
+    occurrence = np.concatenate([[0.0], (np.arange(values.size) + 0.5) / values.size, [1.0]])
+    share = 0.5 * (at - low) / (high - low) + 0.5 * occurrence
+    widths = np.diff(np.interp(np.linspace(0.0, 1.0, BINS + 1), share, at))
+    # a value that occurs very often holds several edges: keep them apart
+    least = max(1e-12 * (high - low), 4.0 * float(np.spacing(max(abs(low), abs(high)))))
+    widths = np.maximum(widths, least)
+    widths *= (high - low) / widths.sum()
+    return np.asarray(low + np.concatenate([[0.0], np.cumsum(widths)]))

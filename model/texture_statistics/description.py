@@ -1,0 +1,362 @@
+"""The statistics of a texture as one vector, and textures that have given statistics.
+
+Histograms of an image and of its steerable-pyramid responses, in decorrelated channels, describe
+a stochastic texture; matching them in turn, starting from an image or from noise, makes another
+texture with them. `model.texture_statistics.space` says how the vector is laid out and what a population
+shares.
+
+References
+----------
+Heeger, Bergen 1995, doi:10.1145/218380.218446.
+Weyrich et al. 2006, doi:10.1145/1141911.1141987, sections 10.2 and 11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.texture_statistics import steerable_pyramid
+from model.texture_statistics.histograms import Bins, Counted, distance
+from model.texture_statistics.masks import fill_smoothly, response_weights
+from model.texture_statistics.space import TextureError, TextureSpace, checked_image, weight_of
+from model.texture_statistics.steerable_pyramid import Responses, thread_count
+
+Floats = NDArray[np.float64]
+Array = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+Weights = tuple[Array, tuple[Array, ...]] | None
+T = TypeVar("T")
+_SMALL = 128 * 128
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TextureStatistics:
+    """The vector of one texture, and how far to trust it."""
+
+    vector: Floats
+    """(23808,) for RGB at full depth: shares of 256 bins, histogram after histogram."""
+    clipped: Floats
+    """(C, responses): share of samples outside the space's edges, counted in the end bins."""
+    effective: Floats
+    """(C, responses): independent samples at most; neighbors are correlated."""
+
+    def stderr(self) -> Floats:
+        """Return the least standard error of the vector: binomial, of `effective` samples."""
+        h = self.vector.reshape(*self.effective.shape, -1)
+        return np.sqrt(h * (1.0 - h) / self.effective[..., None]).reshape(-1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchedTexture:
+    """What matching made, and how it went."""
+
+    image: Array
+    """As the image given; texels outside the mask or the region as they were."""
+    distances: Floats
+    """(iterations + 1, C, responses): how far the values of each response are from the target's,
+    in spreads of the population (`model.texture_statistics.histograms.distance`): at the start, then after
+    each iteration."""
+    clipped: Floats
+    """(C, responses): share of the result's samples outside the space's edges."""
+
+    @property
+    def before(self) -> Floats:
+        """(C, responses): distances at the start, with noise added."""
+        return self.distances[0]
+
+    @property
+    def after(self) -> Floats:
+        """(C, responses): distances of the result."""
+        return self.distances[-1]
+
+
+def describe(
+    image: ArrayLike,
+    *,
+    space: TextureSpace | None = None,
+    valid: Mask | None = None,
+    region: ArrayLike | None = None,
+    workers: int | None = None,
+) -> Floats:
+    """Return the statistics of a texture as a row vector, (23808,) for RGB.
+
+    The vector of `statistics`, with its parameters.
+
+    Examples
+    --------
+    >>> vector = describe(np.full((16, 16, 3), 0.4))
+    >>> vector.shape, round(float(vector.sum()), 6)
+    ((23808,), 93.0)
+    """
+    return statistics(image, space=space, valid=valid, region=region, workers=workers).vector
+
+
+def statistics(
+    image: ArrayLike,
+    *,
+    space: TextureSpace | None = None,
+    valid: Mask | None = None,
+    region: ArrayLike | None = None,
+    workers: int | None = None,
+) -> TextureStatistics:
+    """Count the histograms of a texture and of its responses.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W) or (H, W, C)
+        Reflectance or any unit, that of ``space``. Filtered in float64 if it is, else in float32.
+    space : TextureSpace or None
+        Color space and edges of a population; None: `TextureSpace.standard`, for 0...1.
+    valid : ndarray of bool, shape (H, W), or None
+        Texels that are known. The others are continued smoothly before filtering and never
+        counted; responses near them weigh less (`model.texture_statistics.masks.response_weights`).
+    region : array_like, shape (H, W), or None
+        Bool, or weights 0...1: where to count (beard, or no beard). Filters reach over its border
+        to valid texels.
+    workers : int or None
+        Threads; None: one a core, 4 at most.
+
+    Returns
+    -------
+    TextureStatistics
+
+    Raises
+    ------
+    TextureError
+        For an image, mask or region that fits nothing, an empty mask, valid texels that are not
+        finite, a region without valid texels.
+    """
+    colors, mask = checked_image(image, valid)
+    used = TextureSpace.standard(colors.shape[2]) if space is None else space
+    _check_channels(colors, used)
+    weights = _weights(mask, region, used.levels)
+    channels = used.to_channels(fill_smoothly(colors, mask))
+    counted = []
+    with ThreadPoolExecutor(thread_count(workers)) as pool:
+        for c, channel in enumerate(channels):
+            pyramid = _analyze(channel, used, workers)
+            counted.append(_count(pool, (channel, *pyramid), _bins(used, c), used, weights))
+    return TextureStatistics(
+        np.concatenate([one.shares for row in counted for one in row]),
+        np.array([[one.below + one.above for one in row] for row in counted]),
+        np.array([[one.effective for one in row] for row in counted]),
+    )
+
+
+def match(
+    image: ArrayLike,
+    target: ArrayLike,
+    *,
+    space: TextureSpace | None = None,
+    iterations: int = 5,
+    noise: float = 0.0,
+    valid: Mask | None = None,
+    region: ArrayLike | None = None,
+    target_valid: Mask | None = None,
+    target_region: ArrayLike | None = None,
+    start: Literal["image", "noise"] = "image",
+    tolerance: float = 1e-4,
+    rng: np.random.Generator | None = None,
+    workers: int | None = None,
+) -> MatchedTexture:
+    """Give a texture the statistics of another (Heeger and Bergen's matching).
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W) or (H, W, C)
+        The source; with ``start="noise"`` it only says how large, and what stands outside.
+    target : array_like, shape (n,), or an image (H, W[, C])
+        A vector of ``space``, or a texture to take it from.
+    space : TextureSpace or None
+        None: fitted to a target image (and the source), the standard space for a vector.
+    iterations : int
+        At least 0; each matches the image, then all responses of its pyramid.
+    noise : float
+        Standard deviation of white noise added first, in each decorrelated channel's own
+        standard deviation; at least 0. It lets details appear that the source lacks.
+    valid, region
+        As of `statistics`. Only the region changes; weights between 0 and 1 blend.
+    target_valid, target_region
+        The same for a target image.
+    start : {"image", "noise"}
+        From the source, or from white noise with the mean and deviation of the target.
+    tolerance : float
+        A response no farther from its target, in spreads, is left alone: rounding would only
+        shuffle its rare values.
+    rng : numpy.random.Generator or None
+        Needed for noise.
+    workers : int or None
+        Threads; None: one a core, 4 at most.
+
+    Returns
+    -------
+    MatchedTexture
+        A texture with the target's statistics already comes back as it is, to rounding.
+
+    Raises
+    ------
+    TextureError
+        As of `statistics` and `TextureSpace.check`; for ``iterations``, ``noise`` or ``start``
+        out of range, and noise without ``rng``.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> rough, smooth = rng.uniform(0.2, 0.8, (32, 32)), np.linspace(0.3, 0.5, 32)[:, None]
+    >>> found = match(smooth + 0.01 * rng.standard_normal((32, 32)), rough)
+    >>> bool(found.after.mean() < 0.5 * found.before.mean())
+    True
+    """
+    colors, mask = checked_image(image, valid)
+    if iterations < 0 or not (np.isfinite(noise) and noise >= 0.0 and tolerance >= 0.0):
+        raise TextureError(
+            f"iterations, noise, tolerance: got {iterations}, {noise}, {tolerance}, expected at "
+            "least 0"
+        )
+    if start not in ("image", "noise"):
+        raise TextureError(f'start: got {start!r}, expected "image" or "noise"')
+    if (noise > 0.0 or start == "noise") and rng is None:
+        raise TextureError("rng: got None, expected a generator: noise is drawn from it")
+    if np.ndim(target) == 1:
+        used = TextureSpace.standard(colors.shape[2]) if space is None else space
+        wanted = used.check(target)
+    else:
+        texture, known = checked_image(target, target_valid)
+        if space is None:
+            both = ([texture], [known]) if start == "noise" else ([texture, colors], [known, mask])
+            used = TextureSpace.fit(both[0], valid=both[1], workers=workers)
+        else:
+            used = space
+        wanted = used.histograms(
+            describe(texture, space=used, valid=known, region=target_region, workers=workers)
+        )
+    _check_channels(colors, used)
+    weights = _weights(mask, region, used.levels)
+    # what changes; the other valid texels stay as surroundings of the filters
+    blend = (mask if weights is None else weights[0]).astype(colors.dtype)
+    channels = used.to_channels(fill_smoothly(colors, mask))
+    distances = np.empty((iterations + 1, used.channels, len(used.responses)))
+    clipped = np.empty(distances.shape[1:])
+    with ThreadPoolExecutor(thread_count(workers)) as pool:
+        for c, original in enumerate(channels):
+            bins, now = _bins(used, c), original
+            if rng is not None and start == "noise":
+                middle, spread = _moments(bins[0], wanted[c, 0])
+                grain = middle + spread * rng.standard_normal(now.shape)
+                now = _blended(original, grain, blend, mask)
+            if rng is not None and noise > 0.0:
+                grain = noise * float(now[blend > 0.0].std()) * rng.standard_normal(now.shape)
+                now = _blended(original, now + grain, blend, mask)
+            for iteration in range(iterations + 1):
+                pyramid = _analyze(now, used, workers)
+                counted = _count(pool, (now, *pyramid), bins, used, weights)
+                shares = np.stack([one.shares for one in counted])
+                distances[iteration, c] = distance(shares, wanted[c], used.edges[c])
+                if iteration == iterations:
+                    break
+                far = distances[iteration, c] > tolerance
+                if far[1:].any():
+                    _move(pool, pyramid, counted, bins, wanted[c], far)
+                    now = steerable_pyramid.synthesize(pyramid, workers=workers)
+                    counted[0] = bins[0].count(now, None if weights is None else weights[0])
+                if far.any():
+                    now = bins[0].match(now, counted[0], wanted[c, 0])
+                    now = _blended(original, now, blend, mask)
+            clipped[c] = [one.below + one.above for one in counted]
+            channels[c] = now
+    matched = np.where(blend[..., None] > 0.0, used.to_colors(channels), colors)
+    return MatchedTexture(matched.reshape(np.shape(image)), distances, clipped)
+
+
+def _check_channels(colors: Array, space: TextureSpace) -> None:
+    if colors.shape[2] != space.channels:
+        raise TextureError(
+            f"image: got {colors.shape[2]} channels, expected {space.channels} as in the space"
+        )
+
+
+def _weights(mask: Mask, region: ArrayLike | None, levels: int) -> Weights:
+    """Return the weights of texels and samples; None: all count fully."""
+    if region is not None:
+        wanted = np.asarray(region)
+        fits = wanted.shape == mask.shape and np.isfinite(wanted).all()
+        if not fits or wanted.min() < 0.0 or wanted.max() > 1.0:
+            raise TextureError(
+                f"region: got {wanted.dtype} {wanted.shape}, expected bool or 0...1 {mask.shape}"
+            )
+        if not (wanted[mask] > 0.0).any():
+            raise TextureError("region: got no valid texel, expected at least one")
+    elif mask.all():
+        return None
+    return response_weights(mask, region, levels)
+
+
+def _analyze(channel: Array, space: TextureSpace, workers: int | None) -> Responses:
+    return steerable_pyramid.analyze(
+        channel, levels=space.levels, orientations=space.orientations, workers=workers
+    )
+
+
+def _bins(space: TextureSpace, channel: int) -> list[Bins]:
+    return [Bins.over(edges) for edges in space.edges[channel]]
+
+
+def _count(
+    pool: ThreadPoolExecutor,
+    responses: tuple[Array, ...],
+    bins: list[Bins],
+    space: TextureSpace,
+    weights: Weights,
+) -> list[Counted]:
+    """Count all histograms of a channel."""
+
+    def one(r: int) -> Counted:
+        counts = None if weights is None else weight_of(weights, r, space.orientations)
+        return bins[r].count(responses[r], counts)
+
+    return _each(pool, one, range(len(bins)), large=responses[0].size > _SMALL)
+
+
+def _move(
+    pool: ThreadPoolExecutor,
+    pyramid: Responses,
+    counted: list[Counted],
+    bins: list[Bins],
+    wanted: Floats,
+    far: Mask,
+) -> None:
+    """Match the responses of a pyramid in place; the first histogram of all is the image's."""
+
+    def one(r: int, response: Array) -> None:
+        if far[r]:
+            bins[r].match(response, counted[r], wanted[r], out=response)
+
+    _each(pool, one, range(1, len(bins)), pyramid, large=pyramid.high.size > _SMALL)
+
+
+def _each(
+    pool: ThreadPoolExecutor, one: Callable[..., T], *items: Iterable[Any], large: bool
+) -> list[T]:
+    """Do all items: in threads when images are large enough to be worth them."""
+    return list((pool.map if large else map)(one, *items))
+
+
+def _blended(original: Array, new: Array, blend: Array, mask: Mask) -> Array:
+    """Keep the original where nothing is to change, and continue the result past the mask."""
+    if mask.all() and blend.min() >= 1.0:
+        return new.astype(original.dtype, copy=False)
+    mixed = (original + blend * (new - original)).astype(original.dtype, copy=False)
+    return fill_smoothly(mixed[..., None], mask)[..., 0]
+
+
+def _moments(bins: Bins, shares: Floats) -> tuple[float, float]:
+    """Return mean and standard deviation of a histogram."""
+    middles = 0.5 * (bins.edges[1:] + bins.edges[:-1])
+    mean = float(shares @ middles)
+    return mean, float(np.sqrt(shares @ (middles - mean) ** 2))

@@ -1,0 +1,328 @@
+"""Histograms over fixed, uneven bins: counting, distances, matching, valid ones nearby."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.texture_statistics import histogram_kernels
+
+Floats = NDArray[np.float64]
+Array = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+BINS = 256
+"""Bins of every histogram (Weyrich et al. 2006, section 10.2)."""
+
+
+class HistogramError(ValueError):
+    """Edges, histograms or groups that fit nothing."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Counted:
+    """One histogram and what it was counted from."""
+
+    shares: Floats
+    """(256,), sums to 1."""
+    below: float
+    """Share of values below the edges; it is in the first bin."""
+    above: float
+    """Share of values above the edges; it is in the last bin."""
+    least: float
+    """Least value."""
+    most: float
+    """Largest value."""
+    effective: float
+    """Samples of equal weight that would tell as much."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bins:
+    """256 bins, and a table that finds the bin of a value quickly."""
+
+    edges: Floats
+    """(257,), rising; a bin holds its lower edge."""
+    scale: float
+    least: NDArray[np.int16]
+    most: NDArray[np.int16]
+
+    @classmethod
+    def over(cls, edges: ArrayLike) -> Bins:
+        """Make the table of some edges."""
+        e = np.ascontiguousarray(edges, np.float64)
+        if e.shape != (BINS + 1,) or not np.isfinite(e).all() or not (np.diff(e) > 0.0).all():
+            raise HistogramError(f"edges: got shape {e.shape}, expected {BINS + 1} rising numbers")
+        scale = histogram_kernels.CELLS / float(e[-1] - e[0])
+        least = np.empty(histogram_kernels.CELLS, np.int16)
+        most = np.empty_like(least)
+        histogram_kernels.bound_bins(e, BINS, scale, least, most)
+        return cls(e, scale, least, most)
+
+    def count(self, values: Array, weights: Array | None = None) -> Counted:
+        """Count values (any shape), weighted or not.
+
+        Examples
+        --------
+        >>> found = Bins.over(np.arange(257.0)).count(np.array([-1.0, 0.0, 3.5, 256.0]))
+        >>> found.shares[[0, 3, 255]].tolist(), found.below
+        ([0.5, 0.25, 0.25], 0.25)
+        """
+        flat = np.ascontiguousarray(values).reshape(-1)
+        sums = np.zeros(BINS)
+        table = (self.edges, self.scale, self.least, self.most, sums)
+        if weights is None:
+            below, above, least, most = histogram_kernels.count(flat, *table)
+            squares = float(flat.size)
+        else:
+            some = np.ascontiguousarray(weights, flat.dtype).reshape(-1)
+            below, above, least, most, squares = histogram_kernels.count_weighted(
+                flat, some, *table
+            )
+        total = float(sums.sum())
+        if not total > 0.0:
+            raise HistogramError("weights: got none above 0, expected at least one")
+        return Counted(
+            sums / total, below / total, above / total, least, most, total * total / squares
+        )
+
+    def match(
+        self, values: Array, source: Counted, target: Floats, *, out: Array | None = None
+    ) -> Array:
+        """Move values so that their histogram becomes the target's.
+
+        Parameters
+        ----------
+        values
+            Of any shape.
+        source
+            What `count` said about them.
+        target : ndarray, shape (256,)
+            At least 0, sums to 1.
+        out : ndarray or None
+            Where to write, contiguous; may be ``values`` itself.
+
+        Returns
+        -------
+        ndarray, shape and dtype of values
+            Under the identical histogram the same values, to rounding.
+
+        Raises
+        ------
+        HistogramError
+            For values that are not finite, and a target of another shape, with a negative share or
+            without any above 0.
+
+        Notes
+        -----
+        A density is even inside a bin, so that the outcome has no steps. Values beyond the edges
+        widen the end bins of both histograms to where they reach.
+        """
+        flat = np.ascontiguousarray(values).reshape(-1)
+        _check_shares("target", target, BINS)
+        wrong = flat.size - np.count_nonzero(np.isfinite(flat))
+        if wrong:
+            raise HistogramError(
+                f"values: got {wrong} of {flat.size} that are NaN or infinite, expected finite "
+                "ones: leave out what is masked"
+            )
+        own, wanted = cumulated(source.shares), cumulated(target)
+        edges = self.edges.copy()
+        edges[0], edges[-1] = min(edges[0], source.least), max(edges[-1], source.most)
+        moved = np.empty(np.shape(values), flat.dtype) if out is None else out
+        histogram_kernels.move(flat, own, wanted, edges, moved.reshape(-1))
+        return moved
+
+
+def _check_shares(name: str, shares: ArrayLike, bins: int | None = None) -> Floats:
+    h = np.asarray(shares, np.float64)
+    if h.ndim < 1 or not h.shape[-1] or (bins is not None and h.shape[-1] != bins):
+        raise HistogramError(f"{name}: got shape {h.shape}, expected (..., {bins or BINS})")
+    if not (np.isfinite(h).all() and (h >= 0.0).all() and (h.sum(axis=-1) > 0.0).all()):
+        raise HistogramError(
+            f"{name}: got NaN, infinite or negative shares, or none above 0, expected shares that "
+            "sum to 1"
+        )
+    return h
+
+
+def cumulated(shares: ArrayLike) -> Floats:
+    """Return the cumulated shares at all edges, (..., 257), from 0 to exactly 1.
+
+    Raises
+    ------
+    HistogramError
+        For shares that are not finite, negative, or all 0.
+    """
+    h = _check_shares("shares", shares)
+    run = np.concatenate([np.zeros((*h.shape[:-1], 1)), np.cumsum(h, axis=-1)], axis=-1)
+    run /= run[..., -1:]
+    return np.asarray(np.minimum(run, 1.0))
+
+
+def distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Floats:
+    """Return how far values must move, on average, to make one histogram of another.
+
+    Parameters
+    ----------
+    a, b : array_like, shape (..., 256)
+        Histograms that sum to 1.
+    edges : array_like, shape (..., 257)
+
+    Returns
+    -------
+    ndarray, shape (...)
+        The earth mover's distance over the width of the middle half of the bins. In a fitted
+        space that is about the spread of the population.
+
+    Raises
+    ------
+    HistogramError
+        For shares that are not finite, negative or all 0, and edges that do not rise.
+
+    Examples
+    --------
+    >>> float(distance(np.eye(256)[3], np.eye(256)[131], np.arange(257.0)))
+    1.0
+    """
+    e = np.asarray(edges, np.float64)
+    first, second = _check_shares("a", a, BINS), _check_shares("b", b, BINS)
+    if e.ndim < 1 or e.shape[-1] != BINS + 1:
+        raise HistogramError(f"edges: got shape {e.shape}, expected (..., {BINS + 1})")
+    if not (np.isfinite(e).all() and (np.diff(e, axis=-1) > 0.0).all()):
+        raise HistogramError("edges: got some that do not rise, expected finite rising edges")
+    apart = np.abs(cumulated(first) - cumulated(second))
+    moved = np.sum(0.5 * (apart[..., 1:] + apart[..., :-1]) * np.diff(e, axis=-1), axis=-1)
+    quarter = BINS // 4
+    return np.asarray(moved / (e[..., 3 * quarter] - e[..., quarter]))
+
+
+def project_to_histograms(vectors: ArrayLike) -> Floats:
+    """Return the nearest vectors (least squares) whose histograms are all valid.
+
+    Parameters
+    ----------
+    vectors : array_like, shape (..., n)
+        n a multiple of 256; finite.
+
+    Returns
+    -------
+    ndarray of float64, same shape
+        At least 0; every run of 256 sums to 1. A valid vector comes back as it is, to rounding.
+
+    Notes
+    -----
+    Each histogram is projected on the simplex: a constant is taken off and what is negative set
+    to 0 (Held, Wolfe, Crowder 1974, doi:10.1007/BF01580223).
+
+    Examples
+    --------
+    >>> edited = np.zeros(256)
+    >>> edited[:3] = 0.9, 0.3, -0.2
+    >>> project_to_histograms(edited)[:3].round(6).tolist()
+    [0.8, 0.2, 0.0]
+    """
+    v = np.asarray(vectors, np.float64)
+    if not v.ndim or v.shape[-1] % BINS or not v.size or not np.isfinite(v).all():
+        raise HistogramError(
+            f"vectors: got shape {v.shape}, expected finite (..., n x {BINS}), n at least 1"
+        )
+    h = v.reshape(-1, BINS)
+    falling = -np.sort(-h, axis=1)
+    excess = (np.cumsum(falling, axis=1) - 1.0) / np.arange(1, BINS + 1)
+    kept = np.count_nonzero(falling > excess, axis=1)
+    taken = excess[np.arange(len(h)), kept - 1]
+    return np.maximum(h - taken[:, None], 0.0).reshape(v.shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroupHistograms:
+    """Color histograms averaged over groups of images."""
+
+    edges: Floats
+    """(B + 1,), unit of the images."""
+    names: tuple[str, ...]
+    """The G groups."""
+    mean: Floats
+    """(G, channels, B): every image counts the same; each sums to 1."""
+    stderr: Floats
+    """(G, channels, B): of the mean over the group; NaN in groups of one."""
+    members: NDArray[np.int64]
+    """(G,)"""
+    clipped: Floats
+    """(G, channels): share that lies outside the edges and was counted in the end bins."""
+
+
+def rgb_histograms(
+    images: Sequence[ArrayLike],
+    groups: Mapping[str, ArrayLike],
+    valid: Sequence[Mask | None] | None = None,
+    *,
+    reach: tuple[float, float] = (0.0, 1.0),
+    bins: int = BINS,
+) -> GroupHistograms:
+    """Average the color histograms of images over groups (Weyrich et al. 2006, figure 16).
+
+    Parameters
+    ----------
+    images : sequence of (H, W, C)
+        One size is not needed; finite where valid.
+    groups : mapping of str to bool array, shape (images,)
+        Members; an image may be in several.
+    valid : sequence of (H, W) bool, or None
+        Texels that count.
+    reach : tuple of float
+        First and last edge; the bins between are even.
+    bins : int
+        At least 2.
+
+    Examples
+    --------
+    >>> dark, light = np.full((4, 4, 3), 0.1), np.full((4, 4, 3), 0.9)
+    >>> found = rgb_histograms([dark, light], {"all": [True, True]}, bins=2)
+    >>> found.mean[0].tolist(), found.members.tolist()
+    ([[0.5, 0.5], [0.5, 0.5], [0.5, 0.5]], [2])
+    """
+    low, high = reach
+    if bins < 2 or not (np.isfinite([low, high]).all() and low < high):
+        raise HistogramError(f"reach, bins: got {reach}, {bins}, expected low < high and 2 bins")
+    if valid is not None and len(valid) != len(images):
+        raise HistogramError(f"valid: got {len(valid)} masks for {len(images)} images")
+    edges = np.linspace(low, high, bins + 1)
+    found, outside = [], []
+    for number, image in enumerate(images):
+        pixels = np.asarray(image)
+        mask = None if valid is None else valid[number]
+        if pixels.ndim != 3 or (mask is not None and np.shape(mask) != pixels.shape[:2]):
+            raise HistogramError(
+                f"images[{number}]: got shape {pixels.shape}, mask "
+                f"{None if mask is None else mask.shape}, expected (H, W, C) and (H, W)"
+            )
+        rows = pixels.reshape(-1, pixels.shape[2]) if mask is None else pixels[mask]
+        if not len(rows) or not np.isfinite(rows).all():
+            raise HistogramError(f"images[{number}]: got no valid texel, or one that is not finite")
+        shares = [np.histogram(np.clip(c, low, high), edges)[0] / len(rows) for c in rows.T]
+        found.append(shares)
+        outside.append(((rows < low) | (rows > high)).mean(axis=0))
+    each, beyond = np.array(found), np.array(outside)
+    mean, stderr, clipped, members = [], [], [], []
+    for name, flags in groups.items():
+        chosen = np.asarray(flags)
+        if chosen.shape != (len(images),) or chosen.dtype != np.bool_ or not chosen.any():
+            raise HistogramError(
+                f"groups[{name!r}]: got {chosen.dtype} {chosen.shape}, expected bool "
+                f"({len(images)},) with at least one member"
+            )
+        n = int(chosen.sum())
+        mean.append(each[chosen].mean(axis=0))
+        spread = each[chosen].std(axis=0, ddof=1) if n > 1 else np.full(each.shape[1:], np.nan)
+        stderr.append(spread / np.sqrt(n))
+        clipped.append(beyond[chosen].mean(axis=0))
+        members.append(n)
+    return GroupHistograms(
+        edges, tuple(groups), np.array(mean), np.array(stderr), np.array(members, np.int64),
+        np.array(clipped),
+    )  # fmt: skip

@@ -1,0 +1,128 @@
+"""Masked textures before a pyramid: what stands outside the mask, and which responses count."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import convolve1d
+
+from model.texture_statistics.steerable_pyramid import level_sizes
+
+Array = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+_BINOMIAL = np.array([1.0, 4.0, 6.0, 4.0, 1.0], np.float32) / 16.0
+
+
+def fill_smoothly(image: Array, valid: Mask) -> Array:
+    """Continue a texture smoothly to where it is not valid, periodically.
+
+    Means of 2 x 2 texels, level by level, until nothing is missing; then back with linear
+    interpolation, so that a filled texel has the color of its surroundings and no detail.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W, C)
+        Finite where valid; anything elsewhere.
+    valid : ndarray of bool, shape (H, W)
+        At least one True.
+
+    Returns
+    -------
+    ndarray, shape (H, W, C)
+        Valid texels as they were.
+
+    Raises
+    ------
+    ValueError
+        Where no texel is valid, or one that is valid is not finite.
+    """
+    if not valid.any():
+        raise ValueError(f"valid: got no texel of {valid.shape}, expected one at least")
+    if not np.isfinite(image[valid]).all():
+        raise ValueError("image: got NaN or infinity at a valid texel, expected finite values")
+    if valid.all():
+        return image
+    known = np.where(valid[..., None], image, 0)
+    share = valid.astype(image.dtype)[..., None]
+    steps = [(known, share)]
+    while not (share > 0.0).all():
+        sums, share = _halved(known * share), _halved(share)
+        known = sums / np.maximum(share, np.finfo(image.dtype).tiny)
+        share = np.minimum(share, 1.0)
+        steps.append((known, share))
+    filled = known
+    for known, share in reversed(steps[:-1]):
+        filled = share * known + (1.0 - share) * _doubled(filled, known.shape[:2])
+    return np.where(valid[..., None], image, filled).astype(image.dtype)
+
+
+def _halved(a: Array) -> Array:
+    """Add up 2 x 2 texels; a last odd row or column stands alone."""
+    padded = np.pad(a, ((0, a.shape[0] % 2), (0, a.shape[1] % 2), (0, 0)))
+    return np.asarray(padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2])
+
+
+def _doubled(a: Array, shape: tuple[int, int]) -> Array:
+    """Interpolate linearly between the middles of 2 x 2 texels, periodically."""
+    for axis in (0, 1):
+        before = 0.75 * a + 0.25 * np.roll(a, 1, axis)
+        after = 0.75 * a + 0.25 * np.roll(a, -1, axis)
+        both = np.stack([before, after], axis=axis + 1)
+        size = list(a.shape)
+        size[axis] *= 2
+        a = both.reshape(size)
+    return a[: shape[0], : shape[1]]
+
+
+def response_weights(
+    valid: Mask, region: ArrayLike | None, levels: int
+) -> tuple[Array, tuple[Array, ...]]:
+    """Return the weight of every texel, and of every sample of every level and the low-pass.
+
+    Parameters
+    ----------
+    valid : ndarray of bool, shape (H, W)
+    region : array_like, shape (H, W), or None
+        Bool, or weights 0...1; None: everywhere.
+    levels : int
+
+    Returns
+    -------
+    texels : ndarray of float32, shape (H, W)
+        The region where valid.
+    samples : tuple of ndarray of float32
+        A sample weighs the region's mean over its own cell, times the part of its surroundings
+        that is valid (binomial weights over 5 x 5 cells): the reach of the filters. The first
+        is of the high-pass and the first level.
+    """
+    texels = valid.astype(np.float32)
+    inside = texels if region is None else texels * np.asarray(region, np.float32)
+    samples = []
+    for size in level_sizes((valid.shape[0], valid.shape[1]), levels):
+        support = _cell_means(texels, size)
+        for axis in (0, 1):
+            support = convolve1d(support, _BINOMIAL, axis=axis, mode="wrap")
+        samples.append(_cell_means(inside, size) * support)
+    return inside, tuple(samples)
+
+
+def _cell_means(texels: Array, size: tuple[int, int]) -> Array:
+    """Average texels over the cells about the samples of a coarser, periodic grid."""
+    found = texels
+    for axis in (0, 1):
+        fine, coarse = found.shape[axis], size[axis]
+        if fine == coarse:
+            continue
+        cell = np.rint(np.arange(fine) * (coarse / fine)).astype(np.int64)
+        begins = np.searchsorted(cell, np.arange(cell[-1] + 1))
+        sums = np.add.reduceat(found, begins, axis=axis)
+        count = np.bincount(cell).astype(np.float32)
+        if len(count) > coarse:  # the last texels are nearest to the first sample, around the end
+            sums, rest = np.split(sums, [coarse], axis=axis)
+            first = [slice(None)] * 2
+            first[axis] = slice(0, 1)
+            sums[tuple(first)] += rest
+            count[0] += count[-1]
+            count = count[:-1]
+        found = sums / (count[:, None] if axis == 0 else count)
+    return found

@@ -1,0 +1,342 @@
+"""What the texture statistics of a population have in common: color space and bin edges.
+
+A texture is described by one row vector: 256-bin histograms of the image itself and of the 30
+responses of its steerable pyramid, in each of three decorrelated channels: 23,808 numbers,
+
+    vector[((channel * 31) + response) * 256 + bin],
+
+where response 0 is the image, 1 the high-pass, 2 + 4 l + k the band of level l (0 the finest) and
+orientation k, and 30 the low-pass. (Weyrich et al. call the vectors columns and give 87 x 23,808
+as the size of their matrix; here they are the rows of (n, 23808).)
+
+References
+----------
+Heeger, Bergen 1995, doi:10.1145/218380.218446, section 3.5 (the decorrelated color space).
+Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10.2.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.texture_statistics import steerable_pyramid
+from model.texture_statistics.bins import OPPONENT, principal_axes, uneven_edges
+from model.texture_statistics.histograms import BINS
+from model.texture_statistics.masks import fill_smoothly, response_weights
+from model.texture_statistics.steerable_pyramid import LEVELS, ORIENTATIONS
+
+Floats = NDArray[np.float64]
+Array = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+_QUANTILES = 2049
+
+
+class TextureError(ValueError):
+    """A texture, mask, vector or file that no texture statistics can be made of."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TextureSpace:
+    """Color axes and bin edges; vectors of one space can be compared, averaged and edited."""
+
+    mean: Floats
+    """(C,): the population's mean color, unit of the images."""
+    axes: Floats
+    """(C, C): orthonormal rows, by falling variance; channel = axes @ (color - mean)."""
+    edges: Floats
+    """(C, responses, 257): rising; responses as in the vector, so 31 of them at full depth."""
+    levels: int
+    orientations: int
+    images: int
+    """How many images it was fitted to; 0: the standard space."""
+
+    def __post_init__(self) -> None:
+        """Check shapes, axes and edges."""
+        C = len(self.mean)
+        R = self.levels * self.orientations + 3
+        if min(self.levels, self.orientations, C) < 1 or self.axes.shape != (C, C):
+            raise TextureError(
+                f"TextureSpace: got {self.levels} levels, {self.orientations} orientations, mean "
+                f"{self.mean.shape}, axes {self.axes.shape}, expected at least 1, (C,), (C, C)"
+            )
+        if self.edges.shape != (C, R, BINS + 1):
+            raise TextureError(
+                f"TextureSpace.edges: got {self.edges.shape}, expected {(C, R, BINS + 1)}"
+            )
+        arrays = (self.mean, self.axes, self.edges)
+        if any(a.dtype != np.float64 or not np.isfinite(a).all() for a in arrays):
+            raise TextureError("TextureSpace: got arrays that are not finite float64")
+        if np.abs(self.axes @ self.axes.T - np.eye(C)).max() > 1e-9:
+            raise TextureError("TextureSpace.axes: got rows that are not orthonormal")
+        if not (np.diff(self.edges, axis=-1) > 0.0).all():
+            raise TextureError("TextureSpace.edges: got edges that do not rise")
+
+    @property
+    def channels(self) -> int:
+        """Number of channels C."""
+        return len(self.mean)
+
+    @property
+    def responses(self) -> tuple[str, ...]:
+        """Names of the histograms of a channel, in the vector's order."""
+        bands = [
+            f"level {level} orientation {k}"
+            for level in range(self.levels)
+            for k in range(self.orientations)
+        ]
+        return ("image", "high-pass", *bands, "low-pass")
+
+    @property
+    def size(self) -> int:
+        """Length of a vector."""
+        return self.channels * len(self.responses) * BINS
+
+    def part(self, channel: int, response: int | str) -> slice:
+        """Return where one histogram lies in a vector.
+
+        Parameters
+        ----------
+        channel : int
+            0 to C - 1, by falling variance.
+        response : int or str
+            Index or name out of `responses`.
+
+        Examples
+        --------
+        >>> TextureSpace.standard().part(2, "low-pass")
+        slice(23552, 23808, None)
+        """
+        names = self.responses
+        number = response
+        if isinstance(number, str):
+            number = names.index(number) if number in names else -1
+        if not (0 <= channel < self.channels and 0 <= number < len(names)):
+            raise TextureError(
+                f"part: got channel {channel}, response {response!r}, expected 0 to "
+                f"{self.channels - 1} and 0 to {len(names) - 1} or one of {', '.join(names)}"
+            )
+        begin = (channel * len(names) + number) * BINS
+        return slice(begin, begin + BINS)
+
+    def histograms(self, vector: ArrayLike) -> Floats:
+        """Return vectors (..., n) as histograms (..., C, responses, 256)."""
+        v = np.asarray(vector, np.float64)
+        if not v.ndim or v.shape[-1] != self.size:
+            raise TextureError(f"vector: got shape {v.shape}, expected (..., {self.size})")
+        return v.reshape(*v.shape[:-1], self.channels, len(self.responses), BINS)
+
+    def check(self, vector: ArrayLike) -> Floats:
+        """Return a vector as histograms (C, responses, 256) after checking that each is one.
+
+        Raises
+        ------
+        TextureError
+            For a wrong length, negative shares, or histograms that do not sum to 1 within 1e-6:
+            `model.texture_statistics.histograms.project_to_histograms` makes valid ones of edited ones.
+        """
+        h = self.histograms(vector)
+        if h.ndim != 3 or not np.isfinite(h).all() or h.min() < 0.0:
+            raise TextureError(
+                f"vector: got shape {np.shape(vector)} or negative or non-finite shares, expected "
+                f"({self.size},) of shares at least 0; see project_to_histograms"
+            )
+        off = np.abs(h.sum(axis=-1) - 1.0)
+        if off.max() > 1e-6:
+            c, r = np.unravel_index(int(off.argmax()), off.shape)
+            raise TextureError(
+                f"vector: got shares that sum to {h[c, r].sum():.6g} in channel {c}, "
+                f"{self.responses[r]}, expected 1; see project_to_histograms"
+            )
+        return h
+
+    def to_channels(self, image: Array) -> Array:
+        """Return (C, H, W) decorrelated channels of an image (H, W, C), in its precision."""
+        rows = image.reshape(-1, self.channels) - self.mean.astype(image.dtype)
+        turned = self.axes.astype(image.dtype) @ rows.T
+        return np.ascontiguousarray(turned).reshape(self.channels, *image.shape[:2])
+
+    def to_colors(self, channels: Array) -> Array:
+        """Return the image (H, W, C) of decorrelated channels (C, H, W)."""
+        rows = channels.reshape(self.channels, -1).T @ self.axes.astype(channels.dtype)
+        return np.asarray(
+            (rows + self.mean.astype(channels.dtype)).reshape(*channels.shape[1:], self.channels)
+        )
+
+    @classmethod
+    def standard(cls, channels: int = 3) -> TextureSpace:
+        """Return the space for reflectances 0...1 of which no population is known.
+
+        Channels are brightness, red less green and yellow less blue (RGB), or the image itself
+        (1 channel). Bins of the image and low-pass are even; those of the bands grow
+        exponentially away from 0. A fitted space describes a population much better.
+        """
+        if channels not in (1, 3):
+            raise TextureError(
+                f"channels: got {channels}; the standard space has 1 or 3: fit one to the images"
+            )
+        even = np.linspace(0.0, 1.0, BINS + 1)
+        grown = np.sinh(8.0 * (2.0 * even - 1.0)) / np.sinh(8.0)
+        count = LEVELS * ORIENTATIONS + 3
+        edges = np.empty((channels, count, BINS + 1))
+        for c in range(channels):
+            edges[c] = grown
+            top = 1.25 * np.sqrt(channels)
+            edges[c, [0, -1]] = top * even if c == 0 else 1.5 * grown
+        axes = OPPONENT if channels == 3 else np.eye(1)
+        return cls(np.zeros(channels), axes.copy(), edges, LEVELS, ORIENTATIONS, 0)
+
+    @classmethod
+    def fit(
+        cls,
+        images: Sequence[ArrayLike],
+        *,
+        valid: Sequence[Mask | None] | None = None,
+        levels: int = LEVELS,
+        orientations: int = ORIENTATIONS,
+        workers: int | None = None,
+    ) -> TextureSpace:
+        """Fit color axes and bin edges to a population; every image counts the same.
+
+        Parameters
+        ----------
+        images : sequence of array_like, each (H, W) or (H, W, C)
+            In one color space and unit; sizes may differ. Read twice, one at a time.
+        valid : sequence of ndarray of bool (H, W) or None
+            Texels that count.
+        levels, orientations : int
+            7 and 4 give the vector of 23,808.
+        workers : int or None
+            Threads; None: one a core, 4 at most.
+
+        Returns
+        -------
+        TextureSpace
+
+        Raises
+        ------
+        TextureError
+            For no image, channels that differ, an empty mask, valid texels that are not finite.
+
+        Notes
+        -----
+        Axes are the principal axes of the mean covariance of the images' colors about the common
+        mean; directions without variance are turned to brightness and opponent colors. Half of
+        the bins of a response is spread evenly over its range in the population (and 5 % more),
+        half by how often values occur, so that neither rare extremes nor the crowd at 0 fall
+        into a few bins. A response without variance gets narrow bins about its value.
+        """
+        count = len(images)
+        if not count or (valid is not None and len(valid) != count):
+            raise TextureError(
+                f"images, valid: got {count} images and "
+                f"{'no' if valid is None else len(valid)} masks, expected at least 1, as many"
+            )
+        masks = [None] * count if valid is None else list(valid)
+        moments = []
+        unit = 0.0
+        for image, mask in zip(images, masks, strict=True):
+            colors, inside = checked_image(image, mask)
+            rows = colors[inside].astype(np.float64)
+            unit = max(unit, float(np.abs(rows).max()))
+            center = rows.mean(axis=0)
+            moments.append((center, (rows - center).T @ (rows - center) / len(rows)))
+        channels = {len(center) for center, _ in moments}
+        if len(channels) != 1:
+            raise TextureError(f"images: got {sorted(channels)} channels, expected one number")
+        centers = np.array([center for center, _ in moments])
+        mean = centers.mean(axis=0)
+        spread = np.mean([c for _, c in moments], axis=0)
+        spread = spread + (centers - mean).T @ (centers - mean) / count
+        axes = principal_axes(spread, unit or 1.0)
+        plain = cls(
+            mean, axes, np.tile(np.linspace(0.0, 1.0, BINS + 1),
+                                (len(mean), levels * orientations + 3, 1)),
+            levels, orientations, count,
+        )  # fmt: skip
+        found = [
+            _quantiles(plain, image, mask, workers)
+            for image, mask in zip(images, masks, strict=True)
+        ]
+        pooled = np.stack(found)  # (images, C, R, quantiles)
+        edges = np.empty_like(plain.edges)
+        for c in range(pooled.shape[1]):
+            for r in range(pooled.shape[2]):
+                edges[c, r] = uneven_edges(pooled[:, c, r], unit or 1.0)
+        return cls(mean, axes, edges, levels, orientations, count)
+
+    def save(self, path: str | Path) -> None:
+        """Write the space as npz, exactly; ``path`` is used as it is."""
+        with Path(path).open("wb") as file:
+            np.savez_compressed(
+                file, mean=self.mean, axes=self.axes, edges=self.edges,
+                counts=np.array([self.levels, self.orientations, self.images]),
+            )  # fmt: skip
+
+    @classmethod
+    def load(cls, path: str | Path) -> TextureSpace:
+        """Read what `save` wrote; TextureError when it is not that."""
+        try:
+            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as stored:
+                mean, axes, edges = (stored[name] for name in ("mean", "axes", "edges"))
+                levels, orientations, images = (int(n) for n in stored["counts"])
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise TextureError(f"{path}: got no texture space ({error})") from error
+        return cls(mean, axes, edges, levels, orientations, images)
+
+
+def checked_image(image: ArrayLike, valid: ArrayLike | None) -> tuple[Array, Mask]:
+    """Return an image as (H, W, C), float64 if it was and float32 if not, and its mask."""
+    values = np.asarray(image)
+    values = values.astype(np.float64 if values.dtype == np.float64 else np.float32, copy=False)
+    if values.ndim == 2:
+        values = values[..., None]
+    if values.ndim != 3 or not values.size:
+        raise TextureError(
+            f"image: got shape {np.shape(image)}, expected (H, W) or (H, W, C), not empty"
+        )
+    mask = np.ones(values.shape[:2], bool) if valid is None else np.asarray(valid)
+    if mask.dtype != np.bool_ or mask.shape != values.shape[:2]:
+        raise TextureError(
+            f"valid: got {mask.dtype} {mask.shape}, expected bool {values.shape[:2]}"
+        )
+    if not mask.any():
+        raise TextureError(f"valid: got no valid texel of {mask.size}, expected at least one")
+    wrong = int(np.count_nonzero(~np.isfinite(values).all(axis=-1) & mask))
+    if wrong:
+        raise TextureError(
+            f"image: got {wrong} valid texels that are not finite; mark them in valid"
+        )
+    return values, mask
+
+
+def _quantiles(
+    space: TextureSpace, image: ArrayLike, valid: Mask | None, workers: int | None
+) -> Array:
+    """Return even quantiles of the valid samples of all responses, (C, R, quantiles) float32."""
+    colors, mask = checked_image(image, valid)
+    weights = None if mask.all() else response_weights(mask, None, space.levels)
+    out = np.empty((space.channels, len(space.responses), _QUANTILES), colors.dtype)
+    for c, channel in enumerate(space.to_channels(fill_smoothly(colors, mask))):
+        pyramid = steerable_pyramid.analyze(
+            channel, levels=space.levels, orientations=space.orientations, workers=workers
+        )
+        for r, values in enumerate((channel, *pyramid)):
+            if weights is not None:
+                values = values[weight_of(weights, r, space.orientations) > 0.0]
+            ordered = np.sort(values, axis=None)
+            ranks = np.linspace(0.0, ordered.size - 1.0, _QUANTILES)
+            out[c, r] = ordered[np.rint(ranks).astype(np.int64)]
+    return out
+
+
+def weight_of(weights: tuple[Array, tuple[Array, ...]], response: int, orientations: int) -> Array:
+    """Return the weights of the samples of a response out of those of all levels."""
+    texels, samples = weights
+    return texels if response == 0 else samples[max(response - 2, 0) // orientations]

@@ -1,0 +1,193 @@
+"""Sets that samples must stay in: mixtures without negative shares, and histograms.
+
+Both are convex, and what falls outside is put on the nearest place inside. Such a projection never
+moves two points apart, which bounds what an edit and its opposite leave: see `model.traits`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.traits import nonnegative_kernels
+
+FloatArray = NDArray[np.float64]
+
+TOLERANCE = 1e-5
+"""What float32 leaves of a sum of one, and of a share of zero."""
+BINS = 256
+
+
+class FeasibleError(ValueError):
+    """A sample outside the set that it should lie in."""
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """Everything finite."""
+
+    def contains(self, samples: ArrayLike) -> NDArray[np.bool_]:
+        """Return whether each sample (..., d) lies in the set, (...)."""
+        return np.asarray(np.isfinite(np.asarray(samples, np.float64)).all(axis=-1))
+
+    def project(self, samples: ArrayLike, metric: FloatArray | None = None) -> FloatArray:
+        """Return the samples (..., d) as they are."""
+        return np.array(samples, np.float64)
+
+    def tangent(self, vector: ArrayLike) -> FloatArray:
+        """Return the part of a direction (d,) along the set: all of it."""
+        return np.array(vector, np.float64)
+
+    def document(self) -> dict[str, Any]:
+        """Return what `from_document` reads."""
+        return {"set": "free"}
+
+
+@dataclass(frozen=True, slots=True)
+class NonNegative:
+    """Samples of shares that are at least 0."""
+
+    def contains(self, samples: ArrayLike) -> NDArray[np.bool_]:
+        """Return whether each sample (..., d) lies in the set, (...)."""
+        s = np.asarray(samples, np.float64)
+        scale = np.abs(s).max(axis=-1, initial=0.0, keepdims=True)
+        return np.asarray((np.isfinite(s) & (s >= -TOLERANCE * scale)).all(axis=-1))
+
+    def project(self, samples: ArrayLike, metric: FloatArray | None = None) -> FloatArray:
+        """Return the nearest samples of the set.
+
+        Parameters
+        ----------
+        samples : array_like, shape (..., d)
+        metric : ndarray, shape (d,) or (d, d), optional
+            What a difference counts, as weights or as a matrix of products. A weight moves nothing.
+            By a matrix, what one share lacks others of its kind make up for.
+
+        Returns
+        -------
+        ndarray of float64, shape (..., d)
+
+        Examples
+        --------
+        >>> NonNegative().project([1.0, -0.5]).tolist()
+        [1.0, 0.0]
+        >>> NonNegative().project([1.0, -0.5], np.array([[1.0, 0.8], [0.8, 1.0]])).round(6).tolist()
+        [0.6, 0.0]
+        """
+        s = np.asarray(samples, np.float64)
+        if metric is None or metric.ndim == 1:
+            return np.maximum(s, 0.0)
+        return nonnegative_kernels.nearest(metric, s.reshape(-1, s.shape[-1])).reshape(s.shape)
+
+    def tangent(self, vector: ArrayLike) -> FloatArray:
+        """Return the part of a direction (d,) along the set: all of it."""
+        return np.array(vector, np.float64)
+
+    def document(self) -> dict[str, Any]:
+        """Return what `from_document` reads."""
+        return {"set": "non-negative"}
+
+
+@dataclass(frozen=True, slots=True)
+class Histograms:
+    """Samples made of histograms, one after another, each at least 0 and of sum one."""
+
+    block: int = BINS
+    """Bins of each histogram."""
+
+    def __post_init__(self) -> None:
+        """Refuse histograms without bins."""
+        if self.block < 1:
+            raise FeasibleError(f"block: got {self.block}, expected at least 1 bin")
+
+    def contains(self, samples: ArrayLike) -> NDArray[np.bool_]:
+        """Return whether each sample (..., d) lies in the set, (...)."""
+        s = self._blocks(samples)
+        with np.errstate(invalid="ignore"):
+            good = (s >= -TOLERANCE) & (np.abs(s.sum(axis=-1, keepdims=True) - 1.0) <= TOLERANCE)
+        return np.asarray(good.all(axis=(-1, -2)))
+
+    def project(self, samples: ArrayLike, metric: FloatArray | None = None) -> FloatArray:
+        """Return the nearest samples of the set, all bins counting the same.
+
+        Parameters
+        ----------
+        samples : array_like, shape (..., d)
+        metric : None
+            Weights of bins are not supported.
+
+        Returns
+        -------
+        ndarray of float64, shape (..., d)
+
+        Notes
+        -----
+        Each histogram loses the same from all bins that keep something: with bins in falling order
+        u, the loss is the last of (u_1 + ... + u_j - 1) / j that is below u_j (Held, Wolfe and
+        Crowder 1974, doi:10.1007/BF01580223).
+
+        Examples
+        --------
+        >>> Histograms(3).project([0.75, 0.5, -0.25]).tolist()
+        [0.625, 0.375, 0.0]
+        """
+        if metric is not None:
+            raise FeasibleError("metric: got weights, expected none for histograms")
+        s = self._blocks(samples)
+        u = -np.sort(-s, axis=-1)
+        loss = (np.cumsum(u, axis=-1) - 1.0) / np.arange(1, self.block + 1)
+        last = np.count_nonzero(u > loss, axis=-1, keepdims=True) - 1
+        found = np.maximum(s - np.take_along_axis(loss, last, axis=-1), 0.0)
+        return found.reshape(np.shape(samples))
+
+    def tangent(self, vector: ArrayLike) -> FloatArray:
+        """Return the part of a direction (d,) along the set: each histogram keeps its sum."""
+        s = self._blocks(vector)
+        return np.asarray((s - s.mean(axis=-1, keepdims=True)).reshape(np.shape(vector)))
+
+    def document(self) -> dict[str, Any]:
+        """Return what `from_document` reads."""
+        return {"set": "histograms", "block": self.block}
+
+    def _blocks(self, samples: ArrayLike) -> FloatArray:
+        s = np.asarray(samples, np.float64)
+        if not s.ndim or s.shape[-1] % self.block or not s.shape[-1]:
+            raise FeasibleError(
+                f"samples: got shape {s.shape}, expected (..., d) with d a multiple of {self.block}"
+            )
+        return s.reshape(*s.shape[:-1], -1, self.block)
+
+
+FeasibleSet: TypeAlias = Free | NonNegative | Histograms
+
+
+def from_document(document: Mapping[str, Any]) -> FeasibleSet:
+    """Return the set that a `document` names."""
+    name = document.get("set")
+    if name == "free":
+        return Free()
+    if name == "non-negative":
+        return NonNegative()
+    if name == "histograms":
+        return Histograms(int(document["block"]))
+    raise FeasibleError(
+        f"set: got {name!r}, expected 'free', 'non-negative' or 'histograms'; a newer version "
+        "may have written it"
+    )
+
+
+def smallest(samples: FloatArray) -> FeasibleSet:
+    """Return the smallest set that holds samples (n, d): histograms of 256, non-negative, free.
+
+    Examples
+    --------
+    >>> smallest(np.array([[0.0, 2.0]])), smallest(np.array([[0.0, -2.0]]))
+    (NonNegative(), Free())
+    """
+    if samples.shape[-1] % BINS == 0 and Histograms().contains(samples).all():
+        return Histograms()
+    return NonNegative() if bool((samples >= 0.0).all()) else Free()

@@ -1,0 +1,245 @@
+"""Traits of surface BRDFs added to maps of lobes: lotion on a face, texel by texel.
+
+A face's maps are shares of few lobes, each a mixture of many materials; a trait is a signed mixture
+of the same materials. What it adds may be a lobe that the face lacks, what it takes away must be
+taken off lobes that are there. So an edit brings at most one lobe for each trait: of some
+candidates the one with which all texels come nearest to what was asked, if that is worth it.
+Candidates are what is positive in the trait's mixture, and what remains of it when a texel of
+usual shares gives off what it can.
+
+On the lobes, the trait is the signed shares z that come nearest to it, lengths being those of
+BRDFs over directions; the shares t of a texel become the non-negative ones nearest to t + a z:
+t + a z itself, unless a lobe is used up, when its kin make up for it. The opposite edit, on lobes
+that hold the trait already, comes back wherever nothing was used up.
+
+Two other ways were measured on simulated faces (`skinrig bench --stage traits` measures this one):
+the best lobe when any amount may be taken off the others lies so close to them that all is used up
+at once, and the population's common mixtures, eight more lobes, do no better.
+
+References
+----------
+Weyrich et al. 2005, "Measuring and modeling human skin reflectance", section 11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import nnls
+from threadpoolctl import threadpool_limits
+
+from model.traits import nonnegative_kernels, reduced_spaces
+from model.traits.space import TraitSpace
+from model.traits.vectors import TraitError
+
+FloatArray = NDArray[np.float64]
+
+WORTH = 0.05
+"""A trait brings a lobe when that lowers the error of its edit by more than this share of it."""
+GIVEN = (0.3, 1.0, 3.0)
+"""Times the mean shares that a candidate assumes can be taken off."""
+TRIED = 1000
+"""Texels on which candidates are tried."""
+MOST_LOBES = 15
+"""More lobes than this, with those of traits, are refused."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LobeEdit:
+    """Edited maps of lobes, and what was not possible.
+
+    Attributes
+    ----------
+    weights : ndarray, shape (T, K')
+        Shares of the lobes, at least 0; those of the source first, as many as it had.
+    mix : ndarray of float64, shape (K', d)
+        The lobes as mixtures of the materials.
+    moved : ndarray of float64, shape (T,)
+        Length of the change asked for.
+    clipped : ndarray of float64, shape (T,)
+        Length of what could not be taken off.
+    return_bound : ndarray of float64, shape (T,)
+        The opposite edit comes back to the source's BRDF within this: what was clipped, and what
+        of the traits the lobes cannot show.
+    misfit : mapping of str to float
+        Share of each trait's vector that the lobes cannot show.
+    """
+
+    weights: NDArray[np.floating]
+    mix: FloatArray
+    moved: FloatArray
+    clipped: FloatArray
+    return_bound: FloatArray
+    misfit: Mapping[str, float]
+
+    @property
+    def share(self) -> float:
+        """Share of the change over all texels that could not be taken off, RMS."""
+        asked = float(np.sqrt(np.mean(self.moved**2))) if len(self.moved) else 0.0
+        return float(np.sqrt(np.mean(self.clipped**2))) / asked if asked > 0.0 else 0.0
+
+
+def edit_weights(
+    weights: ArrayLike,
+    mix: ArrayLike,
+    space: TraitSpace,
+    amounts: Mapping[str, ArrayLike],
+    *,
+    materials: tuple[str, ...] = (),
+) -> LobeEdit:
+    """Add traits of surface BRDFs to shares of lobes.
+
+    Parameters
+    ----------
+    weights : array_like, shape (T, K)
+        Shares of the lobes, at least 0 and finite.
+    mix : array_like, shape (K, d)
+        Each lobe as a mixture of the space's materials, at least 0.
+    space : TraitSpace
+        Of mixtures of the same d materials.
+    amounts : mapping of str to float or array_like, shape (T,)
+        Times each trait's vector, the same for all texels or one each.
+    materials : tuple of str
+        Of the d columns of `mix`; checked against the space's names where both are given.
+
+    Returns
+    -------
+    LobeEdit
+        Weights of the floating type given. All amounts 0: weights and lobes exactly as given.
+
+    Raises
+    ------
+    TraitError
+        For shapes or materials that do not fit, shares below 0, unknown traits, amounts that are
+        not finite, and more than 15 lobes.
+
+    Examples
+    --------
+    >>> wide, sharp = [1.0, 0.0], [0.0, 1.0]
+    >>> space = TraitSpace.fit([wide, [0.5, 0.5]], {"lotion": [False, True]})
+    >>> oiled = edit_weights([[1.0], [0.25]], [wide], space, {"lotion": 1.0})
+    >>> oiled.weights.round(6).tolist(), oiled.clipped.round(6).tolist()
+    ([[0.5, 0.5], [0.0, 0.5]], [0.0, 0.25])
+    """
+    given = np.asarray(weights)
+    dtype = given.dtype if np.issubdtype(given.dtype, np.floating) else np.dtype(np.float64)
+    t, lobes = _checked(given, mix, space, materials)
+    by = {name: _amount(name, amount, len(t)) for name, amount in amounts.items()}
+    for name in by:
+        space.trait(name)
+    zero = np.zeros(len(t))
+    asked = {name: amount for name, amount in by.items() if amount.any()}
+    if not asked:
+        return LobeEdit(given.astype(dtype), lobes, zero, zero, zero, {})
+    vectors = {name: space.trait(name).vector for name in asked}
+    with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
+        for name, vector in vectors.items():
+            some = np.flatnonzero(asked[name])
+            tried = some[:: -(-len(some) // TRIED)]
+            lobes = _with_lobe(t[tried], lobes, vector, asked[name][tried], space.metric)
+    if len(lobes) > max(MOST_LOBES, t.shape[1]):
+        raise TraitError(f"lobes: got {len(lobes)} with those of traits, expected {MOST_LOBES}")
+    gram = reduced_spaces.times_metric(lobes, space.metric) @ lobes.T
+    change = np.zeros((len(t), len(lobes)))
+    misfit, unseen = {}, zero.copy()
+    for name, vector in vectors.items():
+        z = _on_lobes(lobes, vector, space.metric)
+        change += asked[name][:, None] * z
+        size = float(reduced_spaces.lengths(vector, space.metric))
+        off = float(reduced_spaces.lengths(z @ lobes - vector, space.metric))
+        misfit[name] = off / size if size > 0.0 else 0.0
+        unseen += np.abs(asked[name]) * off
+    wanted = _padded(t, len(lobes)) + change
+    found = nonnegative_kernels.nearest(gram, wanted)
+    clipped = reduced_spaces.lengths(found - wanted, gram)
+    moved = reduced_spaces.lengths(change, gram)
+    return LobeEdit(found.astype(dtype), lobes, moved, clipped, clipped + unseen, misfit)
+
+
+def _checked(
+    given: NDArray[np.generic], mix: ArrayLike, space: TraitSpace, materials: tuple[str, ...]
+) -> tuple[FloatArray, FloatArray]:
+    t, lobes = np.asarray(given, np.float64), np.array(mix, np.float64)
+    d = len(space.center)
+    if lobes.ndim != 2 or lobes.shape[1] != d or not (lobes >= 0.0).all():
+        raise TraitError(f"mix: got shape {lobes.shape}, expected (K, {d}) of values at least 0")
+    if not np.isfinite(lobes).all():
+        raise TraitError("mix: got values that are not finite")
+    if t.ndim != 2 or t.shape[1] != len(lobes):
+        raise TraitError(f"weights: got shape {t.shape}, expected (T, {len(lobes)})")
+    if not (np.isfinite(t).all() and (t >= 0.0).all()):
+        raise TraitError("weights: got values that are negative or not finite")
+    if materials and space.names and tuple(materials) != space.names:
+        raise TraitError(
+            f"materials: got {', '.join(materials[:3])}, ... ({len(materials)}), expected those of "
+            f"the traits, {', '.join(space.names[:3])}, ... ({len(space.names)})"
+        )
+    return t, lobes
+
+
+def _amount(name: str, amount: ArrayLike, count: int) -> FloatArray:
+    a = np.asarray(amount, np.float64)
+    if a.shape not in ((), (count,)) or not np.isfinite(a).all():
+        raise TraitError(
+            f"amount of {name}: got shape {a.shape}, expected one or {count} finite numbers"
+        )
+    return np.array(np.broadcast_to(a, (count,)))
+
+
+def _padded(t: FloatArray, count: int) -> FloatArray:
+    return np.pad(t, ((0, 0), (0, count - t.shape[1])))
+
+
+def _on_lobes(lobes: FloatArray, vector: FloatArray, metric: FloatArray | None) -> FloatArray:
+    """Return the signed shares of lobes that come nearest to a vector."""
+    products = reduced_spaces.times_metric(lobes, metric)
+    gram = products @ lobes.T
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    scaled = products @ vector / size
+    return np.asarray(np.linalg.lstsq(gram / np.outer(size, size), scaled, rcond=1e-10)[0] / size)
+
+
+def _with_lobe(
+    t: FloatArray,
+    lobes: FloatArray,
+    vector: FloatArray,
+    amount: FloatArray,
+    metric: FloatArray | None,
+) -> FloatArray:
+    """Return the lobes and, where it is worth it, one more for a trait."""
+    mean = float(amount.mean())
+    strength = float(np.sqrt(np.mean(amount**2)))
+    size = strength * float(reduced_spaces.lengths(vector, metric))
+    if size == 0.0:
+        return lobes
+    way = vector if mean >= 0.0 else -vector
+    found = [np.maximum(way, 0.0)]
+    frame = reduced_spaces.framed(np.eye(len(vector)), metric)
+    columns = np.vstack([lobes, np.eye(len(vector))]) @ frame
+    usual = _padded(t, len(lobes)).mean(axis=0)
+    for given in GIVEN:
+        wanted = given * usual @ lobes + strength * way
+        found.append(nnls(columns.T, wanted @ frame, maxiter=50 * len(columns))[0][len(lobes) :])
+    sets = [lobes] + [np.vstack([lobes, one / one.sum()]) for one in found if one.sum() > 0.0]
+    errors = [_error(t, s, vector, amount, metric) / size for s in sets]
+    best = int(np.argmin(errors))
+    return sets[best] if errors[0] - errors[best] > WORTH else lobes
+
+
+def _error(
+    t: FloatArray,
+    lobes: FloatArray,
+    vector: FloatArray,
+    amount: FloatArray,
+    metric: FloatArray | None,
+) -> float:
+    """Return the RMS length by which edits on some lobes miss what was asked."""
+    z = _on_lobes(lobes, vector, metric)
+    source = _padded(t, len(lobes))
+    gram = reduced_spaces.times_metric(lobes, metric) @ lobes.T
+    done = nonnegative_kernels.nearest(gram, source + amount[:, None] * z) - source
+    off = reduced_spaces.lengths(done @ lobes - amount[:, None] * vector, metric)
+    return float(np.sqrt(np.mean(off**2)))

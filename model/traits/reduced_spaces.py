@@ -1,0 +1,299 @@
+"""Few coordinates for samples of many numbers: principal components, or non-negative mixtures.
+
+References
+----------
+Weyrich et al. 2005, "Measuring and modeling human skin reflectance", sections 10 and 11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike, NDArray
+
+from model.traits import nonnegative_kernels
+from model.traits.vectors import Trait, TraitError, exponent_of
+
+FloatArray = NDArray[np.float64]
+SpaceKind = Literal["pca", "nmf"]
+
+HALVINGS = 20
+"""Random halvings of the people that choose the number of components."""
+GAIN = 1.05
+"""Few components are taken when their score is more than this times that of all."""
+LEAST_SCORE = 0.5
+"""Scores below this tell too little to drop a component for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reduction:
+    """A reduced space and where the samples lie in it.
+
+    Attributes
+    ----------
+    kind : {"pca", "nmf"}
+    center : ndarray, shape (d,)
+        Mean of the samples.
+    basis : ndarray, shape (K, d)
+        Directions of the space: orthonormal under the metric and in falling order (PCA), or
+        non-negative mixtures (NMF).
+    whole, scores : ndarray, shape (n, r)
+        The samples, and what the space holds of them, in one frame that is orthonormal under the
+        metric: for what needs lengths.
+    coordinates : ndarray, shape (n, K)
+        The samples in the basis; from the center (PCA) or from 0 (NMF).
+    lost : float
+        Root of the squared part of the samples' differences that the space does not hold.
+    """
+
+    kind: SpaceKind
+    center: FloatArray
+    basis: FloatArray
+    whole: FloatArray
+    scores: FloatArray
+    coordinates: FloatArray
+    lost: float
+
+
+def check_metric(metric: ArrayLike | None, length: int) -> FloatArray | None:
+    """Return a metric as float64; refuse one that is none of samples of this length."""
+    if metric is None:
+        return None
+    g = np.asarray(metric, np.float64)
+    if g.shape not in ((length,), (length, length)) or not np.isfinite(g).all():
+        raise TraitError(
+            f"metric: got shape {g.shape}, expected ({length},) or ({length}, {length}), finite"
+        )
+    if g.ndim == 1:
+        if not (g > 0.0).all():
+            raise TraitError(f"metric: got a weight of {g.min():g}, expected all above 0")
+        return g
+    size = np.diag(g)
+    if not np.allclose(g, g.T, rtol=1e-9, atol=1e-12 * float(np.abs(g).max())):
+        raise TraitError("metric: got a matrix that is not symmetric")
+    if not (size > 0.0).all() or float(np.linalg.eigvalsh(g)[0]) < -1e-6 * float(size.max()):
+        raise TraitError("metric: got a matrix of products that is not positive semidefinite")
+    return np.asarray(0.5 * (g + g.T))
+
+
+def times_metric(samples: FloatArray, metric: FloatArray | None) -> FloatArray:
+    """Return samples (..., d) times the metric."""
+    if metric is None:
+        return samples
+    return np.asarray(samples * metric if metric.ndim == 1 else samples @ metric)
+
+
+def lengths(samples: FloatArray, metric: FloatArray | None) -> FloatArray:
+    """Return the lengths of samples (..., d) under the metric, (...)."""
+    squared = np.sum(samples * times_metric(samples, metric), axis=-1)
+    return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
+
+
+def framed(samples: FloatArray, metric: FloatArray | None) -> FloatArray:
+    """Return samples (n, d) in a frame where the metric is the plain sum of squares."""
+    if metric is None:
+        return samples
+    if metric.ndim == 1:
+        return np.asarray(samples * np.sqrt(metric))
+    values, vectors = np.linalg.eigh(metric)
+    return np.asarray(samples @ (vectors * np.sqrt(np.maximum(values, 0.0))))
+
+
+def principal(
+    samples: FloatArray,
+    traits: Sequence[Trait],
+    *,
+    components: int | None,
+    metric: FloatArray | None,
+    rng: np.random.Generator,
+) -> Reduction:
+    """Return the principal components of samples.
+
+    Parameters
+    ----------
+    samples : ndarray, shape (n, d)
+        Finite, in any unit; d may be far larger than n: the work grows with n^2 d.
+    traits
+        What the number of components is chosen for.
+    components : int or None
+        At most the rank of the samples' differences; None: see `choose`.
+    metric
+        See `check_metric`.
+    rng
+        Halves the people.
+
+    Raises
+    ------
+    TraitError
+        When all samples are the same, have fewer independent differences than asked for, or are
+        not finite.
+    """
+    exponent = exponent_of(samples)
+    samples = np.ldexp(samples, -exponent)
+    n, d = samples.shape
+    center = samples.mean(axis=0)
+    off = samples - center
+    y = framed(off, metric)
+    # The triangle of a QR factorization has the same values and left vectors, and is small.
+    small = np.asarray(np.linalg.qr(y.T, mode="r")).T if d > n else y
+    u, s, _ = scipy.linalg.svd(small, full_matrices=False)
+    eps = float(np.finfo(np.float64).eps)
+    # What rounding leaves of directions that are not there, and of the mean taken off
+    floor = max(max(n, d) * s[0], 8.0 * np.sqrt(n) * float(lengths(center, metric))) * eps
+    rank = int(np.count_nonzero(s > floor))
+    if rank == 0:
+        raise TraitError(f"samples: all {n} are the same, nothing can be learned from them")
+    if components is not None and not 1 <= components <= rank:
+        raise TraitError(
+            f"components: got {components}, expected 1 to {rank}, as many as {n} samples differ in"
+        )
+    scores = u[:, :rank] * s[:rank]
+    kept = choose(scores, traits, rng=rng) if components is None else components
+    # A basis as sums of the samples needs no inverse of the metric.
+    basis = (u[:, :kept] / s[:kept]).T @ off
+    held = np.where(np.arange(rank) < kept, scores, 0.0)
+    lost = float(np.sqrt(np.sum(s[kept:] ** 2) / np.sum(s**2)))
+    center, scores, held = (np.ldexp(values, exponent) for values in (center, scores, held))
+    return Reduction("pca", center, basis, scores, held, scores[:, :kept].copy(), lost)
+
+
+def choose(scores: FloatArray, traits: Sequence[Trait], *, rng: np.random.Generator) -> int:
+    """Return how many components make trait vectors that hold for other people.
+
+    Parameters
+    ----------
+    scores : ndarray, shape (n, r)
+        The samples in all their components; finite.
+    traits
+        Binary ones with at least 2 faces on both sides count; without any, all components stay.
+    rng
+        Halves the people.
+
+    Notes
+    -----
+    Both groups of a trait are halved at random. One half gives a vector in its own first k
+    components, the other a plain difference of means. As that one errs independently, the cosine
+    between both is, but for a factor that does not depend on k, the cosine to the truth. The k
+    of the largest mean over traits and 20 halvings wins when it is better than all components by
+    more than a twentieth: dropping components helps where noise is spread over many and the trait
+    is not, and loses a trait that is smaller than what people differ in anyway.
+    """
+    n, rank = scores.shape
+    used = [
+        t for t in traits if t.kind == "binary" and 2 <= t.members <= n - 2
+    ]  # fmt: skip
+    most = min(n // 2 - 2, rank)
+    if not used or most < 2 or not scores.any():
+        return rank
+    scores = np.ldexp(scores, -exponent_of(scores))
+    total = np.zeros(most)
+    products = scores @ scores.T
+    for trait in used:
+        groups = [np.flatnonzero(trait.values == side) for side in (1.0, 0.0)]
+        for _ in range(HALVINGS):
+            contrast = np.zeros((2, n))  # of the two halves
+            for group, sign in zip(groups, (1.0, -1.0), strict=True):
+                mixed = rng.permutation(group)
+                for half, chosen in enumerate((mixed[: len(group) // 2], mixed[len(group) // 2 :])):
+                    contrast[half, chosen] = sign / len(chosen)
+            mine = np.flatnonzero(contrast[0])
+            inner = products[np.ix_(mine, mine)]
+            inner = inner - inner.mean(axis=0) - inner.mean(axis=1)[:, None] + inner.mean()
+            squares, axes = np.linalg.eigh(inner)
+            kept = slice(max(len(mine) - most, int(np.sum(squares < 1e-10 * squares[-1]))), None)
+            axes = axes[:, kept][:, ::-1] / np.sqrt(squares[kept][::-1])
+            reach = products[mine] @ contrast.T
+            along, truth = (reach - reach.mean(axis=0)).T @ axes
+            length = np.sqrt(np.maximum(np.cumsum(along**2), 1e-300))
+            other = float(np.sqrt(max(contrast[1] @ products @ contrast[1], 1e-300)))
+            score = np.cumsum(along * truth) / length / other
+            total[: len(score)] += score
+            total[len(score) :] += score[-1]
+    total /= len(used) * HALVINGS
+    better = total.max() > max(GAIN * total[-1], LEAST_SCORE)
+    return int(np.argmax(total)) + 1 if better else rank
+
+
+def mixtures(
+    samples: FloatArray, basis: ArrayLike | None, *, metric: FloatArray | None
+) -> Reduction:
+    """Return samples as non-negative mixtures of a basis.
+
+    Parameters
+    ----------
+    samples : ndarray, shape (n, d)
+        Finite, in any unit.
+    basis : array_like, shape (K, d)
+        Finite values of at least 0, as `reconstruction.brdf_basis.reduce` gives them.
+    metric
+        See `check_metric`.
+
+    Raises
+    ------
+    TraitError
+        Without a basis, for one that does not fit the samples, and for samples that are all the
+        same or not finite.
+    """
+    if basis is None:
+        raise TraitError(
+            "basis: got none, expected (K, d) non-negative mixtures for space='nmf', such as "
+            "reconstruction.brdf_basis.reduce(weights, K)[1]"
+        )
+    b = np.asarray(basis, np.float64)
+    fits = b.ndim == 2 and b.shape[1] == samples.shape[1] and len(b) > 0
+    if not fits or not ((b >= 0.0) & (b < np.inf)).all():
+        raise TraitError(
+            f"basis: got shape {b.shape}, expected (K, {samples.shape[1]}) of finite values, at "
+            "least 0"
+        )
+    if not (b.max(axis=1) > 0.0).all():
+        raise TraitError("basis: got a mixture of nothing")
+    exponent = exponent_of(samples)
+    samples = np.ldexp(samples, -exponent)
+    coordinates = mixture_coordinates(samples, b, metric)
+    mixed = coordinates @ b
+    off = samples - mixed
+    center = samples.mean(axis=0)
+    spread = float(np.linalg.norm(lengths(samples - center, metric)))
+    rounding = 8.0 * len(samples) * float(lengths(center, metric)) * np.finfo(np.float64).eps
+    if spread <= rounding:
+        raise TraitError(f"samples: all {len(samples)} are the same, nothing can be learned")
+    gone = off - off.mean(axis=0)
+    lost = float(np.linalg.norm(lengths(gone, metric))) / spread
+    whole, held = framed(samples, metric), framed(mixed, metric)
+    center, whole, held, coordinates = (
+        np.ldexp(values, exponent) for values in (center, whole, held, coordinates)
+    )
+    return Reduction("nmf", center, b, whole, held, coordinates, lost)
+
+
+def mixture_coordinates(
+    samples: FloatArray, basis: FloatArray, metric: FloatArray | None
+) -> FloatArray:
+    """Return the non-negative shares (n, K) of a basis (K, d) that come nearest to samples.
+
+    Both finite, each in any unit; what is narrower than double precision is widened.
+
+    Raises
+    ------
+    TraitError
+        For what is not finite, and a metric that is none of samples of this length.
+    """
+    samples, basis = np.asarray(samples, np.float64), np.asarray(basis, np.float64)
+    unit, own = exponent_of(samples), exponent_of(basis)
+    d = basis.shape[1]
+    if metric is not None:
+        if metric.shape not in ((d,), (d, d)) or not np.isfinite(metric).all():
+            raise TraitError(
+                f"metric: got shape {metric.shape}, expected ({d},) or ({d}, {d}), finite"
+            )
+    materials = np.ldexp(basis, -own)
+    products = times_metric(materials, metric)
+    gram = products @ materials.T
+    plain = np.linalg.lstsq(gram, products @ np.ldexp(samples, -unit).T, rcond=1e-12)[0].T
+    shares = nonnegative_kernels.nearest(gram, np.ascontiguousarray(plain))
+    return np.asarray(np.ldexp(shares, unit - own))

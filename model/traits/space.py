@@ -1,0 +1,401 @@
+"""Edit faces by traits: more lotion, more tan, a younger skin.
+
+A population of samples, user-assigned labels, and differences of the means of those with a trait
+and without. An edit adds such vectors to a sample, or mixes it with the means of groups, and keeps
+it a possible one. What of a sample the reduced space does not hold is kept, so an edit of amount 0
+changes nothing.
+
+References
+----------
+Weyrich et al. 2005, "Measuring and modeling human skin reflectance", section 11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
+
+from model.traits import feasible_sets, reduced_spaces
+from model.traits import vectors as trait_vectors
+from model.traits.feasible_sets import FeasibleSet
+from model.traits.reduced_spaces import Reduction, SpaceKind
+from model.traits.vectors import Contrast, Trait, TraitError, TraitVector
+
+FloatArray = NDArray[np.float64]
+Mode = Literal["linear", "convex"]
+Source = Literal["simulated", "measured"]
+
+EMPTY: Mapping[str, ArrayLike] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EditOutcome:
+    """An edited sample, and what of the edit was not possible.
+
+    Attributes
+    ----------
+    sample : ndarray, shape (..., d)
+    moved : ndarray, shape (...)
+        Length of the change asked for, under the space's metric.
+    clipped : ndarray, shape (...)
+        Length of what the feasible set did not allow of it.
+    return_bound : ndarray, shape (...)
+        The linear edit by the opposite amounts comes back to the source within this, under the
+        metric: a projection onto a convex set never moves points apart.
+    """
+
+    sample: NDArray[np.floating]
+    moved: FloatArray
+    clipped: FloatArray
+    return_bound: FloatArray
+
+    @property
+    def share(self) -> FloatArray:
+        """Share of the change that was not possible; 0 where nothing was asked for."""
+        asked = np.where(self.moved > 0.0, self.moved, 1.0)
+        return np.where(self.moved > 0.0, self.clipped / asked, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TraitSpace:
+    """Trait vectors of a population in a reduced space; make one with `fit`.
+
+    Attributes
+    ----------
+    kind : {"pca", "nmf"}
+    center : ndarray of float64, shape (d,)
+        Mean of the samples.
+    basis : ndarray of float64, shape (K, d)
+        See `model.traits.reduced_spaces.Reduction`.
+    traits : mapping of str to TraitVector
+    feasible : FeasibleSet
+        Where samples must stay.
+    metric : ndarray, shape (d,) or (d, d), or None
+        What differences of samples count; None: the sum of squares.
+    samples : int
+        n.
+    lost : float
+        Share of the samples' differences that the reduced space does not hold, RMS.
+    seed : int
+        Of everything random in the fit.
+    names : tuple of str
+        Of the d numbers; empty when they have none.
+    """
+
+    kind: SpaceKind
+    center: FloatArray
+    basis: FloatArray
+    traits: Mapping[str, TraitVector]
+    feasible: FeasibleSet
+    metric: FloatArray | None
+    samples: int
+    lost: float
+    seed: int
+    names: tuple[str, ...] = ()
+    notes: Mapping[str, str] = field(default_factory=dict)
+    """What else to know about the samples."""
+    storage_error: Mapping[str, float] = field(default_factory=dict)
+    """Relative error that storing has left in each trait's vector; empty in a fresh space."""
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit each other."""
+        d = len(self.center)
+        if self.basis.ndim != 2 or self.basis.shape[1] != d:
+            raise TraitError(f"basis: got shape {self.basis.shape}, expected (K, {d})")
+        for name, trait in self.traits.items():
+            if trait.vector.shape != (d,) or trait.coordinates.shape != (len(self.basis),):
+                raise TraitError(
+                    f"trait {name!r}: got shapes {trait.vector.shape}, {trait.coordinates.shape}, "
+                    f"expected ({d},), ({len(self.basis)},)"
+                )
+        if self.names and len(self.names) != d:
+            raise TraitError(f"names: got {len(self.names)}, expected {d} or none")
+
+    @classmethod
+    def fit(
+        cls,
+        samples: ArrayLike,
+        labels: Mapping[str, ArrayLike],
+        *,
+        space: SpaceKind = "pca",
+        continuous: Mapping[str, ArrayLike] = EMPTY,
+        basis: ArrayLike | None = None,
+        components: int | None = None,
+        metric: ArrayLike | None = None,
+        feasible: FeasibleSet | None = None,
+        contrast: Contrast = "means",
+        names: tuple[str, ...] = (),
+        seed: int = 0,
+    ) -> TraitSpace:
+        """Learn trait vectors from labelled samples.
+
+        Parameters
+        ----------
+        samples : array_like, shape (n, d)
+            One sample a face: a histogram vector (d = 23,808), or a mean mixture of materials.
+        labels : mapping of str to array_like of bool, shape (n,)
+            Whether each face has the trait; it may be given any name.
+        space : {"pca", "nmf"}
+            Principal components of the samples, or non-negative mixtures of `basis`.
+        continuous : mapping of str to array_like, shape (n,)
+            Values such as an age; their vectors are changes per unit.
+        basis : array_like, shape (K, d)
+            For "nmf": non-negative mixtures, as `reconstruction.brdf_basis.reduce` gives them.
+        components : int, optional
+            For "pca"; by default all, or fewer where their vectors hold better for other people,
+            see `model.traits.reduced_spaces.choose`.
+        metric : array_like, shape (d,) or (d, d), optional
+            What differences count. For mixtures of materials give their products over directions
+            (`brdf_products`): their shares alone are no measure of what is seen.
+        feasible : FeasibleSet, optional
+            Where samples must stay; by default the smallest of histograms of 256 bins, values of
+            at least 0 and everything that holds all samples.
+        contrast : {"means", "regression"}
+            "means": differences of complement means, the paper's. "regression": what a trait adds
+            beside all other traits given.
+        names : tuple of str
+            Of the d numbers.
+        seed : int
+            Of the halvings, exchanges and resamplings.
+
+        Raises
+        ------
+        TraitError
+            For a trait nobody or everybody has, more components than the samples differ in,
+            samples that are all the same, and shapes that do not fit.
+
+        Examples
+        --------
+        >>> samples = [[1.0, 0.0], [1.0, 0.2], [3.0, 0.1], [3.0, 0.3]]
+        >>> space = TraitSpace.fit(samples, {"oily": [False, False, True, True]})
+        >>> space.trait("oily").vector.round(6).tolist()
+        [2.0, 0.1]
+        >>> space.edit([2.0, 0.5], {"oily": 0.5}).round(6).tolist()
+        [3.0, 0.55]
+        """
+        x = np.asarray(samples, np.float64)
+        if x.ndim != 2 or not x.size or not np.isfinite(x).all():
+            raise TraitError(f"samples: got shape {x.shape}, expected (n, d) of finite values")
+        if space not in ("pca", "nmf"):
+            raise TraitError(f"space: got {space!r}, expected 'pca' or 'nmf'")
+        traits = trait_vectors.traits_of(labels, continuous, len(x), contrast=contrast)
+        g = reduced_spaces.check_metric(metric, x.shape[1])
+        inside = feasible_sets.smallest(x) if feasible is None else feasible
+        if not inside.contains(x).all():
+            bad = int(np.count_nonzero(~inside.contains(x)))
+            raise TraitError(f"samples: {bad} of {len(x)} are not in the set {inside}")
+        rng = np.random.default_rng(seed)
+        with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
+            if space == "pca":
+                reduced = reduced_spaces.principal(
+                    x, traits, components=components, metric=g, rng=rng
+                )
+            else:
+                reduced = reduced_spaces.mixtures(x, basis, metric=g)
+            found = _vectors(x, traits, reduced, inside, contrast, rng)
+        return cls(
+            kind=space,
+            center=reduced.center,
+            basis=reduced.basis,
+            traits=found,
+            feasible=inside,
+            metric=g,
+            samples=len(x),
+            lost=reduced.lost,
+            seed=seed,
+            names=names,
+        )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to know before trusting the traits, a sentence each."""
+        return tuple(w for trait in self.traits.values() for w in trait.warnings)
+
+    def trait(self, name: str) -> TraitVector:
+        """Return a trait's vector; raises `TraitError` for a trait that is not there."""
+        if name not in self.traits:
+            raise TraitError(f"trait: got {name!r}, expected one of {', '.join(self.traits)}")
+        return self.traits[name]
+
+    def mean_with(self, name: str) -> FloatArray:
+        """Return the mean sample of those with a binary trait, (d,), as far as the space holds it.
+
+        The nearest sample of the feasible set, where the space is too small to hold the mean.
+        """
+        trait = self.trait(name)
+        if trait.kind != "binary":
+            raise TraitError(f"trait: got {name!r}, a continuous one, expected one with a group")
+        share = trait.others / (trait.members + trait.others)
+        return self.feasible.project(self.center + share * trait.vector, self._products())
+
+    def cosine(self, name: str, direction: ArrayLike) -> float:
+        """Return the cosine between a trait's vector and a direction (d,), under the metric."""
+        return cosine(self.trait(name).vector, direction, self.metric)
+
+    def coordinates(self, samples: ArrayLike) -> FloatArray:
+        """Return samples (..., d) in the reduced space, (..., K).
+
+        From the center in principal components, else shares of the basis, at least 0.
+        """
+        s = self._checked(samples)
+        if self.kind == "pca":
+            return np.asarray(
+                reduced_spaces.times_metric(s - self.center, self.metric) @ self.basis.T
+            )
+        flat = s.reshape(-1, s.shape[-1])
+        found = reduced_spaces.mixture_coordinates(flat, self.basis, self.metric)
+        return found.reshape(*s.shape[:-1], -1)
+
+    def reduced(self, samples: ArrayLike) -> FloatArray:
+        """Return the part of samples (..., d) that the reduced space holds, (..., d)."""
+        inside = self.coordinates(samples) @ self.basis
+        return np.asarray(inside + self.center if self.kind == "pca" else inside)
+
+    def edit(
+        self, sample: ArrayLike, amounts: Mapping[str, float], *, mode: Mode = "linear"
+    ) -> NDArray[np.floating]:
+        """Return samples with more or less of some traits; see `outcome`.
+
+        Examples
+        --------
+        >>> space = TraitSpace.fit([[0.2, 1.0], [0.6, 1.0]], {"red": [False, True]})
+        >>> space.edit([0.5, 1.0], {"red": -2.0}).tolist()
+        [0.0, 1.0]
+        """
+        return self.outcome(sample, amounts, mode=mode).sample
+
+    def outcome(
+        self, sample: ArrayLike, amounts: Mapping[str, float], *, mode: Mode = "linear"
+    ) -> EditOutcome:
+        """Edit samples by traits, and say what was not possible.
+
+        Parameters
+        ----------
+        sample : array_like, shape (..., d)
+            In the feasible set.
+        amounts : mapping of str to float
+            "linear": times the trait's vector, added; 1 makes somebody without a trait like those
+            with it, negative amounts take it away; continuous traits in their unit.
+            "convex": share of the mean of those with the trait, at least 0 and together at most 1,
+            the rest being the sample; only for traits with a group.
+        mode : {"linear", "convex"}
+
+        Returns
+        -------
+        EditOutcome
+            Its sample has the floating type of the given one. All amounts 0: exactly as given.
+
+        Raises
+        ------
+        TraitError
+            For traits that are not there, amounts that are not finite or make no convex
+            combination, and samples outside the feasible set.
+        """
+        if mode not in ("linear", "convex"):
+            raise TraitError(f"mode: got {mode!r}, expected 'linear' or 'convex'")
+        given = np.asarray(sample)
+        dtype = given.dtype if np.issubdtype(given.dtype, np.floating) else np.dtype(np.float64)
+        s = self._checked(given)
+        if not self.feasible.contains(s).all():
+            raise TraitError(f"sample: is not in the set {self.feasible} where samples must stay")
+        for name, amount in amounts.items():
+            self.trait(name)
+            if not np.isfinite(amount):
+                raise TraitError(f"amount of {name}: got {amount}, expected a finite number")
+        if mode == "convex":
+            wanted = self._mixed(s, amounts)
+        else:
+            wanted = s + sum(
+                (a * self.traits[n].vector for n, a in amounts.items()), np.zeros(s.shape[-1])
+            )
+        moved = reduced_spaces.lengths(wanted - s, self.metric)
+        if not any(amounts.values()):
+            zero = np.zeros_like(moved)
+            return EditOutcome(given.astype(dtype), zero, zero, zero)
+        found = self.feasible.project(wanted, self._products())
+        clipped = reduced_spaces.lengths(found - wanted, self.metric)
+        return EditOutcome(found.astype(dtype), moved, clipped, clipped)
+
+    def _products(self) -> FloatArray | None:
+        """Return the metric where it joins several numbers; weights alone move no projection."""
+        return self.metric if self.metric is not None and self.metric.ndim == 2 else None
+
+    def _mixed(self, s: FloatArray, amounts: Mapping[str, float]) -> FloatArray:
+        total = sum(amounts.values())
+        if min(amounts.values(), default=0.0) < 0.0 or total > 1.0 + 1e-12:
+            raise TraitError(
+                f"amounts: got {dict(amounts)}, expected shares of at least 0, together at most 1"
+            )
+        mixed = (1.0 - total) * s
+        for name, amount in amounts.items():
+            mixed = mixed + amount * self.mean_with(name)
+        return np.asarray(mixed)
+
+    def _checked(self, samples: ArrayLike) -> FloatArray:
+        s = np.asarray(samples, np.float64)
+        if not s.ndim or s.shape[-1] != len(self.center) or not np.isfinite(s).all():
+            raise TraitError(
+                f"sample: got shape {s.shape}, expected (..., {len(self.center)}) of finite values"
+            )
+        return s
+
+
+def cosine(a: ArrayLike, b: ArrayLike, metric: FloatArray | None = None) -> float:
+    """Return the cosine between two directions (d,) under a metric; 0 when one has no length.
+
+    Examples
+    --------
+    >>> cosine([1.0, 1.0], [2.0, 0.0])
+    0.7071067811865475
+    """
+    x, y = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    if x.shape != y.shape or x.ndim != 1:
+        raise TraitError(f"directions: got shapes {x.shape}, {y.shape}, expected (d,) twice")
+    size = float(reduced_spaces.lengths(x, metric) * reduced_spaces.lengths(y, metric))
+    return float(x @ reduced_spaces.times_metric(y, metric)) / size if size > 0.0 else 0.0
+
+
+def _vectors(
+    x: FloatArray,
+    traits: tuple[Trait, ...],
+    reduced: Reduction,
+    inside: FeasibleSet,
+    contrast: Contrast,
+    rng: np.random.Generator,
+) -> dict[str, TraitVector]:
+    """Return the vectors of traits in a reduced space, with what they are worth."""
+    related = trait_vectors.correlations(traits)
+    found = {}
+    for k, trait in enumerate(traits):
+        beside = tuple(t for t in traits if t is not trait) if contrast == "regression" else ()
+        sure = trait_vectors.confidence(
+            trait, reduced.scores, whole=reduced.whole, beside=beside, rng=rng
+        )
+        left = trait_vectors.residuals(trait, x, beside=beside)
+        weights = trait_vectors.error_weights(trait, left[:, -1], 2 + len(beside))
+        others = [
+            (t.name, float(r))
+            for t, r in zip(traits, related[k], strict=True)
+            if t is not trait and abs(r) > trait_vectors.CONFOUNDED
+        ]
+        confounded = tuple(sorted(others, key=lambda other: -abs(other[1])))
+        along = trait.contrast @ reduced.coordinates
+        found[trait.name] = TraitVector(
+            name=trait.name,
+            kind=trait.kind,
+            vector=inside.tangent(along @ reduced.basis),
+            stderr=np.sqrt(weights @ left[:, :-1] ** 2),
+            coordinates=along,
+            members=trait.members,
+            others=len(x) - trait.members,
+            confidence=sure,
+            confounded=confounded,
+            warnings=trait_vectors.doubts(trait, sure, confounded),
+        )
+    return found

@@ -1,0 +1,135 @@
+"""The alternative to partial derivatives: differences of normals added to the base normals.
+
+It keeps ordinary normal maps and slopes beyond 45 degrees, needs three channels for two, and is
+exact only for a weight of 1 on the base that it was made for: between, normals are blended along
+a chord instead of relief being scaled.
+
+References
+----------
+Jimenez, Echevarria, Oat, Gutierrez 2011, Practical and Realistic Facial Wrinkles Animation,
+GPU Pro 2, chapter 1 (section 1.2.1). ISBN 978-1-56881-718-7
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.wrinkles import kernels
+from model.wrinkles import partial_derivatives as wrinkles
+from model.wrinkles.expressions import (
+    JIMENEZ2011,
+    Clamp,
+    Table,
+    Weights,
+    WrinkleError,
+    clamped,
+    zone_sums,
+)
+from model.wrinkles.masks import Masks
+from model.wrinkles.partial_derivatives import Floating
+
+
+@dataclass(frozen=True, slots=True)
+class NormalDifference:
+    """A difference of normals as a texture of [0, 1] holds it.
+
+    Attributes
+    ----------
+    values : ndarray, shape (h, w, 3)
+        0.5 + 0.5 (w - b); 0.5 where not valid.
+    valid : ndarray of bool, shape (h, w)
+        Both normals are finite and not zero.
+    clamped_fraction : float
+        Of the valid texels: a component of w - b was beyond [-1, 1], as opposite slopes of more
+        than 30 degrees are.
+    """
+
+    values: Floating
+    valid: NDArray[np.bool_]
+    clamped_fraction: float
+
+
+def difference_map(base: ArrayLike, wrinkled: ArrayLike) -> NormalDifference:
+    """Return the scaled and biased difference of two maps of unit normals.
+
+    Parameters
+    ----------
+    base, wrinkled : array_like, shape (h, w, 3)
+        Unit normals in the same tangent space.
+
+    Examples
+    --------
+    >>> difference_map([[[0, 0, 1.0]]], [[[0.6, 0, 0.8]]]).values.round(9).tolist()
+    [[[0.8, 0.5, 0.4]]]
+    """
+    b, w = _normals("base", base), _normals("wrinkled", wrinkled)
+    if b.shape != w.shape:
+        raise WrinkleError(f"wrinkled: got shape {w.shape}, expected that of base, {b.shape}")
+    valid = np.asarray(np.isfinite(b).all(axis=2) & np.isfinite(w).all(axis=2))
+    valid &= (b != 0).any(axis=2) & (w != 0).any(axis=2)
+    with np.errstate(invalid="ignore"):
+        d = np.where(valid[..., None], 0.5 + 0.5 * (w - b), 0.5)
+    beyond = valid & ((d < 0) | (d > 1)).any(axis=2)
+    count = int(np.count_nonzero(valid))
+    share = float(np.count_nonzero(beyond)) / count if count else 0.0
+    return NormalDifference(np.clip(d, 0.0, 1.0).astype(b.dtype, copy=False), valid, share)
+
+
+def combine(
+    base: ArrayLike,
+    difference: NormalDifference | ArrayLike,
+    masks: Masks,
+    weights: Weights,
+    *,
+    clamp: Clamp = "unit",
+    table: Table = JIMENEZ2011,
+    renormalize: bool = True,
+) -> Floating:
+    """Return base normals plus the difference, times the strength of its zones.
+
+    Parameters
+    ----------
+    base : array_like, shape (H, W, 3)
+        Unit normals of the neutral face.
+    difference : NormalDifference, or array_like (h, w, 3) in [0, 1]
+        At any resolution over the same square.
+    masks, weights, clamp, table
+        As of `wrinkles.combine`.
+    renormalize : bool
+        Return unit vectors, as the paper advises for compressed differences; otherwise what the
+        sum gives, shorter or longer.
+
+    Returns
+    -------
+    ndarray, shape (H, W, 3)
+        Of the base's type; 0 where the base is not finite or the sum vanishes.
+    """
+    normals = np.ascontiguousarray(_normals("base", base))
+    given = difference.values if isinstance(difference, NormalDifference) else difference
+    d = wrinkles.from_unit(_normals("difference", given))
+    if not np.isfinite(d).all():
+        raise WrinkleError("difference: got NaN or infinity, expected values in [0, 1]")
+    stack = wrinkles.mask_stack(masks)
+    sums = clamped(zone_sums(weights, table), clamp)
+    shape = (normals.shape[0], normals.shape[1])
+    out = np.empty_like(normals)
+    with kernels.threads_for(shape[0] * shape[1]):
+        kernels.add_difference(
+            normals,
+            *wrinkles.widened(np.moveaxis(d, 2, 0), shape, normals.dtype),
+            *wrinkles.widened(wrinkles.zone_strength(stack, sums)[None], shape, normals.dtype),
+            int(renormalize),
+            out,
+        )
+    return out
+
+
+def _normals(name: str, values: ArrayLike) -> Floating:
+    n = np.asarray(values)
+    n = n if n.dtype in (np.float32, np.float64) else n.astype(np.float64)
+    if n.ndim != 3 or n.shape[2] != 3 or 0 in n.shape:
+        raise WrinkleError(f"{name}: got shape {n.shape}, expected (H, W, 3)")
+    return n

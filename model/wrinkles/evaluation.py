@@ -1,0 +1,227 @@
+"""A face with its wrinkles: evaluated for any weights, and kept as maps of an appearance.
+
+Maps are `wrinkle_base` (n_x/n_z, n_y/n_z, 0), `wrinkle_map` in the same form and
+`wrinkle_mask_<zone>` of the first wrinkle map, `wrinkle_<k>_map` and `wrinkle_<k>_mask_<zone>`
+of others, zones numbered from 0; and the file `wrinkles.json` with names, tables and the clamp.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.skin import SkinMap
+from model.wrinkles import partial_derivatives as wrinkles
+from model.wrinkles.expressions import (
+    CLAMPS,
+    Clamp,
+    ExpressionTable,
+    Weights,
+    WrinkleError,
+    as_table,
+    clamped,
+    zone_sums,
+)
+from model.wrinkles.partial_derivatives import Floating, Layer
+
+SCHEMA = "skinrig.wrinkles/1"
+FILE = "wrinkles.json"
+FRAME = "tangent space, +X right, +Y up; derivatives n_x/n_z, n_y/n_z"
+NO_ERRORS: Mapping[str, tuple[float, ...]] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True)
+class WrinkledNormals:
+    """What a model gives for some weights.
+
+    Attributes
+    ----------
+    normals : ndarray, shape (H, W, 3)
+        Tangent-space unit normals; 0 where not valid.
+    valid : ndarray of bool, shape (H, W)
+        The base was measured there; a wrinkle map's own hole adds nothing and is not counted.
+    zone_sums, zone_weights : tuple of ndarray, shape (Z,)
+        Each layer's sums over blend shapes before and after the clamp.
+    clamped_fraction : float
+        Part of the texture that lies in a zone whose sum the clamp changed, in any layer: the
+        largest of the layers' parts.
+    """
+
+    normals: Floating
+    valid: NDArray[np.bool_]
+    zone_sums: tuple[NDArray[np.float64], ...]
+    zone_weights: tuple[NDArray[np.float64], ...]
+    clamped_fraction: float
+
+
+@dataclass(frozen=True, slots=True)
+class WrinkleModel:
+    """A base map with wrinkle maps on top.
+
+    Attributes
+    ----------
+    base : ndarray, shape (H, W, 2)
+        Derivatives of the neutral face; 0 where not valid.
+    layers : tuple of Layer
+        Wrinkle maps with masks and tables.
+    clamp : {"unit", "signed"}
+        Range of a zone's sum over blend shapes.
+    valid : ndarray of bool, shape (H, W), optional
+        Where the base was measured; by default where it is finite.
+    base_stderr : ndarray, shape (H, W, 2), optional
+        Standard error of `base`.
+    weight_stderr : mapping of str to tuple of float
+        Standard error of the rows of the first layer's table that were fitted; infinite for a
+        weight that nothing determined.
+    """
+
+    base: Floating
+    layers: tuple[Layer, ...]
+    clamp: Clamp = "unit"
+    valid: NDArray[np.bool_] | None = None
+    base_stderr: Floating | None = None
+    weight_stderr: Mapping[str, tuple[float, ...]] = field(default_factory=lambda: NO_ERRORS)
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that do not fit; put 0 where nothing was measured."""
+        base = np.asarray(self.base)
+        if base.ndim != 3 or base.shape[2] != 2:
+            raise WrinkleError(f"base: got shape {base.shape}, expected (H, W, 2)")
+        finite = np.asarray(np.isfinite(base).all(axis=2))
+        valid = finite if self.valid is None else np.asarray(self.valid)
+        if valid.dtype != np.bool_ or valid.shape != base.shape[:2]:
+            raise WrinkleError(
+                f"valid: got {valid.dtype} {valid.shape}, expected bool {base.shape[:2]}"
+            )
+        if (valid & ~finite).any():
+            raise WrinkleError("base: got NaN or infinity at a valid pixel")
+        if self.base_stderr is not None and np.shape(self.base_stderr) != base.shape:
+            raise WrinkleError(
+                f"base_stderr: got shape {np.shape(self.base_stderr)}, expected {base.shape}"
+            )
+        if self.clamp not in CLAMPS:
+            raise WrinkleError(f"clamp: got {self.clamp!r}, expected one of {', '.join(CLAMPS)}")
+        object.__setattr__(self, "base", np.where(valid[..., None], base, base.dtype.type(0)))
+        object.__setattr__(self, "valid", valid)
+        object.__setattr__(self, "layers", tuple(self.layers))
+        errors = {name: tuple(map(float, row)) for name, row in self.weight_stderr.items()}
+        object.__setattr__(self, "weight_stderr", MappingProxyType(errors))
+
+    def evaluate(self, weights: Weights) -> WrinkledNormals:
+        """Return the normals of the face with some weights.
+
+        Parameters
+        ----------
+        weights : mapping of str to float, or array_like, shape (Z,)
+            Blend shapes by name, or sums of the zones, as `wrinkles.combine_layers` takes them.
+
+        Examples
+        --------
+        >>> layer = Layer(np.full((2, 2, 2), 0.5), np.ones((8, 1, 1)))
+        >>> face = WrinkleModel(np.zeros((4, 4, 2)), (layer,)).evaluate({"anger": 1.0})
+        >>> face.zone_weights[0].tolist(), face.clamped_fraction
+        ([0.0, 0.0, 0.0, 0.0, 0.8, 0.8, 1.0, 0.0], 1.0)
+        """
+        assert self.valid is not None  # noqa: S101
+        sums = tuple(zone_sums(weights, layer.table) for layer in self.layers)
+        held = tuple(clamped(one, self.clamp) for one in sums)
+        normals = wrinkles.combine_layers(self.base, self.layers, weights, clamp=self.clamp)
+        normals[~self.valid] = 0.0
+        parts = [
+            float((layer.masks[before != after] > 0).any(axis=0).mean())
+            for layer, before, after in zip(self.layers, sums, held, strict=True)
+        ]
+        return WrinkledNormals(normals, self.valid, sums, held, max(parts, default=0.0))
+
+    def to_maps(self) -> tuple[dict[str, SkinMap], bytes]:
+        """Return the maps and the bytes of `FILE` that :meth:`from_maps` reads."""
+        maps = {"wrinkle_base": _map(self.base, self.base_stderr, self.valid, "neutral")}
+        layers: list[dict[str, Any]] = []
+        for k, layer in enumerate(self.layers):
+            table = as_table(layer.table)
+            head = "wrinkle" if k == 0 else f"wrinkle_{k}"
+            maps[f"{head}_map"] = _map(layer.wrinkle, layer.stderr, layer.valid, "what to add")
+            names = [f"{head}_mask_{z}" for z in range(len(layer.masks))]
+            zones = [*table.zones, *names][: len(names)]
+            for name, mask, zone in zip(names, layer.masks, zones, strict=True):
+                maps[name] = SkinMap(mask.astype(np.float32), "1", description=f"zone {zone}")
+            layers.append(
+                {
+                    "map": f"{head}_map",
+                    "masks": names,
+                    "zones": list(table.zones),
+                    "rows": {name: list(row) for name, row in table.rows.items()},
+                    "source": table.source,
+                }
+            )
+        errors = {
+            name: [value if math.isfinite(value) else None for value in row]
+            for name, row in self.weight_stderr.items()
+        }
+        document = {"schema": SCHEMA, "frame": FRAME, "clamp": self.clamp, "layers": layers,
+                    "weight_stderr": errors}  # fmt: skip
+        return maps, (json.dumps(document, indent=1, sort_keys=True) + "\n").encode()
+
+    @classmethod
+    def from_maps(cls, maps: Mapping[str, SkinMap], document: bytes) -> WrinkleModel:
+        """Read what :meth:`to_maps` gave.
+
+        Raises
+        ------
+        WrinkleError
+            For a document of another kind, or a map that it names and is not there.
+        """
+        try:
+            given: Any = json.loads(document)
+        except ValueError as error:
+            raise WrinkleError(f"{FILE}: got text that is not JSON: {error}") from error
+        schema = given.get("schema") if isinstance(given, dict) else type(given).__name__
+        if schema != SCHEMA:
+            raise WrinkleError(f"{FILE}: schema: got {schema!r}, expected {SCHEMA!r}")
+        try:
+            layers = tuple(_layer(entry, maps) for entry in given["layers"])
+            errors = {
+                name: tuple(math.inf if value is None else float(value) for value in row)
+                for name, row in given["weight_stderr"].items()
+            }
+            base = _named(maps, "wrinkle_base")
+            return cls(
+                base.values[..., :2], layers, given["clamp"], base.valid,
+                None if base.stderr is None else base.stderr[..., :2], errors,
+            )  # fmt: skip
+        except WrinkleError:
+            raise
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+            raise WrinkleError(f"{FILE}: got keys or values of a wrong kind: {error!r}") from error
+
+
+def _map(
+    derivatives: Floating, stderr: Floating | None, valid: NDArray[np.bool_] | None, what: str
+) -> SkinMap:
+    def three(values: Floating) -> NDArray[np.float32]:
+        padding = ((0, 0), (0, 0), (0, 1))
+        return np.pad(np.asarray(values, np.float32), padding)
+
+    error = None if stderr is None else three(stderr)
+    return SkinMap(three(derivatives), "1", error, valid, f"{what}: {FRAME}")
+
+
+def _layer(entry: Mapping[str, Any], maps: Mapping[str, SkinMap]) -> Layer:
+    wrinkle = _named(maps, entry["map"])
+    masks = np.stack([_named(maps, name).values for name in entry["masks"]])
+    table = ExpressionTable(tuple(entry["zones"]), entry["rows"], str(entry["source"]))
+    stderr = None if wrinkle.stderr is None else wrinkle.stderr[..., :2]
+    return Layer(wrinkle.values[..., :2], masks, table, stderr, wrinkle.valid)
+
+
+def _named(maps: Mapping[str, SkinMap], name: str) -> SkinMap:
+    if name not in maps:
+        raise WrinkleError(f"{FILE}: names the map {name!r}, which is not there")
+    return maps[name]

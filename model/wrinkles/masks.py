@@ -1,0 +1,81 @@
+"""Masks of wrinkle zones: as planes, as RGBA textures of four each, and summed by their weights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.wrinkles.expressions import WrinkleError
+
+Floating: TypeAlias = NDArray[np.floating]
+Masks: TypeAlias = Floating | Sequence[Floating]
+
+
+def mask_stack(masks: Masks) -> Floating:
+    """Return masks as (Z, h, w), from that or from RGBA textures (h, w, 4), four zones each.
+
+    Parameters
+    ----------
+    masks : ndarray (Z, h, w), ndarray (T, h, w, 4), or sequence of (h, w) or of (h, w, 4)
+        Finite; 1 where a zone's weight counts in full.
+
+    Raises
+    ------
+    WrinkleError
+        For other shapes, or a value that is not finite.
+    """
+    try:
+        stack = real_array(np.stack([real_array(one) for one in masks]))
+    except ValueError as error:
+        raise WrinkleError(f"masks: got arrays of different shapes: {error}") from error
+    if stack.ndim == 4 and stack.shape[3] == 4:
+        stack = np.moveaxis(stack, 3, 1).reshape(-1, *stack.shape[1:3])
+    if stack.ndim != 3 or 0 in stack.shape:
+        raise WrinkleError(
+            f"masks: got shape {stack.shape}, expected (zones, h, w) or textures (h, w, 4)"
+        )
+    if not np.isfinite(stack).all():
+        raise WrinkleError("masks: got NaN or infinity, expected finite values")
+    return stack
+
+
+def mask_textures(masks: Masks) -> Floating:
+    """Return masks as RGBA textures (T, h, w, 4), four zones each; unused channels are 0.
+
+    Examples
+    --------
+    >>> mask_textures(np.ones((8, 2, 3))).shape
+    (2, 2, 3, 4)
+    """
+    stack = mask_stack(masks)
+    zones, h, w = stack.shape
+    out = np.zeros((math.ceil(zones / 4), 4, h, w), stack.dtype)
+    out.reshape(-1, h, w)[:zones] = stack
+    return np.ascontiguousarray(np.moveaxis(out, 1, 3))
+
+
+def zone_strength(masks: Floating, sums: Floating) -> Floating:
+    """Return masks (Z, h, w) summed with their zones' weights (Z,): (h, w), float64.
+
+    Bilinear reading is linear, so that one map is read instead of as many as there are zones.
+    """
+    if sums.shape[0] != masks.shape[0]:
+        last = masks.shape[2] == sums.shape[0]
+        hint = "; zones come first: numpy.moveaxis(masks, -1, 0)" if last else ""
+        raise WrinkleError(
+            f"masks: got shape {masks.shape}, expected ({sums.shape[0]}, h, w), one for each of "
+            f"the {sums.shape[0]} zones' weights{hint}"
+        )
+    return np.tensordot(sums, masks.astype(np.float64, copy=False), axes=1)
+
+
+def real_array(values: ArrayLike) -> Floating:
+    """Return float32 arrays as they are, half as float32, and everything else as float64."""
+    given = np.asarray(values)
+    if given.dtype in (np.float16, np.float32):
+        return given.astype(np.float32, copy=False)
+    return given.astype(np.float64, copy=False)

@@ -1,0 +1,311 @@
+"""What wrinkle maps and masks cost in bytes, and what storing them costs in degrees.
+
+Examples
+--------
+The paper's figure of 96 KB: a block-compressed 256 x 256 map and two 64 x 64 masks, times 4/3
+for their mip-maps; the base map, which the face has anyway, is not counted.
+
+>>> paper_footprint().total_bytes / 1024
+96.0
+
+References
+----------
+Jimenez, Echevarria, Oat, Gutierrez 2011, Practical and Realistic Facial Wrinkles Animation,
+GPU Pro 2, chapter 1 (section 1.3). ISBN 978-1-56881-718-7
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import metrics
+from model.texture_resampling import resampled
+from model.wrinkles import block_compression as blocks
+from model.wrinkles import partial_derivatives as wrinkles
+from model.wrinkles.expressions import Clamp, Weights, WrinkleError
+from model.wrinkles.partial_derivatives import Floating, Layer
+
+MapEncoding: TypeAlias = Literal["float32", "float16", "unit8", "bc5"]
+MaskEncoding: TypeAlias = Literal["float32", "float16", "unit8", "bc3"]
+
+MAP_BYTES: Mapping[str, int] = MappingProxyType({"float32": 8, "float16": 4, "unit8": 2, "bc5": 1})
+"""Bytes a texel of two derivatives; "unit8" is 8 bits of [0, 1], "bc5" 16 bytes a block."""
+MASK_BYTES: Mapping[str, int] = MappingProxyType(
+    {"float32": 16, "float16": 8, "unit8": 4, "bc3": 1}
+)
+"""Bytes a texel of four zones."""
+MIP_FACTOR = 4 / 3
+"""All mip levels over the first, in the limit of many levels."""
+WRINKLE_SIDE, MASK_SIDE, BASE_SIDE = 256, 64, 2048
+"""The paper's resolutions."""
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """Bytes of a face's wrinkles without its base map.
+
+    Attributes
+    ----------
+    wrinkle_bytes, mask_bytes : int
+        Of the first mip levels.
+    mip_factor : float
+        All levels over the first; 1 without mip-maps.
+    """
+
+    wrinkle_bytes: int
+    mask_bytes: int
+    mip_factor: float
+
+    @property
+    def total_bytes(self) -> float:
+        """All textures with their mip-maps."""
+        return (self.wrinkle_bytes + self.mask_bytes) * self.mip_factor
+
+
+def texture_bytes(shape: tuple[int, int], bytes_per_texel: int, *, in_blocks: bool = False) -> int:
+    """Return the bytes of one level; blocks of 4 x 4 are whole."""
+    h, w = shape
+    if in_blocks:
+        rows, columns = blocks.blocks_of(shape)
+        h, w = rows * blocks.SIDE, columns * blocks.SIDE
+    return h * w * bytes_per_texel
+
+
+def mip_chain_bytes(
+    shape: tuple[int, int], bytes_per_texel: int, *, in_blocks: bool = False
+) -> int:
+    """Return the bytes of all levels down to 1 x 1, each half of the one before, rounded down.
+
+    Examples
+    --------
+    >>> mip_chain_bytes((256, 256), 1, in_blocks=True), mip_chain_bytes((4, 2), 4)
+    (87408, 44)
+    """
+    h, w = shape
+    total = texture_bytes((h, w), bytes_per_texel, in_blocks=in_blocks)
+    while h > 1 or w > 1:
+        h, w = max(h // 2, 1), max(w // 2, 1)
+        total += texture_bytes((h, w), bytes_per_texel, in_blocks=in_blocks)
+    return total
+
+
+def footprint(
+    wrinkle_shape: tuple[int, int],
+    mask_shape: tuple[int, int],
+    *,
+    maps: MapEncoding = "bc5",
+    masks: MaskEncoding = "bc3",
+    zones: int = 8,
+    mip_maps: bool = True,
+) -> Footprint:
+    """Return what one wrinkle map and its masks take.
+
+    Parameters
+    ----------
+    wrinkle_shape, mask_shape : (int, int)
+        Rows and columns.
+    maps, masks : str
+        Keys of `MAP_BYTES` and `MASK_BYTES`.
+    zones : int
+        At least 1; four a mask texture.
+    mip_maps : bool
+
+    Raises
+    ------
+    WrinkleError
+        For an encoding that does not exist, or a size or number below 1.
+    """
+    for name, encoding, known in (("maps", maps, MAP_BYTES), ("masks", masks, MASK_BYTES)):
+        if encoding not in known:
+            raise WrinkleError(f"{name}: got {encoding!r}, expected one of {', '.join(known)}")
+    if min(*wrinkle_shape, *mask_shape, zones) < 1:
+        raise WrinkleError(
+            f"wrinkle_shape, mask_shape, zones: got {wrinkle_shape}, {mask_shape}, {zones}, "
+            "expected at least 1 each"
+        )
+    textures = -(-zones // 4)
+    return Footprint(
+        texture_bytes(wrinkle_shape, MAP_BYTES[maps], in_blocks=maps == "bc5"),
+        textures * texture_bytes(mask_shape, MASK_BYTES[masks], in_blocks=masks == "bc3"),
+        MIP_FACTOR if mip_maps else 1.0,
+    )
+
+
+def paper_footprint() -> Footprint:
+    """Return the paper's: 64 KB of map and 8 KB of masks, times 4/3."""
+    return footprint((WRINKLE_SIDE, WRINKLE_SIDE), (MASK_SIDE, MASK_SIDE))
+
+
+def stored_map(derivatives: Floating, encoding: MapEncoding) -> Floating:
+    """Return derivatives as they come back from a texture.
+
+    Parameters
+    ----------
+    derivatives : ndarray, shape (h, w, 2)
+        "unit8" and "bc5" hold [-1, 1] and refuse others: clamp them with `wrinkles.encode`, or
+        scale map and table.
+    encoding : {"float32", "float16", "unit8", "bc5"}
+
+    Returns
+    -------
+    ndarray, shape (h, w, 2), float32
+    """
+    if encoding not in MAP_BYTES:
+        raise WrinkleError(f"maps: got {encoding!r}, expected one of {', '.join(MAP_BYTES)}")
+    d = np.asarray(derivatives)
+    if encoding == "float16":
+        limit = float(np.finfo(np.float16).max)
+        if d.size and not float(np.abs(d).max()) <= limit:
+            raise WrinkleError(f"derivatives: got values beyond {limit:g} or not finite")
+        d = d.astype(np.float16)
+    elif encoding == "unit8":
+        d = wrinkles.from_unit(_eight_bits(wrinkles.to_unit(d)))
+    elif encoding == "bc5":
+        packed = blocks.encode_bc5(wrinkles.to_unit(d))
+        d = wrinkles.from_unit(blocks.decode_bc5(packed, d.shape[:2]))
+    return d.astype(np.float32)
+
+
+def stored_masks(masks: wrinkles.Masks, encoding: MaskEncoding) -> Floating:
+    """Return masks (Z, h, w), float32, as they come back from RGBA textures.
+
+    "unit8" and "bc3" hold [0, 1]; the others what their numbers hold.
+
+    Raises
+    ------
+    WrinkleError
+        For an encoding that does not exist, and masks that it does not hold.
+    """
+    if encoding not in MASK_BYTES:
+        raise WrinkleError(f"masks: got {encoding!r}, expected one of {', '.join(MASK_BYTES)}")
+    stack = wrinkles.mask_stack(masks)
+    if encoding in ("unit8", "bc3") and not (stack.min() >= 0.0 and stack.max() <= 1.0):
+        raise WrinkleError(
+            f"masks: got {stack.min():.3g}...{stack.max():.3g}, expected [0, 1] for {encoding}"
+        )
+    if encoding in ("float16", "float32"):
+        limit = float(np.finfo(encoding).max)
+        if float(np.abs(stack).max()) > limit:
+            raise WrinkleError(f"masks: got values beyond {limit:g}, expected less for {encoding}")
+    if encoding == "float16":
+        stack = stack.astype(np.float16)
+    elif encoding == "unit8":
+        stack = _eight_bits(stack)
+    elif encoding == "bc3":
+        shape = stack.shape[1:]
+        textures = [
+            blocks.decode_bc3(blocks.encode_bc3(texture), (shape[0], shape[1]))
+            for texture in wrinkles.mask_textures(stack)
+        ]
+        stack = wrinkles.mask_stack(textures)[: len(stack)]
+    return stack.astype(np.float32)
+
+
+def _eight_bits(values: NDArray[np.floating]) -> Floating:
+    return np.rint(values * 255.0) / 255.0
+
+
+@dataclass(frozen=True, slots=True)
+class StorageRow:
+    """What one way of storing wrinkles costs.
+
+    Attributes
+    ----------
+    side, mask_side : int
+        Texels a side of wrinkle map and masks.
+    maps, masks : str
+        Encodings.
+    total_bytes : float
+        Map and masks with mip-maps, without the base.
+    mean_deg, percentile_99_deg : float
+        Angle between the normals and those of the given maps, over the face's pixels.
+    """
+
+    side: int
+    mask_side: int
+    maps: MapEncoding
+    masks: MaskEncoding
+    total_bytes: float
+    mean_deg: float
+    percentile_99_deg: float
+
+
+def storage_table(
+    base: Floating,
+    layer: Layer,
+    weights: Weights,
+    *,
+    sides: Sequence[int] = (2048, 1024, 512, 256, 128, 64),
+    mask_side: int | None = None,
+    encodings: Sequence[tuple[MapEncoding, MaskEncoding]] = (
+        ("float32", "float32"), ("float16", "float16"), ("unit8", "unit8"), ("bc5", "bc3"),
+    ),
+    clamp: Clamp = "unit",
+    valid: NDArray[np.bool_] | None = None,
+) -> tuple[StorageRow, ...]:  # fmt: skip
+    """Store a layer at several sizes and encodings, and compare the normals with its own.
+
+    Parameters
+    ----------
+    base : ndarray, shape (H, W, 2)
+        Derivatives of the neutral face; not stored anew.
+    layer : Layer
+        At its full resolution, which is the reference.
+    weights : mapping or array_like
+        Of the expression to show.
+    sides : sequence of int
+        Wrinkle maps of so many texels a side, averaged down; larger ones than the layer are left
+        out.
+    mask_side : int, optional
+        Side of the masks; as they are by default.
+    encodings : sequence of (str, str)
+    clamp : {"unit", "signed"}
+    valid : ndarray of bool, shape (H, W), optional
+        Pixels that count.
+
+    Returns
+    -------
+    tuple of StorageRow
+    """
+    whole = np.asarray(base, np.float64)
+    reference = wrinkles.combine_layers(whole, [layer], weights, clamp=clamp)
+    given = layer.masks.shape[1:]
+    mask_shape = (mask_side, mask_side) if mask_side is not None else (given[0], given[1])
+    masks = resampled(layer.masks, mask_shape)
+    rows = []
+    for side in sides:
+        if side > max(layer.wrinkle.shape[:2]):
+            continue
+        small = np.moveaxis(resampled(np.moveaxis(layer.wrinkle, 2, 0), (side, side)), 0, 2)
+        for maps_as, masks_as in encodings:
+            stored = Layer(stored_map(small, maps_as), stored_masks(masks, masks_as), layer.table)
+            shown = wrinkles.combine_layers(whole, [stored], weights, clamp=clamp)
+            mean, high = normal_error_deg(shown, reference, valid)
+            size = footprint((side, side), mask_shape, maps=maps_as, masks=masks_as,
+                             zones=len(masks))  # fmt: skip
+            rows.append(
+                StorageRow(side, mask_shape[0], maps_as, masks_as, size.total_bytes, mean, high)
+            )
+    return tuple(rows)
+
+
+def normal_error_deg(
+    normals: Floating, reference: Floating, valid: NDArray[np.bool_] | None = None
+) -> tuple[float, float]:
+    """Return mean and 99th percentile of the angle between two maps of normals, degrees.
+
+    Pixels without a direction in either map do not count; NaN when none is left.
+    """
+    angle = np.degrees(metrics.angular_error_rad(normals, reference))
+    if valid is not None:
+        angle = angle[valid]
+    angle = angle[np.isfinite(angle)]
+    if not angle.size:
+        return float("nan"), float("nan")
+    return float(angle.mean()), float(np.percentile(angle, 99))
