@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from model import color_table
 from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import model_error, shading_prior
+from reconstruction.chromophores import model_error, shading_prior
 
 Floats = NDArray[np.float64]
 

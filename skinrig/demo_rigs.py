@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from model import store
-from reconstruction import pipeline
+from reconstruction.pipeline import recipes as pipeline
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.light_safety import light_rows
 from skinrig.simulating.simulation import Simulated, simulate_session

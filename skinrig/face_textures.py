@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
-from reconstruction import common_parameterization, landmark_table
-from reconstruction.common_parameterization import (
+from reconstruction.correspondence import common_parameterization, landmark_table
+from reconstruction.correspondence.common_parameterization import (
     Chart,
     CommonFrame,
     Correspondence,

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
-from reconstruction import translucency
-from reconstruction.probe_stages import CHANNELS, SUBSURFACE_FILE
-from reconstruction.translucency import TranslucencyMap
+from reconstruction.pipeline.probe.stages import CHANNELS, SUBSURFACE_FILE
+from reconstruction.subsurface import translucency
+from reconstruction.subsurface.translucency import TranslucencyMap
 
 FloatArray = NDArray[np.float64]
 
@@ -112,7 +112,7 @@ def place(
     ------
     ProbeSiteError
         Where nothing was measured at a place that is known and on the scan.
-    reconstruction.translucency.TranslucencyError
+    reconstruction.subsurface.translucency.TranslucencyError
         Where no measurement is usable, or the table is faulty.
     """
     measured = _measured(probe)

@@ -6,7 +6,7 @@ Subjects of seeds 0 to 19 over all skin types stand before the flash rig, at two
 each pixel the color that the table predicts for the true chromophores is compared with the crossed
 image over a white tile's, both seen through the color filter array but without noise. What the two
 differ by, in the logarithm and without the brightness that is common to the channels, is the
-model's error. Its terms (see ``reconstruction.model_error``) are those under which the errors are
+model's error. Its terms (see ``reconstruction.chromophores.model_error``) are those under which the errors are
 likeliest, as of Student's t with few degrees of freedom: outlines, nostrils and eyelids must not
 widen everybody's intervals. Fine structure is taken from the picture with its noise, as later. The
 whole is scaled so that with the sensor's noise 68 % of pixels lie inside the 68 % ellipse of both.
@@ -30,7 +30,7 @@ from capture import raw
 from capture.rig import load_rig
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import model_error
+from reconstruction.chromophores import model_error
 from rigsim.scenes.flash import FlashScene
 from rigsim.subject import make_subject
 from rigsim.targets import make_target

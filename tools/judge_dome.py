@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from model import store
-from reconstruction import pipeline
+from reconstruction.pipeline import recipes as pipeline
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as surface_evaluation

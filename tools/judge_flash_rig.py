@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from model import store
-from reconstruction import pipeline
-from reconstruction.flash_stages import NOISE_STDERR
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.flash.stages import NOISE_STDERR
 from skinrig.bounds import cramer_rao
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating.flash import BANDS, BOUND_FACTOR, BOUND_LIMIT, MEDIAN_LIMIT

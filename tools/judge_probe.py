@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from model import store
-from reconstruction import pipeline
+from reconstruction.pipeline import recipes as pipeline
 from skinrig.benchmarks.probe import medium
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation

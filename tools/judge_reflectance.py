@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from reconstruction import pipeline
+from reconstruction.pipeline import recipes as pipeline
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.fitting.reflectance import fit_reflectance
 from skinrig.rendering.evaluation import FULL, evaluate_folders

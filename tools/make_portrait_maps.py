@@ -17,7 +17,7 @@ import skimage.data
 
 from capture.importers import import_photos
 from model import store
-from reconstruction import pipeline
+from reconstruction.pipeline import recipes as pipeline
 from skinrig.reporting import png
 
 TARGET = Path(__file__).resolve().parents[1] / "docs/images/portrait-maps.png"

@@ -34,7 +34,8 @@ from model.brdf import tables as brdf_tables
 from model.texture_statistics.space import TextureSpace
 from model.traits import TraitSpace, cosine
 from model.traits.storage import PACKAGED, TraitLibrary, from_bytes
-from reconstruction import brdf_basis, common_regions
+from reconstruction import brdf_basis
+from reconstruction.correspondence import common_regions
 from rigsim.population import Member, shifted, table_1
 from rigsim.skin_conditions import CONDITIONS
 from skinrig.traits import albedo_vectors, regions

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from model.texture_statistics import histograms as texture_histograms
 from model.texture_statistics.histograms import GroupHistograms
 from model.texture_statistics.space import TextureSpace
-from reconstruction import common_regions
+from reconstruction.correspondence import common_regions
 from skinrig import consent, face_textures
 from skinrig.fitting import traits
 from skinrig.fitting.traits import AlbedoSample, TraitFitError

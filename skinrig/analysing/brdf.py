@@ -19,8 +19,8 @@ from model import store
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.skin import SkinMap
-from reconstruction import brdf_space
-from reconstruction.brdf_space import SpaceCurve
+from reconstruction.brdf_basis import space as brdf_space
+from reconstruction.brdf_basis.space import SpaceCurve
 from skinrig import consent
 from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf_space_datasets import Dataset
@@ -112,7 +112,7 @@ def analyse(
     groups
         Which labels are averaged together, by name, (labels,) bool each; None: each for itself.
     ranks, method
-        See `reconstruction.brdf_space.curve`.
+        See `reconstruction.brdf_basis.space.curve`.
     rng
         Chooses the points.
 
@@ -176,7 +176,7 @@ def analyse_simulated(
     points_each
         Points of each of the 87 people of dataset B.
     method
-        See `reconstruction.brdf_space.curve`.
+        See `reconstruction.brdf_basis.space.curve`.
     seed
         Of points, noise and factorizations.
     progress

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from capture.rig import load_rig
 from model import fresnel
 from model.brdf import tables as brdf_tables
-from reconstruction import brdf_basis, brdf_space, diffuse_albedo
+from reconstruction import brdf_basis, diffuse_albedo
+from reconstruction.brdf_basis import space as brdf_space
 from rigsim import surface_brdf
 from rigsim.mesh import Float32Array
 from rigsim.population import HAIR_LIMIT, Member, table_1

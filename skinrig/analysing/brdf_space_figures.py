@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from model.brdf.tables import BrdfBasis
 from reconstruction import brdf_basis
-from reconstruction.brdf_space import SpaceCurve
+from reconstruction.brdf_basis.space import SpaceCurve
 
 FloatArray = NDArray[np.float64]
 

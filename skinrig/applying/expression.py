@@ -318,7 +318,7 @@ def _carried(rig: HemoglobinRig, other: OtherFace, done: Applied) -> HemoglobinR
         )
     shape = (blood.values.shape[0], blood.values.shape[1])
     if other.landmarks is not None and other.landmarks_rig is not None:
-        from reconstruction.rig_transfer import carried
+        from reconstruction.facial_color.rig_transfer import carried
 
         rig = carried(rig, shape, landmarks_rig=other.landmarks_rig, landmarks_onto=other.landmarks)
     else:

@@ -12,7 +12,7 @@ from model import color_table
 from model.color_table import ColorTable
 from model.facial_color import HemoglobinRig
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import expression_alignment
+from reconstruction.correspondence import expression_alignment
 from rigsim.subject import Subject, make_subject
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.skin_bands import MELANIN_BANDS

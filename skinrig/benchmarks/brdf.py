@@ -14,7 +14,8 @@ from scipy.optimize import nnls
 from model.brdf import microfacet
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
-from reconstruction import brdf_basis, diffuse_albedo
+from reconstruction import brdf_basis
+from reconstruction.diffuse_albedo import estimation as diffuse_albedo
 from skinrig import brdf_truth
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, Timing, measure, once
 

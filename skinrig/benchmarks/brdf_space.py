@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.brdf import tables as brdf_tables
-from reconstruction import brdf_space
+from reconstruction.brdf_basis import space as brdf_space
 from skinrig.analysing import brdf_space_datasets
 from skinrig.analysing.brdf_space_datasets import Dataset
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure

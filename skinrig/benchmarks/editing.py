@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.common_parameterization import Chart
+from reconstruction.correspondence.common_parameterization import Chart
 from rigsim.population import Member, table_1
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.editing import albedo as editing_albedo

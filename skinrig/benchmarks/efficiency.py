@@ -18,13 +18,8 @@ from numpy.typing import NDArray
 
 from model import color_table, fresnel, photon_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import (
-    chromophores,
-    diffuse_albedo,
-    light_selection,
-    photometric_stereo,
-    subsurface,
-)
+from reconstruction import chromophores, diffuse_albedo, photometric_stereo, subsurface
+from reconstruction.photometric_stereo import light_selection
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.skin_bands import MELANIN_BANDS, melanin_band
 

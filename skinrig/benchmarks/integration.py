@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from scipy import fft, sparse
 from scipy.sparse.linalg import splu
 
-from reconstruction import slope_fields
-from reconstruction.discontinuity_integration import integrate_broken
-from reconstruction.height_errors import expected_rms
-from reconstruction.height_filters import high_pass
-from reconstruction.normal_integration import Settings, integrate, integrate_map
+from reconstruction.normal_integration import Settings, integrate, integrate_map, slope_fields
+from reconstruction.normal_integration.discontinuities import integrate_broken
+from reconstruction.normal_integration.height_errors import expected_rms
+from reconstruction.normal_integration.height_filters import high_pass
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure
 
 Floats = NDArray[np.float64]

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from model import metrics, store
 from model.skin import SkinAppearance
-from reconstruction import pipeline
-from reconstruction.dome_stages import WEIGHTS
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.dome.stages import WEIGHTS
 from skinrig import skin_bands
 from skinrig.benchmarks.interval_coverage import Trial
 from skinrig.benchmarks.interval_trials import (

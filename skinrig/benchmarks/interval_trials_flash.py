@@ -1,7 +1,7 @@
 """Trials of the flash rig's intervals: chromophores, and how blood changes with a state.
 
 Stated errors are of people who do not stand exactly where the white tile stood
-(`reconstruction.shading_prior.SOFTNESS`), and so each subject is drawn a place off it.
+(`reconstruction.chromophores.shading_prior.SOFTNESS`), and so each subject is drawn a place off it.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ import numpy as np
 
 from capture.rig import load_rig
 from model import store
-from reconstruction import pipeline, shading_prior
-from reconstruction.facial_color_fit import UnknownBloodError
+from reconstruction.chromophores import shading_prior
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.flash.facial_color import UnknownBloodError
 from skinrig.benchmarks.interval_coverage import Trial
 from skinrig.benchmarks.interval_trials import (
     band_of,

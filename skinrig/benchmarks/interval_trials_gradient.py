@@ -18,13 +18,14 @@ import numpy as np
 
 from model import metrics, store
 from model.skin import SkinAppearance
-from reconstruction import pipeline
-from reconstruction.gradient_stages import CUTOFF_UM, KERNEL_FILE
-from reconstruction.height_filters import high_pass
-from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, fit_kernel
-from reconstruction.kernel_outcome import KernelFit
-from reconstruction.normal_statistics import measure
-from reconstruction.strain_kernels import COARSER
+from reconstruction.kernel_fit import fit_kernel
+from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
+from reconstruction.kernel_fit.outcome import KernelFit
+from reconstruction.normal_histogram.statistics import measure
+from reconstruction.normal_integration.height_filters import high_pass
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.gradient.stages import CUTOFF_UM, KERNEL_FILE
+from reconstruction.pipeline.gradient.strain_kernels import COARSER
 from skinrig.benchmarks.interval_coverage import GAUSSIAN_95, Trial
 from skinrig.benchmarks.interval_trials import (
     ANY_BAND,

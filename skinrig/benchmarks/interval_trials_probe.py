@@ -12,8 +12,9 @@ import numpy as np
 
 from model import store
 from model.skin import SkinAppearance
-from reconstruction import anisotropy, pipeline
-from reconstruction.probe_stages import ANISOTROPY_FILE, CHANNELS, SUBSURFACE_FILE
+from reconstruction.anisotropy import estimation as anisotropy
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, CHANNELS, SUBSURFACE_FILE
 from skinrig import skin_bands
 from skinrig.benchmarks.interval_coverage import GAUSSIAN_95, Trial
 from skinrig.benchmarks.interval_trials import ANY_BAND, Floats, forget, truth_of

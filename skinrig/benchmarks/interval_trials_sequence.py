@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from model import store
-from reconstruction import pipeline
+from reconstruction.pipeline import recipes as pipeline
 from skinrig.benchmarks.interval_coverage import GAUSSIAN_95, Trial
 from skinrig.benchmarks.interval_trials import band_of, calibrated, forget, truth_of
 from skinrig.sequences import SequenceOrder

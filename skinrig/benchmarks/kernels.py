@@ -11,16 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
-from reconstruction import (
-    kernel_fit,
-    kernel_outcome,
-    kernel_search,
-    neutral_relief,
-    normal_histogram,
-    normal_statistics,
-    relief_slopes,
-)
-from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM
+from reconstruction import kernel_fit, normal_histogram
+from reconstruction.kernel_fit import neutral_relief
+from reconstruction.kernel_fit import outcome as kernel_outcome
+from reconstruction.kernel_fit import search as kernel_search
+from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
+from reconstruction.normal_histogram import relief_slopes
+from reconstruction.normal_histogram import statistics as normal_statistics
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.resampling import mean_error
 

@@ -26,7 +26,9 @@ from model.microstructure.convolution import (
 from model.microstructure.map_windows import Window
 from model.microstructure.mesh_strain import strain
 from model.microstructure.strain_fields import rasterize
-from reconstruction import kernel_fit, kernel_table, normal_histogram, relief_slopes
+from reconstruction import kernel_fit, normal_histogram
+from reconstruction.kernel_fit import table as kernel_table
+from reconstruction.normal_histogram import relief_slopes
 from rigsim.microrelief import MicroSkin, make_micro_skin
 from rigsim.skin_stretch import StretchedSkin, deform
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure

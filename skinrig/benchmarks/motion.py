@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction import head_motion
+from reconstruction.registration import head_motion
 from skinrig.benchmark import BandError, Point, StageBenchmark, measure
 from skinrig.skin_bands import MELANIN_BANDS
 

@@ -14,8 +14,8 @@ from capture.plan.multiplexed import multiplexed_plan, phases
 from capture.rig import load_rig
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction.perfusion_curves import FALSE_ALARM, transition
-from reconstruction.perfusion_fit import RelaxationFit, fit_cycle
+from reconstruction.facial_color.perfusion_curves import FALSE_ALARM, transition
+from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
 from rigsim.perfusion_course import PromptedCourse
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, Timing, measure
 from skinrig.skin_bands import MELANIN_BANDS

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import store
-from reconstruction import pipeline
-from reconstruction.probe_stages import METHODS
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.probe.stages import METHODS
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation

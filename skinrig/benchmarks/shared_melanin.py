@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.color_table import ColorTable
-from reconstruction import chromophore_posterior, model_error, shading_prior, shared_melanin
-from reconstruction.shading_prior import ShadingPrior
+from reconstruction.chromophores import model_error, shading_prior
+from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores.shading_prior import ShadingPrior
+from reconstruction.facial_color import shared_melanin
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.benchmarks.alignment import face_of, oval, table
 from skinrig.benchmarks.resampling import median_error

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from model.dipole import kienle_patterson as diffusion
 from reconstruction import subsurface
-from reconstruction.subsurface_models import Method
+from reconstruction.subsurface.models import Method
 from rigsim.fibre_profile import fibre_profile
 from rigsim.tissue_mc import Layer, LayerStack
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure

@@ -16,10 +16,10 @@ from scipy.ndimage import distance_transform_edt
 from capture.calibration.geometry import CameraPose
 from capture.calibration.lights import LightTable
 from capture.rig import load_rig
-from reconstruction import texture_fill
-from reconstruction.lumitexel_store import LumitexelStore
 from reconstruction.lumitexels import Surface
-from reconstruction.ray_casting import RayCaster
+from reconstruction.lumitexels.ray_casting import RayCaster
+from reconstruction.lumitexels.store import LumitexelStore
+from reconstruction.surface import texture_fill
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure
 from skinrig.benchmarks.resampling import mean_error, tiled_rms
 

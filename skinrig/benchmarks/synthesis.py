@@ -11,7 +11,8 @@ from scipy import fft
 from scipy.special import ndtri
 
 from model.displacement_synthesis import growth as displacement_synthesis
-from reconstruction import normal_histogram, relief_slopes
+from reconstruction import normal_histogram
+from reconstruction.normal_histogram import relief_slopes
 from rigsim.microrelief import make_micro_skin
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing, measure
 

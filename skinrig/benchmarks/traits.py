@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from model.brdf import tables as brdf_tables
 from model.traits import TraitSpace, cosine, lobe_edits, reduced_spaces
 from model.traits.reduced_spaces import SpaceKind
-from reconstruction import brdf_basis, common_regions
+from reconstruction import brdf_basis
+from reconstruction.correspondence import common_regions
 from rigsim.population import Member, shifted, table_1
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
 from skinrig.benchmarks import resident_memory

@@ -13,8 +13,11 @@ from scipy import stats
 from threadpoolctl import threadpool_limits
 
 from model import photon_table
-from reconstruction import anisotropy, profile_anisotropy, subsurface, translucency
-from reconstruction.translucency import SITE_UV, TEXTURE_MM, TranslucencyPrior
+from reconstruction import subsurface
+from reconstruction.anisotropy import estimation as anisotropy
+from reconstruction.anisotropy import profile_anisotropy
+from reconstruction.subsurface import translucency
+from reconstruction.subsurface.translucency import SITE_UV, TEXTURE_MM, TranslucencyPrior
 from skinrig.benchmark import BandError, Limit, Point, StageBenchmark, measure
 from skinrig.skin_bands import MELANIN_BANDS
 

@@ -16,7 +16,9 @@ from model import texture_resampling as resampling
 from model.wrinkles import JIMENEZ2011, Layer
 from model.wrinkles import differences as wrinkle_differences
 from model.wrinkles import storage as wrinkle_storage
-from reconstruction import wrinkle_fit, wrinkle_texels, wrinkle_weights
+from reconstruction.wrinkles import fit as wrinkle_fit
+from reconstruction.wrinkles import texels as wrinkle_texels
+from reconstruction.wrinkles import weights as wrinkle_weights
 from skinrig.benchmark import Limit, Point, StageBenchmark, measure, once
 
 Floats = NDArray[np.float64]
@@ -187,7 +189,7 @@ def fitting(*, toy: bool) -> StageBenchmark:
         () if toy else (
             Limit("of the neutral face's error, with the best map", best / rest, 0.6, "<="),
         ),
-        left_out=(("masks from the data", "see tests of reconstruction.wrinkle_zones"),),
+        left_out=(("masks from the data", "see tests of reconstruction.wrinkles.zones"),),
         interval_of="squares of the face",
         no_bands="shape alone: no color of skin enters",
     )  # fmt: skip

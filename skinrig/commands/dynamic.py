@@ -246,7 +246,7 @@ def apply_microstructure(
 def _other_face(onto: Path | None, landmarks: list[Path]) -> Any:
     """Return the face that a rig is applied to, with its landmarks."""
     from model import store
-    from reconstruction import landmark_table
+    from reconstruction.correspondence import landmark_table
     from skinrig.applying.expression import OtherFace
     from skinrig.errors import UsageError
 

@@ -133,7 +133,7 @@ def reconstruct(
 
     Example: skinrig reconstruct monday tuesday --want melanin --out appearances
     """
-    from reconstruction import pipeline
+    from reconstruction.pipeline import recipes as pipeline
     from skinrig.state_truth import truth_beside
 
     console = Console(json)

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model import texture_statistics
-from reconstruction import texture_fill
-from reconstruction.common_parameterization import Chart
+from reconstruction.correspondence.common_parameterization import Chart
+from reconstruction.surface import texture_fill
 from skinrig.traits import albedo_vectors
 from skinrig.traits.albedo_vectors import AlbedoTraits, VectorKind
 

@@ -16,7 +16,7 @@ from model import store
 from model.skin import SkinAppearance, SkinMap
 from model.traits.storage import TraitLibrary
 from model.traits.vectors import DOUBTFUL_P, TraitVector
-from reconstruction import common_regions
+from reconstruction.correspondence import common_regions
 from skinrig import consent, face_textures
 from skinrig.editing import albedo as editing_albedo
 from skinrig.editing import masks, pigment_spots, surface_mixtures

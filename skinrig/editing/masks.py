@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from model import store
-from reconstruction import common_regions
-from reconstruction.common_parameterization import Chart, CommonFrame
+from reconstruction.correspondence import common_regions
+from reconstruction.correspondence.common_parameterization import Chart, CommonFrame
 
 Image = NDArray[np.float32]
 

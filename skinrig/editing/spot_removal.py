@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from reconstruction import texture_fill
-from reconstruction.common_parameterization import Chart
+from reconstruction.correspondence.common_parameterization import Chart
+from reconstruction.surface import texture_fill
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from model.skin import SkinMap
-from reconstruction import common_parameterization, texture_fill
-from reconstruction.common_parameterization import Chart, CommonFrame
+from reconstruction.correspondence import common_parameterization
+from reconstruction.correspondence.common_parameterization import Chart, CommonFrame
+from reconstruction.surface import texture_fill
 from skinrig import face_textures
 from skinrig.editing import pigment_spots, spot_removal
 from skinrig.face_textures import Face

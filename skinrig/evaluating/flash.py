@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.flash_stages import NOISE_STDERR
+from reconstruction.pipeline.flash.stages import NOISE_STDERR
 from skinrig.bounds import cramer_rao
 
 BANDS: tuple[tuple[float, float], ...] = (

@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 
 from model import metrics
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.gradient_stages import CUTOFF_UM, HISTOGRAM_FILE, KERNEL_FILE, STRAIN_FILE
-from reconstruction.height_filters import high_pass
+from reconstruction.normal_integration.height_filters import high_pass
+from reconstruction.pipeline.gradient.stages import (
+    CUTOFF_UM,
+    HISTOGRAM_FILE,
+    KERNEL_FILE,
+    STRAIN_FILE,
+)
 
 NORMAL_LIMIT_DEG = 1.5
 HEIGHT_LIMIT = 0.05

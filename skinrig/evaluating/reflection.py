@@ -15,8 +15,8 @@ from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.skin import SkinAppearance
 from reconstruction import brdf_basis
-from reconstruction.dome_stages import BASIS_FILE, weight_names
-from reconstruction.surface_estimates import transmitted
+from reconstruction.pipeline.dome.stages import BASIS_FILE, weight_names
+from reconstruction.surface.estimates import transmitted
 from skinrig.evaluating.reflection_truth import TEST_FILE, sphere
 from skinrig.evaluating.surface import NEAR_MM
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
-from reconstruction.probe_stages import CHANNELS, METHODS, PROFILE_FILE, SUBSURFACE_FILE
+from reconstruction.pipeline.probe.stages import CHANNELS, METHODS, PROFILE_FILE, SUBSURFACE_FILE
 
 MEDIAN_LIMIT, WORST_LIMIT = 0.03, 0.08
 """Relative error of sigma_tr on homogeneous media, median and worst."""

@@ -109,7 +109,7 @@ def write(
 
 def _filled(base: Floats, valid: Bools) -> Floats:
     """Return colors with the holes filled from around, as a texture must have them."""
-    from reconstruction.texture_fill import push_pull
+    from reconstruction.surface.texture_fill import push_pull
 
     return np.asarray(push_pull(base, valid.astype(np.float32)).values, np.float64)
 
@@ -179,7 +179,7 @@ def _on_texture(
 
 def _places(delivery: Delivery, shape: tuple[int, int]) -> Floats:
     """Return the flash picture's pixel under each pixel of the pack, column and row, (N, N, 2)."""
-    from reconstruction import landmark_field, landmark_table
+    from reconstruction.correspondence import landmark_field, landmark_table
 
     own, onto = (landmark_table.read(path) for path in delivery.landmarks)
     names = sorted(set(own) & set(onto))

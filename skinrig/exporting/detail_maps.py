@@ -209,7 +209,7 @@ def micro_normals(
     left_out : list of (str, str)
         Sites whose relief is not known.
     """
-    from reconstruction.texture_fill import push_pull
+    from reconstruction.surface.texture_fill import push_pull
 
     y = NORMAL_Y[delivery.normal_y]
     green = "+Y (OpenGL)" if y > 0 else "-Y (DirectX)"

@@ -84,9 +84,9 @@ def _write(
 ) -> list[tuple[str, str]]:
     import tifffile
 
-    from reconstruction.calibrated_dome import calibrated
-    from reconstruction.dome_images import DomeImages
-    from reconstruction.evidence import Evidence
+    from reconstruction.pipeline.dome.calibrated import calibrated
+    from reconstruction.pipeline.dome.images import DomeImages
+    from reconstruction.pipeline.evidence import Evidence
 
     evidence = Evidence.of(session, calibration, state="neutral", on_date=None)
     images = DomeImages(session)

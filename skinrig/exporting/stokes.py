@@ -115,9 +115,9 @@ def _write(
     session: Session, folder: Path, only: tuple[str, ...], with_errors: bool,
     calibration: str | Path | None,
 ) -> list[tuple[str, str]]:  # fmt: skip
-    from reconstruction.evidence import Evidence
-    from reconstruction.gradient_images import GradientImages
-    from reconstruction.gradient_stages import WAVELENGTH_UM
+    from reconstruction.pipeline.evidence import Evidence
+    from reconstruction.pipeline.gradient.images import GradientImages
+    from reconstruction.pipeline.gradient.stages import WAVELENGTH_UM
 
     evidence = Evidence.of(session, calibration, state="neutral", on_date=None)
     shots = session.frames("gradient")
@@ -200,7 +200,7 @@ def _write(
 
 def _noise(evidence: Any, camera: str) -> Any:
     from capture.calibration.sensor import SensorCalibration
-    from reconstruction.dome_images import SensorNoise
+    from reconstruction.pipeline.dome.images import SensorNoise
 
     serial = evidence.session.rig.view(camera).serial
     found = evidence.load("sensor", [serial], "the frames are as noisy as they say of themselves")

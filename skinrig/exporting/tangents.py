@@ -140,7 +140,7 @@ class FramedMesh:
             Rows are tangent, bitangent and normal, in the mesh's frame; row 0 is v = 1.
         covered : ndarray of bool, shape (size, size)
         """
-        from reconstruction.texture_fill import rasterize
+        from reconstruction.surface.texture_fill import rasterize
 
         texels = rasterize(self.uv[self.faces].astype(np.float64), size)
         covered = texels.covered
@@ -212,7 +212,7 @@ def filled(tangent_normals: ArrayLike, valid: Bools) -> NDArray[np.float32]:
     >>> filled(tilted, np.eye(8, dtype=bool))[0, 7].round(3).tolist()
     [0.6000000238418579, 0.0, 0.800000011920929]
     """
-    from reconstruction.texture_fill import push_pull
+    from reconstruction.surface.texture_fill import push_pull
 
     given = np.asarray(tangent_normals, np.float32)
     if not valid.any():

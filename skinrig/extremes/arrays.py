@@ -108,7 +108,8 @@ def _no_numbers_in_media(real: Real) -> str:
 
 def _single_pixels(real: Real) -> str:
     from model import facial_color
-    from reconstruction import normal_integration, polarization, texture_fill
+    from reconstruction import normal_integration, polarization
+    from reconstruction.surface import texture_fill
 
     near(normal_integration.integrate(as_real([[[0.0, 0.6, 0.8]]], real)), [[0.0]])
     one = as_real(np.full((1, 1, 3), 0.5), real)

@@ -262,7 +262,7 @@ def _no_diffuse(real: Real) -> str:
 
 
 def _nothing_to_fill(real: Real) -> str:
-    from reconstruction import texture_fill
+    from reconstruction.surface import texture_fill
 
     empty = texture_fill.push_pull(as_real(np.zeros((9, 7, 3)), real), np.zeros((9, 7)))
     one = np.zeros((9, 7))

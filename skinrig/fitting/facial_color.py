@@ -14,9 +14,11 @@ from model import store
 from model.facial_color import FacialColorError
 from model.facial_color import document as facial_color_document
 from model.skin import SkinMap
-from reconstruction import facial_color_fit, landmark_table, state_images
-from reconstruction.facial_color_fit import FacialColorFit, UnknownBloodError
-from reconstruction.state_images import Landmarks, Subject
+from reconstruction.correspondence import landmark_table
+from reconstruction.pipeline.flash import facial_color as facial_color_fit
+from reconstruction.pipeline.flash import state_images
+from reconstruction.pipeline.flash.facial_color import FacialColorFit, UnknownBloodError
+from reconstruction.pipeline.flash.state_images import Landmarks, Subject
 from skinrig import dynamic_appearance
 from skinrig.dynamic_appearance import FACIAL_COLOR, Part
 from skinrig.state_truth import truth_of_state

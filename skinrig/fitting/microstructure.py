@@ -15,8 +15,8 @@ import numpy as np
 from model import store
 from model.microstructure import FOREHEAD, KernelTable, KernelTableError
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.gradient_stages import KERNEL_FILE
-from reconstruction.kernel_table import KernelTableFitError, fit_table
+from reconstruction.kernel_fit.table import KernelTableFitError, fit_table
+from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig import consent, dynamic_appearance
 from skinrig.dynamic_appearance import MICROSTRUCTURE, Part
 

@@ -12,8 +12,8 @@ import numpy as np
 from model import skin_reflectance, store
 from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import TRANSLUCENCY, SkinReflectance
-from reconstruction.probe_stages import SUBSURFACE_FILE
-from reconstruction.translucency import population_prior
+from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
+from reconstruction.subsurface.translucency import population_prior
 from skinrig import consent, probe_sites
 from skinrig.errors import UsageError
 from skinrig.probe_sites import PlacedTranslucency

@@ -17,8 +17,9 @@ from model.texture_statistics.space import TextureSpace
 from model.traits import TraitSpace
 from model.traits.storage import TraitLibrary
 from model.traits.vectors import Contrast
-from reconstruction import brdf_basis, common_regions
-from reconstruction.common_parameterization import CommonFrame
+from reconstruction import brdf_basis
+from reconstruction.correspondence import common_regions
+from reconstruction.correspondence.common_parameterization import CommonFrame
 from skinrig import consent, face_textures
 from skinrig.editing import surface_mixtures
 from skinrig.editing.surface_mixtures import SurfaceMixtureError

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from model import store
 from model.skin import SkinAppearance
 from model.wrinkles.evaluation import FILE as WRINKLE_FILE
-from reconstruction.dome_stages import MESH_FILE
 from reconstruction.normal_maps import NormalMaps
-from reconstruction.tangent_space import SMOOTHING_MM, tangent_normals
-from reconstruction.wrinkle_fit import WrinkleFit, fit
-from reconstruction.wrinkle_zones import ZoneFit, amplitudes, fit_zones
+from reconstruction.pipeline.dome.stages import MESH_FILE
+from reconstruction.surface.tangent_space import SMOOTHING_MM, tangent_normals
+from reconstruction.wrinkles.fit import WrinkleFit, fit
+from reconstruction.wrinkles.zones import ZoneFit, amplitudes, fit_zones
 from skinrig import consent, dynamic_appearance
 from skinrig.dynamic_appearance import WRINKLES, Part
 

@@ -19,8 +19,10 @@ from capture.plan import Plan
 from capture.plan.dome import EXPOSURES_S, dome_plan
 from capture.plan.rows import lights_of
 from capture.rig import Rig
-from reconstruction import light_selection, surface_errors, surface_estimates
-from reconstruction.light_selection import Prediction
+from reconstruction.photometric_stereo import light_selection
+from reconstruction.photometric_stereo.light_selection import Prediction
+from reconstruction.surface import errors as surface_errors
+from reconstruction.surface import estimates as surface_estimates
 from skinrig.planning.dome_sight import LIGHT_ERROR, Sight, sight
 from skinrig.planning.plans import Choice, Forecast, PlanningError, light_of
 
@@ -145,7 +147,7 @@ def confirm(
 ) -> list[dict[str, Any]]:
     """Simulate the dome of a choice and its calibration, reconstruct, compare with the truth."""
     from model import store
-    from reconstruction import pipeline
+    from reconstruction.pipeline import recipes as pipeline
     from skinrig.calibrating.calibrate import calibrate
     from skinrig.evaluating import surface as surface_evaluation
     from skinrig.simulating.simulation import simulate_session

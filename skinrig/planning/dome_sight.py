@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from capture.plan.dome import EXPOSURES_S
 from capture.rig import Rig
-from reconstruction import light_selection, surface_errors, surface_estimates
-from reconstruction.light_selection import Information
+from reconstruction.photometric_stereo import light_selection
+from reconstruction.photometric_stereo.light_selection import Information
+from reconstruction.surface import errors as surface_errors
+from reconstruction.surface import estimates as surface_estimates
 
 Floats = NDArray[np.float64]
 

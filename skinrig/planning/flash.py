@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from capture.plan import Plan, flash_plan
 from capture.rig import Rig
-from reconstruction import shading_prior
-from reconstruction.detectability import detectable
-from reconstruction.flash_stages import DARKEST_SIGMAS
+from reconstruction.chromophores import shading_prior
+from reconstruction.chromophores.detectability import detectable
+from reconstruction.pipeline.flash.stages import DARKEST_SIGMAS
 from skinrig.bounds import relative_bounds
 from skinrig.planning.plans import Choice, Forecast, PlanningError, interval_of, median_of_normals
 
@@ -260,7 +260,7 @@ def confirm(
 ) -> list[dict[str, Any]]:
     """Simulate a face under a choice, and the calibration, reconstruct, compare with the truth."""
     from model import store
-    from reconstruction import pipeline
+    from reconstruction.pipeline import recipes as pipeline
     from skinrig.calibrating.calibrate import calibrate
     from skinrig.evaluating import flash
     from skinrig.simulating.simulation import simulate_session

@@ -137,8 +137,8 @@ def predict(look: Sight, setting: Setting) -> Prediction:
         Patterns, exposure and darks.
     """
     from reconstruction.gradient_normals import estimate_roughness, from_patterns
-    from reconstruction.gradient_stages import SMOOTH_PX
-    from reconstruction.light_selection import median_of_rayleigh
+    from reconstruction.photometric_stereo.light_selection import median_of_rayleigh
+    from reconstruction.pipeline.gradient.stages import SMOOTH_PX
 
     rng = np.random.default_rng([look.seed, 23])
     gain, floor = look.chip.noise_profile(setting.exposure_s)
@@ -231,7 +231,7 @@ def confirm(
 ) -> list[dict[str, Any]]:
     """Simulate the neutral skin under a choice, and the calibration, reconstruct, compare."""
     from model import metrics, store
-    from reconstruction import pipeline
+    from reconstruction.pipeline import recipes as pipeline
     from skinrig.calibrating.calibrate import calibrate
     from skinrig.simulating.simulation import simulate_session
 
@@ -310,7 +310,7 @@ def setting_of(plan: Plan) -> Setting:
     PlanningError
         Where its pictures do not tell light and three gradients, in both polarizations.
     """
-    from reconstruction.gradient_patterns import MissingPatterns, require
+    from reconstruction.gradient_normals.patterns import MissingPatterns, require
 
     shots = [step for step in plan.steps if step.kind == "gradient" and state_of(step)]
     neutral = [step for step in shots if int(step.index.get("caliper", 1)) == 0]

@@ -122,8 +122,8 @@ def confirm(
 ) -> list[dict[str, Any]]:
     """Simulate the skin of a choice and the phantom, reconstruct, compare with the truth."""
     from model import store
-    from reconstruction import pipeline
-    from reconstruction.probe_stages import METHODS
+    from reconstruction.pipeline import recipes as pipeline
+    from reconstruction.pipeline.probe.stages import METHODS
     from skinrig.calibrating.calibrate import calibrate
     from skinrig.evaluating import subsurface
     from skinrig.simulating.simulation import simulate_session

@@ -176,8 +176,8 @@ def _fitted(
 ) -> Sequence[Any]:
     """Return the fits of profiles with these variances of their readings."""
     from capture.calibration.fiber.gains import FibreReflectance
-    from reconstruction.probe_images import Measurement
-    from reconstruction.probe_stages import Profile, fit_profiles
+    from reconstruction.pipeline.probe.images import Measurement
+    from reconstruction.pipeline.probe.stages import Profile, fit_profiles
 
     names = tuple(fibre.name for fibre in look.probe.fibres)
     radius = np.array(look.probe.radius_mm)
@@ -219,7 +219,7 @@ def _crosstalk(count: int) -> Any:
 
 def _between(look: Sight, found: Floats, sigma: Floats, good: NDArray[np.bool_]) -> Floats:
     """Return the relative error of sigma_tr at each site by the map between the others, (S, 3)."""
-    from reconstruction import translucency
+    from reconstruction.subsurface import translucency
 
     known = [k for k, site in enumerate(look.sites) if site in translucency.SITE_UV]
     measured = [k for k in known if good[k].any()]

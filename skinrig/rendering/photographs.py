@@ -11,13 +11,13 @@ import numpy as np
 
 from capture.session import Session
 from model.skin import SkinAppearance
-from reconstruction.calibrated_dome import Dome, calibrated, seen_from
-from reconstruction.dome_images import DomeImages
-from reconstruction.dome_registration import register
-from reconstruction.evidence import Evidence
-from reconstruction.hold_out import HoldOut
-from reconstruction.mesh_repair import TriangleMesh
-from reconstruction.surface_estimates import LEAST_LIGHTS
+from reconstruction.pipeline.dome.calibrated import Dome, calibrated, seen_from
+from reconstruction.pipeline.dome.images import DomeImages
+from reconstruction.pipeline.dome.registration import register
+from reconstruction.pipeline.evidence import Evidence
+from reconstruction.pipeline.hold_out import HoldOut
+from reconstruction.scan.repair import TriangleMesh
+from reconstruction.surface.estimates import LEAST_LIGHTS
 from skinrig.rendering.camera import Camera, binned
 from skinrig.rendering.geometry import own_mesh
 from skinrig.rendering.lights import Light

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.flash_stages import NOISE_STDERR
+from reconstruction.pipeline.flash.stages import NOISE_STDERR
 from skinrig.evaluating import flash
 from skinrig.reporting import figures, map_names, map_pictures, page
 
@@ -169,7 +169,8 @@ def identifiability(appearances: Iterable[SkinAppearance]) -> str:
 def _of_table(camera: str, illuminant: str) -> str:
     from model import color_table
     from model.tissue_optics.layers import ANISOTROPY_SKIN
-    from reconstruction import chromophores, model_error
+    from reconstruction import chromophores
+    from reconstruction.chromophores import model_error
 
     table = color_table.build(camera, illuminant, anisotropy=ANISOTROPY_SKIN)
     plots = []

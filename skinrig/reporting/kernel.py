@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from model.skin import SkinAppearance
-from reconstruction.gradient_stages import KERNEL_FILE
+from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig.evaluating import microrelief as evaluation
 from skinrig.reporting import figures, page
 from skinrig.reporting.map_names import state_words

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.gradient_stages import HISTOGRAM_FILE, STRAIN_FILE
+from reconstruction.pipeline.gradient.stages import HISTOGRAM_FILE, STRAIN_FILE
 from skinrig.evaluating import microrelief as evaluation
 from skinrig.reporting import figures, kernel, map_pictures, page
 from skinrig.reporting.map_names import state_words

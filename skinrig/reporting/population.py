@@ -17,7 +17,7 @@ from model.translucency_population import (
     table,
     weyrich_2005,
 )
-from reconstruction.probe_stages import CHANNELS, SUBSURFACE_FILE
+from reconstruction.pipeline.probe.stages import CHANNELS, SUBSURFACE_FILE
 from skinrig.evaluating.subsurface import document_of, number
 from skinrig.reporting import page
 

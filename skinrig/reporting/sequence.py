@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from model.skin import SkinAppearance
-from reconstruction.sequence_stages import CURVES_FILE
+from reconstruction.pipeline.flash.sequence import CURVES_FILE
 from skinrig.reporting import figures, page
 
 COLORS = ("#2a78b8", "#d1602b", "#3f8f4f", "#8153a8", "#b8912a", "#555555")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from model.skin import SkinAppearance
-from reconstruction.probe_stages import (
+from reconstruction.pipeline.probe.stages import (
     ANISOTROPY_FILE,
     CHANNELS,
     PROFILE_FILE,
@@ -43,7 +43,7 @@ def section(
     name
         For headings.
     appearance
-        With the documents of `reconstruction.probe_stages`.
+        With the documents of `reconstruction.pipeline.probe.stages`.
     truth
         Of the same session; None: standard errors only.
     checks

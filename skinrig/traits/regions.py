@@ -16,8 +16,8 @@ from model.texture_statistics.space import TextureError, TextureSpace
 from model.traits import TraitSpace
 from model.traits import storage as trait_storage
 from model.traits.storage import TraitLibrary
-from reconstruction import common_regions
-from reconstruction.common_parameterization import CommonFrame
+from reconstruction.correspondence import common_regions
+from reconstruction.correspondence.common_parameterization import CommonFrame
 from skinrig.traits.albedo_vectors import KINDS, AlbedoTraits, VectorKind
 
 SURFACE: Final = "surface"

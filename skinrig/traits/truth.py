@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.brdf.tables import BrdfBasis
-from reconstruction import brdf_basis, common_parameterization, diffuse_albedo
-from reconstruction.common_parameterization import Chart, CommonFrame
+from reconstruction import brdf_basis, diffuse_albedo
+from reconstruction.correspondence import common_parameterization
+from reconstruction.correspondence.common_parameterization import Chart, CommonFrame
 from rigsim import skin_conditions, surface_brdf
 from rigsim.population import Member
 from skinrig.fitting.traits import AlbedoSample

@@ -160,7 +160,7 @@ def picture_landmarks(source: SceneSource, part: dict[str, Any]) -> dict[str, tu
     SceneError
         There is no table, and no simulation's truth beside the folder.
     """
-    from reconstruction import landmark_table
+    from reconstruction.correspondence import landmark_table
 
     if source.landmarks is not None:
         return landmark_table.read(source.landmarks)

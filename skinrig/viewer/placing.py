@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from reconstruction import landmark_field
+from reconstruction.correspondence import landmark_field
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

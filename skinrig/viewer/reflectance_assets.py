@@ -20,7 +20,7 @@ from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import TRANSLUCENCY
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from model.traits import storage as trait_storage
-from reconstruction import texture_fill
+from reconstruction.surface import texture_fill
 from skinrig.viewer import compact_brdf, gaussian_profiles
 from skinrig.viewer.compact_brdf import LANES, CompactBrdf
 from skinrig.viewer.gaussian_profiles import GaussianProfile

@@ -68,8 +68,8 @@ def simulated_model(subject: Subject, *, size: int) -> WrinkleModel:
     size : int
         Texels a side of the normals that are fitted and of the wrinkle map.
     """
-    from reconstruction.wrinkle_fit import fit
-    from reconstruction.wrinkle_zones import amplitudes, fit_zones
+    from reconstruction.wrinkles.fit import fit
+    from reconstruction.wrinkles.zones import amplitudes, fit_zones
     from rigsim.expressions import EXPRESSIONS
     from rigsim.subject import make_subject
 

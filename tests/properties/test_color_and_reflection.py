@@ -8,16 +8,11 @@ from hypothesis import strategies as st
 from model import color_table, merl, metrics, skin_reflectance, spectra
 from model.brdf import microfacet
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import (
-    chromophore_posterior,
-    chromophores,
-    detectability,
-    lobe_response,
-    polarization,
-    relief_errors,
-    shading_prior,
-    tsumura,
-)
+from reconstruction import chromophores, polarization
+from reconstruction.chromophores import detectability, shading_prior, tsumura
+from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.gradient_normals import lobe_response
+from reconstruction.normal_integration import relief_errors
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=40, database=None)
 FEW = settings(CHEAP, max_examples=10)

@@ -5,17 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reconstruction import (
-    affine_fit,
-    block_errors,
-    dense_flow,
-    light_change,
-    misplacement,
-    normal_blocks,
-    perfusion_fit,
-    repeat_average,
-)
-from reconstruction.expression_alignment import Alignment
+from reconstruction.correspondence.expression_alignment import Alignment
+from reconstruction.facial_color import light_change, perfusion_fit, repeat_average
+from reconstruction.facial_color import registration_error as misplacement
+from reconstruction.normal_histogram import block_errors
+from reconstruction.normal_histogram import blocks as normal_blocks
+from reconstruction.registration import affine_fit, dense_flow
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=25, database=None)
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reconstruction import model_error
+from reconstruction.chromophores import model_error
 
 
 @settings(max_examples=30, deadline=None)

@@ -13,15 +13,12 @@ from model.facial_color import basis as facial_color_basis
 from model.texture_statistics import space as texture_space
 from model.traits import lobe_edits
 from model.traits import vectors as trait_vectors
-from reconstruction import (
-    brdf_basis,
-    brdf_space,
-    chromophore_posterior,
-    chromophore_start,
-    dark_spots,
-    face_distribution,
-    mesh_repair,
-)
+from reconstruction import brdf_basis
+from reconstruction.brdf_basis import space as brdf_space
+from reconstruction.chromophores import dark_spots, face_distribution
+from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores import start as chromophore_start
+from reconstruction.scan import repair as mesh_repair
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=20, database=None)
 FEW = settings(CHEAP, max_examples=8)

@@ -6,20 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model import texture_resampling
-from reconstruction import (
-    common_parameterization,
-    dense_flow,
-    discontinuity_integration,
-    gradient_channels,
-    lens_restoration,
-    light_check,
-    registration,
-    surface_errors,
-    wrinkle_texels,
-)
-from reconstruction.gradient_noise import SensorNoise
+from reconstruction import registration
+from reconstruction.correspondence import common_parameterization
+from reconstruction.gradient_normals import channels as gradient_channels
+from reconstruction.gradient_normals.noise import SensorNoise
+from reconstruction.normal_integration import discontinuities as discontinuity_integration
+from reconstruction.normal_integration import lens_restoration
 from reconstruction.normal_maps import PhotometricStereoError
-from reconstruction.photometric_stereo import estimate_normals
+from reconstruction.photometric_stereo import estimate_normals, light_check
+from reconstruction.registration import dense_flow
+from reconstruction.surface import errors as surface_errors
+from reconstruction.wrinkles import texels as wrinkle_texels
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=20, database=None)
 FEW = settings(CHEAP, max_examples=8)

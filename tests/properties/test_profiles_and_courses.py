@@ -6,23 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model import dipole, photon_table
-from reconstruction import (
-    anisotropy,
-    brdf_basis,
-    diffuse_albedo,
+from reconstruction import brdf_basis, diffuse_albedo, subsurface, tiles
+from reconstruction.anisotropy import (
     diffusion_ellipse,
     direction_harmonics,
-    perfusion_curves,
-    perfusion_fit,
     plane_vectors,
     profile_anisotropy,
-    repeatability,
-    smooth_misfit,
-    subsurface,
-    tiles,
-    translucency,
 )
-from reconstruction.one_direction_bias import one_direction_bias
+from reconstruction.anisotropy import estimation as anisotropy
+from reconstruction.anisotropy.one_direction_bias import one_direction_bias
+from reconstruction.facial_color import perfusion_curves, perfusion_fit, repeatability
+from reconstruction.subsurface import smooth_misfit, translucency
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=25, database=None)
 FEW = settings(CHEAP, max_examples=8)

@@ -7,31 +7,28 @@ from hypothesis import strategies as st
 
 from model import microstructure
 from model.microstructure import mesh_strain, profile_length
-from reconstruction import (
-    gradient_patterns,
-    gradient_wiener,
-    half_vector_normals,
-    head_motion,
+from reconstruction import kernel_fit, normal_histogram, photometric_stereo
+from reconstruction.correspondence import landmark_field
+from reconstruction.gradient_normals import patterns as gradient_patterns
+from reconstruction.gradient_normals import wiener as gradient_wiener
+from reconstruction.kernel_fit import neutral_relief
+from reconstruction.kernel_fit import search as kernel_search
+from reconstruction.kernel_fit import table as kernel_table
+from reconstruction.normal_histogram import blocks as normal_blocks
+from reconstruction.normal_histogram import relief_slopes
+from reconstruction.normal_histogram import statistics as normal_statistics
+from reconstruction.normal_integration import (
     height_errors,
     height_filters,
-    kernel_fit,
-    kernel_search,
-    kernel_table,
-    landmark_field,
-    light_selection,
-    mesh_repair,
-    neutral_relief,
-    normal_blocks,
-    normal_histogram,
-    normal_integration,
-    normal_statistics,
-    photometric_stereo,
-    relief_slopes,
     slope_fields,
-    tangent_space,
-    texture_fill,
     weighted_poisson,
 )
+from reconstruction.normal_integration import integration as normal_integration
+from reconstruction.photometric_stereo import half_vectors as half_vector_normals
+from reconstruction.photometric_stereo import light_selection
+from reconstruction.registration import head_motion
+from reconstruction.scan import repair as mesh_repair
+from reconstruction.surface import tangent_space, texture_fill
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=30, database=None)
 FEW = settings(CHEAP, max_examples=8)

@@ -13,7 +13,8 @@ from model.microstructure import mesh_strain, strain_fields
 from model.microstructure.map_windows import Window
 from model.wrinkles import expressions as wrinkle_expressions
 from model.wrinkles import storage as wrinkle_storage
-from reconstruction import gradient_patterns, kernel_table
+from reconstruction.gradient_normals import patterns as gradient_patterns
+from reconstruction.kernel_fit import table as kernel_table
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=30, database=None)
 FEW = settings(CHEAP, max_examples=10)

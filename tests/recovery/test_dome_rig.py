@@ -15,9 +15,10 @@ import pytest
 from capture.session import Session
 from model import store
 from model.skin import SkinAppearance
-from reconstruction import pipeline, scan_mesh
-from reconstruction.surface_estimates import PointValues
-from reconstruction.surface_texture import SurfaceTexture
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.scan import mesh as scan_mesh
+from reconstruction.surface.estimates import PointValues
+from reconstruction.surface.texture import SurfaceTexture
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import reflection
 from skinrig.evaluating import surface as surface_evaluation
@@ -189,7 +190,7 @@ def test_a_head_that_moved_is_followed_and_errs_less_than_one_whose_motion_is_ig
     motion = followed.maps.parameters["motion"]
     assert not motion["still"]
     assert motion["displacement_mm_max"] > 0.15 * PIXEL_MM
-    monkeypatch.setattr("reconstruction.dome_stages.follow_head", lambda *_: None)
+    monkeypatch.setattr("reconstruction.pipeline.dome.stages.follow_head", lambda *_: None)
     pipeline.reconstruct(
         dome / "session-move", want=want, out=dome / "ignored", calibration=calibration
     )

@@ -21,10 +21,10 @@ from capture.plan import Plan, Step
 from capture.rig import load_rig
 from capture.session import Session, Subject
 from model import store
-from reconstruction import pipeline
-from reconstruction.evidence import EvidenceError
-from reconstruction.hold_out import HoldOutError
-from reconstruction.stages import StageError
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.graph import StageError
+from reconstruction.pipeline.hold_out import HoldOutError
 from skinrig.simulating.dome import small_dome
 
 AXES_MM = np.array([58.0, 85.0, 66.0])

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 from model.facial_color import HemoglobinRig
-from reconstruction import (
-    chromophore_posterior,
-    expression_alignment,
-    shading_prior,
-    shared_melanin,
-)
+from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores import shading_prior
+from reconstruction.correspondence import expression_alignment
+from reconstruction.facial_color import shared_melanin
 from skinrig.benchmarks.alignment import (
     displaced,
     face_of,

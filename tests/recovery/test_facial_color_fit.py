@@ -7,8 +7,10 @@ import pytest
 
 from model import color_table, store
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import chromophore_posterior, pipeline, shading_prior
-from reconstruction.facial_color_fit import UnknownBloodError
+from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores import shading_prior
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.flash.facial_color import UnknownBloodError
 from skinrig.applying.expression import hemoglobin_rig
 from skinrig.benchmarks import interval_trials_flash
 from skinrig.calibrating.calibrate import calibrate

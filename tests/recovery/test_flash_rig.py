@@ -15,7 +15,7 @@ import pytest
 from capture.calibration import store as calibration_store
 from capture.session import Session
 from model import store
-from reconstruction import pipeline
+from reconstruction.pipeline import recipes as pipeline
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating.flash import compare, limit
 from skinrig.simulating.simulation import simulate_session

@@ -8,11 +8,12 @@ import pytest
 
 from capture.session import Session
 from model import store
-from reconstruction import pipeline
-from reconstruction.evidence import EvidenceError
-from reconstruction.gradient_images import GradientImages
-from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, fit_kernel
-from reconstruction.normal_statistics import measure
+from reconstruction.kernel_fit import fit_kernel
+from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
+from reconstruction.normal_histogram.statistics import measure
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.gradient.images import GradientImages
 from skinrig.evaluating import microrelief as evaluation
 from skinrig.report import build
 from skinrig.simulating.simulation import simulate_session

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruction import head_motion
+from reconstruction.registration import head_motion
 from skinrig.benchmarks.motion import simulate
 
 

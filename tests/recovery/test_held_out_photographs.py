@@ -16,7 +16,7 @@ from capture.calibration.lights import CameraResponse, LightTable
 from capture.rig import load_rig
 from model import store
 from model.skin_reflectance import assemble
-from reconstruction import pipeline
+from reconstruction.pipeline import recipes as pipeline
 from rigsim import dome_build
 from rigsim.led_light import lobe_exponent, white_intensity
 from rigsim.sensor import sensor_of, vignetting_map

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from reconstruction.height_filters import high_pass
-from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, fit_kernel
-from reconstruction.normal_blocks import BLOCKS, block_counts, grid_of
-from reconstruction.normal_statistics import measure
+from reconstruction.kernel_fit import fit_kernel
+from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
+from reconstruction.normal_histogram.blocks import BLOCKS, block_counts, grid_of
+from reconstruction.normal_histogram.statistics import measure
+from reconstruction.normal_integration.height_filters import high_pass
 from rigsim.microrelief import make_micro_skin
 from rigsim.skin_stretch import deform
 

@@ -7,8 +7,8 @@ import tifffile
 
 from model import store
 from model.metrics import angular_error_rad
-from reconstruction import pipeline
 from reconstruction.photometric_stereo import Robustness, estimate_normals
+from reconstruction.pipeline import recipes as pipeline
 from skinrig.cli import main
 
 

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from reconstruction import pipeline
-from reconstruction.evidence import EvidenceError
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.evidence import EvidenceError
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.sequences import SequenceOrder
 from skinrig.simulating.simulation import SimulationError, simulate_session

@@ -5,9 +5,9 @@ import json
 import pytest
 
 from model import store
-from reconstruction import pipeline
-from reconstruction.evidence import EvidenceError
-from reconstruction.stages import StageError
+from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.graph import StageError
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.cli import main
 from skinrig.evaluating import subsurface as evaluation

@@ -6,15 +6,10 @@ import pytest
 from capture.calibration.geometry import CameraPose
 from capture.calibration.lights import LightTable
 from capture.rig import load_rig
-from reconstruction.mesh_repair import crop, repair
-from reconstruction.ray_casting import RayCaster
-from reconstruction.scan_mesh import FACE_BOX_MM, load_ply
-from reconstruction.scan_registration import (
-    NormalEvidence,
-    RegistrationError,
-    align,
-    register,
-)
+from reconstruction.lumitexels.ray_casting import RayCaster
+from reconstruction.scan.mesh import FACE_BOX_MM, load_ply
+from reconstruction.scan.registration import NormalEvidence, RegistrationError, align, register
+from reconstruction.scan.repair import crop, repair
 from rigsim.head import build_head
 from rigsim.render import Caster, g_buffer
 from rigsim.scanner import Scanner, scan_face

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from reconstruction.height_filters import high_pass
-from reconstruction.normal_statistics import measure
+from reconstruction.normal_histogram.statistics import measure
+from reconstruction.normal_integration.height_filters import high_pass
 from rigsim.microrelief import make_micro_skin
 from rigsim.skin_stretch import deform
 

@@ -10,7 +10,9 @@ import pytest
 
 from model import metrics, wrinkles
 from model.wrinkles import JIMENEZ2011
-from reconstruction import wrinkle_fit, wrinkle_texels, wrinkle_zones
+from reconstruction.wrinkles import fit as wrinkle_fit
+from reconstruction.wrinkles import texels as wrinkle_texels
+from reconstruction.wrinkles import zones as wrinkle_zones
 from rigsim.subject import make_subject
 from skinrig.benchmarks import wrinkles as bench_wrinkles
 

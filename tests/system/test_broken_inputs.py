@@ -8,7 +8,7 @@ import pytest
 
 from capture import raw
 from model.facial_color import FacialColorError
-from reconstruction import facial_color_fit
+from reconstruction.pipeline.flash import facial_color as facial_color_fit
 from skinrig.cli import main
 from skinrig.simulating.simulation import simulate_session
 

@@ -11,7 +11,7 @@ from model import store
 from model.brdf import recipe as brdf_recipe
 from model.brdf import tables as brdf_tables
 from model.skin import UNITS, SkinAppearance, SkinMap
-from reconstruction.dome_stages import BASIS_FILE, _basis_bytes
+from reconstruction.pipeline.dome.stages import BASIS_FILE, _basis_bytes
 from rigsim.atlas import unwrap
 from rigsim.mesh import build_mesh
 from skinrig.cli import app, main

@@ -169,7 +169,7 @@ def test_several_sessions_are_reconstructed_into_folders_of_their_names(
         asked.append((session.name, out))
         return SimpleNamespace(ran=("a",), reused=(), left_out=(), assumed=(), work=())
 
-    monkeypatch.setattr("reconstruction.pipeline.reconstruct", reconstruct)
+    monkeypatch.setattr("reconstruction.pipeline.recipes.reconstruct", reconstruct)
     monday, tuesday, out = tmp_path / "monday", tmp_path / "tuesday", tmp_path / "maps"
     command = ["reconstruct", "--want", "melanin", "--out", str(out), "--json"]
     assert main([*command, str(monday), str(tuesday)]) == 0

@@ -47,7 +47,11 @@ def test_a_kernel_that_does_not_fit_is_counted_and_left_to_its_first_call(tool):
             "evaluate",
             good,
         ),  # has types of its own, and takes no other
-        ("reconstruction.photometric_kernels", "fit_points", "unicode_type"),  # makes no such one
+        (
+            "reconstruction.photometric_stereo.kernels",
+            "fit_points",
+            "unicode_type",
+        ),  # makes no such one
         ("rigsim.head", "_distance", "(Array(float64"),
         ("rigsim.head", "_distance", "__import__('os')"),
     ]:
@@ -59,7 +63,7 @@ def test_a_kernel_that_does_not_fit_is_counted_and_left_to_its_first_call(tool):
     [
         ("rigsim.atlas", "_rasterize"),
         ("model.photon_table.kernels", "evaluate"),  # compiled as it is imported
-        ("reconstruction.photometric_kernels", "fit_points"),  # made by a cached function
+        ("reconstruction.photometric_stereo.kernels", "fit_points"),  # made by a cached function
     ],
 )
 def test_a_listed_kernel_compiles_for_its_types(module, function, tool):
@@ -70,7 +74,7 @@ def test_a_listed_kernel_compiles_for_its_types(module, function, tool):
 
 def test_kernels_are_listed_under_the_name_that_compiles_them(tool):
     """A kernel's function may stand under another name, or be compiled by a function's call."""
-    from reconstruction import photometric_kernels
+    from reconstruction.photometric_stereo import kernels as photometric_kernels
     from rigsim import atlas, skin_table
 
     kinds = (tool._NAMES["float32"], tool._NAMES["int64"])
@@ -84,7 +88,7 @@ def test_kernels_are_listed_under_the_name_that_compiles_them(tool):
 def test_arrays_that_cannot_be_written_or_lie_otherwise_cost_no_compilation(rng):
     """Statistics in discs and filled textures: 10 s and 13 s each time, before."""
     from model.facial_color import disc_kernels, disc_statistics
-    from reconstruction import texture_fill
+    from reconstruction.surface import texture_fill
 
     height, weight = rng.normal(size=(9, 12)), rng.random((9, 12)).astype(np.float32)
     kept = height.copy()

@@ -259,7 +259,7 @@ MAPS_PAGE = ROOT / "docs" / "maps.md"
 
 def recipes():
     """Every recipe with the heading that its maps stand under."""
-    from reconstruction import pipeline
+    from reconstruction.pipeline import recipes as pipeline
 
     headings = {
         "subject": "Maps of the flash rig",

@@ -8,7 +8,7 @@ import pytest
 from model import fresnel, merl
 from model.brdf import recipe as brdf_recipe
 from model.brdf import tables as brdf_tables
-from reconstruction import nnls_kernels
+from reconstruction.brdf_basis import nnls_kernels
 
 
 @pytest.fixture(scope="module")

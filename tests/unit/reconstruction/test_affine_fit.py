@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruction.affine_fit import fit_affine
+from reconstruction.registration.affine_fit import fit_affine
 
 WINDOW_PX = 25.0
 TRUE = np.array([[1.1, 0.02], [-0.01, 0.95]])

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from reconstruction import direction_harmonics
-from reconstruction.anisotropy import AnisotropyError, estimate
+from reconstruction.anisotropy import direction_harmonics
+from reconstruction.anisotropy.estimation import AnisotropyError, estimate
 
 SIXTEEN = np.deg2rad(np.arange(16) * 22.5)
 STDERR = 0.02

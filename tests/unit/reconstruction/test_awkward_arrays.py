@@ -4,16 +4,14 @@ import numpy as np
 import pytest
 
 from model.facial_color import deviation_ratio, histogram_matching
-from reconstruction import (
-    affine_fit,
-    half_vector_normals,
-    misplacement,
-    model_error,
-    perfusion_fit,
-    photometric_stereo,
-)
-from reconstruction.expression_alignment import Alignment
-from reconstruction.perfusion_curves import CurveError
+from reconstruction import photometric_stereo
+from reconstruction.chromophores import model_error
+from reconstruction.correspondence.expression_alignment import Alignment
+from reconstruction.facial_color import perfusion_fit
+from reconstruction.facial_color import registration_error as misplacement
+from reconstruction.facial_color.perfusion_curves import CurveError
+from reconstruction.photometric_stereo import half_vectors as half_vector_normals
+from reconstruction.registration import affine_fit
 
 
 def strided(array):

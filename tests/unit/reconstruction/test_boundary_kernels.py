@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model import fresnel
-from reconstruction import boundary_kernels
+from reconstruction.lumitexels import boundary_kernels
 
 
 def plain(cos_light, cos_view, eta):

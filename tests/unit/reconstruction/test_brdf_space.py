@@ -5,8 +5,9 @@ import pytest
 from scipy.optimize import nnls
 
 from model.brdf import tables as brdf_tables
-from reconstruction import brdf_basis, brdf_space
-from reconstruction.brdf_space import SpaceError
+from reconstruction import brdf_basis
+from reconstruction.brdf_basis import space as brdf_space
+from reconstruction.brdf_basis.space import SpaceError
 
 
 @pytest.fixture(scope="module")

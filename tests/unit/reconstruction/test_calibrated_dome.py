@@ -5,7 +5,7 @@ import numpy as np
 from capture.calibration.geometry.intrinsics import CameraPose
 from capture.calibration.lights.light_list import LightTable
 from capture.rig import load_rig
-from reconstruction.calibrated_dome import Dome, seen_from
+from reconstruction.pipeline.dome.calibrated import Dome, seen_from
 
 RIG = load_rig("dome").subset(lights=["L000", "L017", "L023"], views=["C00", "C07"]).resized(64)
 

@@ -3,10 +3,11 @@ import pytest
 
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import chromophore_reference, model_error, shading_prior
-from reconstruction.chromophore_posterior import weigh
-from reconstruction.chromophores import ChromophoreError, invert, without_brightness
-from reconstruction.shading_prior import lognormal
+from reconstruction.chromophores import model_error, shading_prior
+from reconstruction.chromophores import reference as chromophore_reference
+from reconstruction.chromophores.inversion import ChromophoreError, invert, without_brightness
+from reconstruction.chromophores.posterior import weigh
+from reconstruction.chromophores.shading_prior import lognormal
 
 NOISE = 0.004
 

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
-from reconstruction import chromophore_reference, chromophores
-from reconstruction.chromophores import ChromophoreError, identifiability, invert
+from reconstruction.chromophores import inversion as chromophores
+from reconstruction.chromophores import reference as chromophore_reference
+from reconstruction.chromophores.inversion import ChromophoreError, identifiability, invert
 
 CAMERA = "Nikon 5100 (NPL)"
 MODES = [None, "known"]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from reconstruction import common_parameterization as common
-from reconstruction import common_regions
-from reconstruction.common_parameterization import Cylinder, ParameterizationError
+from reconstruction.correspondence import common_parameterization as common
+from reconstruction.correspondence import common_regions
+from reconstruction.correspondence.common_parameterization import Cylinder, ParameterizationError
 
 SIZE = 96
 

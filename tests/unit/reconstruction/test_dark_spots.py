@@ -5,11 +5,11 @@ import pytest
 
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import shading_prior
-from reconstruction.chromophore_posterior import weigh
-from reconstruction.chromophores import ChromophoreError
-from reconstruction.dark_spots import darker_than_around, either, lighter_by_itself
-from reconstruction.face_chromophores import of_colors
+from reconstruction.chromophores import shading_prior
+from reconstruction.chromophores.dark_spots import darker_than_around, either, lighter_by_itself
+from reconstruction.chromophores.face import of_colors
+from reconstruction.chromophores.inversion import ChromophoreError
+from reconstruction.chromophores.posterior import weigh
 
 NOISE = 0.004
 SIDE = 90

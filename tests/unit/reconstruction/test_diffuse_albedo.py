@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model import dipole
-from reconstruction.diffuse_albedo import estimate, reduced_albedo
+from reconstruction.diffuse_albedo.estimation import estimate, reduced_albedo
 from skinrig import brdf_truth
 
 SKINS = {"light": brdf_truth.LIGHT_SKIN, "dark": brdf_truth.DARK_SKIN}

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from reconstruction.discontinuity_integration import Bilateral, integrate_broken
-from reconstruction.normal_integration import IntegrationError, integrate
+from reconstruction.normal_integration.discontinuities import Bilateral, integrate_broken
+from reconstruction.normal_integration.integration import integrate
+from reconstruction.normal_integration.weighted_poisson import IntegrationError
 
 
 def flap(side, rise):

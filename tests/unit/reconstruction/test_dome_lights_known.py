@@ -11,8 +11,8 @@ from capture.calibration.lights.light_list import LightTable
 from capture.plan import Plan, Step
 from capture.rig import load_rig
 from capture.session import Session, Subject
-from reconstruction import dome_stages
-from reconstruction.evidence import Evidence
+from reconstruction.pipeline.dome import stages as dome_stages
+from reconstruction.pipeline.evidence import Evidence
 
 RIG = load_rig("dome").subset(lights=["L000", "L001"], views=["C00"]).resized(24)
 TODAY = date(2026, 11, 21)

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from capture.calibration.geometry.intrinsics import CameraPose
 from capture.raw import RawFrame
 from capture.rig import load_rig
-from reconstruction.dome_images import DomeImage
-from reconstruction.dome_motion import HalfPixels, follow_head
-from reconstruction.evidence import EvidenceError
+from reconstruction.pipeline.dome.images import DomeImage
+from reconstruction.pipeline.dome.motion import HalfPixels, follow_head
+from reconstruction.pipeline.evidence import EvidenceError
 
 RADIUS_MM = 70.0
 RIG = load_rig("dome")

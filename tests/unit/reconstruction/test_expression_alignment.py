@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from model.skin import SkinMap
-from reconstruction import expression_alignment as alignment
-from reconstruction import landmark_field, landmark_table
+from reconstruction.correspondence import expression_alignment as alignment
+from reconstruction.correspondence import landmark_field, landmark_table
 
 SIDE = 96
 

@@ -5,12 +5,14 @@ import pytest
 
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import chromophore_posterior, chromophore_reference, shading_prior
-from reconstruction.chromophore_posterior import weigh
-from reconstruction.chromophore_start import LOWEST
-from reconstruction.chromophores import ChromophoreError, without_brightness
-from reconstruction.face_chromophores import of_colors
-from reconstruction.face_distribution import Bell, FaceDistribution
+from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores import reference as chromophore_reference
+from reconstruction.chromophores import shading_prior
+from reconstruction.chromophores.face import of_colors
+from reconstruction.chromophores.face_distribution import Bell, FaceDistribution
+from reconstruction.chromophores.inversion import ChromophoreError, without_brightness
+from reconstruction.chromophores.posterior import weigh
+from reconstruction.chromophores.start import LOWEST
 
 NOISE = 0.004
 

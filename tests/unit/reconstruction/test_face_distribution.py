@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from reconstruction import face_distribution_kernels as kernels
-from reconstruction.face_distribution import (
+from reconstruction.chromophores import face_kernels as kernels
+from reconstruction.chromophores.face_distribution import (
     LEAST_SPREAD,
     UNEXPECTED,
     Bell,

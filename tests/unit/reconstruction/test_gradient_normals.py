@@ -11,17 +11,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from model.metrics import angular_error_rad
-from reconstruction import gradient_kernels as kernels
-from reconstruction.gradient_normals import (
-    GradientError,
-    MissingPatterns,
-    SensorNoise,
-    SphereLights,
-    SphereLightsError,
-    estimate_roughness,
-    from_patterns,
-)
-from reconstruction.gradient_patterns import design
+from reconstruction.gradient_normals import kernels
+from reconstruction.gradient_normals.estimation import estimate_roughness, from_patterns
+from reconstruction.gradient_normals.lobe_response import SphereLights, SphereLightsError
+from reconstruction.gradient_normals.noise import SensorNoise
+from reconstruction.gradient_normals.patterns import GradientError, MissingPatterns, design
 
 VIEW = np.array([0.0, 0.0, 1.0])
 NAMES = ("full", "x", "y", "z", "-x", "-y", "-z", "dark")
@@ -541,7 +535,7 @@ def test_tiles_of_rows_make_no_seams(scene, monkeypatch):
     lights, _, images = scene
     kwargs = {"lights": SphereLights(lights), "alpha": 0.2, "smooth_px": 1.0, "variance": 1e-8}
     whole = from_patterns(images, **kwargs)
-    monkeypatch.setattr("reconstruction.gradient_moments.TILE_PIXELS", 48 * 7)
+    monkeypatch.setattr("reconstruction.gradient_normals.moments.TILE_PIXELS", 48 * 7)
     tiled = from_patterns(images, **kwargs)
     np.testing.assert_array_equal(whole.normals, tiled.normals)
     np.testing.assert_array_equal(whole.stderr_rad, tiled.stderr_rad)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model.metrics import angular_error_rad
-from reconstruction.half_vector_normals import HalfVectorError, estimate
+from reconstruction.photometric_stereo.half_vectors import HalfVectorError, estimate
 
 
 def unit(v):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from reconstruction import head_motion
-from reconstruction.head_motion import HeadMotionError, rotation_matrix
+from reconstruction.registration import head_motion
+from reconstruction.registration.head_motion import HeadMotionError, rotation_matrix
 
 RADIUS_MM = 80.0
 WIDTH, HEIGHT, FOCAL_PX = 160, 150, 500.0

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from reconstruction import slope_fields
-from reconstruction.height_errors import expected_rms, sampled_stderr
-from reconstruction.height_filters import denoise_slopes, high_pass
-from reconstruction.normal_integration import IntegrationError, integrate, integrate_map
+from reconstruction.normal_integration import slope_fields
+from reconstruction.normal_integration.height_errors import expected_rms, sampled_stderr
+from reconstruction.normal_integration.height_filters import denoise_slopes, high_pass
+from reconstruction.normal_integration.integration import integrate, integrate_map
+from reconstruction.normal_integration.weighted_poisson import IntegrationError
 
 
 def facing_with_noise(shape, sigma, rng):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from reconstruction.hold_out import HoldOut, HoldOutError
+from reconstruction.pipeline.hold_out import HoldOut, HoldOutError
 
 LIGHTS = tuple(f"L{k:03}" for k in range(12))
 VIEWS = ("C00", "C03", "C07")

@@ -4,16 +4,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from reconstruction import (
-    kernel_errors,
-    kernel_fit,
-    kernel_search,
-    neutral_relief,
-    normal_blocks,
-    normal_histogram,
-    relief_slopes,
-)
-from reconstruction import kernel_fit_kernels as kernels
+from reconstruction import kernel_fit, normal_histogram
+from reconstruction.kernel_fit import errors as kernel_errors
+from reconstruction.kernel_fit import neutral_relief
+from reconstruction.kernel_fit import search as kernel_search
+from reconstruction.normal_histogram import blocks as normal_blocks
+from reconstruction.normal_histogram import kernels, relief_slopes
 
 ALPHAS, SIGMAS_UM = np.linspace(-1.0, 1.0, 21), np.linspace(2.0, 40.0, 20)
 

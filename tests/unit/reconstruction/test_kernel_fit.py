@@ -3,12 +3,12 @@ import pytest
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from model.microstructure.kernel_table import gaussian_weights
-from reconstruction import kernel_fit_kernels as kernels
-from reconstruction import kernel_search as ks
 from reconstruction import normal_histogram as nh
-from reconstruction.kernel_fit import ALPHAS, SIGMAS_UM, convolved_histogram, fit_kernel
-from reconstruction.neutral_relief import KernelFitError, convolved, relief_of
-from reconstruction.two_axis_fit import fit_two_axes
+from reconstruction.kernel_fit import search as ks
+from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM, convolved_histogram, fit_kernel
+from reconstruction.kernel_fit.neutral_relief import KernelFitError, convolved, relief_of
+from reconstruction.kernel_fit.two_axes import fit_two_axes
+from reconstruction.normal_histogram import kernels
 
 PIXEL_UM = 6.0
 COARSE = {"alphas": np.round(np.arange(-2, 1.01, 0.1), 2), "sigmas_um": np.arange(2.0, 81.0, 3.0)}

@@ -7,7 +7,7 @@ from model.microstructure.kernel_table import (
     forehead_points,
     kernel_parameters,
 )
-from reconstruction.kernel_table import (
+from reconstruction.kernel_fit.table import (
     KernelTableFitError,
     alpha_rms,
     direction_dependence,

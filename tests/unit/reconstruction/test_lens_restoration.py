@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import fft
 
-from reconstruction.lens_restoration import Aperture, RestorationError, restore
+from reconstruction.normal_integration.lens_restoration import Aperture, RestorationError, restore
 
 SIDE = 192
 LENS = Aperture(17.9, 6.0)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from reconstruction import light_check
-from reconstruction.photometric_stereo import PhotometricStereoError
+from reconstruction.normal_maps import PhotometricStereoError
+from reconstruction.photometric_stereo import light_check
 
 
 def scene(rng, lights=24, points=800, noise=0.01):

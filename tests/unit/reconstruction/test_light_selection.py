@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from reconstruction import light_selection as selection
+from reconstruction.photometric_stereo import light_selection as selection
 
 UP = np.array([0.0, 0.0, 1.0])
 

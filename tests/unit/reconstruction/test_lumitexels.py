@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from reconstruction.lumitexel_store import LumitexelStore
-from reconstruction.lumitexels import Surface, gather, visibility
-from reconstruction.ray_casting import RayCaster
+from reconstruction.lumitexels.ray_casting import RayCaster
+from reconstruction.lumitexels.samples import Surface, gather, visibility
+from reconstruction.lumitexels.store import LumitexelStore
 
 RADIUS = 80.0
 FOCAL_PX, WIDTH, HEIGHT = 500.0, 200, 160
@@ -338,7 +338,7 @@ def test_samples_asked_for_again_are_kept_until_an_image_comes_in(tmp_path, monk
     # what is too large to keep, or on disk, is put together anew, and the same
     on_disk = filled(tmp_path)
     assert on_disk.chunk(0, 77) is not on_disk.chunk(0, 77)
-    monkeypatch.setattr("reconstruction.lumitexel_store.KEPT_BYTES", 0)
+    monkeypatch.setattr("reconstruction.lumitexels.store.KEPT_BYTES", 0)
     large = filled()
     assert large.chunk(0, 77) is not large.chunk(0, 77)
     np.testing.assert_array_equal(large.chunk(0, 77).f, first[0].f)

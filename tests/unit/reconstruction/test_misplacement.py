@@ -6,8 +6,11 @@ from scipy.ndimage import gaussian_filter, map_coordinates, shift
 
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import dense_flow, misplacement, shading_prior, shared_melanin
-from reconstruction.expression_alignment import Alignment
+from reconstruction.chromophores import shading_prior
+from reconstruction.correspondence.expression_alignment import Alignment
+from reconstruction.facial_color import registration_error as misplacement
+from reconstruction.facial_color import shared_melanin
+from reconstruction.registration import dense_flow
 
 SIZE = 96
 

@@ -3,7 +3,8 @@
 import numpy as np
 
 from model.brdf import tables as brdf_tables
-from reconstruction import brdf_basis, mixture_kernels
+from reconstruction import brdf_basis
+from reconstruction.brdf_basis import mixture_kernels
 
 
 def directions(rng, *shape):

@@ -7,10 +7,10 @@ import pytest
 
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import model_error
-from reconstruction.chromophore_posterior import weigh
-from reconstruction.chromophores import ChromophoreError
-from reconstruction.shading_prior import lognormal
+from reconstruction.chromophores import model_error
+from reconstruction.chromophores.inversion import ChromophoreError
+from reconstruction.chromophores.posterior import weigh
+from reconstruction.chromophores.shading_prior import lognormal
 
 SIZE = 48
 

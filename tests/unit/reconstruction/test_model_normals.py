@@ -8,8 +8,8 @@ import pytest
 from model import fresnel
 from model.brdf import tables as brdf_tables
 from model.metrics import angular_error_rad
-from reconstruction import model_normals
-from reconstruction.lumitexels import Lumitexels
+from reconstruction.lumitexels.samples import Lumitexels
+from reconstruction.surface import model_normals
 
 NOISE = 0.01
 

@@ -6,8 +6,8 @@ from scipy.optimize import least_squares
 
 from model import photon_table
 from reconstruction import subsurface
-from reconstruction.nearest_medium import FAINTEST_PER_MM2
-from reconstruction.subsurface import Outcome
+from reconstruction.subsurface.nearest import FAINTEST_PER_MM2
+from reconstruction.subsurface.outcome import Outcome
 
 RADIUS = 0.3 + 0.25 * np.arange(28)
 CORES = {"core_mm": 0.2, "source_core_mm": 0.2}

@@ -3,7 +3,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from reconstruction import normal_histogram as nh
-from reconstruction import relief_slopes
+from reconstruction.normal_histogram import relief_slopes
 
 
 def rough(side, rng, *, correlation_px=2.0, slope=0.3):

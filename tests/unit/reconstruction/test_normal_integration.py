@@ -5,17 +5,16 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
-from reconstruction import slope_fields
-from reconstruction.normal_integration import (
-    IntegrationError,
+from reconstruction.normal_integration import slope_fields
+from reconstruction.normal_integration.integration import (
     NotConverged,
-    Perspective,
     Settings,
     integrate,
     integrate_map,
 )
+from reconstruction.normal_integration.slope_fields import Perspective
+from reconstruction.normal_integration.weighted_poisson import Hierarchy, IntegrationError, solve
 from reconstruction.normal_maps import NormalMaps
-from reconstruction.weighted_poisson import Hierarchy, solve
 
 
 def crooked_surface(rows, columns, steepness=1.0):

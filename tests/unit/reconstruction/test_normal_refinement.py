@@ -5,7 +5,7 @@ import pytest
 
 from model.metrics import angular_error_rad
 from reconstruction import photometric_stereo
-from reconstruction.photometric_stereo import PhotometricStereoError
+from reconstruction.normal_maps import PhotometricStereoError
 
 RHO, GLOSS, EXPONENT = 0.3, 0.12, 25.0
 
@@ -118,7 +118,9 @@ def test_tiles_change_nothing(rng, monkeypatch):
         return glossy(normals, light_dir, view_dir)
 
     whole = photometric_stereo.refine(values, light, view, n, glossy)
-    monkeypatch.setattr("reconstruction.normal_refinement.TILE_SAMPLES", 3 * values.shape[1])
+    monkeypatch.setattr(
+        "reconstruction.photometric_stereo.refinement.TILE_SAMPLES", 3 * values.shape[1]
+    )
     tiled = photometric_stereo.refine(values, light, view, n, predict)
     np.testing.assert_allclose(tiled.normals, whole.normals, atol=1e-9)
     assert set(np.concatenate(seen).tolist()) == set(range(10))

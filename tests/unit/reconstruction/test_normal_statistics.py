@@ -3,8 +3,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from reconstruction import normal_histogram as nh
-from reconstruction.normal_statistics import measure, measure_normals
-from reconstruction.relief_slopes import SlopeError, slopes
+from reconstruction.normal_histogram.relief_slopes import SlopeError, slopes
+from reconstruction.normal_histogram.statistics import measure, measure_normals
 
 
 def rough(side, rng, *, correlation_px=2.0, slope=0.3):

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from reconstruction import plane_vectors
-from reconstruction.anisotropy import AnisotropyError, estimate
-from reconstruction.one_direction_bias import one_direction_bias
+from reconstruction.anisotropy import plane_vectors
+from reconstruction.anisotropy.estimation import AnisotropyError, estimate
+from reconstruction.anisotropy.one_direction_bias import one_direction_bias
 
 SIXTEEN = np.deg2rad(np.arange(16) * 22.5)
 STDERR = 0.02

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from reconstruction.perfusion_curves import (
+from reconstruction.facial_color.perfusion_curves import (
     PLACES,
     CurveError,
     disc_means,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from reconstruction.perfusion_curves import CurveError
-from reconstruction.perfusion_fit import fit_course, fit_cycle, of_vessels
-from reconstruction.perfusion_samples import PoseStep, Samples
+from reconstruction.facial_color.perfusion_curves import CurveError
+from reconstruction.facial_color.perfusion_fit import fit_course, fit_cycle, of_vessels
+from reconstruction.facial_color.perfusion_samples import PoseStep, Samples
 
 CYCLE_S = 10.0
 PHASE = (5.5 * np.arange(22)) % CYCLE_S + 0.007

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from model.metrics import angular_error_rad
-from reconstruction import photometric_stereo as stereo
-from reconstruction.photometric_stereo import PhotometricStereoError, Robustness, estimate_normals
+from reconstruction.normal_maps import PhotometricStereoError
+from reconstruction.photometric_stereo import estimation as stereo
+from reconstruction.photometric_stereo.estimation import Robustness, estimate_normals
 
 
 def ring(count, elevation=0.7, turn=0.0):

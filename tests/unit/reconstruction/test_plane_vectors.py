@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from reconstruction import plane_vectors
+from reconstruction.anisotropy import plane_vectors
 
 
 @pytest.mark.parametrize("length", [0.0, 0.3, 1.0, 2.5, 8.0])

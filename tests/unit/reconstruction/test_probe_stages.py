@@ -10,8 +10,8 @@ from capture.calibration.fiber.gains import FibreReflectance
 from capture.plan.suction import Placement
 from capture.rig import load_rig
 from model import photon_table
-from reconstruction import probe_stages
-from reconstruction.probe_images import Measurement, measurement_name
+from reconstruction.pipeline.probe import stages as probe_stages
+from reconstruction.pipeline.probe.images import Measurement, measurement_name
 
 PROBE = load_rig("probe").probe
 RADIUS = np.array(PROBE.radius_mm)

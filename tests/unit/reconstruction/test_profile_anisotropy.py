@@ -3,9 +3,9 @@ import pytest
 from scipy import stats
 
 from model import photon_table
-from reconstruction import profile_comparison
-from reconstruction.anisotropy import AnisotropyError
-from reconstruction.profile_anisotropy import estimate_from_profiles
+from reconstruction.anisotropy import profile_comparison
+from reconstruction.anisotropy.estimation import AnisotropyError
+from reconstruction.anisotropy.profile_anisotropy import estimate_from_profiles
 
 SIXTEEN = np.deg2rad(np.arange(16) * 22.5)
 FALSE_ALARM_OF_A_TEST = 1e-6

@@ -1,7 +1,12 @@
 import numpy as np
 import pytest
 
-from reconstruction.relief_slopes import SlopeError, slopes, slopes_of_normals, stencil
+from reconstruction.normal_histogram.relief_slopes import (
+    SlopeError,
+    slopes,
+    slopes_of_normals,
+    stencil,
+)
 
 
 def test_a_wide_pixel_halves_the_slope_along_its_rows():

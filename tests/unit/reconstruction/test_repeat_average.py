@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruction import repeat_average
+from reconstruction.facial_color import repeat_average
 
 NOISE = 0.004
 

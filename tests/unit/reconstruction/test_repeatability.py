@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from reconstruction import repeatability
-from reconstruction.repeatability import RepeatabilityError
+from reconstruction.facial_color import repeatability
+from reconstruction.facial_color.repeatability import RepeatabilityError
 
 SIDE = 24
 ORDER = ("neutral", "smile", "anger") * 4

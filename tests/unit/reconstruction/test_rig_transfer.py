@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model.facial_color.rig import HemoglobinRig
-from reconstruction.rig_transfer import RigTransferError, carried
+from reconstruction.facial_color.rig_transfer import RigTransferError, carried
 
 SHAPE = (96, 80)
 MARKS = {

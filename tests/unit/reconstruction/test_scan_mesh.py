@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from reconstruction.mesh_repair import (
+from reconstruction.scan.mesh import load_ply, prepare, refine, unwrap
+from reconstruction.scan.repair import (
     ScanMeshError,
     TriangleMesh,
     boundary_edges,
@@ -13,7 +14,6 @@ from reconstruction.mesh_repair import (
     repair,
     weld,
 )
-from reconstruction.scan_mesh import load_ply, prepare, refine, unwrap
 
 RADIUS = 80.0
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from model.skin import SkinMap
-from reconstruction.sequence_stages import _laid_over_rest
+from reconstruction.pipeline.flash.sequence import _laid_over_rest
 
 SIDE, NOISE, PROMPT_S = 128, 5e-4, 5.0
 PHASE = (5.5 * np.arange(22)) % (2 * PROMPT_S) + 0.007

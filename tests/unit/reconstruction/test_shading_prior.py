@@ -1,8 +1,13 @@
 import numpy as np
 import pytest
 
-from reconstruction import model_error, shading_prior
-from reconstruction.shading_prior import ShadingPrior, ShadingPriorError, from_samples, lognormal
+from reconstruction.chromophores import model_error, shading_prior
+from reconstruction.chromophores.shading_prior import (
+    ShadingPrior,
+    ShadingPriorError,
+    from_samples,
+    lognormal,
+)
 
 
 def test_the_prior_of_faces_has_the_mean_and_width_of_its_data():

@@ -5,8 +5,10 @@ import pytest
 
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import chromophore_posterior, model_error, shading_prior, shared_melanin
-from reconstruction.chromophores import ChromophoreError
+from reconstruction.chromophores import model_error, shading_prior
+from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores.inversion import ChromophoreError
+from reconstruction.facial_color import shared_melanin
 
 BLOOD = np.array([0.02, 0.03, 0.024, 0.016, 0.027])
 MELANIN = 0.02

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
 
-from reconstruction import smooth_misfit as module
-from reconstruction.smooth_misfit import SPREAD, STRENGTHS, USUAL, smooth_misfit
+from reconstruction.subsurface import smooth_misfit as module
+from reconstruction.subsurface.smooth_misfit import SPREAD, STRENGTHS, USUAL, smooth_misfit
 
 RADIUS = 0.3 + 0.25 * np.arange(28)
 PLACE = np.sqrt(RADIUS)

@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from reconstruction import stage_record, stages
-from reconstruction.evidence import EvidenceError
-from reconstruction.stages import Stage
+from reconstruction.pipeline import graph as stages
+from reconstruction.pipeline import record as stage_record
+from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.graph import Stage
 
 
 class Memory:
@@ -81,7 +82,7 @@ def test_a_changed_setting_runs_what_depends_on_it_and_says_so():
 def test_asking_for_nothing_new_reads_no_frame_and_touches_no_file(tmp_path, monkeypatch):
     from capture.session import Session
     from model import store
-    from reconstruction import pipeline
+    from reconstruction.pipeline import recipes as pipeline
     from skinrig.simulating.simulation import simulate_session
 
     plain = ("lateral", "interreflections", "spectral", "optics", "relief_shadows")

@@ -1,6 +1,6 @@
 import pytest
 
-from reconstruction.stages import Stage, StageError, order, run
+from reconstruction.pipeline.graph import Stage, StageError, order, run
 
 
 class Memory(dict):

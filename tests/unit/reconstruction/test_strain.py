@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from reconstruction.registration import RegistrationError
-from reconstruction.strain import measure_strain
+from reconstruction.registration.strain import measure_strain
+from reconstruction.registration.tracking import RegistrationError
 
 SIDE = 1100
 

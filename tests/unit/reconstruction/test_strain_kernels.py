@@ -7,11 +7,10 @@ import pytest
 from scipy import ndimage
 
 from model.skin import SkinMap
-from reconstruction.gradient_images import SkinState, state_name
-from reconstruction.normal_blocks import BLOCKS, block_counts, block_of, grid_of
-from reconstruction.skin_strain import StateStrain, skin_mask
-from reconstruction.strain import Strain
-from reconstruction.strain_kernels import (
+from reconstruction.normal_histogram.blocks import BLOCKS, block_counts, block_of, grid_of
+from reconstruction.pipeline.gradient.images import SkinState, state_name
+from reconstruction.pipeline.gradient.skin_strain import StateStrain, skin_mask
+from reconstruction.pipeline.gradient.strain_kernels import (
     HIDDEN,
     _along_x,
     _skin_blocks,
@@ -19,6 +18,7 @@ from reconstruction.strain_kernels import (
     fit_kernels,
     histogram_document,
 )
+from reconstruction.registration.strain import Strain
 
 SIDE, PIXEL_UM = 240, 6.0
 

@@ -7,8 +7,9 @@ from scipy.optimize import least_squares
 from model import dipole, photon_table
 from model.dipole import kienle_patterson as diffusion
 from reconstruction import subsurface
-from reconstruction.subsurface import Outcome, SubsurfaceError
-from reconstruction.subsurface_models import DIFFUSE_FROM, DIFFUSE_RATIO, profile_model
+from reconstruction.subsurface.inversion import SubsurfaceError
+from reconstruction.subsurface.models import DIFFUSE_FROM, DIFFUSE_RATIO, profile_model
+from reconstruction.subsurface.outcome import Outcome
 
 RADIUS = 0.3 + 0.25 * np.arange(28)
 

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from reconstruction import surface_errors
-from reconstruction.mesh_repair import RepairReport, TriangleMesh
-from reconstruction.scan_mesh import RefinedScan
-from reconstruction.surface_estimates import PointValues
+from reconstruction.scan.mesh import RefinedScan
+from reconstruction.scan.repair import RepairReport, TriangleMesh
+from reconstruction.surface import errors as surface_errors
+from reconstruction.surface.estimates import PointValues
 
 
 def assert_clean(found):

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 from model import fresnel
 from model.brdf import tables as brdf_tables
 from reconstruction import diffuse_albedo
-from reconstruction import surface_estimates as estimates
-from reconstruction.lumitexels import Lumitexels
+from reconstruction.lumitexels.samples import Lumitexels
+from reconstruction.surface import estimates
 
 R_D = np.array([0.6, 0.35, 0.2])
 VIEWS = np.array([[0.0, 0.1, 1.0], [0.5, 0.0, 1.0], [-0.5, 0.2, 1.0], [0.1, -0.5, 1.0]])

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from reconstruction.mesh_repair import RepairReport, TriangleMesh
-from reconstruction.scan_mesh import RefinedScan
-from reconstruction.surface_estimates import PointValues
-from reconstruction.surface_texture import SurfaceTexture
+from reconstruction.scan.mesh import RefinedScan
+from reconstruction.scan.repair import RepairReport, TriangleMesh
+from reconstruction.surface.estimates import PointValues
+from reconstruction.surface.texture import SurfaceTexture
 
 SIDE = 17
 REPORT = RepairReport(**{f.name: 0 for f in dataclasses.fields(RepairReport)})

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruction.tangent_space import TangentSpaceError, frames, tangent_normals
+from reconstruction.surface.tangent_space import TangentSpaceError, frames, tangent_normals
 
 
 def cylinder(shape=(96, 128), radius_mm=60.0, height_mm=80.0):

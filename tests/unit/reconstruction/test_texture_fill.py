@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruction.texture_fill import (
+from reconstruction.surface.texture_fill import (
     densify,
     points_from_texels,
     push_pull,

@@ -3,7 +3,7 @@ import pytest
 from scipy import stats
 
 from model.translucency_population import weyrich_2005
-from reconstruction.translucency import (
+from reconstruction.subsurface.translucency import (
     LARGEST_RELATIVE_ERROR,
     LENGTH_MM,
     SITE_UV,

@@ -9,8 +9,10 @@ from model import texture_resampling as resampling
 from model import wrinkles
 from model.wrinkles.expressions import JIMENEZ2011, WrinkleError
 from model.wrinkles.partial_derivatives import Layer
-from reconstruction import wrinkle_fit, wrinkle_texels, wrinkle_weights
 from reconstruction.normal_maps import NormalMaps
+from reconstruction.wrinkles import fit as wrinkle_fit
+from reconstruction.wrinkles import texels as wrinkle_texels
+from reconstruction.wrinkles import weights as wrinkle_weights
 
 SIDE = 128
 CENTRES = [(0.2, 0.15), (0.8, 0.15), (0.2, 0.4), (0.8, 0.4),

@@ -7,7 +7,9 @@ from scipy.ndimage import gaussian_filter
 from model import wrinkles
 from model.wrinkles.expressions import JIMENEZ2011, WrinkleError
 from model.wrinkles.partial_derivatives import Layer
-from reconstruction import wrinkle_fit, wrinkle_texels, wrinkle_zones
+from reconstruction.wrinkles import fit as wrinkle_fit
+from reconstruction.wrinkles import texels as wrinkle_texels
+from reconstruction.wrinkles import zones as wrinkle_zones
 
 SIDE, TEXELS = 128, 16
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from reconstruction.scan_mesh import load_ply
+from reconstruction.scan.mesh import load_ply
 from rigsim.head import build_head
 from rigsim.mesh import MeshError, build_mesh
 from rigsim.render import Caster

@@ -4,8 +4,8 @@ import pytest
 from model import color_table
 from model.skin import UNITS, SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import model_error, shading_prior
-from reconstruction.chromophores import identifiability
+from reconstruction.chromophores import model_error, shading_prior
+from reconstruction.chromophores.inversion import identifiability
 from skinrig.bounds import cramer_rao, relative_bounds
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.probe_stages import ANISOTROPY_FILE, SUBSURFACE_FILE
+from reconstruction.pipeline.probe.stages import ANISOTROPY_FILE, SUBSURFACE_FILE
 from skinrig.benchmarks import interval_trials_probe as probe
 from skinrig.benchmarks.interval_coverage import pooled
 from skinrig.benchmarks.interval_trials import of_map

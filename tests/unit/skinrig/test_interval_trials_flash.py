@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from reconstruction import shading_prior
+from reconstruction.chromophores import shading_prior
 from skinrig.benchmarks import interval_trials_flash as trials
 
 

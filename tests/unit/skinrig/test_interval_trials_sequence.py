@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruction.perfusion_fit import fit_course
+from reconstruction.facial_color.perfusion_fit import fit_course
 from skinrig.benchmarks.interval_coverage import pooled
 from skinrig.benchmarks.interval_trials_sequence import REACTIONS_S, of_fits, order_of
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reconstruction import anisotropy
+from reconstruction.anisotropy import estimation as anisotropy
 from skinrig.benchmark import Timing
 from skinrig.benchmarks import interval_trials_probe, intervals
 from skinrig.benchmarks.interval_coverage import Covered

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from model.skin import SkinAppearance
-from reconstruction.gradient_stages import KERNEL_FILE
+from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig.reporting import kernel
 
 FIT = {

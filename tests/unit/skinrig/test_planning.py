@@ -9,7 +9,7 @@ import pytest
 
 from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
-from reconstruction import light_selection
+from reconstruction.photometric_stereo import light_selection
 from skinrig.cli import main
 from skinrig.planning import dome, dome_sight, plans
 

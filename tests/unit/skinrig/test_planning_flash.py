@@ -121,7 +121,7 @@ def test_a_plan_without_crossed_frames_or_of_another_rig_is_refused(rig, small, 
 @pytest.mark.long
 def test_chromophores_are_reconstructed_from_crossed_frames_alone(rig, tmp_path):
     from model import store
-    from reconstruction import pipeline
+    from reconstruction.pipeline import recipes as pipeline
     from skinrig.calibrating.calibrate import calibrate
     from skinrig.simulating.simulation import simulate_session
 

@@ -85,7 +85,7 @@ def test_patterns_that_do_not_tell_a_gradient_are_refused(rig):
 
 @pytest.mark.long
 def test_normals_are_reconstructed_from_four_patterns_as_well_as_is_forecast(rig, tmp_path):
-    from reconstruction.gradient_normals import estimate_roughness, from_patterns
+    from reconstruction.gradient_normals.estimation import estimate_roughness, from_patterns
 
     look = gradient.sight(rig, "III", seed=3, side_px=96)
     setting = Setting(SETS[0], 0.018, 0)

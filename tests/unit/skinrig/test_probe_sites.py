@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.translucency import SITE_UV, TranslucencyError
+from reconstruction.subsurface.translucency import SITE_UV, TranslucencyError
 from rigsim.head import build_head
 from skinrig import probe_sites
 from skinrig.probe_sites import ProbeSiteError

@@ -6,7 +6,7 @@ import pytest
 from model import fresnel
 from model.brdf import tables as brdf_tables
 from model.skin import SkinAppearance, SkinMap
-from reconstruction.dome_stages import BASIS_FILE, RANK, WEIGHTS, _basis_bytes
+from reconstruction.pipeline.dome.stages import BASIS_FILE, RANK, WEIGHTS, _basis_bytes
 from skinrig.evaluating import reflection as evaluation
 from skinrig.evaluating import reflection_truth
 

@@ -5,7 +5,7 @@ import pytest
 
 from model import store
 from model.skin import UNITS, SkinAppearance, SkinMap
-from reconstruction.probe_stages import SUBSURFACE_FILE
+from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from skinrig import report
 from skinrig.benchmark import Limit, Point, StageBenchmark, Timing
 from skinrig.benchmarks.document import to_document

@@ -5,8 +5,8 @@ import pytest
 
 from model.color_table import build
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import common_parameterization, common_regions
-from reconstruction.common_parameterization import Correspondence, find_cylinder
+from reconstruction.correspondence import common_parameterization, common_regions
+from reconstruction.correspondence.common_parameterization import Correspondence, find_cylinder
 from skinrig.editing import pigment_spots, spot_removal
 from skinrig.editing.pigment_spots import KINDS, SpotError
 

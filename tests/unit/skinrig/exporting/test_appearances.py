@@ -153,7 +153,7 @@ def test_maps_of_a_captured_session_bear_its_consent_and_older_ones_are_brought_
     from capture.plan import flash_plan
     from capture.rig import load_rig
     from capture.session import Session, Subject
-    from reconstruction.pipeline import reconstruct
+    from reconstruction.pipeline.recipes import reconstruct
 
     rig = load_rig("flash").resized(16)
     with Session.create(

@@ -1,0 +1,1 @@
+"""Anisotropy of subsurface scattering from the probe's profiles."""

@@ -1,0 +1,166 @@
+"""The ellipse that 1/sigma_tr draws over the directions of anisotropic tissue: equations and fit.
+
+With parameters ``l, u, v``: h = hypot(u, v) is the log of the ratio of its axes, (u, v) / h is
+(cos, sin) of twice the direction of its long axis, and l the log of the geometric mean of the
+extremes of sigma_tr^2::
+
+    sigma_tr(theta)^2 = exp(l) (cosh h - sinh(h) / h (u cos 2 theta + v sin 2 theta))
+
+Any (l, u, v) is an ellipse, and none is singular at the circle, u = v = 0.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.anisotropy.direction_harmonics import AXIAL, ODD, HarmonicFit
+
+Floats: TypeAlias = NDArray[np.float64]
+
+MEAN_DIRECTIONS = 360
+"""Directions over which sigma_tr is averaged; exact to rounding up to ratios of 25."""
+ITERATIONS = 100
+LARGEST_STEP = 1.0
+"""Of u and v in one iteration."""
+SETTLED = 1e-11
+"""Of the parameters' steps."""
+
+
+def relative_sigma_tr(angle_rad: Floats, uv: Floats) -> tuple[Floats, Floats]:
+    """Return sigma_tr over the geometric mean of its extremes, and its derivatives.
+
+    Parameters
+    ----------
+    angle_rad : ndarray, shape (N,)
+    uv : ndarray, shape (B, 2)
+
+    Returns
+    -------
+    values : ndarray, shape (B, N)
+    derivatives : ndarray, shape (B, N, 2)
+        By u and v.
+    """
+    c, s = np.cos(2 * angle_rad), np.sin(2 * angle_rad)
+    u, v = uv[:, :1], uv[:, 1:]
+    h = np.hypot(u, v)
+    small = h < 1e-3
+    safe = np.where(small, 1.0, h)
+    # sinh(h) / h, and its derivative over h, over h
+    k = np.where(small, 1.0 + h * h / 6.0, np.sinh(safe) / safe)
+    k1 = np.where(small, 1.0 / 3.0 + h * h / 30.0, (np.cosh(safe) - k) / safe**2)
+    along = u * c + v * s
+    cosine = along / np.where(h > 0, h, 1.0)
+    # cosh h - sinh h cosine, without cancelling along the long axis
+    values = np.sqrt(np.exp(-h) + np.sinh(h) * (1.0 - cosine))
+    by_u = (k * u - k1 * u * along - k * c) / (2 * values)
+    by_v = (k * v - k1 * v * along - k * s) / (2 * values)
+    return values, np.stack([by_u, by_v], axis=-1)
+
+
+def all_directions() -> Floats:
+    """Return directions that go evenly over all axes, rad, (`MEAN_DIRECTIONS`,)."""
+    return np.asarray(np.arange(MEAN_DIRECTIONS) * (np.pi / MEAN_DIRECTIONS))
+
+
+def fit(
+    angle_rad: Floats, values: Floats, weight: Floats, start: HarmonicFit
+) -> tuple[Floats, Floats, Floats]:
+    """Fit ellipses, with the first harmonic as a factor ``1 + a cos theta + b sin theta``.
+
+    Levenberg-Marquardt, from the linear fit of harmonics.
+
+    Parameters
+    ----------
+    angle_rad : ndarray, shape (N,)
+    values, weight : ndarray, shape (N, B)
+        Of sigma_tr, near 1 in size; weights as of `start`.
+    start : HarmonicFit
+        Tells where there is a fit, and where the first harmonic is in it.
+
+    Returns
+    -------
+    parameters : ndarray, shape (B, 5)
+        l, u, v, a, b; a and b are 0 where not fitted, all where nothing is.
+    inverse : ndarray, shape (B, 5, 5)
+        Covariance for weights that are inverse variances; 0 in what is not fitted.
+    residual : ndarray, shape (B,)
+        Weighted sum of squared residuals.
+    """
+    count = values.shape[1]
+    free = np.column_stack(
+        [np.repeat(start.told[:, None], 3, axis=1), np.repeat(start.odd[:, None], 2, axis=1)]
+    )
+    y, w = values.T, np.where(start.told, weight, 0.0).T
+    mean = np.where(start.told, start.coefficients[:, 0], 1.0)
+    mean = np.where(mean > 0, mean, 1.0)
+    axial = -start.coefficients[:, AXIAL] / mean[:, None]
+    size = np.hypot(axial[:, 0], axial[:, 1])
+    # an amplitude a of sigma_tr makes the ratio (1 + a) / (1 - a)
+    lengthen = 2.0 * np.arctanh(np.minimum(size, 0.9)) / np.where(size > 0, size, 1.0)
+    p = np.zeros((count, 5))
+    p[:, 0] = 2.0 * np.log(mean)
+    p[:, 1:3] = axial * np.where(size > 0, lengthen, 2.0)[:, None]
+    p[:, 3:] = start.coefficients[:, ODD] / mean[:, None]
+    p *= free
+    error, jacobian = _linearized(angle_rad, y, p, free)
+    cost = (w * error**2).sum(axis=1)
+    damping = np.full(count, 1e-3)
+    eye = np.eye(5)
+    active = np.arange(count)
+    for _ in range(ITERATIONS):
+        now, weights, free_now = jacobian[active], w[active], free[active]
+        weighted = now * weights[..., None]
+        normal = now.transpose(0, 2, 1) @ weighted
+        diagonal = np.einsum("bii->bi", normal) * damping[active, None]
+        damped = normal + eye * np.where(free_now, diagonal, 1.0)[:, None, :]
+        right = np.einsum("bni,bn->bi", weighted, error[active])
+        step = np.linalg.solve(damped, right[..., None])[..., 0]
+        step /= np.maximum(1.0, np.abs(step[:, 1:3]).max(axis=1) / LARGEST_STEP)[:, None]
+        there = _linearized(angle_rad, y[active], p[active] + step, free_now)
+        tried = (weights * there[0] ** 2).sum(axis=1)
+        better = tried <= cost[active]
+        at = active[better]
+        p[at] += step[better]
+        cost[at], error[at], jacobian[at] = tried[better], there[0][better], there[1][better]
+        damping[active] = np.clip(damping[active] * np.where(better, 0.2, 5.0), 1e-12, 1e12)
+        active = active[np.abs(step).max(axis=1) > SETTLED]
+        if not active.size:
+            break
+    # a factor that is 1 where nothing is fitted keeps the decomposition regular
+    rows = np.concatenate([np.sqrt(w)[..., None] * jacobian, eye * ~free[:, None, :]], axis=1)
+    triangle = np.linalg.inv(np.linalg.qr(rows, mode="r"))
+    inverse = np.einsum("bij,bkj->bik", triangle, triangle) * (free[:, :, None] & free[:, None, :])
+    return p, inverse, cost
+
+
+def _linearized(
+    angle_rad: Floats, y: Floats, p: Floats, free: NDArray[np.bool_]
+) -> tuple[Floats, Floats]:
+    """Return residuals (B, N) and the model's derivatives (B, N, 5), 0 by what is not free."""
+    shape, by_uv = relative_sigma_tr(angle_rad, p[:, 1:3])
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    size = np.exp(0.5 * p[:, :1])
+    factor = 1.0 + p[:, 3:4] * cosine + p[:, 4:] * sine
+    model = size * shape * factor
+    derivatives = np.stack(
+        [
+            0.5 * model,
+            (size * factor) * by_uv[..., 0],
+            (size * factor) * by_uv[..., 1],
+            size * shape * cosine,
+            size * shape * sine,
+        ],
+        axis=-1,
+    )
+    return y - model, derivatives * free[:, None, :]
+
+
+def mean_over_directions(parameters: Floats) -> tuple[Floats, Floats]:
+    """Return sigma_tr averaged over all directions (B,), and its derivatives by l, u, v (B, 3)."""
+    shape, by_uv = relative_sigma_tr(all_directions(), parameters[:, 1:3])
+    size = np.exp(0.5 * parameters[:, 0])
+    mean = size * shape.mean(axis=1)
+    return mean, np.column_stack([0.5 * mean, size[:, None] * by_uv.mean(axis=1)])

@@ -1,0 +1,319 @@
+"""Whether light spreads farther along one direction of the skin: ratio, axis and p-value.
+
+A probe's head turned about its source reads sigma_tr along several directions. Where diffusion is
+described by a tensor, light decays as ``exp(-sqrt(sigma_a r' D^-1 r))``: sigma_tr^2 is a quadratic
+form of the direction, and 1/sigma_tr drawn over it is an ellipse (`diffusion_ellipse`).
+
+theta and theta + 180 degrees are one axis. A first harmonic, in theta itself, is no property of
+such tissue: it tells that the head was tilted or badly coupled, or that the skin changes from one
+side to the other. It is fitted beside and reported apart, where the directions go around.
+
+The p-value is that of the harmonic in 2 theta of a linear weighted fit of sigma_tr, exact for
+normal errors in known ratios (`direction_harmonics`), at any size.
+
+References
+----------
+Nickell et al. 2000, Anisotropy of light propagation in human skin, Phys. Med. Biol. 45, 2873.
+doi:10.1088/0031-9155/45/10/310
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import special, stats
+
+from reconstruction.anisotropy import diffusion_ellipse, direction_harmonics
+from reconstruction.anisotropy.direction_harmonics import LEAST_DIRECTIONS
+from reconstruction.anisotropy.plane_vectors import (
+    UNKNOWN_AXIS_RAD,
+    axis_stderr,
+    length_and_errors,
+    quadratic_form,
+    within_period,
+)
+
+Floats: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
+Errors: TypeAlias = Literal["relative", "absolute"]
+
+FAR = 300
+"""Powers of two from 1 beyond which values are brought near it: their squares keep within range."""
+LEAST_ERROR, MOST_ERROR = 1e-307, 1e150
+"""Relative standard errors of one direction: less would divide 0 by 0, more is no reading."""
+MOST_APART = 1e12
+"""Standard errors over the least: directions of greater ones are left out, since beside the best
+ones rounding hides what they tell."""
+
+
+class AnisotropyError(ValueError):
+    """Directions, values or errors that no anisotropy can be told from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Anisotropy:
+    """How far sigma_tr depends on the direction.
+
+    Arrays have the shape (...) of one direction's values, such as (3,) for channels. Where not
+    `valid`, ratios and p-values are 1 and standard errors infinite.
+
+    Attributes
+    ----------
+    ratio, ratio_stderr : ndarray
+        Greatest over least 1/sigma_tr, 1 or more, and its standard error. Errors make it greater
+        than it is: isotropic tissue shows some 1 + ratio_stderr.
+    axis_rad, axis_stderr_rad : ndarray
+        Direction of greatest 1/sigma_tr in [0, pi), counted as the angles are, and its standard
+        error; up to `plane_vectors.UNKNOWN_AXIS_RAD`, where the ratio cannot be told from 1.
+    p_value, log10_p : ndarray
+        Chance that isotropic tissue shows such a harmonic in 2 theta, and its decimal logarithm.
+    mean_per_mm, mean_stderr_per_mm : ndarray
+        sigma_tr averaged over all directions, 1/mm.
+    tilt, tilt_stderr, tilt_rad, tilt_p_value : ndarray
+        The first harmonic over the mean, with the direction of greatest sigma_tr in [0, 2 pi), and
+        the chance of it without a cause. 0, infinity, 0 and 1 where it is not fitted.
+    chi2 : ndarray
+        Sum of squared residuals of the ellipse over the standard errors given; without any, `dof`.
+    dof : ndarray of int
+        Degrees of freedom of the residuals.
+    used, outlier : ndarray of bool, shape (N, ...)
+        Directions that the fit rests on; those left out because they contradict the others.
+    valid : ndarray of bool
+    reason : ndarray of str
+        Why not valid; empty otherwise.
+    parameters, covariance : ndarray, shapes (..., 3), (..., 3, 3)
+        l, u, v of `diffusion_ellipse`, sigma_tr in 1/mm, and their covariance.
+    errors : str
+        As of :func:`estimate`.
+    """
+
+    ratio: Floats
+    ratio_stderr: Floats
+    axis_rad: Floats
+    axis_stderr_rad: Floats
+    p_value: Floats
+    log10_p: Floats
+    mean_per_mm: Floats
+    mean_stderr_per_mm: Floats
+    tilt: Floats
+    tilt_stderr: Floats
+    tilt_rad: Floats
+    tilt_p_value: Floats
+    chi2: Floats
+    dof: NDArray[np.int64]
+    used: Bools
+    outlier: Bools
+    valid: Bools
+    reason: NDArray[np.str_]
+    parameters: Floats
+    covariance: Floats
+    errors: Errors
+
+
+def estimate(
+    angle_rad: ArrayLike,
+    sigma_tr_per_mm: ArrayLike,
+    stderr_per_mm: ArrayLike | None = None,
+    *,
+    valid: ArrayLike | None = None,
+    errors: Errors = "relative",
+    outliers: bool = True,
+    log_ratio_error: float = 0.0,
+) -> Anisotropy:
+    """Tell ratio and axis of anisotropy from sigma_tr along several directions.
+
+    Parameters
+    ----------
+    angle_rad : array_like, shape (N,)
+        Direction from the source to the detectors, rad; any turn, repeats allowed.
+    sigma_tr_per_mm : array_like, shape (N, ...)
+        sigma_tr along each direction, 1/mm. Values that are not finite and above 0 are left out.
+    stderr_per_mm : array_like, shape (N, ...), optional
+        Standard errors, 1/mm. None, or zeros throughout a channel: equal ones, of unknown size.
+        One that is not finite leaves its direction out.
+    valid : array_like of bool, shape (N, ...), optional
+        Directions that count; the others may be anything.
+    errors : {"relative", "absolute"}
+        Of unknown size in ratios as given, scaled by the residuals (F test); or of the size given
+        (chi-square test). The first holds when contact differs from turn to turn, which no
+        error of a fit knows of.
+    outliers : bool
+        Leave out directions that contradict the others, one of eight at most: t test of deleted
+        residuals, with a chance of `direction_harmonics.OUTLIER_RATE` to lose a good one.
+    log_ratio_error : float
+        Error of the log of the ratio over itself that all directions have in common; it widens
+        the ratio's standard error.
+
+    Returns
+    -------
+    Anisotropy
+
+    Raises
+    ------
+    AnisotropyError
+        For fewer than `LEAST_DIRECTIONS` different directions, shapes that do not fit, a standard
+        error below 0, of 0 beside others, or none where "absolute" ones are asked.
+
+    Examples
+    --------
+    >>> angle = np.deg2rad(np.arange(16) * 22.5)
+    >>> sigma_tr = 0.6 * np.hypot(np.cos(angle - 0.3) / 1.5, np.sin(angle - 0.3))
+    >>> found = estimate(angle, sigma_tr)
+    >>> round(float(found.ratio), 6), round(float(found.axis_rad), 6), bool(found.p_value < 1e-9)
+    (1.5, 0.3, True)
+    """
+    angle, values, stderr, good, shape = _checked(
+        angle_rad, sigma_tr_per_mm, stderr_per_mm, valid, errors
+    )
+    # sums and squares of values at the ends of the range would leave it
+    exponent = _far_exponent(np.where(good, values, 0.0).max(axis=0, initial=0.0))
+    with np.errstate(over="ignore"):
+        values, stderr = np.ldexp(values, -exponent), np.ldexp(stderr, -exponent)
+    scale = np.where(good, values, 0.0).sum(axis=0) / np.maximum(good.sum(axis=0), 1)
+    scale = np.where(scale > 0, scale, 1.0)
+    y = np.where(good, values / scale, 0.0)
+    with np.errstate(over="ignore"):
+        relative = np.clip(stderr / scale, LEAST_ERROR, MOST_ERROR)
+    relative = np.where(good, relative, math.inf)
+    least = relative.min(axis=0, initial=math.inf)
+    least = np.where(np.isfinite(least), least, 1.0)
+    # weights of 1 at most: errors of any size keep within range
+    weight = np.where(good & (relative <= MOST_APART * least), (least / relative) ** 2, 0.0)
+    outlier = np.zeros(weight.shape, bool)
+    if outliers:
+        weight, outlier = direction_harmonics.without_outliers(angle, y, weight)
+        # others beside one far above them were next to nothing of the mean
+        kept = np.where(weight > 0, y, 0.0)
+        closer = _far_exponent(kept.max(axis=0, initial=0.0))
+        y = np.ldexp(np.where(closer == 0, y, kept), -closer)
+        least, exponent = np.ldexp(least, -closer), exponent + closer
+    linear = direction_harmonics.fit(angle, y, weight)
+    p, inverse, residual = diffusion_ellipse.fit(angle, y, weight, linear)
+    # what rounding leaves is neither a residual nor a harmonic
+    rounding = (16 * np.finfo(np.float64).eps) ** 2 * (weight * y * y).sum(axis=0)
+    residual = np.maximum(residual, rounding)
+    dof = np.maximum(linear.dof, 1)
+    if errors == "relative":
+        # as wide as needed to hold 68 % with few degrees of freedom, too
+        factor = np.sqrt(residual / dof) * stats.t.ppf(special.ndtr(1.0), dof)
+        linear_residual = np.maximum(linear.residual, rounding)
+        log_p = direction_harmonics.log_tail(linear.axial_power, linear_residual, linear.dof)
+        log_odd = direction_harmonics.log_tail(linear.odd_power, linear_residual, linear.dof)
+    else:
+        factor = least
+        with np.errstate(over="ignore"):
+            log_p, log_odd = (
+                -0.5 * power / least / least for power in (linear.axial_power, linear.odd_power)
+            )
+    covariance = inverse * (factor**2)[:, None, None]
+    covariance[:, 1:3, 1:3] += log_ratio_error**2 * p[:, 1:3, None] * p[:, None, 1:3]
+    with np.errstate(over="ignore"):
+        told_chi2 = residual / least / least
+    chi2 = linear.dof.astype(np.float64) if stderr_per_mm is None else told_chi2
+
+    h, h_stderr, h_across = length_and_errors(p[:, 1:3], covariance[:, 1:3, 1:3])
+    mean, by_parameter = diffusion_ellipse.mean_over_directions(p[:, :3])
+    mean_error = np.sqrt(quadratic_form(by_parameter, covariance[:, :3, :3]))
+    with np.errstate(over="ignore"):
+        mean, mean_error = (np.ldexp(one * scale, exponent) for one in (mean, mean_error))
+    tilt, tilt_stderr, _ = length_and_errors(p[:, 3:], covariance[:, 3:, 3:])
+    ellipse = p[:, :3].copy()
+    ellipse[:, 0] += 2.0 * (np.log(scale) + exponent * math.log(2.0))
+    told, odd = linear.told, linear.odd
+
+    def shaped(found: NDArray[Any], otherwise: float, where: Bools = told) -> NDArray[Any]:
+        kept = where.reshape(-1, *[1] * (found.ndim - 1))
+        return np.where(kept, found, otherwise).reshape((*shape, *found.shape[1:]))
+
+    return Anisotropy(
+        ratio=shaped(np.exp(h), 1.0),
+        ratio_stderr=shaped(np.exp(h) * h_stderr, math.inf),
+        axis_rad=shaped(within_period(0.5 * np.arctan2(p[:, 2], p[:, 1]), math.pi), 0.0),
+        axis_stderr_rad=shaped(axis_stderr(h, h_across), UNKNOWN_AXIS_RAD),
+        p_value=shaped(np.exp(log_p), 1.0),
+        log10_p=shaped(log_p / math.log(10.0), 0.0),
+        mean_per_mm=shaped(mean, 0.0),
+        mean_stderr_per_mm=shaped(mean_error, math.inf),
+        tilt=shaped(tilt, 0.0, odd),
+        tilt_stderr=shaped(tilt_stderr, math.inf, odd),
+        tilt_rad=shaped(within_period(np.arctan2(p[:, 4], p[:, 3]), math.tau), 0.0, odd),
+        tilt_p_value=shaped(np.exp(log_odd), 1.0, odd),
+        chi2=shaped(chi2, 0.0),
+        dof=linear.dof.reshape(shape),
+        used=(weight > 0).reshape((-1, *shape)),
+        outlier=outlier.reshape((-1, *shape)),
+        valid=told.reshape(shape),
+        reason=_reasons(angle, weight > 0, told).reshape(shape),
+        parameters=shaped(ellipse, 0.0),
+        covariance=shaped(covariance[:, :3, :3], math.inf),
+        errors=errors,
+    )
+
+
+def _checked(
+    angle_rad: ArrayLike,
+    sigma_tr_per_mm: ArrayLike,
+    stderr_per_mm: ArrayLike | None,
+    valid: ArrayLike | None,
+    errors: Errors,
+) -> tuple[Floats, Floats, Floats, Bools, tuple[int, ...]]:
+    """Return angles (N,), values, standard errors and what counts (N, B), and the shape of B."""
+    angle = np.asarray(angle_rad, np.float64)
+    given = np.asarray(sigma_tr_per_mm, np.float64)
+    if angle.ndim != 1 or not np.isfinite(angle).all():
+        raise AnisotropyError(f"angle_rad: got shape {angle.shape}, expected (N,), all finite")
+    if given.shape[:1] != angle.shape:
+        raise AnisotropyError(
+            f"sigma_tr_per_mm: got shape {given.shape}, expected ({angle.size}, ...)"
+        )
+    if errors not in ("relative", "absolute"):
+        raise AnisotropyError(f'errors: got {errors!r}, expected "relative" or "absolute"')
+    several = direction_harmonics.different_directions(angle, np.ones((angle.size, 1), bool))[0]
+    if several < LEAST_DIRECTIONS:
+        raise AnisotropyError(
+            f"angle_rad: got {several} different directions, expected {LEAST_DIRECTIONS} or more"
+        )
+    stderr: Floats = np.zeros_like(given)
+    if stderr_per_mm is not None:
+        stderr = np.asarray(stderr_per_mm, np.float64)
+    good = np.ones(given.shape, bool) if valid is None else np.array(valid, bool)
+    for name, array in (("stderr_per_mm", stderr), ("valid", good)):
+        if array.shape != given.shape:
+            raise AnisotropyError(f"{name}: got shape {array.shape}, expected {given.shape}")
+    shape = given.shape[1:]
+    values, stderr, good = (a.reshape(angle.size, -1) for a in (given, stderr, good))
+    good = good & np.isfinite(values) & (values > 0) & np.isfinite(stderr)
+    if (stderr[good] < 0).any():
+        raise AnisotropyError(f"stderr_per_mm: got {stderr[good].min()}, expected 0 or above")
+    zero = good & (stderr == 0)
+    whole = (zero == good).all(axis=0)
+    if (zero.any(axis=0) & ~whole).any():
+        raise AnisotropyError("stderr_per_mm: got 0 beside others, expected all above 0 or all 0")
+    if errors == "absolute" and zero.any():
+        raise AnisotropyError('stderr_per_mm: got none or 0, expected above 0 for "absolute"')
+    return angle, values, np.where(whole, 1.0, stderr), good, shape
+
+
+def _far_exponent(largest: Floats) -> NDArray[np.int64]:
+    """Return the power of two of values (B,) far from 1; 0 for those that are not, and for 0."""
+    exponent = np.frexp(largest)[1].astype(np.int64)
+    return np.where((largest > 0) & (np.abs(exponent) > FAR), exponent, 0)
+
+
+def _reasons(angle: Floats, used: Bools, told: Bools) -> NDArray[np.str_]:
+    several = direction_harmonics.different_directions(angle, used)
+    return np.array(
+        [
+            ""
+            if ok
+            else f"{n} usable directions, expected {LEAST_DIRECTIONS} or more"
+            if n < LEAST_DIRECTIONS
+            else "directions lie too close together to tell an axis"
+            for ok, n in zip(told, several, strict=True)
+        ],
+        dtype=np.str_,
+    )

@@ -1,0 +1,378 @@
+"""Surface BRDFs as non-negative mixtures of tabulated materials, and fewer mixtures for all.
+
+One convention, in fit and evaluation alike. With L the radiance, E the irradiance a surface facing
+the light would get, theta the light's angle to the normal and F_t = 1 - F_r::
+
+    surface sample  R_s = L / E - cos(theta) F_t(light) F_t(view) R_d / pi      [1/sr]
+    model           R_s = cos(theta) sum_j x_j M_j(light, view)
+
+The materials M_j hold their Fresnel reflection as measured ones do, so F_r is counted once: nothing
+multiplies it again (the paper's eqs. (2), (3), (7) leave room for twice). Highlights have the
+light's color, so samples are one number for all channels.
+
+References
+----------
+Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 7.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.decomposition import NMF
+from sklearn.exceptions import ConvergenceWarning
+
+from model.brdf.tables import BrdfBasis
+from reconstruction.brdf_basis.nnls_kernels import fit_points
+from reconstruction.lumitexels import boundary_kernels
+
+FloatArray = NDArray[np.float64]
+
+LEAST_COSINE = 0.1
+"""Samples whose light or view is nearer to the horizon are not used."""
+REWEIGHTINGS = 3
+BLOCK = 64  # points that share their working memory
+PLATEAU = 0.05
+
+
+class SampleError(ValueError):
+    """Samples whose shapes do not fit each other."""
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceSamples:
+    """What the surface of P points reflected in M pairs of light and view.
+
+    Attributes
+    ----------
+    value : ndarray of float32, shape (P, M)
+        R_s of this module's convention, 1/sr; negative by noise.
+    variance : ndarray of float32, shape (P, M)
+        Of `value`; 0: not known (then all samples of a point count the same).
+    light_dir, view_dir : ndarray of float32, shape (P, M, 3)
+        Unit vectors away from the surface, rig frame.
+    normals : ndarray of float32, shape (P, 3)
+        Unit normals, rig frame.
+    valid : ndarray of bool, shape (P, M)
+        Samples to use: finite, light and view at least 0.1 (cosine) above the horizon.
+    """
+
+    value: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    light_dir: NDArray[np.float32]
+    view_dir: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        """Check the shapes."""
+        if self.value.ndim != 2:
+            raise SampleError(f"value: got shape {self.value.shape}, expected (P, M)")
+        points, samples = self.value.shape
+        for name, shape in (
+            ("variance", (points, samples)),
+            ("light_dir", (points, samples, 3)),
+            ("view_dir", (points, samples, 3)),
+            ("normals", (points, 3)),
+            ("valid", (points, samples)),
+        ):
+            got = getattr(self, name).shape
+            if got != shape:
+                raise SampleError(f"{name}: got shape {got}, expected {shape}")
+
+
+@dataclass(frozen=True, slots=True)
+class BasisWeights:
+    """Mixtures of a basis, one a point.
+
+    Attributes
+    ----------
+    weights : ndarray of float64, shape (P, K)
+        Shares of the materials, at least 0. The materials are nearly dependent: compare mixtures by
+        their BRDFs, never by these numbers. 0 where not `valid`.
+    residual : ndarray of float64, shape (P,)
+        Weighted RMS of samples - model, 1/sr; NaN where not `valid`.
+    stderr : ndarray of float64, shape (P,)
+        Relative standard error of the BRDF's overall scale; NaN where not `valid`, or where the
+        mixture is empty.
+    valid : ndarray of bool, shape (P,)
+        False where no sample could be used.
+    """
+
+    weights: FloatArray
+    residual: FloatArray
+    stderr: FloatArray
+    valid: NDArray[np.bool_]
+
+
+def surface_samples(
+    brdf_samples: ArrayLike,
+    light_dirs: ArrayLike,
+    view_dirs: ArrayLike,
+    normals: ArrayLike,
+    r_d: ArrayLike,
+    *,
+    eta: float,
+    variance: ArrayLike | None = None,
+    valid: ArrayLike | None = None,
+) -> SurfaceSamples:
+    """Subtract the diffuse part from BRDF samples, and average the channels.
+
+    Parameters
+    ----------
+    brdf_samples
+        f_r = L / (E cos) in 1/sr, (P, M, C), of a white-balanced camera (1 for a white surface
+        over pi in all channels).
+    light_dirs, view_dirs
+        Unit vectors (P, M, 3) or broadcast, away from the surface.
+    normals
+        Unit normals (P, 3).
+    r_d
+        Diffuse reflectance (P, C); a point where it is not finite has no valid sample.
+    eta
+        Relative refractive index, as in the estimate of `r_d`.
+    variance
+        Of `brdf_samples`, same shape. Channels are averaged by its inverse, evenly without it.
+    valid
+        Samples to use, (P, M); None: all that are finite.
+
+    Returns
+    -------
+    SurfaceSamples
+    """
+    f = np.asarray(brdf_samples, dtype=np.float32)
+    if f.ndim != 3:
+        raise SampleError(f"brdf_samples: got shape {f.shape}, expected (P, M, C)")
+    points, samples, channels = f.shape
+    light, view = (
+        np.broadcast_to(np.asarray(v, dtype=np.float32), (points, samples, 3))
+        for v in (light_dirs, view_dirs)
+    )
+    n = np.asarray(normals, dtype=np.float32)
+    albedo = np.asarray(r_d, dtype=np.float64)
+    if n.shape != (points, 3) or albedo.shape != (points, channels):
+        raise SampleError(
+            f"normals, r_d: got shapes {n.shape}, {albedo.shape}, "
+            f"expected {(points, 3)}, {(points, channels)}"
+        )
+    cos_l = np.einsum("pmc,pc->pm", light, n)
+    cos_v = np.einsum("pmc,pc->pm", view, n)
+    through = boundary_kernels.transmitted(np.nan_to_num(cos_l), np.nan_to_num(cos_v), eta)
+    surface = f - (through[..., None] * albedo[:, None] / np.pi)
+    usable = np.all(np.isfinite(surface), axis=-1) & (cos_l >= LEAST_COSINE)
+    usable &= cos_v >= LEAST_COSINE
+    if valid is not None:
+        usable &= np.asarray(valid, dtype=bool)
+    if variance is None:
+        value, spread = surface.mean(axis=-1), np.zeros((points, samples))
+    else:
+        var = np.asarray(variance, dtype=np.float64)
+        usable &= np.all((var > 0.0) & np.isfinite(var), axis=-1)
+        weight = 1.0 / np.where(usable[..., None], var, 1.0)
+        spread = 1.0 / weight.sum(axis=-1)
+        value = np.sum(weight * surface, axis=-1) * spread
+    return SurfaceSamples(
+        np.where(usable, value * cos_l, 0.0).astype(np.float32),
+        np.where(usable, spread * cos_l**2, 1.0).astype(np.float32),
+        light,
+        view,
+        n,
+        usable,
+    )
+
+
+def fit_weights(
+    samples: SurfaceSamples, basis: BrdfBasis, *, compress: Literal["cbrt", "none"] = "cbrt"
+) -> BasisWeights:
+    """Fit a non-negative mixture of the basis to each point.
+
+    Parameters
+    ----------
+    samples
+        See :func:`surface_samples`; give large sets in chunks of some thousand points.
+    basis
+        Materials; see :mod:`model.brdf.tables`.
+    compress
+        "cbrt": misfits count as differences of cube roots, as far as they exceed the noise.
+        "none": plain least squares, weighted by the variances where these are known.
+
+    Returns
+    -------
+    BasisWeights
+
+    Notes
+    -----
+    The cube root of a mixture is not the mixture of cube roots (taking roots of the matrix'
+    elements, as the paper's words can be read, is another model). To first order a difference of
+    cube roots is 1 / (3 u^(2/3)) of the difference, so the fit is a plain one whose weights,
+    1 / (variance + 9 tau^2 u^(4/3)), follow its own model u: three reweighted passes. tau, the
+    misfit of cube roots that the basis leaves, is estimated with them. Samples, which can be
+    negative by noise, are never rooted themselves: that would bias dark ones. Residuals beyond
+    3 standard deviations pull with constant force.
+    """
+    if compress not in ("cbrt", "none"):
+        raise ValueError(f"compress: got {compress!r}, expected 'cbrt' or 'none'")
+    points = len(samples.value)
+    weights = np.zeros((points, basis.size))
+    residual, stderr = fit_points(
+        basis.table, basis.size, basis.kinship(),
+        *(np.ascontiguousarray(a, dtype=np.float32) for a in (
+            samples.value, samples.variance, samples.light_dir, samples.view_dir, samples.normals,
+        )),
+        np.ascontiguousarray(samples.valid),
+        REWEIGHTINGS if compress == "cbrt" else 0,
+        BLOCK,
+        weights,
+    )  # fmt: skip
+    return BasisWeights(weights, residual, stderr, np.isfinite(residual))
+
+
+def evaluate(
+    weights: ArrayLike,
+    basis: BrdfBasis,
+    light_dir: ArrayLike,
+    view_dir: ArrayLike,
+    normal: ArrayLike,
+) -> FloatArray:
+    """Return the mixtures' BRDF, 1/sr, without the cosine; nothing multiplies it by F_r again.
+
+    Parameters
+    ----------
+    weights
+        Shares (..., K), broadcast with the directions.
+    light_dir, view_dir, normal
+        Unit vectors (..., 3) away from the surface, in one frame.
+
+    Returns
+    -------
+    ndarray
+        Shape (...); 0 where light or view are below the horizon.
+    """
+    material = basis.evaluate(light_dir, view_dir, normal)
+    return np.asarray(np.sum(np.asarray(weights, dtype=np.float64) * material, axis=-1))
+
+
+def reduce(
+    weights: BasisWeights | ArrayLike,
+    rank: int,
+    *,
+    basis: BrdfBasis | None = None,
+    seed: int = 0,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Factor mixtures into fewer, non-negative ones common to all points.
+
+    Parameters
+    ----------
+    weights
+        Shares (P, K) or a fit; points that are not valid are left at 0.
+    rank
+        Number of common mixtures, at least 1. More than the data can hold is refused.
+    basis
+        Where given, materials count by how much they reflect and the error is that of the BRDFs;
+        else both are of the shares themselves, whatever a share of its material means.
+    seed
+        Of the factorization.
+
+    Returns
+    -------
+    weights : ndarray, shape (P, rank)
+        Shares of the common mixtures. A fit to the samples on ``basis.mixed(basis_mix)`` is better.
+    basis_mix : ndarray, shape (rank, K)
+        The common mixtures, each of sum 1.
+    relative_error : float
+        Root of the squared misfit over the square of what is factored.
+    """
+    shares = np.asarray(
+        weights.weights if isinstance(weights, BasisWeights) else weights, dtype=np.float64
+    )
+    if shares.ndim != 2 or not np.all((shares >= 0.0) & (shares < np.inf)):
+        raise ValueError(
+            f"weights: got shape {shares.shape}, expected (P, K) of finite values at least 0"
+        )
+    if not 1 <= rank <= min(shares.shape):
+        raise ValueError(f"rank: got {rank}, expected 1 to {min(shares.shape)}")
+    top = float(shares.max())
+    if top > 0.0 and not 1e-100 < top < 1e100:  # squares would under- or overflow
+        found, mix, error = reduce(shares / top, rank, basis=basis, seed=seed)
+        return found * top, mix, error
+    scale = np.ones(shares.shape[1]) if basis is None else basis.strength()
+    scaled = shares * scale
+    total = scaled.sum()
+    if total == 0.0:
+        return np.zeros((len(shares), rank)), np.full((rank, shares.shape[1]), 1 / len(scale)), 0.0
+    model = NMF(rank, init="nndsvda", solver="cd", max_iter=400, tol=1e-3, random_state=seed)
+    found, mix = _factor(model, scaled / scaled.max())
+    mix = mix * scaled.max() / scale
+    size = mix.sum(axis=1, keepdims=True)
+    mix = np.where(size > 0.0, mix / np.where(size > 0.0, size, 1.0), 1.0 / len(scale))
+    found = found * size.T
+    gap = shares - found @ mix
+    gram = np.eye(len(scale)) if basis is None else basis.kinship() * np.outer(scale, scale)
+    squared = [float(np.einsum("pk,kl,pl->", a, gram, a, optimize=True)) for a in (gap, shares)]
+    return found, mix, float(np.sqrt(max(squared[0], 0.0) / squared[1]))
+
+
+def _factor(model: NMF, data: FloatArray) -> tuple[FloatArray, FloatArray]:
+    with warnings.catch_warnings():
+        # A factorization stopped early is a valid one, a little worse; its error says how good.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        found = model.fit_transform(data)
+    return found, np.asarray(model.components_)
+
+
+def plateau(errors: ArrayLike, *, share: float = PLATEAU) -> int:
+    """Return the rank from which more do not help: within `share` of all that ranks gained.
+
+    Parameters
+    ----------
+    errors
+        Errors of ranks 1, 2, ...
+    share
+        The rule: the first rank whose error exceeds the least one by no more than this share of the
+        fall from rank 1 to the least error.
+
+    Examples
+    --------
+    >>> plateau([1.0, 0.4, 0.15, 0.11, 0.1, 0.1])
+    4
+    """
+    error = np.asarray(errors, dtype=np.float64)
+    least = float(error.min())
+    return int(np.argmax(error <= least + share * (float(error[0]) - least))) + 1
+
+
+def lit_sphere(
+    weights: ArrayLike,
+    basis: BrdfBasis,
+    *,
+    light_dir: ArrayLike = (0.5, 0.5, 0.70710678),
+    size_px: int = 128,
+) -> FloatArray:
+    """Return the lobe of one mixture on a sphere seen from +z, far away.
+
+    Parameters
+    ----------
+    weights
+        Shares (K,).
+    light_dir
+        Unit vector to the light; +x right, +y up.
+    size_px
+        Height and width of the image.
+
+    Returns
+    -------
+    ndarray, shape (size_px, size_px)
+        BRDF times cosine of the light, 1/sr; row 0 is the top; 0 beside the sphere.
+    """
+    at = (np.arange(size_px) + 0.5) / size_px * 2.0 - 1.0
+    x, y = np.meshgrid(at, -at)
+    inside = x**2 + y**2 < 1.0
+    normal = np.stack([x, y, np.sqrt(np.where(inside, 1.0 - x**2 - y**2, 0.0))], axis=-1)
+    light = np.asarray(light_dir, dtype=np.float64)
+    light = light / np.linalg.norm(light)
+    lobe = evaluate(weights, basis, light, np.array([0.0, 0.0, 1.0]), normal)
+    return np.asarray(np.where(inside, lobe * np.maximum(normal @ light, 0.0), 0.0))

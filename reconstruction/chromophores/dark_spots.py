@@ -1,0 +1,222 @@
+"""Pixels that may be no skin of the face's usual kind: moles and shade, lips and eyelids.
+
+One person's skin tells which of both a dark color is where pigment changes slowly
+(`reconstruction.chromophores.face`). A mole is not of that skin, and shade is so much more frequent
+that a face's distribution explains a mole away: as usual skin in little light, with a small
+standard error. But light changes slowly, too, beside an edge of shadow. So a pixel that is darker
+than its surroundings is one of both, and neither is the more probable: the estimate lies halfway
+between that of the face and that of the pixel alone, and its standard error holds both.
+
+Lips and eyelids have less melanin than the rest of a face, and the face explains that away
+likewise: as usual skin with less blood. Shade makes a pixel by itself look like darker skin, never
+like lighter, and so one that by itself has less melanin than by its face, by more than its standard
+error, is one of both, too.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reconstruction.chromophores.inversion import ChromophoreError
+from reconstruction.chromophores.posterior import WeighedChromophores
+
+Floats = NDArray[np.float32]
+
+DARKER: Final = 0.1
+"""Least difference of log light from the surroundings: 12 % more melanin on skin of 5 %, 31 % more
+on skin of 1 %, which is within or near a face's own spread. Less needs no second look."""
+NOISES: Final = 3.0
+"""The same, in standard deviations of a pixel's noise."""
+PART: Final = 20
+"""The surroundings are a square whose side is the skin's, as a square, over this: 9 mm of
+skin 180 mm across; larger ones hold more that is darker for its slope alone."""
+LEAST_SIDE: Final = 7
+"""Pixels; fewer have no median that a mole would not move."""
+_BLOCKS: Final = 11
+"""Odd; finer squares than this are medians of blocks of pixels, or large pictures take minutes."""
+_WINDOWS: Final = 1 << 14
+_BAND: Final = 128
+
+
+def darker_than_around(
+    colors: ArrayLike, *, variance: ArrayLike | None = None, valid: ArrayLike | None = None
+) -> NDArray[np.bool_]:
+    """Return where skin is darker than the median of its surroundings.
+
+    Parameters
+    ----------
+    colors
+        Shape (rows, columns, channels): light of the pixels, linear, in any unit. Not modified.
+    variance
+        Noise variance of `colors`, broadcast to its shape. None: none.
+    valid
+        Shape (rows, columns): False where a pixel is no skin. None: all are that have light.
+
+    Returns
+    -------
+    ndarray of bool
+        (rows, columns); False where a pixel is masked or has no light above 0.
+
+    Raises
+    ------
+    reconstruction.chromophores.ChromophoreError
+        When shapes do not fit.
+
+    Examples
+    --------
+    >>> skin = np.ones((20, 20, 3))
+    >>> skin[9:11, 9:11] = 0.5
+    >>> np.argwhere(darker_than_around(skin)).tolist()
+    [[9, 9], [9, 10], [10, 9], [10, 10]]
+    """
+    light = np.asarray(colors)
+    if light.ndim != 3 or light.shape[-1] == 0:
+        raise ChromophoreError(f"colors: expected shape (rows, columns, 3), got {light.shape}")
+    with np.errstate(invalid="ignore"):
+        good = (light > 0.0).all(axis=-1) & np.isfinite(light).all(axis=-1)
+    if valid is not None:
+        mask = np.asarray(valid, dtype=np.bool_)
+        if mask.shape != good.shape:
+            raise ChromophoreError(f"valid: expected shape {good.shape}, got {mask.shape}")
+        good &= mask
+    whole = None
+    if variance is not None:
+        try:
+            whole = np.broadcast_to(np.asarray(variance), light.shape)
+        except ValueError as problem:
+            raise ChromophoreError(
+                f"variance: expected to broadcast to {light.shape}, got {np.shape(variance)}"
+            ) from problem
+    log_light = np.full(good.shape, np.nan, dtype=np.float32)
+    least = np.full(good.shape, DARKER, dtype=np.float32)
+    for start in range(0, len(good), _BAND):  # copies of a whole picture need gigabytes
+        band = slice(start, start + _BAND)
+        kept = light[band][good[band]].astype(np.float64)
+        log_light[band][good[band]] = np.log(kept).mean(axis=-1)
+        if whole is not None:
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                noise = np.sqrt((whole[band][good[band]] / np.square(kept)).sum(axis=-1))
+            # noise that is no number says nothing; nothing then stands out of it
+            noise = np.where(noise >= 0.0, noise, np.inf) / light.shape[-1]
+            least[band][good[band]] = np.maximum(DARKER, NOISES * noise)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(_median_around(log_light, good) - log_light > least)
+
+
+def lighter_by_itself(
+    by_face: WeighedChromophores, alone: WeighedChromophores
+) -> NDArray[np.bool_]:
+    """Return where a pixel alone has less melanin than by its face, outside its 68 % interval.
+
+    Parameters
+    ----------
+    by_face, alone
+        Estimates of the same pixels, with and without what the face tells.
+
+    Returns
+    -------
+    ndarray of bool
+        Of the pixels' shape; False where either is unknown.
+
+    Raises
+    ------
+    reconstruction.chromophores.ChromophoreError
+        When shapes differ.
+    """
+    if by_face.melanin.shape != alone.melanin.shape:
+        raise ChromophoreError(
+            f"alone: expected the shape {by_face.melanin.shape} of by_face, got "
+            f"{alone.melanin.shape}"
+        )
+    with np.errstate(invalid="ignore"):
+        return np.asarray(by_face.melanin - alone.melanin > alone.stderr_melanin)
+
+
+def either(
+    by_face: WeighedChromophores, alone: WeighedChromophores, where: ArrayLike
+) -> WeighedChromophores:
+    """Return estimates that hold both of two explanations, where they are equally probable.
+
+    Parameters
+    ----------
+    by_face, alone
+        Estimates of the same pixels, with and without what the face tells.
+    where
+        Of the pixels' shape: where either may be true; elsewhere `by_face` is kept.
+
+    Returns
+    -------
+    WeighedChromophores
+        Means of both, with the standard deviation of their mixture in equal parts; `valid` where
+        both are. The residual stays that of `by_face`.
+
+    Raises
+    ------
+    reconstruction.chromophores.ChromophoreError
+        When shapes differ.
+    """
+    doubtful = np.asarray(where, dtype=np.bool_)
+    if not by_face.melanin.shape == alone.melanin.shape == doubtful.shape:
+        raise ChromophoreError(
+            f"where: expected the estimates' shapes {by_face.melanin.shape} and "
+            f"{alone.melanin.shape} to be its own, got {doubtful.shape}"
+        )
+    mixed = {}
+    for name in ("melanin", "hemoglobin"):
+        first, second = getattr(by_face, name), getattr(alone, name)
+        errors = getattr(by_face, f"stderr_{name}"), getattr(alone, f"stderr_{name}")
+        half = 0.5 * (first - second)
+        spread = np.sqrt(0.5 * (np.square(errors[0]) + np.square(errors[1])) + np.square(half))
+        mixed[name] = np.where(doubtful, first - half, first)
+        mixed[f"stderr_{name}"] = np.where(doubtful, spread, errors[0])
+    return replace(
+        by_face,
+        **mixed,
+        shading=np.where(doubtful, np.sqrt(by_face.shading * alone.shading), by_face.shading),
+        valid=by_face.valid & (alone.valid | ~doubtful),
+    )
+
+
+def _median_around(values: Floats, good: NDArray[np.bool_]) -> Floats:
+    """Return the median of the good pixels in the square around each pixel, NaN without any."""
+    if not good.any():
+        return np.full(values.shape, np.nan, dtype=np.float32)
+    side = max(LEAST_SIDE, round(math.sqrt(int(good.sum())) / PART))
+    block = -(-side // _BLOCKS)
+    coarse = _by_blocks(values, block)
+    reach = max(1, round(side / block) // 2)
+    padded = np.pad(coarse, reach, constant_values=np.nan)
+    width = 2 * reach + 1
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (width, width))
+    around = np.full(coarse.shape, np.nan, dtype=np.float32)
+    wanted = np.argwhere(np.isfinite(coarse))
+    for start in range(0, len(wanted), _WINDOWS):
+        rows, columns = wanted[start : start + _WINDOWS].T
+        around[rows, columns] = _medians(windows[rows, columns].reshape(len(rows), -1))
+    whole = around.repeat(block, axis=0).repeat(block, axis=1)
+    return whole[: values.shape[0], : values.shape[1]]
+
+
+def _by_blocks(values: Floats, block: int) -> Floats:
+    """Return the median of each block's numbers, NaN where it has none."""
+    if block == 1:
+        return values
+    rows, columns = (-(-size // block) for size in values.shape)
+    margins = [(0, rows * block - values.shape[0]), (0, columns * block - values.shape[1])]
+    cut = np.pad(values, margins, constant_values=np.nan)
+    cut = cut.reshape(rows, block, columns, block).swapaxes(1, 2)
+    return _medians(cut.reshape(rows * columns, -1)).reshape(rows, columns)
+
+
+def _medians(values: Floats) -> Floats:
+    """Return medians along the last axis (n, m) without NaN, in a part of `nanmedian`'s time."""
+    ordered = np.sort(values, axis=-1)  # NaN last
+    count = np.isfinite(ordered).sum(axis=-1)
+    row = np.arange(len(values))
+    middle = 0.5 * (ordered[row, np.maximum(count - 1, 0) // 2] + ordered[row, count // 2])
+    return np.asarray(middle)

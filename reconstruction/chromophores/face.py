@@ -1,0 +1,221 @@
+"""The distribution of one person's melanin and blood, from the colors of the face's pixels.
+
+`reconstruction.chromophores.face_distribution` says what it is and why; `reconstruction.chromophores.posterior`
+weighs each pixel by it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.color_table import ColorTable
+from reconstruction.chromophores import model_error as color_errors
+from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores import shading_prior
+from reconstruction.chromophores.face_distribution import FaceDistribution, fit, with_common_errors
+from reconstruction.chromophores.inversion import ChromophoreError, without_brightness
+from reconstruction.chromophores.shading_prior import ShadingPrior
+from reconstruction.chromophores.start import LOWEST, evaluate
+
+Floats = NDArray[np.float64]
+
+PIXELS: Final = 1500
+"""Evenly spread over the face: its mean is known to a thirtieth of its spread by them, less than
+what they have in common."""
+FEWEST_PIXELS: Final = 200
+"""With fewer, pixels are weighed by themselves."""
+STEP: Final = 0.02
+"""From place to place in log melanin."""
+BLOOD_PLACES: Final = 96
+_SUMMED: Final = 3
+RESOLVED: Final = 0.003
+"""Relative error of colors below which places stand too far apart; smaller ones are taken for this
+much, which of light skin is 3 % of melanin, where a face scatters by 10 to 20 %."""
+MARGIN: Final = 0.7
+"""Of log melanin that is looked at beyond what 98 % of the pixels have by themselves."""
+
+
+def of_colors(
+    rgb: ArrayLike,
+    table: ColorTable,
+    *,
+    prior: ShadingPrior,
+    common_light: float,
+    common_color: ArrayLike | None = None,
+    variance: ArrayLike | None = None,
+    model_error: ArrayLike | None = None,
+    valid: ArrayLike | None = None,
+) -> FaceDistribution | None:
+    """Return how melanin and blood are distributed over a face; None with fewer than 200 pixels.
+
+    Parameters
+    ----------
+    rgb
+        Shape (..., 3): light of the pixels over that of a white tile, linear camera RGB; all skin
+        of one person in one picture. Not modified.
+    table
+        Color table of the camera and the light that took the picture.
+    prior
+        How the pixels' shading is distributed, without light that all have in common.
+    common_light
+        Standard error of log light that all pixels have in common, above 0: how far the face may
+        stand from the white tile's place, or how well the exposure is known.
+    common_color
+        (3, 3): covariance of relative errors of color that all pixels have in common. None: none.
+    variance
+        Noise variance of `rgb`, broadcast to its shape. None: 1 percent of each channel.
+    model_error
+        Covariance of the pixels' relative errors beside noise, shape (3, 3) or (..., 3, 3).
+        None: 0.
+    valid
+        Shape (...): False where a pixel is masked. None: all may be used.
+
+    Raises
+    ------
+    reconstruction.chromophores.ChromophoreError
+        When shapes or numbers do not fit.
+
+    Examples
+    --------
+    >>> from model import color_table
+    >>> from reconstruction.chromophores.shading_prior import lognormal
+    >>> rng = np.random.default_rng(0)
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
+    >>> melanin = 0.05 * np.exp(0.15 * rng.standard_normal(1000))
+    >>> light = 0.7 * np.exp(0.3 * rng.standard_normal((1000, 1)))
+    >>> seen = light * table.lookup(melanin, 0.02) * (1 + 3e-3 * rng.standard_normal((1000, 3)))
+    >>> found = of_colors(seen, table, prior=lognormal(0.7, 0.3), common_light=0.1,
+    ...                   variance=(3e-3 * seen) ** 2).melanin
+    >>> bool(abs(np.exp(found.mean) - 0.05) < 0.003), bool(0.1 < found.spread < 0.2)
+    (True, True)
+    """
+    if not (math.isfinite(common_light) and common_light > 0.0):
+        raise ChromophoreError(f"common_light: expected above 0, got {common_light}")
+    colors, noise, errors = _sampled(rgb, variance, model_error, valid)
+    if len(colors) < FEWEST_PIXELS:
+        return None
+    alone = chromophore_posterior.weigh(
+        colors, table, prior=prior, variance=noise, model_error=errors
+    )
+    colors, noise = colors[alone.valid].astype(np.float64), noise[alone.valid]
+    errors = errors if errors.ndim == 2 else errors[alone.valid]
+    if len(colors) < FEWEST_PIXELS:
+        return None
+    weights, mean = _weights(noise / np.square(colors), errors)
+    melanin_ends = math.log(table.c_m_max * LOWEST**3), math.log(table.c_m_max)
+    low, high = np.quantile(np.log(alone.melanin[alone.valid]), [0.01, 0.99])
+    low, high = max(low - MARGIN, melanin_ends[0]), min(high + MARGIN, melanin_ends[1])
+    rows = max(math.ceil((high - low) / STEP), 2)
+    log_melanin = low + (np.arange(rows) + 0.5) * (high - low) / rows
+    blood = LOWEST + (np.arange(BLOOD_PLACES) + 0.5) * (1.0 - LOWEST) / BLOOD_PLACES
+    axis = np.cbrt(np.exp(log_melanin) / table.c_m_max)
+    plane = np.log(evaluate(table, *np.meshgrid(axis, blood, indexing="ij"))[0])
+
+    def fitted(
+        light: float, color: Floats, begin: FaceDistribution | None = None
+    ) -> FaceDistribution:
+        from reconstruction.chromophores import face_kernels as kernels  # compiled when imported
+
+        shape = (len(colors), rows, BLOOD_PLACES // _SUMMED)
+        probability = np.zeros(shape, dtype=np.float32)
+        kernels.plane_probability(
+            np.log(colors) + color, weights, mean, plane, -2.0 * np.log(prior.density),
+            prior.low + light, prior.step, _SUMMED, probability,
+        )  # fmt: skip
+        return fit(
+            probability, log_melanin, blood.reshape(-1, _SUMMED).mean(axis=1),
+            melanin_ends=melanin_ends, blood_ends=(LOWEST, 1.0), begin=begin,
+        )  # fmt: skip
+
+    still = np.zeros(3)
+    usual = fitted(0.0, still)
+    moved = [(fitted(-common_light, still, usual), fitted(common_light, still, usual))]
+    for color in _independent(common_color):
+        moved.append((fitted(0.0, -color, usual), fitted(0.0, color, usual)))
+    return with_common_errors(usual, moved)
+
+
+def in_known_light(
+    rgb: ArrayLike, table: ColorTable, *, variance: ArrayLike, model_error: ArrayLike
+) -> FaceDistribution | None:
+    """Return the distribution over a face before the flash rig, whose white tile was captured.
+
+    Parameters
+    ----------
+    rgb, table, variance, model_error
+        As of `of_colors`.
+
+    Returns
+    -------
+    FaceDistribution or None
+        With what the place of the face and the layered model have wrong in all pixels alike.
+    """
+    return of_colors(
+        rgb,
+        table,
+        prior=shading_prior.of_faces(softness=shading_prior.SHARPEST),
+        common_light=shading_prior.SOFTNESS,
+        common_color=color_errors.color_errors().transport,
+        variance=variance,
+        model_error=model_error,
+    )
+
+
+def _sampled(
+    rgb: ArrayLike,
+    variance: ArrayLike | None,
+    model_error: ArrayLike | None,
+    valid: ArrayLike | None,
+) -> tuple[NDArray[np.float32], Floats, Floats]:
+    """Return colors (n, 3), noise (n, 3) and model errors (n, 3, 3) or (3, 3) of some pixels."""
+    colors = np.asarray(rgb, dtype=np.float32)
+    if colors.ndim == 0 or colors.shape[-1] != 3:
+        raise ChromophoreError(f"rgb: expected shape (..., 3), got {colors.shape}")
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(colors).all(axis=-1) & (colors > 0.0).all(axis=-1)
+    if valid is not None:
+        good &= np.asarray(valid, dtype=np.bool_)
+    places = np.flatnonzero(good)
+    places = places[np.linspace(0, places.size, min(PIXELS, places.size), False).astype(np.intp)]
+    chosen = colors.reshape(-1, 3)[places]
+    if variance is None:
+        noise = np.square(0.01 * chosen.astype(np.float64))
+    else:
+        whole = np.broadcast_to(np.asarray(variance), colors.shape)
+        noise = whole.reshape(-1, 3)[places].astype(np.float64)
+    errors = np.zeros((3, 3)) if model_error is None else np.asarray(model_error, np.float64)
+    if errors.shape not in ((3, 3), (*colors.shape, 3)):
+        raise ChromophoreError(
+            f"model_error: expected shape (3, 3) or {(*colors.shape, 3)}, got {errors.shape}"
+        )
+    return chosen, noise, errors if errors.ndim == 2 else errors.reshape(-1, 3, 3)[places]
+
+
+def _weights(relative: Floats, errors: Floats) -> tuple[Floats, Floats]:
+    """Return weights of color, brightness projected out, and those of the mean that tells light."""
+    total = (relative + RESOLVED**2)[:, :, None] * np.eye(3) + errors
+    weights = np.linalg.inv(without_brightness(total))
+    row = weights.sum(axis=-1)
+    whole = row.sum(axis=-1)
+    weights -= row[:, :, None] * row[:, None, :] / whole[:, None, None]
+    return np.ascontiguousarray(weights), np.ascontiguousarray(row / whole[:, None])
+
+
+def _independent(covariance: ArrayLike | None) -> list[Floats]:
+    """Return vectors whose outer products sum up to a covariance."""
+    if covariance is None:
+        return []
+    given = np.asarray(covariance, dtype=np.float64)
+    if given.shape != (3, 3) or not np.isfinite(given).all():
+        raise ChromophoreError(f"common_color: expected (3, 3) finite numbers, got {given!r}")
+    variances, axes = np.linalg.eigh(given)
+    largest = max(float(variances[-1]), 0.0)
+    return [
+        np.asarray(math.sqrt(variances[k]) * axes[:, k])
+        for k in range(3)
+        if variances[k] > 1e-3 * largest
+    ]

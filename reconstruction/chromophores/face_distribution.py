@@ -1,0 +1,295 @@
+"""How melanin and blood are distributed over one face, told by all of its pixels together.
+
+A pixel in the shade has the color of darker skin in more light, and of darker skin with more blood.
+By itself it must be taken for what is the more probable of any skin in the usual light. But skin is
+of one person: pixels in good light tell how much melanin and blood it has and how both scatter, and
+the others are weighed by that. The distribution is the one under which the colors of many pixels
+together are the most probable (their marginal likelihood, an empirical Bayes estimate), not that of
+their estimates, whose errors would widen it.
+
+What all pixels err by alike does not average out: light (the face may stand off the white tile's
+place) and the layered model. The distribution is fitted again with each of these moved by its
+standard error to both sides; half of what its means move by is their standard error. A mean at the
+end of what there may be cannot move beyond it, which says nothing of how well it is known: there
+the error is what it moves to the other side. Blood that ends at next to none is not told by color
+at all, for all skin that lives has some: any is then as probable.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import ndtr
+
+Floats = NDArray[np.float64]
+Probability = NDArray[np.floating[Any]]
+
+UNEXPECTED: Final = 0.01
+"""Least part of the skin that follows no distribution at all, as of the light
+(`reconstruction.chromophores.shading_prior.UNEXPECTED`): moles and lips are not pulled to the face's mean."""
+MOST_UNEXPECTED: Final = 0.5
+LEAST_SPREAD: Final = (0.02, 0.05)
+"""Least standard deviations of log melanin, below which no colors tell it, and of blood's cube
+root: blood varies by a third to a half over a face, as on simulated subjects of seeds 0 to 7 (0.045
+to 0.050, lips with the rest), less than what pixels err by, from which colors tell it badly."""
+MOST_SPREAD: Final = (2.0, 0.5)
+_BEGIN_SPREAD: Final = (0.3, 0.1)
+_SCALE: Final = np.array([0.1, 0.3, 0.5, 0.03, 0.3, 0.5])
+"""Of means, logs of spreads and of parts: what the search takes for one."""
+_DIFFERENCE: Final = 1e-5
+AT_END: Final = 0.02
+"""Distance from an end, of log melanin and of blood's axis, within which a mean is held by it: the
+last place that a mean may have lies up to 0.016 before the end."""
+_ROUNDS: Final = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Bell:
+    """A normal distribution over part of the skin, and any value alike over the rest."""
+
+    mean: float
+    spread: float
+    """Standard deviation, without what is not known of the mean."""
+    unexpected: float
+    """Part of the skin that may have any value, 0 to 1."""
+    low: float
+    high: float
+    """Ends of what there may be."""
+    stderr: float = 0.0
+    """Standard error of the mean."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no distribution."""
+        numbers = (self.mean, self.spread, self.unexpected, self.low, self.high, self.stderr)
+        if not (
+            all(map(math.isfinite, numbers))
+            and self.spread > 0.0
+            and 0.0 < self.unexpected <= 1.0
+            and self.low < self.high
+            and self.stderr >= 0.0
+        ):
+            raise ValueError(
+                "expected finite numbers, spread above 0, unexpected above 0 and up to 1, low "
+                f"below high, stderr not negative, got {self}"
+            )
+
+    @property
+    def width(self) -> float:
+        """Standard deviation of one pixel's value from the mean, whose error is part of it."""
+        return math.hypot(self.spread, self.stderr)
+
+    @property
+    def height(self) -> float:
+        """Density of the normal part at its mean, over that of any value alike."""
+        width = self.width
+        inside = ndtr((self.high - self.mean) / width) - ndtr((self.low - self.mean) / width)
+        whole = math.sqrt(2.0 * math.pi) * width * max(float(inside), 1e-12)
+        return (self.high - self.low) / whole
+
+    def relative_density(self, at: Floats) -> Floats:
+        """Return the density of a pixel's value over that of any value alike, at values (n,).
+
+        Examples
+        --------
+        >>> bell = Bell(0.0, 1.0, 0.1, -10.0, 10.0)
+        >>> at = np.linspace(-10.0, 10.0, 1001)
+        >>> round(float(bell.relative_density(at).mean()), 2), round(bell.height, 3)
+        (1.0, 7.979)
+        """
+        bell = self.height * np.exp(-0.5 * np.square((at - self.mean) / self.width))
+        return np.asarray((1.0 - self.unexpected) * bell + self.unexpected)
+
+    def of_cells(self, edges: Floats) -> Floats:
+        """Return the means of `relative_density` between ascending edges (n + 1,), shape (n,).
+
+        A cell may be wider than the bell.
+        """
+        below = ndtr((edges - self.mean) / self.width)
+        whole = self.height * math.sqrt(2.0 * math.pi) * self.width
+        bell = whole * np.diff(below) / np.diff(edges)
+        return np.asarray((1.0 - self.unexpected) * bell + self.unexpected)
+
+
+@dataclass(frozen=True, slots=True)
+class FaceDistribution:
+    """What one person's skin may be: melanin and blood, each by itself."""
+
+    melanin: Bell
+    """Of the logarithm of the volume fraction in the epidermis."""
+    blood: Bell
+    """Of the cube root of the volume fraction in the dermis, as a part of the table's end."""
+
+
+def fit(
+    probability: Probability,
+    log_melanin: Floats,
+    blood: Floats,
+    *,
+    melanin_ends: tuple[float, float],
+    blood_ends: tuple[float, float],
+    begin: FaceDistribution | None = None,
+) -> FaceDistribution:
+    """Return the distribution under which the colors of many pixels are the most probable.
+
+    Parameters
+    ----------
+    probability
+        (pixels, m, b): of each pixel's color, over log melanin and blood's cube root; to any scale.
+    log_melanin, blood
+        (m,) and (b,): places, equally spaced.
+    melanin_ends, blood_ends
+        All that there may be of either; the places need not reach as far.
+    begin
+        A distribution near by, if one is known.
+
+    Returns
+    -------
+    FaceDistribution
+        The means' standard errors are 0, see `with_common_errors`.
+
+    Raises
+    ------
+    ValueError
+        When shapes do not fit, or a pixel has no probability.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> melanin, blood = np.linspace(-5.0, -1.0, 161), np.linspace(0.1, 0.9, 33)
+    >>> seen = rng.normal(-3.0, 0.2, (2000, 1, 1)) + 0.3 * rng.standard_normal((2000, 1, 1))
+    >>> of_melanin = np.exp(-0.5 * ((melanin[:, None] - seen) / 0.3) ** 2)
+    >>> of_blood = np.exp(-0.5 * ((blood - 0.4) / 0.1) ** 2)
+    >>> found = fit(of_melanin * of_blood, melanin, blood, melanin_ends=(-9.0, -0.7),
+    ...             blood_ends=(0.04, 1.0)).melanin
+    >>> bool(abs(found.mean + 3.0) < 0.03), bool(abs(found.spread - 0.2) < 0.03)
+    (True, True)
+    """
+    shape = (log_melanin.size, blood.size)
+    if probability.ndim != 3 or probability.shape[1:] != shape or not len(probability):
+        raise ValueError(f"probability: expected shape (pixels, *{shape}), got {probability.shape}")
+    flat = probability.reshape(len(probability), -1)
+    total = flat.sum(axis=1, dtype=np.float64)
+    if not (np.isfinite(total).all() and (total > 0.0).all()):
+        raise ValueError("probability: expected finite positive sums of each pixel")
+    share = (flat / total[:, None]).astype(np.float32)
+    places, ends = (log_melanin, blood), (melanin_ends, blood_ends)
+    edges = [
+        np.concatenate([[1.5 * at[0] - 0.5 * at[1]], at + 0.5 * (at[1] - at[0])]) for at in places
+    ]
+
+    def bells(unknowns: Floats) -> tuple[Bell, Bell]:
+        unknowns = unknowns * _SCALE
+        first, second = (
+            Bell(
+                float(unknowns[3 * k]), math.exp(unknowns[3 * k + 1]),
+                math.exp(unknowns[3 * k + 2]), *ends[k],
+            )
+            for k in range(2)
+        )  # fmt: skip
+        return first, second
+
+    def densities(unknowns: Floats) -> tuple[Floats, Floats]:
+        first, second = bells(unknowns)
+        return first.of_cells(edges[0]), second.of_cells(edges[1])
+
+    def misfit(unknowns: Floats) -> tuple[float, Floats]:
+        """Return -log likelihood of a pixel on the mean, and its gradient."""
+        of_melanin, of_blood = densities(unknowns)
+        both = np.outer(of_melanin, of_blood).astype(np.float32).reshape(-1)
+        each = np.maximum((share @ both).astype(np.float64), 1e-30)
+        pulled = ((1.0 / each).astype(np.float32) @ share).astype(np.float64).reshape(shape)
+        by_density = pulled @ of_blood, of_melanin @ pulled
+        gradient = np.empty(6)
+        for k in range(6):
+            step = np.zeros(6)
+            step[k] = _DIFFERENCE
+            more, less = densities(unknowns + step), densities(unknowns - step)
+            gradient[k] = by_density[k // 3] @ (more[k // 3] - less[k // 3]) / (2.0 * _DIFFERENCE)
+        return -float(np.log(each).mean()), -gradient / len(share)
+
+    if begin is None:
+        usual = share.mean(axis=0, dtype=np.float64).reshape(shape)
+        means = usual.sum(axis=1) @ log_melanin, usual.sum(axis=0) @ blood
+        start = [(means[k], math.log(_BEGIN_SPREAD[k]), math.log(0.1)) for k in range(2)]
+    else:
+        start = [
+            (bell.mean, math.log(bell.spread), math.log(bell.unexpected))
+            for bell in (begin.melanin, begin.blood)
+        ]
+    bounds = [
+        bound
+        for k in range(2)
+        for bound in (
+            (float(places[k][0]), float(places[k][-1])),
+            (math.log(LEAST_SPREAD[k]), math.log(MOST_SPREAD[k])),
+            (math.log(UNEXPECTED), math.log(MOST_UNEXPECTED)),
+        )
+    ]
+    low, high = np.array(bounds).T / _SCALE
+    found = minimize(
+        misfit, np.clip(np.ravel(start) / _SCALE, low, high), jac=True, method="L-BFGS-B",
+        bounds=np.stack([low, high], axis=1),
+        options={"maxiter": _ROUNDS, "ftol": 1e-7, "gtol": 1e-5},
+    )  # fmt: skip
+    return FaceDistribution(*bells(found.x))
+
+
+def with_common_errors(
+    usual: FaceDistribution, moved: Sequence[tuple[FaceDistribution, FaceDistribution]]
+) -> FaceDistribution:
+    """Return the distribution with its means' standard errors, and any blood where none is told.
+
+    Parameters
+    ----------
+    usual
+        The fitted one.
+    moved
+        Those fitted with each error that all pixels have alike, independent of each other, at
+        minus and plus its standard error.
+
+    Examples
+    --------
+    >>> def face(mean):
+    ...     blood = Bell(0.4, 0.1, 0.01, 0.0, 1.0)
+    ...     return FaceDistribution(Bell(mean, 0.3, 0.01, -9.0, -0.7), blood)
+    >>> known = with_common_errors(face(-3.0), [(face(-3.4), face(-2.6)), (face(-3.3), face(-2.7))])
+    >>> round(known.melanin.stderr, 6), known.blood.stderr
+    (0.5, 0.0)
+    """
+    errors = [
+        math.sqrt(
+            sum(
+                _moves_by(pick(usual), pick(minus).mean, pick(plus).mean) ** 2
+                for minus, plus in moved
+            )
+        )
+        for pick in (_melanin_of, _blood_of)
+    ]
+    blood = replace(usual.blood, stderr=errors[1])
+    if blood.mean - blood.low < AT_END:
+        blood = replace(blood, unexpected=1.0)
+    return FaceDistribution(replace(usual.melanin, stderr=errors[0]), blood)
+
+
+def _moves_by(usual: Bell, minus: float, plus: float) -> float:
+    """Return by how much a mean moves with one standard error of what moved it to both sides."""
+    held = any(
+        min(mean - usual.low, usual.high - mean) < AT_END for mean in (minus, usual.mean, plus)
+    )
+    if held:
+        return max(abs(usual.mean - minus), abs(plus - usual.mean))
+    return 0.5 * (plus - minus)
+
+
+def _melanin_of(face: FaceDistribution) -> Bell:
+    return face.melanin
+
+
+def _blood_of(face: FaceDistribution) -> Bell:
+    return face.blood

@@ -1,0 +1,398 @@
+"""Linear camera RGB to melanin, hemoglobin and shading, with standard errors.
+
+Each pixel is fitted by the color table of the two-layer skin model (Jimenez et al. 2010,
+doi:10.1145/1866158.1866167, eq. 7), in the cube roots of both volume fractions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.color_table import ColorTable
+from reconstruction.chromophores import inversion_kernels as kernels
+from reconstruction.chromophores.start import LOWEST, Start, evaluate, start_for
+
+Floats = NDArray[np.float64]
+Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Shading = Literal["known"] | ArrayLike | None
+
+RELATIVE_NOISE = 0.01
+"""Relative noise of each channel that is assumed when no variance is given."""
+IDENTIFIABLE = 1.0
+"""Relative standard error above which a chromophore counts as not seen."""
+_TASK_PIXELS = 8192
+
+
+class ChromophoreError(ValueError):
+    """Arguments of the chromophore fit that do not fit each other."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChromophoreMaps:
+    """Result of the chromophore fit; every map has the pixels' shape."""
+
+    melanin: Map
+    """Volume fraction of melanin in the epidermis, 3e-5 to 0.5; NaN where the input is unusable."""
+    hemoglobin: Map
+    """Volume fraction of blood in the dermis, 2e-5 to 0.32; NaN where the input is unusable."""
+    shading: Map
+    """Factor between the table's color and the pixel: fitted when free, else as given, times the
+    most probable factor where the model error has a part common to the channels."""
+    stderr_melanin: Map
+    """Standard error of `melanin`: Fisher information of noise and model error together."""
+    stderr_hemoglobin: Map
+    """Standard error of `hemoglobin`."""
+    residual: Map
+    """Root of the weighted square sum of what the fit leaves, in standard errors. With the shading
+    free three unknowns fit three channels: it is 0 unless the color lies outside the table."""
+    valid: Mask
+    """Usable input, converged, and not `outside`."""
+    gamut_distance: Map
+    """How far the nearest color of the table is: root mean square relative difference."""
+    outside: Mask
+    """The color does not belong to the table: more than 4 standard errors and 2 percent away."""
+    melanin_identifiable: Mask
+    """The standard error is within the limit and no second solution exists."""
+    hemoglobin_identifiable: Mask
+    """The same for hemoglobin."""
+    ambiguous: Mask
+    """Darker skin under more light has the same color, with the shading free."""
+
+    @property
+    def identifiable(self) -> Mask:
+        """Pixels where both chromophores can be told."""
+        return np.asarray(self.melanin_identifiable & self.hemoglobin_identifiable)
+
+
+def invert(
+    rgb: ArrayLike,
+    table: ColorTable,
+    *,
+    shading: Shading = None,
+    variance: ArrayLike | None = None,
+    model_error: ArrayLike | None = None,
+    valid: ArrayLike | None = None,
+    shading_max: float | None = None,
+    limit: float = IDENTIFIABLE,
+) -> ChromophoreMaps:
+    """Estimate melanin and hemoglobin of every pixel.
+
+    Parameters
+    ----------
+    rgb
+        Shape (..., 3): diffuse reflectance as white-balanced linear camera RGB (radiance times pi
+        over irradiance, a perfect white is 1). With the shading free any positive factor per
+        pixel may be left in. Fitted in float32, whatever its type. Not modified.
+    table
+        Color table of the camera and the light that took the picture.
+    shading
+        None: a free factor per pixel. "known": the factor is 1. Array of shape (...) or number:
+        the known factor.
+    variance
+        Noise variance of `rgb`, broadcast to its shape. None: 1 percent of each channel.
+    model_error
+        Relative error of the table's colors, added to the noise: a standard error, one a channel,
+        or a (3, 3) covariance. A covariance with s^2 in all its cells says that the shading is
+        known to the relative standard error s only; where s is above some 10 percent, skin has
+        two solutions that `reconstruction.chromophores.posterior` weighs. None: 0.
+    valid
+        Shape (...): False where a pixel is saturated or masked otherwise. None: all may be used.
+    shading_max
+        Largest shading that is possible, if it is known; it rules out second solutions. None: any.
+    limit
+        Relative standard error up to which a chromophore counts as identifiable.
+
+    Returns
+    -------
+    ChromophoreMaps
+        Estimates and standard errors, float32, and masks, of the pixels' shape.
+
+    Raises
+    ------
+    ChromophoreError
+        When shapes do not fit, or the model error is no covariance.
+
+    Notes
+    -----
+    NaN, infinite, zero and negative colors are masked; they carry no color at all. Colors outside
+    the table end at its edge or, with the shading known, at the nearest color; `gamut_distance`
+    tells how far that is. With the shading free, skin of more than a few percent melanin turns
+    back towards the colors of lighter skin: `ambiguous` marks both, and the estimate is the
+    lighter one. Errors are those of the linearised fit; at a relative error of half and above
+    they are rough.
+
+    Maps are float32 for float64 input too: what rounding the colors to it changes is below 1e-4
+    of a standard error, with the shading known and with it free, where noise is 1 percent.
+
+    Examples
+    --------
+    >>> from model import color_table
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
+    >>> maps = invert(0.8 * table.lookup([[0.02, 0.03]], [[0.05, 0.02]]), table)
+    >>> [f"{value:.4f}" for value in maps.melanin[0]]
+    ['0.0200', '0.0300']
+    >>> [f"{value:.4f}" for value in maps.hemoglobin[0]]
+    ['0.0500', '0.0200']
+    >>> [f"{value:.3f}" for value in maps.shading[0]]
+    ['0.800', '0.800']
+    """
+    colors = np.asarray(rgb, dtype=np.float32)
+    if colors.ndim == 0 or colors.shape[-1] != 3:
+        raise ChromophoreError(f"rgb: expected shape (..., 3), got {colors.shape}")
+    shape = colors.shape[:-1]
+    free, known = _shading(shading, shape)
+    pixels = int(np.prod(shape, dtype=np.int64))
+    maps = np.empty((len(kernels.MAPS), pixels), dtype=np.float32)
+    masks = np.empty((len(kernels.MASKS), pixels), dtype=np.bool_)
+    covariance = model_covariance(model_error, variance is None)
+    covariance = without_brightness(covariance) if free else covariance
+    start = start_for(table, free)
+    if shading_max is not None and not shading_max > 0.0:
+        raise ChromophoreError(f"shading_max: expected a positive factor, got {shading_max}")
+    kernels.fit_pixels(
+        np.ascontiguousarray(colors).reshape(-1, 3),
+        _variance(variance, shape),
+        known,
+        _usable(valid, shape),
+        free,
+        covariance.astype(np.float32),
+        _cells(table),
+        np.array([table.c_m_max, table.c_hd_max], dtype=np.float32),
+        np.ascontiguousarray(start.projection, dtype=np.float32),
+        start.axes,
+        start.twin_log,
+        np.float32(np.inf if shading_max is None else np.log(shading_max)),
+        np.float32(start.side),
+        np.float32(limit),
+        maps,
+        masks,
+        _TASK_PIXELS,
+    )
+    named = {name: maps[k].reshape(shape) for k, name in enumerate(kernels.MAPS)}
+    flags = {name: masks[k].reshape(shape) for k, name in enumerate(kernels.MASKS)}
+    return ChromophoreMaps(**named, **flags)
+
+
+@dataclass(frozen=True, slots=True)
+class Identifiability:
+    """What a camera under a light can tell: Cramer-Rao bounds over the table."""
+
+    c_m: Floats
+    """Volume fractions of melanin, shape (n,)."""
+    c_hd: Floats
+    """Volume fractions of dermal blood, shape (n,)."""
+    stderr_melanin: Floats
+    """Smallest possible relative standard error of melanin, shape (n, n): [c_m, c_hd]."""
+    stderr_hemoglobin: Floats
+    """The same of hemoglobin."""
+    ambiguous: Mask
+    """Another pair of chromophores has the same color (with the shading free)."""
+    limit: float
+    """Relative standard error up to which a chromophore counts as identifiable."""
+
+    @property
+    def melanin_identifiable(self) -> Mask:
+        """Where melanin can be told."""
+        return np.asarray((self.stderr_melanin <= self.limit) & ~self.ambiguous)
+
+    @property
+    def hemoglobin_identifiable(self) -> Mask:
+        """Where hemoglobin can be told."""
+        return np.asarray((self.stderr_hemoglobin <= self.limit) & ~self.ambiguous)
+
+
+def identifiability(
+    table: ColorTable,
+    *,
+    shading: Literal["known"] | float | None = None,
+    variance: ArrayLike | Callable[[Floats], ArrayLike] | None = None,
+    model_error: ArrayLike | None = None,
+    shading_max: float | None = None,
+    limit: float = IDENTIFIABLE,
+    size: int = 64,
+) -> Identifiability:
+    """Return the Cramer-Rao bounds of both chromophores over the table.
+
+    Parameters
+    ----------
+    table
+        Color table of the camera and the light.
+    shading
+        None: free, around 1. "known": 1. A number: known, the light's level.
+    variance
+        Noise variance of a pixel's RGB: (3,), or a function from RGB (..., 3) to it. None: 1
+        percent of each channel.
+    model_error, shading_max, limit
+        As in `invert`.
+    size
+        Points along each axis, evenly spaced in the cube roots.
+
+    Returns
+    -------
+    Identifiability
+        Relative standard errors that no unbiased estimate can beat, and where estimates mean
+        nothing.
+
+    Examples
+    --------
+    >>> from model import color_table
+    >>> bounds = identifiability(color_table.build("Nikon 5100 (NPL)", "D65"), shading="known")
+    >>> darker = np.searchsorted(bounds.c_m, 0.1), np.searchsorted(bounds.c_hd, 0.02)
+    >>> bool(bounds.stderr_melanin[darker] < 0.1), bool(bounds.hemoglobin_identifiable[darker])
+    (True, False)
+    """
+    if size < 2:
+        raise ChromophoreError(f"size: expected at least 2 points, got {size}")
+    level = shading if isinstance(shading, int | float) else 1.0
+    fraction = np.linspace(LOWEST, 1.0, size)
+    a, b = np.meshgrid(fraction, fraction, indexing="ij")
+    color, by_a, by_b = evaluate(table, a, b)
+    seen = level * color
+    noise = variance(seen) if callable(variance) else variance
+    noise = np.zeros(3) if noise is None else np.asarray(noise, dtype=np.float64)
+    covariance = model_covariance(model_error, variance is None)
+    weights = _weights(
+        np.broadcast_to(noise, seen.shape) / seen**2,
+        without_brightness(covariance) if shading is None else covariance,
+        free=shading is None,
+    )
+    gradient = np.stack([by_a / color, by_b / color], axis=-1)
+    fisher = np.swapaxes(gradient, -1, -2) @ weights @ gradient
+    aa, ab, bb = fisher[..., 0, 0], fisher[..., 0, 1], fisher[..., 1, 1]
+    det = np.maximum(aa * bb - ab**2, 1e-12 * aa * bb)
+    ambiguous = np.zeros(a.shape, dtype=np.bool_)
+    if shading is None:
+        ambiguous = _second_solution(start_for(table, True), color, gradient, shading_max)
+    return Identifiability(
+        c_m=table.c_m_max * fraction**3,
+        c_hd=table.c_hd_max * fraction**3,
+        stderr_melanin=3.0 * np.sqrt(bb / det) / a,
+        stderr_hemoglobin=3.0 * np.sqrt(aa / det) / b,
+        ambiguous=ambiguous,
+        limit=limit,
+    )
+
+
+def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Floats:
+    """Return the (3, 3) covariance of relative errors that `invert` adds to the noise.
+
+    Parameters
+    ----------
+    model_error
+        None, a relative standard error, one a channel, or a covariance.
+    default_noise
+        Whether the 1 percent that stands for an unknown variance is added.
+    """
+    error = np.zeros(3) if model_error is None else np.asarray(model_error, dtype=np.float64)
+    if not np.isfinite(error).all():
+        raise ChromophoreError("model_error: expected finite numbers")
+    if error.shape in ((), (3,)):
+        if (error < 0.0).any():
+            raise ChromophoreError(f"model_error: expected no negative standard error, got {error}")
+        covariance = np.diag(np.broadcast_to(error, (3,)) ** 2)
+    elif error.shape == (3, 3):
+        if not np.allclose(error, error.T) or np.linalg.eigvalsh(error).min() < -1e-12:
+            raise ChromophoreError("model_error: expected a symmetric covariance without negatives")
+        covariance = error.copy()
+    else:
+        raise ChromophoreError(
+            f"model_error: expected a number, shape (3,) or (3, 3), got {error.shape}"
+        )
+    # Single precision of the colors themselves keeps the weights finite.
+    floor = RELATIVE_NOISE**2 if default_noise else 1e-12
+    return np.asarray(covariance + floor * np.eye(3))
+
+
+def without_brightness(covariance: Floats) -> Floats:
+    """Add an error common to the channels to a covariance whose weights will leave it out anyway.
+
+    A covariance of colors without brightness has none, and its inverse would lose all digits.
+
+    Parameters
+    ----------
+    covariance
+        (..., 3, 3), of relative errors.
+    """
+    common = np.trace(covariance, axis1=-2, axis2=-1) / 3.0 + 1e-6
+    return np.asarray(covariance + common[..., None, None])
+
+
+def _weights(relative_variance: Floats, covariance: Floats, *, free: bool) -> Floats:
+    """Return the inverse covariance of relative errors, with a free shading projected out."""
+    total = relative_variance[..., None] * np.eye(3) + covariance
+    weights = np.linalg.inv(total)
+    if free:
+        row = weights.sum(axis=-1)
+        weights = (
+            weights - row[..., :, None] * row[..., None, :] / row.sum(axis=-1)[..., None, None]
+        )
+    return np.asarray(weights)
+
+
+def _second_solution(
+    start: Start, color: Floats, gradient: Floats, shading_max: float | None
+) -> Mask:
+    """Return where skin seen with a shading of 1 has its color from other chromophores too."""
+    log_color = np.log(color)
+    place = np.rint(log_color @ start.projection[:, :3].T + start.projection[:, 3])
+    i, j = np.clip(place, 0, start.twin_log.shape[0] - 1).astype(np.intp).transpose(2, 0, 1)
+    lightest = start.twin_log[i, j].astype(np.float64)
+    darker = np.isfinite(lightest)
+    if shading_max is not None:
+        darker &= log_color.mean(axis=-1) <= lightest + np.log(shading_max)
+    facing = np.cross(gradient[..., 0], gradient[..., 1]).sum(axis=-1) * start.side
+    return np.asarray((facing <= 0.0) | darker)
+
+
+def _shading(shading: Shading, shape: tuple[int, ...]) -> tuple[bool, Map]:
+    if shading is None:
+        return True, np.ones(1, dtype=np.float32)
+    if isinstance(shading, str):
+        if shading != "known":
+            raise ChromophoreError(f'shading: expected None, "known" or an array, got {shading!r}')
+        return False, np.ones(1, dtype=np.float32)
+    known = np.asarray(shading, dtype=np.float32)
+    if known.ndim:
+        try:
+            known = np.broadcast_to(known, shape)
+        except ValueError:
+            raise ChromophoreError(
+                f"shading: expected shape {shape} or a number, got {known.shape}"
+            ) from None
+    return False, np.ascontiguousarray(known).reshape(-1)
+
+
+def _variance(variance: ArrayLike | None, shape: tuple[int, ...]) -> Map:
+    if variance is None:
+        return np.zeros((1, 3), dtype=np.float32)
+    values = np.asarray(variance, dtype=np.float32)
+    if values.shape == (3,):
+        return np.ascontiguousarray(values).reshape(1, 3)
+    try:
+        values = np.broadcast_to(values, (*shape, 3))
+    except ValueError as error:
+        raise ChromophoreError(
+            f"variance: expected a shape that broadcasts to {(*shape, 3)}, got {values.shape}"
+        ) from error
+    return np.ascontiguousarray(values).reshape(-1, 3)
+
+
+def _usable(valid: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
+    if valid is None:
+        return np.ones(1, dtype=np.bool_)
+    usable = np.asarray(valid)
+    if usable.dtype != np.bool_ or usable.shape != shape:
+        raise ChromophoreError(
+            f"valid: expected bool of shape {shape}, got {usable.dtype} of {usable.shape}"
+        )
+    return np.ascontiguousarray(usable).reshape(-1)
+
+
+def _cells(table: ColorTable) -> NDArray[np.float32]:
+    return np.ascontiguousarray(table.cells, dtype=np.float32)

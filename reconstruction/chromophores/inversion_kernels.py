@@ -1,0 +1,438 @@
+"""The chromophore fit's inner loop: one damped Newton fit a pixel, all pixels in parallel.
+
+`reconstruction.chromophores` is the door; `reconstruction.chromophores.reference` does the same in
+plain NumPy and is what this is tested against.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import boolean, float32, float64, int64, njit, prange, types, void
+
+from reconstruction.chromophores.start import LOWEST
+
+MAX_STEPS = 12
+REACH = 0.12
+"""Longest step along an axis, as a fraction of it."""
+DONE = 4e-3
+"""Step, relative to the place, after which the next one would be below 5e-5."""
+DONE_AXIS = 1e-3
+"""The same as a fraction of the axis."""
+DONE_GAIN = 1e-3
+"""The same as the square of the step in standard errors."""
+DONE_MISFIT = 1e-2
+"""What a misfit adds to it, per square of the residual: noise makes more digits worthless."""
+DONE_NOISY = 3e-2
+"""Step, relative to the place, that is the last one if noise leaves more than it gains."""
+CONVERGED = 2e-2
+"""Step, relative to the place, up to which the last one counts as converged."""
+OUTSIDE_SIGMAS = 4.0
+"""Residual, in standard errors, from which on a color does not belong to the table ..."""
+OUTSIDE_DISTANCE = 0.02
+"""... if it is also this far from it, as a relative difference of color."""
+MAPS = (
+    "melanin",
+    "hemoglobin",
+    "shading",
+    "stderr_melanin",
+    "stderr_hemoglobin",
+    "residual",
+    "gamut_distance",
+)
+MASKS = ("valid", "outside", "melanin_identifiable", "hemoglobin_identifiable", "ambiguous")
+HUGE = 1e30
+"""Colors and variances from here on count as infinite."""
+
+# Contraction only: NaN and infinity must keep their meaning.
+_FAST = {"contract"}
+_LOW = np.float32(LOWEST)
+_ONE = np.float32(1.0)
+_TWO = np.float32(2.0)
+_THREE = np.float32(3.0)
+_FOUR = np.float32(4.0)
+_HALF = np.float32(0.5)
+_ZERO = np.float32(0.0)
+
+
+@njit(inline="always", fastmath=_FAST)
+def _cell(q, x, y):  # type: ignore[no-untyped-def]
+    """Return one channel's value and derivatives v, v_x, v_y in its cell."""
+    v = v_x = v_y = _ZERO
+    for p in range(3, -1, -1):
+        c0, c1, c2, c3 = q[p, 0], q[p, 1], q[p, 2], q[p, 3]
+        v_x = v_x * x + v
+        v = v * x + (((c3 * y + c2) * y + c1) * y + c0)
+        v_y = v_y * x + ((_THREE * c3 * y + _TWO * c2) * y + c1)
+    return v, v_x, v_y
+
+
+@njit(inline="always", fastmath=_FAST)
+def _cell_bend(q, x, y):  # type: ignore[no-untyped-def]
+    """Return one channel's second derivatives v_xx, v_xy, v_yy in its cell."""
+    v = v_x = v_y = v_xx = v_xy = v_yy = _ZERO
+    for p in range(3, -1, -1):
+        c0, c1, c2, c3 = q[p, 0], q[p, 1], q[p, 2], q[p, 3]
+        v_xx = v_xx * x + v_x
+        v_xy = v_xy * x + v_y
+        v_x = v_x * x + v
+        v = v * x + (((c3 * y + c2) * y + c1) * y + c0)
+        v_y = v_y * x + ((_THREE * c3 * y + _TWO * c2) * y + c1)
+        v_yy = v_yy * x + (_THREE * c3 * y + c2)
+    return _TWO * v_xx, v_xy, _TWO * v_yy
+
+
+@njit(inline="always", fastmath=_FAST)
+def _solve(haa, hab, hbb, ra, rb):  # type: ignore[no-untyped-def]
+    """Solve the 2 x 2 normal equations; a singular one gets a ridge."""
+    det = float64(haa) * hbb - float64(hab) * hab
+    det = 1.0 / (max(det, 1e-9 * float64(haa) * hbb) + 1e-300)
+    step_a = np.float32((float64(hbb) * ra - float64(hab) * rb) * det)
+    step_b = np.float32((float64(haa) * rb - float64(hab) * ra) * det)
+    return step_a, step_b
+
+
+@njit(inline="always", fastmath=_FAST)
+def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
+    """Return p' W q."""
+    return (
+        w[0] * p0 * q0
+        + w[3] * p1 * q1
+        + w[5] * p2 * q2
+        + w[1] * (p0 * q1 + p1 * q0)
+        + w[2] * (p0 * q2 + p2 * q0)
+        + w[4] * (p1 * q2 + p2 * q1)
+    )
+
+
+@njit(inline="always", fastmath=_FAST)
+def _weights(a00, a11, a22, a01, a02, a12):  # type: ignore[no-untyped-def]
+    """Invert a symmetric 3 x 3 covariance; return w00, w01, w02, w11, w12, w22."""
+    c00 = a11 * a22 - a12 * a12
+    c01 = a02 * a12 - a01 * a22
+    c02 = a01 * a12 - a02 * a11
+    scale = 1.0 / (a00 * c00 + a01 * c01 + a02 * c02)
+    return (
+        c00 * scale,
+        c01 * scale,
+        c02 * scale,
+        (a00 * a22 - a02 * a02) * scale,
+        (a01 * a02 - a00 * a12) * scale,
+        (a00 * a11 - a01 * a01) * scale,
+    )
+
+
+@njit(inline="always", fastmath=_FAST)
+def _project(rows, l0, l1, l2):  # type: ignore[no-untyped-def]
+    """Take log RGB to the coordinates of a start grid."""
+    return (
+        rows[0, 0] * l0 + rows[0, 1] * l1 + rows[0, 2] * l2 + rows[0, 3],
+        rows[1, 0] * l0 + rows[1, 1] * l1 + rows[1, 2] * l2 + rows[1, 3],
+    )
+
+
+@njit(inline="always", fastmath=_FAST)
+def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
+    """Interpolate the start grid bilinearly, clamped to it."""
+    last = axes.shape[0] - 1
+    y0 = min(max(y0, _ZERO), np.float32(last))
+    y1 = min(max(y1, _ZERO), np.float32(last))
+    i, j = min(int(y0), last - 1), min(int(y1), last - 1)
+    x, y = y0 - np.float32(i), y1 - np.float32(j)
+    n00, n01, n10, n11 = axes[i, j], axes[i, j + 1], axes[i + 1, j], axes[i + 1, j + 1]
+    w11 = x * y
+    w10, w01 = x - w11, y - w11
+    w00 = _ONE - x - w01
+    a = w00 * n00[0] + w01 * n01[0] + w10 * n10[0] + w11 * n11[0]
+    b = w00 * n00[1] + w01 * n01[1] + w10 * n10[1] + w11 * n11[1]
+    return min(max(a, _LOW), _ONE), min(max(b, _LOW), _ONE)
+
+
+@njit(inline="always", fastmath=_FAST)
+def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyped-def]
+    """Stop a step at the table's edge, where the other chromophore is fitted alone."""
+    if a + step_a < _LOW or a + step_a > _ONE:
+        step_a = (_LOW if a + step_a < _LOW else _ONE) - a
+        step_b = (rb - ab * step_a) / bb
+        if b + step_b < _LOW or b + step_b > _ONE:
+            step_b = (_LOW if b + step_b < _LOW else _ONE) - b
+            step_a = (ra - ab * step_b) / aa
+    elif b + step_b < _LOW or b + step_b > _ONE:
+        step_b = (_LOW if b + step_b < _LOW else _ONE) - b
+        step_a = (ra - ab * step_b) / aa
+    step_a = min(max(step_a, _LOW - a), _ONE - a)
+    step_b = min(max(step_b, _LOW - b), _ONE - b)
+    longest = max(abs(step_a), abs(step_b))
+    if longest > REACH:
+        shorter = np.float32(REACH) / np.float32(longest)
+        step_a *= shorter
+        step_b *= shorter
+    return np.float32(step_a), np.float32(step_b)
+
+
+def _given(dtype: types.Type, axes: int) -> types.Array:
+    """Return the type of a contiguous argument that is only read, and may be read-only."""
+    return types.Array(dtype, axes, "C", readonly=True)
+
+
+@njit(
+    void(
+        _given(float32, 2),  # rgb (n, 3)
+        _given(float32, 2),  # variance (n, 3) or (1, 3)
+        _given(float32, 1),  # shading (n,) or (1,)
+        _given(boolean, 1),  # usable (n,) or (1,)
+        boolean,  # shading is free
+        _given(float32, 2),  # covariance of the model's relative error (3, 3)
+        _given(float32, 5),  # cells of the color table
+        _given(float32, 1),  # ends of the axes as volume fractions (2,)
+        _given(float32, 2),  # projection of log rgb, and offset (2, 4)
+        _given(float32, 3),  # start grid on it (g, g, 2)
+        _given(float32, 2),  # mean log color of second solutions (g, g)
+        float32,  # largest plausible log shading
+        float32,  # sign of the surface's side on which light skin lies
+        float32,  # largest relative standard error of an identifiable chromophore
+        float32[:, ::1],  # maps (7, n): see MAPS
+        boolean[:, ::1],  # masks (5, n): see MASKS
+        int64,  # pixels a task
+    ),
+    parallel=True,
+    fastmath=_FAST,
+    cache=True,
+    nogil=True,
+    boundscheck=False,
+    error_model="numpy",
+)
+def fit_pixels(  # type: ignore[no-untyped-def]
+    rgb,
+    variance,
+    shading,
+    usable,
+    free,
+    model,
+    cells,
+    ends,
+    projection,
+    start_axes,
+    twin_log,
+    log_shading_max,
+    light_side,
+    limit,
+    maps,
+    masks,
+    block,
+):
+    """Fit every pixel; the arguments' shapes are in the signature above."""
+    pixels = rgb.shape[0]
+    last = cells.shape[0]
+    length = np.float32(last)
+    grid = twin_log.shape[0]
+    m00, m01, m02 = model[0, 0], model[0, 1], model[0, 2]
+    m11, m12, m22 = model[1, 1], model[1, 2], model[2, 2]
+    plain = m01 == 0.0 and m02 == 0.0 and m12 == 0.0
+    common_variance = max(min(m01, m02, m12), _ZERO)
+    each_variance = variance.shape[0] > 1
+    each_shading = shading.shape[0] > 1
+    each_usable = usable.shape[0] > 1
+    for task in prange((pixels + block - 1) // block):
+        for n in range(task * block, min(pixels, (task + 1) * block)):
+            k = n if each_variance else 0
+            known = _ONE if free else shading[n if each_shading else 0]
+            d0, d1, d2 = rgb[n, 0], rgb[n, 1], rgb[n, 2]
+            v0, v1, v2 = variance[k, 0], variance[k, 1], variance[k, 2]
+            good = (
+                usable[n if each_usable else 0]
+                and known > _ZERO
+                and known < HUGE
+                and d0 > _ZERO
+                and d1 > _ZERO
+                and d2 > _ZERO
+                and d0 + d1 + d2 < HUGE
+                and v0 >= _ZERO
+                and v1 >= _ZERO
+                and v2 >= _ZERO
+                and v0 + v1 + v2 < HUGE
+            )
+            if not good:
+                for m in range(7):
+                    maps[m, n] = np.nan
+                for m in range(5):
+                    masks[m, n] = False
+                continue
+            # Weights of the relative errors; a free shading is projected out of them.
+            i0, i1, i2 = _ONE / d0, _ONE / d1, _ONE / d2
+            a00, a11, a22 = v0 * i0 * i0 + m00, v1 * i1 * i1 + m11, v2 * i2 * i2 + m22
+            if plain:
+                x0, x3, x5 = 1.0 / float64(a00), 1.0 / float64(a11), 1.0 / float64(a22)
+                x1 = x2 = x4 = 0.0
+            else:
+                x0, x1, x2, x3, x4, x5 = _weights(
+                    float64(a00),
+                    float64(a11),
+                    float64(a22),
+                    float64(m01),
+                    float64(m02),
+                    float64(m12),
+                )
+            t0, t1, t2 = x0 + x1 + x2, x1 + x3 + x4, x2 + x4 + x5
+            total = t0 + t1 + t2
+            whole = 1.0 / total
+            t0, t1, t2 = t0 * whole, t1 * whole, t2 * whole
+            s0, s1, s2 = np.float32(t0), np.float32(t1), np.float32(t2)
+            if free:
+                x0, x1, x2 = x0 - t0 * t0 * total, x1 - t0 * t1 * total, x2 - t0 * t2 * total
+                x3, x4, x5 = x3 - t1 * t1 * total, x4 - t1 * t2 * total, x5 - t2 * t2 * total
+            else:
+                unshaded = _ONE / known
+                d0, d1, d2 = d0 * unshaded, d1 * unshaded, d2 * unshaded
+            w = (
+                np.float32(x0),
+                np.float32(x1),
+                np.float32(x2),
+                np.float32(x3),
+                np.float32(x4),
+                np.float32(x5),
+            )
+            l0, l1, l2 = math.log(d0), math.log(d1), math.log(d2)
+            y0, y1 = _project(projection, l0, l1, l2)
+            a, b = _guess(start_axes, y0, y1)
+            twin_brightness = -np.float32(np.inf)
+            if free:
+                g0 = min(max(int(y0 + _HALF), 0), grid - 1)
+                g1 = min(max(int(y1 + _HALF), 0), grid - 1)
+                twin_brightness = twin_log[g0, g1]
+            a_before, b_before, cost_before = a, b, np.float32(np.inf)
+            step_a = step_b = _ZERO
+            s = _ONE
+            aa = bb = _ONE
+            ab = ra = rb = _ZERO
+            e0 = e1 = e2 = _ZERO
+            ga0 = ga1 = ga2 = gb0 = gb1 = gb2 = _ZERO
+            done = False
+            for step in range(MAX_STEPS):
+                i, j = a * length, b * length
+                row, column = min(int(i), last - 1), min(int(j), last - 1)
+                x, y = i - np.float32(row), j - np.float32(column)
+                here = cells[row, column]
+                f0, x0, y0_ = _cell(here[0], x, y)
+                f1, x1, y1_ = _cell(here[1], x, y)
+                f2, x2, y2_ = _cell(here[2], x, y)
+                r0, r1, r2 = _ONE / f0, _ONE / f1, _ONE / f2
+                q0, q1, q2 = d0 * r0, d1 * r1, d2 * r2
+                if free:
+                    s = s0 * q0 + s1 * q1 + s2 * q2
+                    t = _ONE / s
+                    e0, e1, e2 = q0 * t - _ONE, q1 * t - _ONE, q2 * t - _ONE
+                else:
+                    # log(q) to second order: a shading known to 50 percent leaves large factors.
+                    mean = (q0 + q1 + q2) / _THREE
+                    t = _ONE / mean
+                    common = math.log(mean) - _ONE
+                    e0, e1, e2 = q0 * t + common, q1 * t + common, q2 * t + common
+                cost = _form(w, e0, e1, e2, e0, e1, e2)
+                r0, r1, r2 = r0 * length, r1 * length, r2 * length
+                ga0, ga1, ga2 = x0 * r0, x1 * r1, x2 * r2
+                gb0, gb1, gb2 = y0_ * r0, y1_ * r1, y2_ * r2
+                facing = (ga1 * gb2 - ga2 * gb1) + (ga2 * gb0 - ga0 * gb2) + (ga0 * gb1 - ga1 * gb0)
+                # Beyond the fold, where gray sees the other side, lies the second solution.
+                beyond = free and cost_before < HUGE and facing * light_side < _ZERO
+                if beyond or cost > cost_before * np.float32(1.01) + np.float32(1e-9):
+                    # Overshot: half of the way back to the last good place.
+                    a, b = _HALF * (a + a_before), _HALF * (b + b_before)
+                    step_a, step_b = a - a_before, b - b_before
+                    if max(abs(step_a), abs(step_b)) < 1e-5:
+                        a, b = a_before, b_before
+                        break
+                    continue
+                cost_before, a_before, b_before = cost, a, b
+                aa = _form(w, ga0, ga1, ga2, ga0, ga1, ga2)
+                ab = _form(w, ga0, ga1, ga2, gb0, gb1, gb2)
+                bb = _form(w, gb0, gb1, gb2, gb0, gb1, gb2)
+                ra = _form(w, ga0, ga1, ga2, e0, e1, e2)
+                rb = _form(w, gb0, gb1, gb2, e0, e1, e2)
+                haa, hab, hbb = aa, ab, bb
+                step_a, step_b = _solve(aa, ab, bb, ra, rb)
+                if step > 1 and not free:
+                    # Off the surface Gauss-Newton converges slowly: Newton's Hessian has the
+                    # second derivatives of log f too, weighted by what no step can remove.
+                    o0 = e0 - ga0 * step_a - gb0 * step_b
+                    o1 = e1 - ga1 * step_a - gb1 * step_b
+                    o2 = e2 - ga2 * step_a - gb2 * step_b
+                    z0 = w[0] * o0 + w[1] * o1 + w[2] * o2
+                    z1 = w[1] * o0 + w[3] * o1 + w[4] * o2
+                    z2 = w[2] * o0 + w[4] * o1 + w[5] * o2
+                    r0, r1, r2 = r0 * length, r1 * length, r2 * length
+                    xx0, xy0, yy0 = _cell_bend(here[0], x, y)
+                    xx1, xy1, yy1 = _cell_bend(here[1], x, y)
+                    xx2, xy2, yy2 = _cell_bend(here[2], x, y)
+                    haa -= (
+                        z0 * (xx0 * r0 - ga0 * ga0)
+                        + z1 * (xx1 * r1 - ga1 * ga1)
+                        + z2 * (xx2 * r2 - ga2 * ga2)
+                    )
+                    hab -= (
+                        z0 * (xy0 * r0 - ga0 * gb0)
+                        + z1 * (xy1 * r1 - ga1 * gb1)
+                        + z2 * (xy2 * r2 - ga2 * gb2)
+                    )
+                    hbb -= (
+                        z0 * (yy0 * r0 - gb0 * gb0)
+                        + z1 * (yy1 * r1 - gb1 * gb1)
+                        + z2 * (yy2 * r2 - gb2 * gb2)
+                    )
+                    straight = float64(aa) * bb - float64(ab) * ab
+                    bent = float64(haa) * hbb - float64(hab) * hab
+                    if haa > _ZERO and hbb > _ZERO and bent > 0.25 * straight:
+                        step_a, step_b = _solve(haa, hab, hbb, ra, rb)
+                    else:
+                        haa, hab, hbb = aa, ab, bb
+                step_a, step_b = _bounded(a, b, step_a, step_b, haa, hab, hbb, ra, rb)
+                a += step_a
+                b += step_b
+                gain = abs(step_a * ra + step_b * rb)
+                longest = max(abs(step_a) / a, abs(step_b) / b)
+                misfit = cost - gain
+                if (
+                    gain < DONE_GAIN + DONE_MISFIT * misfit
+                    or (longest < DONE and max(abs(step_a), abs(step_b)) < DONE_AXIS)
+                    or (longest < DONE_NOISY and gain < misfit)
+                ):
+                    done = True
+                    break
+            # What the last step changed is taken from the linear model.
+            e0 -= ga0 * step_a + gb0 * step_b
+            e1 -= ga1 * step_a + gb1 * step_b
+            e2 -= ga2 * step_a + gb2 * step_b
+            residual = math.sqrt(max(_form(w, e0, e1, e2, e0, e1, e2), _ZERO))
+            # The shading's share of what is left: all of the mean when free, else the most
+            # probable part of it given how well it is known.
+            shift = s0 * e0 + s1 * e1 + s2 * e2
+            if free:
+                s *= _ONE + shift
+            else:
+                shift *= common_variance * np.float32(total)
+                s = np.float32(math.exp(shift))
+            e0, e1, e2 = e0 - shift, e1 - shift, e2 - shift
+            a = min(max(a, _LOW), _ONE)
+            b = min(max(b, _LOW), _ONE)
+            wide = float64(aa) * bb
+            det = max(wide - float64(ab) * ab, 1e-12 * wide) + 1e-300
+            inverse = np.float32(1.0 / det)
+            relative_a = _THREE * math.sqrt(bb * inverse) / a
+            relative_b = _THREE * math.sqrt(aa * inverse) / b
+            distance = math.sqrt((e0 * e0 + e1 * e1 + e2 * e2) / _THREE)
+            maps[0, n] = ends[0] * a * a * a
+            maps[1, n] = ends[1] * b * b * b
+            maps[2, n] = s * known
+            maps[3, n] = relative_a * maps[0, n]
+            maps[4, n] = relative_b * maps[1, n]
+            maps[5, n] = residual
+            maps[6, n] = distance
+            twin = free and (l0 + l1 + l2) / _THREE <= twin_brightness + log_shading_max
+            outside = residual > OUTSIDE_SIGMAS and distance > OUTSIDE_DISTANCE
+            close = max(abs(step_a) / a, abs(step_b) / b) < CONVERGED
+            masks[0, n] = (done or close) and not outside
+            masks[1, n] = outside
+            masks[2, n] = relative_a <= limit and a < _ONE and not twin
+            masks[3, n] = relative_b <= limit and b < _ONE and not twin
+            masks[4, n] = twin

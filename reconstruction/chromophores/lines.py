@@ -1,0 +1,47 @@
+"""Lines of equal melanin over a color table, which the weighing of chromophores goes along.
+
+Both axes run evenly in the cube root of the volume fraction over its largest, from `LOWEST` to 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.color_table import ColorTable
+from reconstruction.chromophores.start import LOWEST, evaluate
+
+Floats = NDArray[np.float64]
+
+LINES = 49
+"""Values of melanin at which there is a line."""
+NODES = 65
+"""Values of blood that each line's colors are stored at."""
+PER_LINE = 32
+"""Nodes of melanin's probability from line to line."""
+MELANIN_AXIS = np.linspace(float(LOWEST), 1.0, (LINES - 1) * PER_LINE + 1)
+"""Fractions of the melanin axis, its cube root, that they stand at."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lines:
+    """Log colors of skin along lines of equal melanin, each array (LINES, NODES, 3)."""
+
+    log_rgb: Floats
+    """Natural logarithm of the color over that of a white tile."""
+    by_a: Floats
+    """Derivative by the fraction of the melanin axis."""
+    by_b: Floats
+    """Derivative by the fraction of the blood axis."""
+
+
+@lru_cache(maxsize=16)
+def lines_of(table: ColorTable) -> Lines:
+    """Return the lines of a table; kept for the tables used last."""
+    low = float(LOWEST)
+    a, b = np.meshgrid(np.linspace(low, 1.0, LINES), np.linspace(low, 1.0, NODES), indexing="ij")
+    color, by_a, by_b = evaluate(table, a, b)
+    return Lines(np.log(color), by_a / color, by_b / color)

@@ -1,0 +1,165 @@
+"""How much light a pixel of a face may get, before its color is looked at.
+
+Light on a face over that on a white tile in its place has no bell's shape: skin that faces the
+flashes gets about the tile's light and hardly ever more, and what turns away gets less, down to
+nothing. The prior is therefore the distribution itself, as measured on simulated faces.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reconstruction.chromophores import model_error
+
+Floats = NDArray[np.float64]
+
+SOFTNESS = 0.1
+"""Spread of log shading that is added to the measured one: a face 5 % of its distance off the
+tile's place gets 10 % more or less light."""
+UNEXPECTED = 0.01
+"""Probability that a pixel does not follow the distribution at all ..."""
+UNEXPECTED_SPREAD = 1.5
+"""... but a normal one this wide in log shading, about the same mean."""
+_LOW, _HIGH, _STEP = -8.0, 5.0, 0.05
+SHARPEST = _STEP
+"""Least softness: the bins' and nodes' own width."""
+
+
+class ShadingPriorError(ValueError):
+    """A distribution of shading that is none."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShadingPrior:
+    """Probability density of the logarithm of a pixel's shading.
+
+    Attributes
+    ----------
+    low, step
+        Log shading at the first node, and from node to node.
+    density
+        (n,) at the nodes, positive; its sum times ``step`` is 1.
+    """
+
+    low: float
+    step: float
+    density: Floats
+
+    def __post_init__(self) -> None:
+        """Refuse what is no density."""
+        density = np.asarray(self.density, dtype=np.float64)
+        if density.ndim != 1 or density.size < 2:
+            raise ShadingPriorError(f"density: expected shape (n,), n >= 2, got {density.shape}")
+        if not (np.isfinite(density).all() and (density > 0.0).all()):
+            raise ShadingPriorError("density: expected finite positive numbers")
+        if not (math.isfinite(self.low) and 0.0 < self.step < math.inf):
+            raise ShadingPriorError(f"low, step: got {self.low}, {self.step}")
+        density = density / (density.sum() * self.step)
+        density.setflags(write=False)
+        object.__setattr__(self, "density", density)
+
+    @property
+    def nodes(self) -> Floats:
+        """Log shading of the nodes, (n,)."""
+        return np.asarray(self.low + self.step * np.arange(self.density.size), dtype=np.float64)
+
+    @property
+    def mean(self) -> float:
+        """Mean of log shading."""
+        return float((self.nodes * self.density).sum() * self.step)
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of log shading."""
+        return float(np.sqrt(((self.nodes - self.mean) ** 2 * self.density).sum() * self.step))
+
+    def broadened(self, spread: float) -> ShadingPrior:
+        """Return the prior with an unknown exposure: a normal spread of log shading more.
+
+        Examples
+        --------
+        >>> prior = lognormal(0.7, 0.3).broadened(0.4)
+        >>> round(prior.spread, 3)
+        0.5
+        """
+        if not 0.0 < spread < 2.0:
+            raise ShadingPriorError(f"spread: got {spread}, expected above 0 and below 2")
+        reach = np.arange(-math.ceil(4 * spread / self.step), math.ceil(4 * spread / self.step) + 1)
+        kernel = np.exp(-0.5 * (reach * self.step / spread) ** 2)
+        wide = np.convolve(self.density, kernel / kernel.sum())
+        return ShadingPrior(
+            self.low + reach[0] * self.step, self.step, np.maximum(wide, np.finfo(float).tiny)
+        )
+
+
+def lognormal(center: float, spread: float) -> ShadingPrior:
+    """Return a prior without a rig's shape: log shading is normal around log ``center``.
+
+    Examples
+    --------
+    >>> round(lognormal(0.7, 0.6).mean, 3) == round(float(np.log(0.7)), 3)
+    True
+    """
+    if not (center > 0.0 and spread > 0.0):
+        raise ShadingPriorError(f"center, spread: got {center}, {spread}, expected positive")
+    step = spread / 12.0
+    reach = np.arange(-96, 97)  # 8 spreads
+    return ShadingPrior(
+        math.log(center) + reach[0] * step, step, np.exp(-0.5 * (reach / 12.0) ** 2)
+    )
+
+
+def from_samples(
+    low: float, step: float, counts: ArrayLike, *, softness: float = SOFTNESS
+) -> ShadingPrior:
+    """Return the prior that a histogram of log shading gives, a little softened.
+
+    Parameters
+    ----------
+    low, step
+        Lower edge and width of the bins, in log shading; between -7 and 4.
+    counts
+        (n,) what fell into the bins.
+    softness
+        Spread of log shading that is added, 0.05 or more: the nodes stand that far apart.
+    """
+    if not _STEP <= softness < 2.0:
+        raise ShadingPriorError(f"softness: got {softness}, expected {_STEP} up to 2")
+    heights = np.asarray(counts, dtype=np.float64)
+    if heights.ndim != 1 or (heights < 0.0).any() or not heights.sum() > 0.0:
+        raise ShadingPriorError("counts: expected a list of numbers, not negative, not all zero")
+    places = low + step * (np.arange(heights.size) + 0.5)
+    nodes = np.arange(_LOW, _HIGH + 0.5 * _STEP, _STEP)
+    if places[0] < _LOW + 1.0 or places[-1] > _HIGH - 1.0:
+        raise ShadingPriorError(f"bins: got {places[0]:.2f} to {places[-1]:.2f}, expected -7 to 4")
+    share = heights / heights.sum()
+    density = (share * _normal(nodes[:, None] - places, softness)).sum(axis=1)
+    mean = float((share * places).sum())
+    rest = _normal(nodes - mean, UNEXPECTED_SPREAD)
+    return ShadingPrior(_LOW, _STEP, (1.0 - UNEXPECTED) * density + UNEXPECTED * rest)
+
+
+def of_faces(*, softness: float = SOFTNESS) -> ShadingPrior:
+    """Return the prior of a face before the flash rig, relative to a white tile in its place.
+
+    The distribution over the skin of the simulated subjects of seeds 0 to 19, all skin types, in
+    their mean and width and shape; ``tools/fit_model_error.py`` measures it. No other seeds set it.
+    `softness` as of `from_samples`: as small as it gets for light that a face's pixels do not have
+    in common.
+
+    Examples
+    --------
+    >>> prior = of_faces()
+    >>> bool(-0.7 < prior.mean < -0.3), bool(0.5 < prior.spread < 0.8)
+    (True, True)
+    """
+    found = model_error.shading_histogram()
+    return from_samples(found.low, found.step, found.counts, softness=softness)
+
+
+def _normal(away: Floats, spread: float) -> Floats:
+    return np.exp(-0.5 * (away / spread) ** 2) / (math.sqrt(2.0 * math.pi) * spread)

@@ -1,0 +1,1 @@
+"""Correspondence between faces: landmarks, fields and common maps."""

@@ -1,0 +1,544 @@
+"""One map (u, v) for many faces: a face unrolled, and bent until its landmarks lie on the common.
+
+A face is unrolled onto a cylinder about a vertical axis behind its nose, which has no seams where a
+face shows, and a thin-plate spline through named landmarks (a radial basis with an affine part)
+takes it to where all faces have them. Texels are averaged into the common map and values read back
+from it by the same coordinates, so that a change made there is continuous over the face, whatever
+islands its own texture consists of.
+
+References
+----------
+Pighin, Hecker, Lischinski, Szeliski, Salesin 1998, doi:10.1145/280814.280825
+Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10.2 (20 points a face)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import binary_closing, map_coordinates, maximum_filter
+
+from model.texture_statistics.masks import fill_smoothly
+from reconstruction.correspondence import landmark_field
+from reconstruction.correspondence.landmark_field import LandmarkField, LandmarkFieldError
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+Point = tuple[float, float, float]
+
+RADIUS_MM: Final = 90.0
+"""Of the cylinder; about that of a head, so that lengths on a cheek stay about what they are."""
+LEAST: Final = 6
+"""Named landmarks that two faces need in common: three for the affine part, as many again."""
+TIP_SHARE: Final = 1e-3
+"""Foremost texels that stand for the tip of the nose where no landmark names it."""
+BEHIND_MM: Final = 10.0
+"""Texels this far under the outermost at their place lie in its shadow (under ear or chin)."""
+SIZES: Final = (16, 4096)
+_BATCH: Final = 40_000
+NOSE: Final = "nose tip"
+
+
+class ParameterizationError(ValueError):
+    """Landmarks or positions that no common parameterization follows from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cylinder:
+    """What a face is unrolled from.
+
+    Attributes
+    ----------
+    tip_mm
+        Tip of the nose, rig frame (+y up, +z out of the face); the axis is vertical,
+        `RADIUS_MM` behind it.
+    """
+
+    tip_mm: Point
+
+    def unroll(self, position_mm: ArrayLike) -> Floats:
+        """Return (u, v), mm: arc to the right of the nose's tip as seen, and height above it.
+
+        Parameters
+        ----------
+        position_mm
+            Shape (..., 3), rig frame.
+
+        Examples
+        --------
+        >>> Cylinder((0.0, 10.0, 20.0)).unroll([[90.0, 15.0, -70.0]]).round(2).tolist()
+        [[141.37, 5.0]]
+        """
+        at = np.asarray(position_mm, np.float64) - np.asarray(self.tip_mm)
+        arc = RADIUS_MM * np.arctan2(at[..., 0], at[..., 2] + RADIUS_MM)
+        return np.stack([arc, at[..., 1]], axis=-1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommonFrame:
+    """The common map: where its landmarks lie, and which part of the plane it shows.
+
+    Attributes
+    ----------
+    names
+        Of the landmarks.
+    landmarks_mm
+        (K, 2), u to the right and v up from the nose's tip.
+    center_mm
+        Middle of the map, (u, v).
+    side_mm
+        Length of its sides, above 0.
+    size
+        Pixels a side, 16 to 4096.
+    """
+
+    names: tuple[str, ...]
+    landmarks_mm: Floats
+    center_mm: tuple[float, float]
+    side_mm: float
+    size: int
+
+    def __post_init__(self) -> None:
+        """Check shapes and ranges."""
+        if self.landmarks_mm.shape != (len(self.names), 2):
+            raise ParameterizationError(
+                f"landmarks_mm: got shape {self.landmarks_mm.shape}, "
+                f"expected ({len(self.names)}, 2)"
+            )
+        if not np.isfinite(self.landmarks_mm).all() or not np.isfinite(self.center_mm).all():
+            raise ParameterizationError("landmarks_mm: got a place that is not finite")
+        if not (math.isfinite(self.side_mm) and self.side_mm > 0):
+            raise ParameterizationError(f"side_mm: got {self.side_mm}, expected above 0")
+        if not SIZES[0] <= self.size <= SIZES[1]:
+            raise ParameterizationError(
+                f"size: got {self.size}, expected {SIZES[0]} to {SIZES[1]} pixels"
+            )
+
+    @property
+    def pixel_mm(self) -> float:
+        """Side of a pixel."""
+        return self.side_mm / self.size
+
+    def pixel(self, uv_mm: ArrayLike) -> Floats:
+        """Return (column, row) of places in the map, (..., 2); pixel (0, 0) is centred at 0, 0."""
+        uv = (np.asarray(uv_mm, np.float64) - self.center_mm) / self.pixel_mm
+        middle = 0.5 * (self.size - 1)
+        return np.stack([middle + uv[..., 0], middle - uv[..., 1]], axis=-1)
+
+    def grid_mm(self) -> Floats:
+        """Return (u, v) of each pixel, (N, N, 2), row 0 at the top."""
+        along = (np.arange(self.size) - 0.5 * (self.size - 1)) * self.pixel_mm
+        u, v = np.meshgrid(along + self.center_mm[0], self.center_mm[1] - along)
+        return np.stack([u, v], axis=-1)
+
+    def landmark(self, name: str) -> Floats:
+        """Return where a landmark lies, (2,), mm."""
+        if name not in self.names:
+            raise ParameterizationError(
+                f"landmark {name!r}: is not one of {', '.join(sorted(self.names))}"
+            )
+        return self.landmarks_mm[self.names.index(name)]
+
+    def document(self) -> dict[str, object]:
+        """Return the frame as JSON values; `from_document` reads them back."""
+        return {
+            "names": list(self.names),
+            "landmarks_mm": self.landmarks_mm.tolist(),
+            "center_mm": list(self.center_mm),
+            "side_mm": self.side_mm,
+            "size": self.size,
+            "radius_mm": RADIUS_MM,
+        }
+
+    @staticmethod
+    def from_document(told: Mapping[str, object]) -> CommonFrame:
+        """Return the frame that `document` described.
+
+        Raises
+        ------
+        ParameterizationError
+            Naming what is missing or of another kind.
+        """
+        try:
+            if float(told["radius_mm"]) != RADIUS_MM:  # type: ignore[arg-type]
+                raise ParameterizationError(
+                    f"radius_mm: got {told['radius_mm']}, expected {RADIUS_MM}"
+                )
+            u, v = (float(x) for x in told["center_mm"])  # type: ignore[attr-defined]
+            return CommonFrame(
+                tuple(str(name) for name in told["names"]),  # type: ignore[attr-defined]
+                np.asarray(told["landmarks_mm"], np.float64).reshape(-1, 2),
+                (u, v),
+                float(told["side_mm"]),  # type: ignore[arg-type]
+                int(told["size"]),  # type: ignore[call-overload]
+            )
+        except ParameterizationError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:
+            raise ParameterizationError(f"common parameterization: {error}") from error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correspondence:
+    """How one face lies in the common map.
+
+    Attributes
+    ----------
+    cylinder
+        What it is unrolled from.
+    field
+        Bends its landmarks onto the common ones; None: it is unrolled and no more.
+    """
+
+    cylinder: Cylinder
+    field: LandmarkField | None = None
+
+    def at(self, position_mm: ArrayLike) -> tuple[Floats, Floats]:
+        """Return common (u, v) of points, (..., 2), and their standard error, (...), mm.
+
+        Parameters
+        ----------
+        position_mm
+            Shape (..., 3), rig frame.
+
+        Returns
+        -------
+        tuple of ndarray
+            The error along each axis holds how precisely landmarks were placed and what a face
+            may do between them; NaN without landmarks, where nothing says it.
+        """
+        flat = self.cylinder.unroll(position_mm).reshape(-1, 2)
+        shape = np.shape(position_mm)[:-1]
+        if self.field is None:
+            return flat.reshape(*shape, 2), np.full(shape, np.nan)
+        moved, error = np.empty_like(flat), np.empty(len(flat))
+        for start in range(0, len(flat), _BATCH):
+            part = slice(start, start + _BATCH)
+            by, off = self.field.at(flat[part])
+            moved[part], error[part] = flat[part] + by, np.hypot(off, self.field.stderr_px)
+        return moved.reshape(*shape, 2), error.reshape(shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chart:
+    """Where each texel of a face's texture lies in the common map.
+
+    Attributes
+    ----------
+    size
+        Pixels a side of the map.
+    place_px
+        (H, W, 2), column and row; may lie outside the map.
+    on_surface
+        (H, W): texels that show the surface.
+    outermost
+        (H, W): those that no other part of the face covers.
+    stderr_mm
+        (H, W): of the place; NaN where nothing says it.
+    """
+
+    size: int
+    place_px: NDArray[np.float64]
+    on_surface: Bools
+    outermost: Bools
+    stderr_mm: Image
+
+    def gather(self, texture: ArrayLike, valid: ArrayLike | None = None) -> tuple[Image, Bools]:
+        """Average a texture into the common map.
+
+        Parameters
+        ----------
+        texture
+            (H, W) or (H, W, C).
+        valid
+            (H, W), texels that count; by default all of the surface.
+
+        Returns
+        -------
+        values : ndarray of float32, shape (N, N) or (N, N, C)
+            Filled from around where no texel lies.
+        valid : ndarray of bool, shape (N, N)
+            Pixels that texels say something about: at most half a texel's distance from one.
+        """
+        image = np.asarray(texture, np.float64)
+        layers = image if image.ndim == 3 else image[..., None]
+        use = self.on_surface & self.outermost
+        if valid is not None:
+            use = use & np.asarray(valid, np.bool_)
+        total, weight = _splat(self.place_px[use], layers[use], self.size)
+        mean = total / np.maximum(weight, 1e-12)[..., None]
+        known = weight > 0.0
+        near = _closed(known)
+        if not known.any():
+            return np.zeros_like(mean if image.ndim == 3 else mean[..., 0], np.float32), known
+        filled = fill_smoothly(mean, known).astype(np.float32)
+        return filled if image.ndim == 3 else filled[..., 0], near
+
+    def read(self, common: ArrayLike) -> tuple[Image, Bools]:
+        """Read a common map at the texels, linearly.
+
+        Parameters
+        ----------
+        common
+            (N, N) or (N, N, C).
+
+        Returns
+        -------
+        values : ndarray of float32, shape (H, W) or (H, W, C)
+            The nearest pixel's where a texel lies outside the map.
+        inside : ndarray of bool, shape (H, W)
+            Texels of the surface inside the map.
+        """
+        image = np.asarray(common, np.float64)
+        layers = image if image.ndim == 3 else image[..., None]
+        at = [self.place_px[..., 1], self.place_px[..., 0]]
+        out = np.stack(
+            [
+                map_coordinates(layers[..., c], at, order=1, mode="nearest")
+                for c in range(layers.shape[2])
+            ],
+            axis=-1,
+        ).astype(np.float32)
+        last = self.size - 0.5
+        inside = self.on_surface & np.all((self.place_px >= -0.5) & (self.place_px <= last), axis=2)
+        return out if image.ndim == 3 else out[..., 0], inside
+
+
+def find_cylinder(
+    position_mm: ArrayLike, valid: ArrayLike, landmarks: Mapping[str, Point] | None = None
+) -> Cylinder:
+    """Find what to unroll a face from: by the landmark "nose tip", else by its foremost texels.
+
+    Parameters
+    ----------
+    position_mm
+        (H, W, 3), rig frame.
+    valid
+        (H, W), texels of the surface.
+    landmarks
+        Name to x, y, z, mm, rig frame.
+
+    Raises
+    ------
+    ParameterizationError
+        When no texel is valid.
+    """
+    if landmarks and NOSE in landmarks:
+        x, y, z = landmarks[NOSE]
+        return Cylinder((float(x), float(y), float(z)))
+    points = np.asarray(position_mm, np.float64)[np.asarray(valid, np.bool_)]
+    if not len(points):
+        raise ParameterizationError("position: no texel is valid")
+    count = max(1, round(TIP_SHARE * len(points)))
+    front = points[np.argpartition(points[:, 2], len(points) - count)[-count:]]
+    x, y, z = np.median(front, axis=0)
+    return Cylinder((float(x), float(y), float(z)))
+
+
+def common_landmarks(
+    faces: Sequence[Mapping[str, Point]],
+) -> tuple[tuple[str, ...], Floats]:
+    """Return the landmarks that all faces have, and their mean places in the unrolled plane.
+
+    Parameters
+    ----------
+    faces
+        One or more: name to x, y, z, mm, rig frame; each with "nose tip".
+
+    Returns
+    -------
+    names : tuple of str
+    landmarks_mm : ndarray, shape (K, 2)
+        Mean of the faces, each brought to the mean size about the landmarks' middle first.
+
+    Raises
+    ------
+    ParameterizationError
+        When fewer than `LEAST` are common, or one face lacks the nose's tip.
+    """
+    if not faces:
+        raise ParameterizationError("landmarks: got no face")
+    names = tuple(name for name in faces[0] if all(name in face for face in faces))
+    if NOSE not in names:
+        raise ParameterizationError(f"landmarks: {NOSE!r} is missing of a face, expected it of all")
+    if len(names) < LEAST:
+        raise ParameterizationError(
+            f"landmarks: all faces have {len(names)} in common ({', '.join(names) or 'none'}), "
+            f"expected at least {LEAST}, better 20"
+        )
+    places = np.stack(
+        [
+            Cylinder(face[NOSE]).unroll(np.array([face[name] for name in names], np.float64))
+            for face in faces
+        ]
+    )
+    middle = places.mean(axis=1, keepdims=True)
+    spread = np.sqrt(((places - middle) ** 2).sum(axis=2).mean(axis=1))[:, None, None]
+    if not np.all(spread > 0):
+        raise ParameterizationError("landmarks: all of a face lie at one point")
+    mean = ((places - middle) / spread).mean(axis=0) * float(spread.mean())
+    return names, mean - mean[names.index(NOSE)]
+
+
+def correspond(
+    landmarks: Mapping[str, Point], frame: CommonFrame, *, stderr_mm: float = 1.0
+) -> Correspondence:
+    """Find how a face's landmarks lie in the common map.
+
+    Parameters
+    ----------
+    landmarks
+        Name to x, y, z, mm, rig frame; those that the frame knows count.
+    frame
+        The common map.
+    stderr_mm
+        Of a landmark's place along each axis, above 0.
+
+    Returns
+    -------
+    Correspondence
+
+    Raises
+    ------
+    ParameterizationError
+        For too few landmarks, some on one line, or such that the map folds, naming the one that
+        fits the others least.
+    """
+    names = [name for name in frame.names if name in landmarks]
+    if NOSE not in names or len(names) < LEAST:
+        raise ParameterizationError(
+            f"landmarks: got {len(names)} that the common map knows "
+            f"({', '.join(names) or 'none'}), expected at least {LEAST} and {NOSE!r} among them"
+        )
+    cylinder = Cylinder(landmarks[NOSE])
+    own = cylinder.unroll(np.array([landmarks[name] for name in names], np.float64))
+    common = np.array([frame.landmark(name) for name in names])
+    try:
+        field = landmark_field.fit(own, common, stderr_px=stderr_mm)
+    except LandmarkFieldError as error:
+        raise ParameterizationError(str(error).replace("stderr_px", "stderr_mm")) from error
+    if _folds(field, own):
+        worst = names[int(np.argmax(field.leave_one_out_px))]
+        raise ParameterizationError(
+            f"landmarks: no map without folds goes through them; {worst!r} lies "
+            f"{field.leave_one_out_px.max():.0f} mm from where the others put it: are two of "
+            "them exchanged, or left and right (as seen in the image)?"
+        )
+    return Correspondence(cylinder, field)
+
+
+def chart(
+    position_mm: ArrayLike, valid: ArrayLike, correspondence: Correspondence, frame: CommonFrame
+) -> Chart:
+    """Lay a face's texels out in the common map.
+
+    Parameters
+    ----------
+    position_mm
+        (H, W, 3), rig frame.
+    valid
+        (H, W), texels that show the surface; values elsewhere mean nothing.
+    correspondence
+        Of this face.
+    frame
+        The common map.
+    """
+    position = np.asarray(position_mm, np.float64)
+    shown = np.asarray(valid, np.bool_)
+    if position.ndim != 3 or position.shape[2] != 3 or shown.shape != position.shape[:2]:
+        raise ParameterizationError(
+            f"position: got shapes {position.shape} and {shown.shape}, expected (H, W, 3), (H, W)"
+        )
+    if not shown.any():
+        raise ParameterizationError("position: no texel is valid")
+    place = np.full((*shown.shape, 2), -2.0)
+    error = np.full(shown.shape, np.nan, np.float32)
+    uv, off = correspondence.at(position[shown])
+    place[shown], error[shown] = frame.pixel(uv), off
+    tip = np.asarray(correspondence.cylinder.tip_mm)
+    reach = np.zeros(shown.shape)
+    reach[shown] = np.hypot(position[shown, 0] - tip[0], position[shown, 2] - tip[2] + RADIUS_MM)
+    return Chart(frame.size, place, shown, shown & _outermost(place, reach, shown, frame), error)
+
+
+def frame_around(
+    names: tuple[str, ...], landmarks_mm: Floats, places_mm: Sequence[Floats], *, size: int
+) -> CommonFrame:
+    """Return a square map that shows what most faces show.
+
+    Parameters
+    ----------
+    names, landmarks_mm
+        As `common_landmarks` gives them.
+    places_mm
+        Of each face, unrolled places of its texels, (n, 2).
+    size
+        Pixels a side.
+    """
+    low = np.median([np.quantile(at, 0.01, axis=0) for at in places_mm], axis=0)
+    high = np.median([np.quantile(at, 0.99, axis=0) for at in places_mm], axis=0)
+    # no wider than a quarter turn to either side: beyond it a face shows ears and hair
+    reach = 0.5 * math.pi * RADIUS_MM
+    low[0], high[0] = max(low[0], -reach), min(high[0], reach)
+    middle = 0.5 * (low + high)
+    side = float(np.max(high - low))
+    return CommonFrame(names, landmarks_mm, (float(middle[0]), float(middle[1])), side, size)
+
+
+def _folds(field: LandmarkField, own: Floats) -> bool:
+    """Return whether the map turns anything over, within the landmarks and a fifth around."""
+    low, high = own.min(axis=0), own.max(axis=0)
+    rim = 0.2 * (high - low)
+    along = [np.linspace(a - r, b + r, 40) for a, b, r in zip(low, high, rim, strict=True)]
+    u, v = np.meshgrid(*along)
+    points = np.stack([u, v], axis=-1)
+    moved = points + field.at(points.reshape(-1, 2))[0].reshape(points.shape)
+    du, dv = np.diff(moved, axis=1)[:-1], np.diff(moved, axis=0)[:, :-1]
+    return bool(np.any(du[..., 0] * dv[..., 1] - du[..., 1] * dv[..., 0] <= 0.0))
+
+
+def _outermost(place: Floats, reach: Floats, shown: Bools, frame: CommonFrame) -> Bools:
+    """Return the texels that lie about as far out as any near their place, on cells of 2 mm."""
+    cells = max(1, math.ceil(frame.side_mm / 2.0))
+    at = np.floor((place + 0.5) * (cells / frame.size)).astype(np.int64)
+    inside = shown & np.all((at >= 0) & (at < cells), axis=2)
+    index = at[..., 1] * cells + at[..., 0]
+    highest = np.zeros(cells * cells)
+    np.maximum.at(highest, index[inside], reach[inside])
+    highest = maximum_filter(highest.reshape(cells, cells), size=3, mode="nearest").ravel()
+    out = shown & ~inside
+    out[inside] = reach[inside] >= highest[index[inside]] - BEHIND_MM
+    return np.asarray(out, np.bool_)
+
+
+def _splat(at: Floats, values: Floats, size: int) -> tuple[Floats, Floats]:
+    """Add values to the four pixels around each place; return sums (N, N, C) and weights."""
+    total = np.zeros((size * size, values.shape[1]))
+    weight = np.zeros(size * size)
+    low = np.floor(at).astype(np.int64)
+    part = at - low
+    for dx in (0, 1):
+        for dy in (0, 1):
+            share = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
+            x, y = low[:, 0] + dx, low[:, 1] + dy
+            use = (x >= 0) & (x < size) & (y >= 0) & (y < size) & (share > 1e-6)
+            index = y[use] * size + x[use]
+            weight += np.bincount(index, share[use], minlength=size * size)
+            for c in range(values.shape[1]):
+                total[:, c] += np.bincount(
+                    index, share[use] * values[use, c], minlength=size * size
+                )
+    return total.reshape(size, size, -1), weight.reshape(size, size)
+
+
+def _closed(known: Bools) -> Bools:
+    """Close gaps of up to two pixels, as between texels that lie wider than the map's pixels."""
+    padded = np.pad(known, 3, mode="edge")
+    closed = binary_closing(padded, structure=np.ones((3, 3)), iterations=2)
+    return np.asarray(closed[3:-3, 3:-3] | known, np.bool_)

@@ -1,0 +1,429 @@
+"""A picture of an expression laid over the neutral one: landmarks, then every pixel.
+
+Named landmarks give a thin-plate spline that is as smooth as their uncertainty leaves open; dense
+optical flow refines it where the skin has texture. Both work on local contrast, from which light
+and regional changes of blood are gone: blood that fills or leaves a region is not motion, and the
+vessels it fills stay where they are in the skin.
+
+Without landmarks, points are found by features, and the result says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.skin import SkinMap
+from reconstruction.correspondence import landmark_field, landmark_table
+from reconstruction.registration import RegistrationError, dense_flow, evened, feature_matches
+
+Float32s = NDArray[np.float32]
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Points = Mapping[str, tuple[float, float]]
+
+LANDMARK_STDERR_PX = 1.0
+"""Of a landmark in one picture along each axis, as placed by hand."""
+FEATURE_STDERR_PX = 0.5
+LARGEST_ERROR_PX = 4.0
+"""Pixels whose estimated error is larger are invalid."""
+FEW_LANDMARKS = 20
+"""Fewer than these leave much of a face to the flow alone."""
+LEAST_SIDE_PX = 32
+
+
+class AlignmentError(RegistrationError):
+    """Pictures or landmarks that cannot be aligned."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """Where each pixel of the neutral picture lies in the moving one.
+
+    Attributes
+    ----------
+    source_px : ndarray of float32, shape (H, W, 2)
+        Column and row in the moving picture; means nothing where not `valid`.
+    valid : ndarray of bool, shape (H, W)
+        Inside both pictures and their masks, not folded, and the error is small enough.
+    error_px : ndarray of float32, shape (H, W)
+        Estimated root mean square distance between `source_px` and the truth.
+    residual_px : ndarray of float32, shape (H, W)
+        How far a pixel ends from where it began, after the way to the moving picture and back.
+    followed : ndarray of bool, shape (H, W)
+        The optical flow was believed; elsewhere landmarks and neighbors tell the place.
+    landmark_rms_px : float
+        Root mean square distance of the landmarks from where the alignment puts them.
+    leave_one_out_px : mapping of str to float
+        How far each landmark lies from where the others put it: a large one is misplaced, or
+        alone in what it moves with.
+    folded_fraction : float
+        Part of the pixels within the masks where the map folds over.
+    by : str
+        "landmarks" or "features".
+    moving_shape : (int, int)
+        Rows and columns of the moving picture.
+    """
+
+    source_px: Float32s
+    valid: Bools
+    error_px: Float32s
+    residual_px: Float32s
+    followed: Bools
+    landmark_rms_px: float
+    leave_one_out_px: Mapping[str, float]
+    folded_fraction: float
+    by: Literal["landmarks", "features"]
+    moving_shape: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that do not fit."""
+        shape = self.valid.shape
+        if self.source_px.shape != (*shape, 2) or self.error_px.shape != shape:
+            raise AlignmentError(
+                f"source_px: got shape {self.source_px.shape}, expected {(*shape, 2)}"
+            )
+
+    def warp(self, values: ArrayLike, valid: ArrayLike | None = None) -> tuple[Float32s, Bools]:
+        """Lay a map of the moving picture over the neutral one.
+
+        Parameters
+        ----------
+        values : array_like, shape (h, w) or (h, w, C)
+            Of the moving picture's size.
+        valid : array_like of bool, shape (h, w), optional
+            Where `values` mean something.
+
+        Returns
+        -------
+        values : ndarray of float32, shape (H, W) or (H, W, C)
+            0 where not valid.
+        valid : ndarray of bool, shape (H, W)
+            No pixel that is read is invalid. Between pixels the values are interpolated by cubic
+            polynomials, which keep small contrast, beside masked ones linearly.
+        """
+        image, good = self._checked(values, valid)
+        filled = np.where(good[..., None] if image.ndim == 3 else good, image, 0.0)
+        filled = filled.astype(np.float32)
+        unknown = (~good).astype(np.float32)
+        near = dense_flow.bilinear(unknown, self.source_px)
+        wide = dense_flow.bilinear(cv2.dilate(unknown, np.ones((5, 5), np.uint8)), self.source_px)
+        linear = dense_flow.bilinear(filled, self.source_px)
+        cubic = dense_flow.bilinear(filled, self.source_px, interpolation=cv2.INTER_CUBIC)
+        smooth = wide <= 0.0
+        seen = self.valid & (near <= 0.0)
+        if image.ndim == 3:
+            linear = linear.reshape(*seen.shape, image.shape[2])
+            cubic = cubic.reshape(*seen.shape, image.shape[2])
+            smooth, shown = smooth[..., None], seen[..., None]
+        else:
+            shown = seen
+        return np.where(shown, np.where(smooth, cubic, linear), 0.0).astype(np.float32), seen
+
+    def warp_stderr(
+        self, values: ArrayLike, stderr: ArrayLike, valid: ArrayLike | None = None
+    ) -> Float32s:
+        """Return the standard error of a warped map: its own, and that of the place.
+
+        Parameters
+        ----------
+        values, stderr : array_like, shape (h, w) or (h, w, C)
+            Map of the moving picture and its standard error.
+        valid : array_like of bool, shape (h, w), optional
+
+        Returns
+        -------
+        ndarray of float32
+            Shape of the warped map, 0 where it is not valid. Interpolation averages some noise
+            away; that is not counted. Where the place is uncertain the value is, by the map's
+            slope (smoothed over 2 px) times the error of the place.
+        """
+        image, good = self._checked(values, valid)
+        own, _ = self._checked(stderr, valid)
+        variance, seen = self.warp(np.square(own), good)
+        slope = _slope_variance(image, good)
+        steep, _ = self.warp(slope, None)
+        place = np.square(self.error_px) / 2.0
+        place = place[..., None] if image.ndim == 3 else place
+        # cubic interpolation may undershoot
+        total = np.maximum(variance, 0.0) + np.maximum(steep, 0.0) * place
+        shown = seen[..., None] if image.ndim == 3 else seen
+        return np.where(shown, np.sqrt(total), 0.0).astype(np.float32)
+
+    def place_stderr(self, values: ArrayLike, valid: ArrayLike | None = None) -> Float32s:
+        """Return how far a map on the neutral picture may be off because its places are.
+
+        Parameters
+        ----------
+        values : array_like, shape (H, W) or (H, W, C)
+            What was warped, or computed of it: the change of a state's blood, for one.
+        valid : array_like of bool, shape (H, W), optional
+
+        Returns
+        -------
+        ndarray of float32
+            Shape of `values`: its slope (smoothed over 2 px) times the error of the place; 0 where
+            not valid. It adds to other errors in squares.
+        """
+        image = np.asarray(values, np.float32)
+        if image.ndim not in (2, 3) or image.shape[:2] != self.valid.shape:
+            raise AlignmentError(f"values: got shape {image.shape}, expected {self.valid.shape}")
+        good = self.valid if valid is None else self.valid & np.asarray(valid, bool)
+        finite = np.isfinite(image)
+        good = good & (finite.all(axis=-1) if image.ndim == 3 else finite)
+        place = self.error_px if image.ndim == 2 else self.error_px[..., None]
+        steep = np.sqrt(_slope_variance(np.where(finite, image, 0.0).astype(np.float32), good))
+        return np.asarray(steep * place / math.sqrt(2.0), np.float32)
+
+    def warp_map(self, skin_map: SkinMap, *, place: bool = True) -> SkinMap:
+        """Lay a map with its standard error and mask over the neutral picture.
+
+        Parameters
+        ----------
+        skin_map
+            Of the moving picture.
+        place
+            Whether the error of the place is added to the map's own. Colors for
+            `reconstruction.facial_color.shared_melanin` go without: `reconstruction.facial_color.registration_error` tells it with
+            how the channels go together. What interpolation averages of the noise is taken off
+            then.
+        """
+        values, seen = self.warp(skin_map.values, skin_map.valid)
+        stderr = None
+        if skin_map.stderr is not None and place:
+            stderr = self.warp_stderr(skin_map.values, skin_map.stderr, skin_map.valid)
+        elif skin_map.stderr is not None:
+            variance, _ = self.warp(np.square(skin_map.stderr), skin_map.valid)
+            left = dense_flow.noise_left(self.source_px)
+            left = left[..., None] if values.ndim == 3 else left
+            stderr = np.sqrt(np.maximum(variance, 0.0) * left).astype(np.float32)
+        return SkinMap(values, skin_map.unit, stderr, seen, skin_map.description)
+
+    def _checked(self, values: ArrayLike, valid: ArrayLike | None) -> tuple[Float32s, Bools]:
+        image = np.asarray(values, np.float32)
+        if image.ndim not in (2, 3) or image.shape[:2] != self.moving_shape:
+            raise AlignmentError(
+                f"values: got shape {image.shape}, expected {self.moving_shape} or with channels"
+            )
+        good = np.ones(self.moving_shape, bool) if valid is None else np.asarray(valid, bool)
+        if good.shape != self.moving_shape:
+            raise AlignmentError(f"valid: got shape {good.shape}, expected {self.moving_shape}")
+        finite = np.isfinite(image)
+        return image, good & (finite.all(axis=-1) if image.ndim == 3 else finite)
+
+
+def align(
+    moving: ArrayLike,
+    neutral: ArrayLike,
+    *,
+    landmarks_moving: Points | None = None,
+    landmarks_neutral: Points | None = None,
+    valid_moving: ArrayLike | None = None,
+    valid_neutral: ArrayLike | None = None,
+    landmark_stderr_px: float = LANDMARK_STDERR_PX,
+    largest_error_px: float = LARGEST_ERROR_PX,
+    rounds: int = dense_flow.ROUNDS,
+) -> Alignment:
+    """Find where each pixel of the neutral picture lies in that of an expression.
+
+    Parameters
+    ----------
+    moving, neutral : array_like, shape (h, w) or (h, w, 3), and (H, W) or (H, W, 3)
+        Linear pictures, best of light from inside the skin (crossed polarizers); of colors the
+        mean of their logarithms is used. Or maps in which the same structure can be seen.
+    landmarks_moving, landmarks_neutral : mapping of str to (x, y), optional
+        Column and row, px; those of the same name are used, at least 4. Neither: points are found
+        by features.
+    valid_moving, valid_neutral : array_like of bool, optional
+        What is skin in each picture.
+    landmark_stderr_px : float
+        Standard error of a landmark in one picture along each axis, above 0. It sets how smooth
+        the motion between landmarks is.
+    largest_error_px : float
+        Pixels with a larger estimated error are invalid.
+    rounds : int
+        How often the dense flow is followed; 0: landmarks or features alone.
+
+    Returns
+    -------
+    Alignment
+
+    Raises
+    ------
+    AlignmentError
+        For pictures or landmarks that do not fit, or too few of either to find a motion.
+
+    Notes
+    -----
+    A wrinkle that opens, an eye that closes or a lip that turns out has no counterpart: such
+    places are told by the ways forth and back that do not meet, and by folds.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> skin = cv2.GaussianBlur(rng.random((80, 80)).astype(np.float32), (0, 0), 1.5)
+    >>> marks = {str(k): (20.0 + 40 * (k % 2), 20.0 + 40 * (k // 2)) for k in range(4)}
+    >>> moved = {name: (x + 3, y) for name, (x, y) in marks.items()}
+    >>> found = align(
+    ...     np.roll(skin, 3, axis=1), skin, landmarks_moving=moved, landmarks_neutral=marks
+    ... )
+    >>> (found.source_px[40, 40] - [40, 40]).round(1).tolist()
+    [3.0, 0.0]
+    """
+    if (landmarks_moving is None) != (landmarks_neutral is None):
+        missing = "landmarks_moving" if landmarks_moving is None else "landmarks_neutral"
+        raise AlignmentError(f"{missing}: got None, expected landmarks of both pictures or neither")
+    if rounds < 0:
+        raise AlignmentError(f"rounds: got {rounds}, expected 0 or more")
+    second, mask_second = _structure("moving", moving, valid_moving)
+    first, mask = _structure("neutral", neutral, valid_neutral)
+    by: Literal["landmarks", "features"]
+    try:
+        if landmarks_moving is not None and landmarks_neutral is not None:
+            names, points, moved = _common(landmarks_moving, landmarks_neutral)
+            by, stderr = "landmarks", math.sqrt(2.0) * landmark_stderr_px
+        else:
+            points, moved = feature_matches.match(
+                first, second, valid=mask, valid_second=mask_second
+            )
+            names = [f"feature {k + 1}" for k in range(len(points))]
+            by, stderr = "features", math.sqrt(2.0) * FEATURE_STDERR_PX
+        field = landmark_field.fit(points, moved, stderr_px=stderr)
+    except (feature_matches.FeatureError, landmark_field.LandmarkFieldError) as few:
+        raise AlignmentError(str(few)) from few
+    displacement, uncertain = field.on_grid(first.shape)
+    flow = dense_flow.refine(
+        first,
+        second,
+        dense_flow.grid(first.shape) + displacement,
+        uncertain,
+        valid=mask,
+        valid_second=mask_second,
+        rounds=rounds,
+    )
+    seen = _within(flow.source_px, mask_second) & mask
+    folded = _folded(flow.source_px)
+    error = math.sqrt(2.0) * flow.stderr_px
+    return Alignment(
+        source_px=flow.source_px,
+        valid=seen & ~folded & (error <= largest_error_px),
+        error_px=error.astype(np.float32),
+        residual_px=flow.gap_px,
+        followed=flow.followed,
+        landmark_rms_px=_landmark_rms(flow.source_px, points, moved),
+        leave_one_out_px=dict(zip(names, field.leave_one_out_px.tolist(), strict=True)),
+        folded_fraction=float((folded & seen).sum() / max(int(seen.sum()), 1)),
+        by=by,
+        moving_shape=(second.shape[0], second.shape[1]),
+    )
+
+
+def read_landmarks(path: str | Path) -> dict[str, tuple[float, float]]:
+    """Read landmarks of a picture from a table ``name,x,y``.
+
+    Parameters
+    ----------
+    path
+        CSV with that header; x to the right and y down from the centre of the upper left pixel of
+        the maps, px.
+
+    Raises
+    ------
+    reconstruction.correspondence.landmark_table.LandmarkError
+        For anything else; it names line and column.
+    """
+    return landmark_table.read(path)
+
+
+def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[Any, Bools]:
+    """Return the local contrast of a picture and where it means something."""
+    image = np.asarray(picture, np.float64)
+    if image.ndim not in (2, 3) or min(image.shape[:2]) < LEAST_SIDE_PX:
+        raise AlignmentError(
+            f"{name}: got shape {image.shape}, expected (H, W) or (H, W, 3), "
+            f"{LEAST_SIDE_PX} x {LEAST_SIDE_PX} or more"
+        )
+    good = np.ones(image.shape[:2], bool) if valid is None else np.asarray(valid, bool)
+    if good.shape != image.shape[:2]:
+        raise AlignmentError(f"valid_{name}: got shape {good.shape}, expected {image.shape[:2]}")
+    usable = np.isfinite(image) & (image > 0.0)
+    good = good & (usable.all(axis=-1) if image.ndim == 3 else usable)
+    if not good.any():
+        raise AlignmentError(f"{name}: has no valid pixel with light")
+    shown = np.where(good[..., None] if image.ndim == 3 else good, image, 1.0)
+    value = np.exp(np.log(shown).mean(axis=-1)) if image.ndim == 3 else shown
+    # where there is no skin goes on what is beside it: an edge of the mask is no structure
+    weight = good.astype(np.float64)
+    share = cv2.GaussianBlur(weight, (0, 0), 8.0)
+    around = cv2.GaussianBlur(value * weight, (0, 0), 8.0) / np.maximum(share, 1e-6)
+    middle = float(np.median(value[good]))
+    around = np.where(share > 1e-3, around, middle)
+    return evened(np.where(good, value, around)), good
+
+
+def _common(moving: Points, neutral: Points) -> tuple[list[str], Floats, Floats]:
+    names = sorted(set(moving) & set(neutral))
+    if len(names) < landmark_field.LEAST:
+        raise AlignmentError(
+            f"landmarks: {len(names)} names are in both pictures, expected at least "
+            f"{landmark_field.LEAST}, best {FEW_LANDMARKS} or more"
+        )
+    return (
+        names,
+        np.array([neutral[name] for name in names], np.float64),
+        np.array([moving[name] for name in names], np.float64),
+    )
+
+
+def _within(source_px: Float32s, mask: Bools) -> Bools:
+    """Return which places are inside a picture, and all pixels around them in its mask."""
+    height, width = mask.shape
+    inside = (source_px >= 0).all(axis=-1)
+    inside &= (source_px[..., 0] <= width - 1) & (source_px[..., 1] <= height - 1)
+    missing = dense_flow.bilinear((~mask).astype(np.float32), source_px)
+    return np.asarray(inside & (missing <= 0.0))
+
+
+def _folded(source_px: Float32s) -> Bools:
+    """Return where the map turns its orientation, by any of a pixel's four triangles."""
+    padded = np.pad(source_px.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="reflect",
+                    reflect_type="odd")  # fmt: skip
+    middle = padded[1:-1, 1:-1]
+    right, left = padded[1:-1, 2:] - middle, middle - padded[1:-1, :-2]
+    below, above = padded[2:, 1:-1] - middle, middle - padded[:-2, 1:-1]
+    least = np.full(source_px.shape[:2], np.inf)
+    for along in (right, left):
+        for across in (below, above):
+            area = along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]
+            least = np.minimum(least, area)
+    return np.asarray(least <= 0.0)
+
+
+def _landmark_rms(source_px: Float32s, points: Floats, moved: Floats) -> float:
+    height, width = source_px.shape[:2]
+    inside = (points >= 0).all(axis=1) & (points <= [width - 1, height - 1]).all(axis=1)
+    if not inside.any():
+        return math.nan
+    at = points[inside].astype(np.float32)[None]
+    put = dense_flow.bilinear(source_px, at)[0]
+    return float(np.sqrt(((put - moved[inside]) ** 2).sum(axis=1).mean()))
+
+
+def _slope_variance(image: Float32s, good: Bools) -> Float32s:
+    """Return the squared slope of a map per px, smoothed over 2 px."""
+    weight = good.astype(np.float32)
+    share = cv2.GaussianBlur(weight, (0, 0), 2.0)
+    keep = weight[..., None] if image.ndim == 3 else weight
+    spread = share[..., None] if image.ndim == 3 else share
+    known = np.where(keep > 0, image, 0.0).astype(np.float32)
+    smooth = np.asarray(cv2.GaussianBlur(known, (0, 0), 2.0)).reshape(image.shape)
+    smooth = smooth / np.maximum(spread, 1e-6)
+    down, right = np.gradient(smooth, axis=(0, 1))
+    return np.where(keep > 0, down**2 + right**2, 0.0).astype(np.float32)

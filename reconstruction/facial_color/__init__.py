@@ -1,0 +1,1 @@
+"""Estimators of facial color over expressions, repeats and sequences."""

@@ -1,0 +1,390 @@
+"""Levels, delay and time constant of blood that relaxes, with what the samples can tell of them.
+
+The curves of a prompted cycle and of an event are here, and what a fit tells; how likely each delay
+and time constant is, and the intervals of that, are of `reconstruction.facial_color.perfusion_likelihood`.
+
+Where the face moves, what is found of the blood of one pose is off that of the other by an unknown
+step, the same in all samples of a pose. It comes as promptly as the movement and would be taken
+for quick blood; so it is one more level of each curve, with its standard error as prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from reconstruction.facial_color.perfusion_curves import CurveError
+from reconstruction.facial_color.perfusion_likelihood import Landscape, Shape
+from reconstruction.facial_color.perfusion_samples import PoseStep, Samples
+
+Floats = NDArray[np.float64]
+Known = Literal["estimated", "only below", "only above", "unknown"]
+
+BOUND_LEVEL = 0.95
+"""Confidence of bounds."""
+ONE_SIGMA_LEVEL = 0.6827
+"""Confidence of the interval whose half a standard error is."""
+GAUSSIAN_95 = 1.959964
+"""Half width of a 95 % interval in standard errors."""
+LEVEL_TEST = 0.001
+"""Two levels differ when chance would make them differ as much at most so often."""
+_GRID = 97
+_DELAYS = 81
+_DELAYS_OF_POSE = 41
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelaxationFit:
+    """What relaxing curves share, and the levels of each."""
+
+    start: Floats
+    """(P,): level that is left: rest, or that of the event's end."""
+    end: Floats
+    """(P,): level that is gone to."""
+    stderr_start: Floats
+    """(P,)"""
+    stderr_end: Floats
+    """(P,)"""
+    time_constant_s: float
+    """Best time constant, s."""
+    stderr_time_constant_s: float
+    """Half of its 68 % interval, s; NaN where it is only bounded."""
+    interval_s: tuple[float, float]
+    """95 % interval of the time constant, s; 0 or inf where there is no such end."""
+    interval_68_s: tuple[float, float]
+    """68 % interval of the time constant, s, within the 95 % one: its ends lie as far from the best
+    as the likelihood says of each side, not a standard error to both."""
+    known: Known
+    """Whether the time constant is estimated, or "only below" the interval's upper end, or "only
+    above" its lower one, or the levels do not differ."""
+    delay_s: float
+    """Time from prompt to change, s; 0 where none is fitted. With steps of a pose, the mean of what
+    it may be."""
+    stderr_delay_s: float
+    """Half of its 68 % interval, s; with steps of a pose, the standard deviation."""
+    delay_interval_s: tuple[float, float]
+    """95 % interval of the delay, s: where the change is quick, the gap between two samples."""
+    stderr_change: Floats
+    """(P,): standard error of ``end`` less ``start``, which hang together."""
+    step: Floats
+    """(P,): what the samples of a moved face are off the curve by together; 0 where none is."""
+    stderr_step: Floats
+    """(P,)"""
+    noise: Floats
+    """(P,): standard deviation of one sample about the curve."""
+    chi2: float
+    """Weighted square sum over the degrees of freedom by the given standard errors; NaN without."""
+
+    def __str__(self) -> str:
+        low, high = self.interval_s
+        if self.known == "estimated":
+            return f"{self.time_constant_s:.3g} +- {self.stderr_time_constant_s:.2g} s"
+        if self.known == "only below":
+            return f"below {high:.3g} s"
+        if self.known == "only above":
+            return f"above {low:.3g} s"
+        if np.any(self.stderr_step > 0):
+            return "unknown: the levels do not differ by more than the pose may make"
+        return "unknown: the levels do not differ"
+
+
+def fit_cycle(
+    phase_s: ArrayLike,
+    values: ArrayLike,
+    *,
+    cycle_s: float,
+    change_s: float | None = None,
+    stderr: ArrayLike | None = None,
+    pose: PoseStep | None = None,
+    bend: float = 0.0,
+) -> RelaxationFit:
+    """Fit blood that relaxes to one level after a prompt and back after the next, again and again.
+
+    Parameters
+    ----------
+    phase_s : array_like, shape (N,)
+        Phase of each sample, s.
+    values : array_like, shape (N,) or (P, N)
+        One curve, or several that share delay and time constant; NaN is left out.
+    cycle_s : float
+        Length of the cycle, s; the expression is asked for at 0.
+    change_s : float, optional
+        When rest is asked for, s; None: after half of the cycle.
+    stderr : array_like, optional
+        Standard errors of the values, their shape: relative weights, and what ``chi2`` is by.
+    pose : PoseStep, optional
+        Which samples are of a moved face, and how well their values are joined to those at rest.
+        Blood is then taken to set out when the face does: without that, a late beginning and a
+        slow course look alike beside a free step. None: all are of one pose.
+    bend : float
+        As of `fit_course`.
+
+    Returns
+    -------
+    RelaxationFit
+        ``start`` is the level of rest, ``end`` that of the expression.
+
+    Raises
+    ------
+    CurveError
+        For fewer than 6 samples, a shape that does not fit, or a cycle without both changes.
+
+    Examples
+    --------
+    >>> phase = np.arange(20) * 0.5
+    >>> true = np.where(phase < 5, 1 - np.exp(-phase / 2), np.exp(-(phase - 5) / 2))
+    >>> found = fit_cycle(phase, 0.03 + 0.01 * true, cycle_s=10)
+    >>> found.known
+    'estimated'
+    """
+    middle = 0.5 * cycle_s if change_s is None else change_s
+    phase = np.asarray(phase_s, np.float64)
+    _check_bend(bend)
+    if not (0.0 < middle < cycle_s < np.inf):
+        raise CurveError(
+            f"cycle_s, change_s: got {cycle_s}, {middle} s, expected 0 < change_s < cycle_s"
+        )
+    data = Samples.of(phase, values, stderr, pose)
+    phase = np.where(np.isfinite(phase), phase, 0.0)  # of weight 0, but a number
+
+    def straight(delay: Floats, constant: Floats) -> Floats:
+        """Part of the way to the expression's level, of the steady cycle."""
+        on, off = middle, cycle_s - middle
+        into = (phase - delay) % cycle_s
+        up, down = np.exp(-on / constant), np.exp(-off / constant)
+        # level at the beginning of the expression, after infinitely many cycles
+        begin = (1.0 - up) * down / (1.0 - up * down)
+        top = 1.0 - (1.0 - begin) * up
+        rising = 1.0 - (1.0 - begin) * np.exp(-np.minimum(into, on) / constant)
+        falling = top * np.exp(-np.maximum(into - on, 0.0) / constant)
+        return np.where(into < on, rising, falling)
+
+    spacing = cycle_s / phase.size
+    constants = np.geomspace(spacing / 50, 4 * cycle_s, _GRID)
+    longest = 0.5 * min(middle, cycle_s - middle)
+    delays = np.linspace(0.0, longest, _DELAYS)
+    if data.stepped:
+        between = data.moves_between(phase % cycle_s, middle, longest)
+        delays = np.linspace(*between, _DELAYS_OF_POSE)
+    changes = np.concatenate([phase % cycle_s, (phase - middle) % cycle_s])
+    plain, *bent = (
+        _fit(data, _bent(straight, amount), delays, constants, changes)
+        for amount in ((0.0, -bend, bend) if bend else (0.0,))
+    )
+    return _with_bends(plain, bent)
+
+
+def fit_course(
+    time_s: ArrayLike, values: ArrayLike, *, stderr: ArrayLike | None = None, bend: float = 0.0
+) -> RelaxationFit:
+    """Fit blood that relaxes to a new level after an event at time 0.
+
+    Parameters
+    ----------
+    time_s : array_like, shape (N,)
+        s after the event; samples before it are not used.
+    values : array_like, shape (N,) or (P, N)
+        One curve, or several that share the time constant; NaN is left out.
+    stderr : array_like, optional
+        Standard errors of the values, their shape.
+    bend : float
+        Standard error of how the values are bent over the change, in [0, 1): a part s of it
+        shows as s +- bend s (1 - s). The best constant is that of no bend; what both bends move it
+        by is added to its errors in squares.
+
+    Returns
+    -------
+    RelaxationFit
+        ``start`` is the level right after the event, ``end`` the one that is approached.
+
+    Raises
+    ------
+    CurveError
+        For fewer than 5 samples after the event, a shape that does not fit, or a bend outside.
+    """
+    _check_bend(bend)
+    time = np.asarray(time_s, np.float64)
+    after = (time >= 0) & np.isfinite(time)
+    time = time[after]
+    shown = np.atleast_2d(np.asarray(values, np.float64))[:, after]
+    errors = None if stderr is None else np.atleast_2d(np.asarray(stderr, np.float64))[:, after]
+    data = Samples.of(time, shown, errors)
+
+    def course(delay: Floats, constant: Floats) -> Floats:
+        """Part of the way to the new level."""
+        return np.asarray(-np.expm1(-time / constant))
+
+    span = float(np.ptp(time))
+    spacing = span / max(1, time.size - 1)
+    constants = np.geomspace(spacing / 50, 50 * span, _GRID)
+    straight, *bent = (
+        _fit(data, _bent(course, amount), np.zeros(1), constants, np.zeros(0))
+        for amount in ((0.0, -bend, bend) if bend else (0.0,))
+    )
+    return _with_bends(straight, bent)
+
+
+def _check_bend(bend: float) -> None:
+    if not 0.0 <= bend < 1.0:
+        raise CurveError(f"bend: got {bend}, expected 0 to 1, 1 not among them")
+
+
+def _bent(shape: Shape, amount: float) -> Shape:
+    """Return a shape as it shows where values are bent over their change."""
+    if amount == 0.0:
+        return shape
+
+    def bent(delay: Floats, constant: Floats) -> Floats:
+        part = shape(delay, constant)
+        return np.asarray(part + amount * part * (1.0 - part))
+
+    return bent
+
+
+def _with_bends(straight: RelaxationFit, bent: Sequence[RelaxationFit]) -> RelaxationFit:
+    """Return a fit whose time constant is as uncertain as what may have bent the values."""
+    if not bent or straight.known == "unknown":
+        return straight
+    constants = [fit.time_constant_s for fit in bent]
+    middle = straight.time_constant_s
+    moved = (min(constants), max(constants))
+
+    def widened(interval: tuple[float, float], sigmas: float) -> tuple[float, float]:
+        """Return an interval of so many standard errors with what bends add to it."""
+        low, high = (
+            middle * np.exp(sign * np.hypot(np.log(end / middle), sigmas * np.log(by / middle)))
+            if 0.0 < end < np.inf
+            else end
+            for sign, end, by in zip((-1.0, 1.0), interval, moved, strict=True)
+        )
+        return float(low), float(high)
+
+    half = 0.5 * (max(constants) - min(constants))
+    return replace(
+        straight,
+        interval_s=widened(straight.interval_s, GAUSSIAN_95),
+        interval_68_s=widened(straight.interval_68_s, 1.0),
+        stderr_time_constant_s=float(np.hypot(straight.stderr_time_constant_s, half)),
+    )
+
+
+def of_vessels(fit: RelaxationFit) -> RelaxationFit:
+    """Return the levels of blood of a fit to its square root.
+
+    Blood fills its vessels' cross-section: where their radius relaxes exponentially, so does the
+    root of blood, and blood itself does not.
+
+    Parameters
+    ----------
+    fit
+        Of roots of blood.
+
+    Returns
+    -------
+    RelaxationFit
+        With levels, their standard errors and the noise of blood.
+
+    Examples
+    --------
+    >>> time = np.linspace(0.0, 60.0, 12)
+    >>> found = of_vessels(fit_course(time, 0.15 + 0.03 * np.exp(-time / 20.0)))
+    >>> round(float(found.start[0]), 4), round(float(found.end[0]), 4), round(found.time_constant_s)
+    (0.0324, 0.0225, 20)
+    """
+    start, end = np.maximum(fit.start, 0.0), np.maximum(fit.end, 0.0)
+    return replace(
+        fit,
+        start=start**2,
+        end=end**2,
+        stderr_start=2.0 * start * fit.stderr_start,
+        stderr_end=2.0 * end * fit.stderr_end,
+        stderr_change=(start + end) * fit.stderr_change,
+        step=(start + end) * fit.step,
+        stderr_step=(start + end) * fit.stderr_step,
+        noise=(start + end) * fit.noise,
+    )
+
+
+def _fit(
+    given: Samples, curve: Shape, delays: Floats, constants: Floats, at: Floats
+) -> RelaxationFit:
+    data = given.with_free_step()
+    for _ in range(1 + data.stepped):
+        fit = _fit_once(data, curve, delays, constants, at)
+        # how much a step is held by its prior depends on the noise, which a free step leaves
+        data = given.with_prior(np.square(fit.noise))
+    return fit
+
+
+def _fit_once(
+    data: Samples, curve: Shape, delays: Floats, constants: Floats, at: Floats
+) -> RelaxationFit:
+    landscape = Landscape.of(data, curve, delays, constants, at)
+    delay, constant, noise2 = landscape.delay_s, landscape.time_constant_s, landscape.noise2
+    interval, inner = (
+        (low if low is not None else 0.0, high if high is not None else np.inf)
+        for low, high in map(landscape.constant_interval, (BOUND_LEVEL, ONE_SIGMA_LEVEL))
+    )
+
+    delay_interval, stderr_delay = (0.0, 0.0), 0.0
+    if delays.size > 1:
+        delay_interval = landscape.delay_interval(BOUND_LEVEL)
+        first, last = landscape.delay_interval(ONE_SIGMA_LEVEL)
+        stderr_delay = 0.5 * (last - first)
+
+    curves = len(data.values)
+    found_shape = curve(np.array([[delay]]), np.array([[constant]]))
+    level, gap = (part[0] for part in data.levels(found_shape))
+    flat = (data.residual(np.zeros_like(found_shape))[0] / noise2).sum()
+    differ = (flat - landscape.least) / curves / max(landscape.least / landscape.freedom, 1e-300)
+    changes = stats.f.sf(differ, curves, landscape.freedom) < LEVEL_TEST
+    known: Known = "estimated"
+    if not changes:
+        known, interval, inner = "unknown", (0.0, float("inf")), (0.0, float("inf"))
+    elif interval[0] == 0.0:
+        known = "only below"
+    elif np.isinf(interval[1]):
+        known = "only above"
+    step = data.step(found_shape)[0]
+    errors = landscape.level_errors(
+        gap,
+        with_constant=known == "estimated",
+        with_delay=delays.size > 1 and not data.stepped,
+    )
+    if data.stepped:
+        # beside a step the delay trades with levels, and its end is as likely as its middle
+        weights = landscape.delay_weights()
+        shapes = curve(delays[:, None], landscape.constant_at_delays()[:, None])
+        levels, gaps = data.levels(shapes)
+        away = (levels - level, levels + gaps - level - gap, gaps - gap, data.step(shapes) - step)
+        errors = tuple(
+            np.sqrt(error**2 + weights @ off**2) for error, off in zip(errors, away, strict=True)
+        )
+        delay = float(weights @ delays)
+        stderr_delay = float(np.sqrt(weights @ (delays - delay) ** 2))
+    return RelaxationFit(
+        start=level,
+        end=level + gap,
+        stderr_start=errors[0],
+        stderr_end=errors[1],
+        stderr_change=errors[2],
+        step=step,
+        stderr_step=errors[3],
+        time_constant_s=constant,
+        stderr_time_constant_s=(
+            0.5 * (inner[1] - inner[0]) if known == "estimated" else float("nan")
+        ),
+        interval_s=interval,
+        interval_68_s=inner,
+        known=known,
+        delay_s=delay,
+        stderr_delay_s=stderr_delay,
+        delay_interval_s=delay_interval,
+        noise=np.sqrt(noise2),
+        chi2=landscape.chi2,
+    )

@@ -1,0 +1,303 @@
+"""How likely each delay and time constant of relaxing blood is: profiles, intervals, errors.
+
+Levels enter a curve linearly: for each delay and time constant they are solved for, and what
+remains is a landscape of two numbers, looked at as a whole. So a time constant far below the
+sampling interval is no failure of a search: the landscape is flat there, and what is told is the
+bound. The noise is that of what the best curve leaves. Intervals are of the profile likelihood: all
+values at which the square sum, least over everything else, exceeds the least one by no more than
+Fisher's F allows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from reconstruction.facial_color.perfusion_samples import Samples
+
+Floats = NDArray[np.float64]
+Ends = tuple[float | None, float | None]
+Shape = Callable[[Floats, Floats], Floats]
+"""Delays and constants of shape (..., 1) to the part of the way, (..., N)."""
+
+_SLOPE = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5])
+"""Time constants since the beginning of a change at which samples are tried."""
+_COARSE = 3.0
+"""Constants below so many steps of the delay need delays between them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landscape:
+    """Square sums of curves over their noise, at delays and time constants."""
+
+    data: Samples
+    curve: Shape
+    delays: Floats
+    """(D,): delays that are tried with each constant, s; one where none is fitted."""
+    constants: Floats
+    """(C,): time constants that are tried, s."""
+    total: Floats
+    """(C, D or more): square sums of the best levels; beyond D are delays of each constant's
+    own."""
+    noise2: Floats
+    """(P,): variance of one sample of each curve."""
+    freedom: float
+    """Degrees of freedom of all curves together."""
+    delay_s: float
+    """Most likely delay, s."""
+    time_constant_s: float
+    """Most likely time constant, s."""
+    least: float
+    """Least square sum."""
+    chi2: float
+    """Weighted square sum over the degrees of freedom by the given standard errors; NaN without."""
+
+    @staticmethod
+    def of(data: Samples, curve: Shape, delays: Floats, constants: Floats, at: Floats) -> Landscape:
+        """Look at all delays and constants, and refine the best.
+
+        Parameters
+        ----------
+        data
+            Samples of P curves.
+        curve
+            Part of the way that blood has gone.
+        delays, constants : ndarray, shape (D,), (C,)
+            What is tried, s, ascending; logarithms of the constants in equal steps.
+        at : ndarray, shape (M,)
+            How long after a prompt samples are, s; () where there are no prompts.
+        """
+
+        def residuals(delay: Floats, constant: Floats) -> Floats:
+            """(..., P) square sums for delays and constants that broadcast to (...)."""
+            return data.residual(curve(delay[..., None], constant[..., None]))
+
+        # by constant: the common delays, and where those are too coarse some that put a sample on a
+        # slope
+        quick = (
+            constants < _COARSE * (delays[1] - delays[0]) if delays.size > 1 else constants < 0.0
+        )
+        near = np.array([_near(at, constant, delays) for constant in constants[quick]])
+        by_curve = np.full(
+            (constants.size, delays.size + (near.shape[1] if quick.any() else 0), len(data.values)),
+            np.inf,
+        )
+        # one constant after the other: all at once would take hundreds of megabytes
+        for row, constant in enumerate(constants):
+            by_curve[row, : delays.size] = residuals(delays, np.full(delays.size, constant))
+        for place, some in zip(np.flatnonzero(quick), near, strict=True):
+            by_curve[place, delays.size :] = residuals(some, np.full(some.size, constants[place]))
+        curves = len(data.values)
+        samples = (data.weights > 0).sum(axis=1)
+        # each curve by its own noise, which the best common curve leaves
+        freedom = np.maximum(samples - 2.0 - (1.0 + (delays.size > 1)) / curves, 1.0)
+        noise2 = np.full(curves, 1.0)
+        tiny = np.finfo(float).eps * np.maximum((data.weights * data.values**2).sum(axis=1), 1e-300)
+        for _ in range(2):
+            total = (by_curve / noise2).sum(axis=-1)
+            best = np.unravel_index(int(np.argmin(total)), total.shape)
+            noise2 = np.maximum(by_curve[best] / freedom, tiny)
+        total = (by_curve / noise2).sum(axis=-1)
+
+        def landscape(delay: float, log_constant: float) -> float:
+            sums = residuals(np.array([delay]), np.exp(np.array([log_constant])))
+            return float((sums[0] / noise2).sum())
+
+        common = best[1] < delays.size
+        begin = (
+            delays[best[1]] if common else near[int(quick[: best[0]].sum()), best[1] - delays.size]
+        )
+        start = np.array([begin, np.log(constants[best[0]])])
+        found = _refined(landscape, start, delays, np.log(constants), float(total[best]))
+        delay, constant, least = float(found[0]), float(np.exp(found[1])), found[2]
+        nu = float(freedom.sum())
+        usual = data.variance
+        chi2 = (
+            float((by_curve[best] / usual).sum() / nu) if np.isfinite(usual).all() else float("nan")
+        )
+        return Landscape(
+            data=data,
+            curve=curve,
+            delays=delays,
+            constants=constants,
+            total=total,
+            noise2=noise2,
+            freedom=nu,
+            delay_s=delay,
+            time_constant_s=constant,
+            least=min(least, float(total.min())),
+            chi2=chi2,
+        )
+
+    def constant_interval(self, level: float) -> Ends:
+        """Return the ends of the time constant's interval of a confidence, s; None: there is none.
+
+        Parameters
+        ----------
+        level
+            Confidence, in (0, 1).
+        """
+        logs = np.log(self.constants)
+        profile = self.total.min(axis=1) - self.least
+        low, high = _crossings(
+            logs, profile, float(np.log(self.time_constant_s)), self._excess(level)
+        )
+        return (
+            float(np.exp(low)) if low is not None else None,
+            float(np.exp(high)) if high is not None else None,
+        )
+
+    def delay_interval(self, level: float) -> tuple[float, float]:
+        """Return the ends of the delay's interval of a confidence, s, within what is tried.
+
+        Parameters
+        ----------
+        level
+            Confidence, in (0, 1).
+        """
+        low, high = _crossings(self.delays, self._along(), self.delay_s, self._excess(level))
+        return (
+            low if low is not None else float(self.delays[0]),
+            high if high is not None else float(self.delays[-1]),
+        )
+
+    def delay_weights(self) -> Floats:
+        """Return the probability of each delay, (D,), all alike before; with its best constant."""
+        weights = np.exp(-0.5 * self._along())
+        return np.asarray(weights / weights.sum())
+
+    def constant_at_delays(self) -> Floats:
+        """Return the best time constant for each delay, (D,), s."""
+        best = np.argmin(self.total[:, : self.delays.size], axis=0)
+        return np.asarray(self.constants[best])
+
+    def level_errors(
+        self, gap: Floats, *, with_constant: bool, with_delay: bool
+    ) -> tuple[Floats, ...]:
+        """Return standard errors of start, end, their difference, and the step of a pose.
+
+        By the information that the samples hold, and with what delay and constant add where they
+        are known.
+
+        Parameters
+        ----------
+        gap : ndarray, shape (P,)
+            Change of level.
+        with_constant, with_delay
+            Whether they are estimated from the samples.
+
+        Returns
+        -------
+        tuple of ndarray, each of shape (P,)
+        """
+        delay, constant = self.delay_s, self.time_constant_s
+
+        def at(d: float, c: float) -> Floats:
+            return np.asarray(self.curve(np.array([[d]]), np.array([[c]]))[0], np.float64)
+
+        base = at(delay, constant)
+        slopes = []
+        if with_constant:
+            h = 1e-3 * constant
+            slopes.append((at(delay, constant + h) - at(delay, constant - h)) / (2 * h))
+            if with_delay and delay > 1e-3 * constant:
+                slopes.append((at(delay + h, constant) - at(delay - h, constant)) / (2 * h))
+        curves = len(gap)
+        size = 3 * curves + len(slopes)
+        normal = np.zeros((size, size))
+        for p in range(curves):
+            rows = np.zeros((size, base.size))
+            rows[2 * p], rows[2 * p + 1] = 1.0 - base, base  # start and end
+            rows[2 * curves + p] = self.data.moved
+            for k, slope in enumerate(slopes):
+                rows[3 * curves + k] = gap[p] * slope
+            normal += (rows * self.data.weights[p] / self.noise2[p]) @ rows.T
+            step = 2 * curves + p
+            if self.data.stderr_of_pose[p] > 0 and normal[step, step] > 0:
+                normal[step, step] += 1.0 / self.data.stderr_of_pose[p] ** 2
+            else:  # no step: not a number of this fit
+                normal[step, :] = normal[:, step] = 0.0
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        covariance = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+        errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        start, end = np.arange(0, 2 * curves, 2), np.arange(1, 2 * curves, 2)
+        change2 = errors[start] ** 2 + errors[end] ** 2 - 2.0 * covariance[start, end]
+        return (
+            errors[start],
+            errors[end],
+            np.asarray(np.sqrt(np.maximum(change2, 0.0))),
+            errors[2 * curves : 3 * curves],
+        )
+
+    def _along(self) -> Floats:
+        """Return the excess of the square sum over its least, by delay, (D,)."""
+        least = self.total[:, : self.delays.size].min(axis=0)
+        return np.asarray(least - self.least)
+
+    def _excess(self, level: float) -> float:
+        return float(stats.f.ppf(level, 1, self.freedom))
+
+
+def _near(since: Floats, constant: float, delays: Floats) -> Floats:
+    """Return delays that leave a sample, so long after a prompt, on the slope of the change, s.
+
+    Their number is the same for each constant; those beyond the range are put into it.
+    """
+    late = since[np.isfinite(since) & (since <= 2 * delays[-1])]
+    return np.clip((late[:, None] - constant * _SLOPE).ravel(), delays[0], delays[-1])
+
+
+def _refined(
+    landscape: Callable[[float, float], float],
+    start: Floats,
+    delays: Floats,
+    logs: Floats,
+    at_start: float,
+) -> tuple[float, float, float]:
+    """Return delay, logarithm of the constant, and height of the lowest point near the start."""
+    step = float(logs[1] - logs[0])
+    if delays.size == 1:
+        found = optimize.minimize_scalar(
+            lambda log: landscape(float(delays[0]), log),
+            bounds=(max(logs[0], start[1] - step), min(logs[-1], start[1] + step)),
+            method="bounded",
+        )
+        point, height = (float(delays[0]), float(found.x)), float(found.fun)
+    else:
+        width = float(delays[1] - delays[0])
+        bounds = [
+            (max(delays[0], start[0] - width), min(delays[-1], start[0] + width)),
+            (max(logs[0], start[1] - step), min(logs[-1], start[1] + step)),
+        ]
+        simplex = optimize.minimize(
+            lambda v: landscape(v[0], v[1]), start, method="Nelder-Mead", bounds=bounds,
+            options={"xatol": 1e-5, "fatol": 1e-9},
+        )  # fmt: skip
+        point, height = (float(simplex.x[0]), float(simplex.x[1])), float(simplex.fun)
+    if height < at_start:
+        return (*point, height)
+    return float(start[0]), float(start[1]), at_start
+
+
+def _crossings(
+    grid: Floats, profile: Floats, best: float, excess: float
+) -> tuple[float | None, float | None]:
+    """Return where a profile first rises by ``excess`` on both sides of its best; None: nowhere."""
+    ends: list[float | None] = []
+    for sign in (-1, 1):
+        side = grid[sign * (grid - best) > 0][::sign]
+        height = profile[sign * (grid - best) > 0][::sign]
+        above = np.flatnonzero(height > excess)
+        if above.size == 0:
+            ends.append(None)
+            continue
+        k = int(above[0])
+        inner, level = (best, 0.0) if k == 0 else (float(side[k - 1]), float(height[k - 1]))
+        # square roots of a parabola's heights are straight
+        a, b, c = (np.sqrt(max(v, 0.0)) for v in (level, float(height[k]), excess))
+        ends.append(inner + (float(side[k]) - inner) * float((c - a) / max(b - a, 1e-12)))
+    return ends[0], ends[1]

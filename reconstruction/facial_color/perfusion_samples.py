@@ -1,0 +1,184 @@
+"""Samples of curves that are fitted by levels and a shape, and the step between poses in them.
+
+A curve is a level, a gap times a shape, and in samples of a moved face a step. Of the step a
+normal prior is known, so it is integrated out: the samples' covariance has one more term of rank
+one, and its inverse is that of independent samples once a part of the moved samples' mean is taken
+from them. All of it is taken where the step is free, nothing where there is none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reconstruction.facial_color.perfusion_curves import CurveError
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseStep:
+    """What is known of the step that a moved face makes in curves."""
+
+    moved: NDArray[np.bool_]
+    """(N,): samples in which the face has moved."""
+    stderr: Floats
+    """(P,): standard error of the level of those samples against the others, >= 0."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Curves (P, N) with weights that sum to the number of samples of each; 0 where missing."""
+
+    values: Floats
+    weights: Floats
+    variance: Floats
+    """(P,): mean variance by the given errors; NaN without."""
+    moved: Floats
+    """(N,): 1 where the face has moved, else 0."""
+    stderr_of_pose: Floats
+    """(P,): prior of the step; 0 where there is none, and where all samples are of one pose."""
+    taken: Floats
+    """(P,): part of the moved samples' mean that is taken from them, 0 to 1."""
+
+    @staticmethod
+    def of(
+        at: Floats, values: ArrayLike, stderr: ArrayLike | None, pose: PoseStep | None = None
+    ) -> Samples:
+        """Return the samples of curves, without steps yet.
+
+        Parameters
+        ----------
+        at : ndarray, shape (N,)
+            Time or phase, s.
+        values : array_like, shape (N,) or (P, N)
+            NaN is left out.
+        stderr : array_like, optional
+            Standard errors, the values' shape.
+        pose : PoseStep, optional
+
+        Raises
+        ------
+        CurveError
+            For fewer than 5 samples of a curve, or a shape that does not fit.
+        """
+        shown = np.atleast_2d(np.asarray(values, np.float64))
+        if shown.ndim != 2 or at.shape != shown.shape[1:]:
+            raise CurveError(f"values: got shape {shown.shape}, expected (P, {at.size})")
+        good = np.isfinite(shown) & np.isfinite(at)
+        variance = np.full(shown.shape, np.nan)
+        if stderr is not None:
+            variance = np.square(np.atleast_2d(np.asarray(stderr, np.float64)))
+            if variance.shape != shown.shape:
+                raise CurveError(f"stderr: got shape {variance.shape}, expected {shown.shape}")
+            good &= np.isfinite(variance) & (variance > 0)
+        if at.size < 5 or (good.sum(axis=1) < 5).any():
+            raise CurveError(f"values: got {int(good.sum(axis=1).min())} usable, expected >= 5")
+        inverse = np.where(good, 1.0 if stderr is None else 1.0 / variance, 0.0)
+        count = good.sum(axis=1, keepdims=True)
+        scale = count / inverse.sum(axis=1, keepdims=True)
+        known = scale[:, 0] if stderr is not None else np.full(len(shown), np.nan)
+        moved, of_pose = _steps(pose, good)
+        none = np.zeros(len(shown))
+        return Samples(np.where(good, shown, 0.0), inverse * scale, known, moved, of_pose, none)
+
+    @property
+    def stepped(self) -> bool:
+        """Whether any curve has a step."""
+        return bool((self.stderr_of_pose > 0).any())
+
+    def moves_between(self, phase: Floats, middle: float, longest: float) -> tuple[float, float]:
+        """Return between which delays the face moves: when it last had not, and first had.
+
+        Parameters
+        ----------
+        phase : ndarray, shape (N,)
+            Since the prompt of the expression, in [0, cycle), s.
+        middle
+            When rest is asked for, s.
+        longest
+            Longest delay that is looked at, s.
+        """
+        since = np.where(phase < middle, phase, phase - middle)
+        done = (self.moved > 0.0) == (phase < middle)  # shows what was asked for last
+        soon = since <= longest
+        not_yet = float(since[soon & ~done].max(initial=0.0))
+        already = float(since[soon & done].min(initial=longest))
+        # reactions differ: between the earliest that has and the latest that has not, where they
+        # cross
+        low, high = min(not_yet, already), max(not_yet, already)
+        return (low, high) if high > low else (0.0, longest)
+
+    def with_free_step(self) -> Samples:
+        """Return these with steps of which nothing is known, where there are any."""
+        return replace(self, taken=np.where(self.stderr_of_pose > 0, 1.0, 0.0))
+
+    def with_prior(self, noise2: Floats) -> Samples:
+        """Return these with steps of their prior, for noise of these variances (P,)."""
+        many = (self.weights * self.moved).sum(axis=-1) * self.stderr_of_pose**2
+        held = many / np.maximum(noise2 + many, 1e-300)
+        # B = 1 - c m m'W / m'Wm has B'WB = W - (2c - c^2) W m m'W / m'Wm: W less the step's part
+        return replace(self, taken=1.0 - np.sqrt(np.maximum(1.0 - held, 0.0)))
+
+    def residual(self, shape: Floats) -> Floats:
+        """Return the weighted square sum of the best levels, (..., P), of shapes (..., N)."""
+        level, gap = self.levels(shape)
+        ones, values, curve = self._without_step(shape)
+        left = values - level[..., None] * ones - gap[..., None] * curve
+        return np.asarray((self.weights * left**2).sum(axis=-1))
+
+    def levels(self, shape: Floats) -> tuple[Floats, Floats]:
+        """Return the best start and gap of each curve, (..., P)."""
+        w = self.weights
+        ones, values, b = self._without_step(shape)
+        total = (w * ones**2).sum(axis=-1)
+        b_mean = (w * ones * b).sum(axis=-1) / total
+        v_mean = (w * ones * values).sum(axis=-1) / total
+        b_off, v_off = b - b_mean[..., None] * ones, values - v_mean[:, None] * ones
+        square = (w * b_off**2).sum(axis=-1)
+        product = (w * b_off * v_off).sum(axis=-1)
+        gap = np.where(square > 1e-12 * total, product / np.maximum(square, 1e-300), 0.0)
+        return v_mean - gap * b_mean, gap
+
+    def step(self, shape: Floats) -> Floats:
+        """Return the best step of each curve, (..., P), of shapes (..., N)."""
+        level, gap = self.levels(shape)
+        left = self.values - level[..., None] - gap[..., None] * shape[..., None, :]
+        return np.asarray((1.0 - (1.0 - self.taken) ** 2) * self._of_moved(left))
+
+    def _without_step(self, shape: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return ones, values and shape with the moved samples' mean taken from them."""
+        curve = shape[..., None, :]
+        if not self.taken.any():
+            return np.ones_like(self.values), self.values, curve
+
+        def shed(part: Floats) -> Floats:
+            off = self.taken * self._of_moved(part)
+            return np.asarray(part - off[..., None] * self.moved)
+
+        return shed(np.ones_like(self.values)), shed(self.values), shed(curve)
+
+    def _of_moved(self, part: Floats) -> Floats:
+        """Return the mean over the moved samples, (..., P); 0 without any."""
+        weights = self.weights * self.moved
+        total = weights.sum(axis=-1)
+        return np.asarray((weights * part).sum(axis=-1) / np.where(total > 0, total, 1.0))
+
+
+def _steps(pose: PoseStep | None, good: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    curves, samples = good.shape
+    if pose is None:
+        return np.zeros(samples), np.zeros(curves)
+    moved = np.asarray(pose.moved, bool)
+    stderr = np.atleast_1d(np.asarray(pose.stderr, np.float64))
+    if moved.shape != (samples,) or stderr.shape != (curves,):
+        raise CurveError(
+            f"pose: got shapes {moved.shape} and {stderr.shape}, expected ({samples},) samples "
+            f"that have moved or not and ({curves},) standard errors"
+        )
+    if not (np.isfinite(stderr) & (stderr >= 0)).all():
+        raise CurveError(f"pose: got standard errors {stderr.tolist()}, expected finite, >= 0")
+    both = (good & moved).any(axis=1) & (good & ~moved).any(axis=1)
+    return moved.astype(np.float64), np.where(both, stderr, 0.0)

@@ -1,0 +1,132 @@
+"""What the color of a picture errs by because it was laid over another one.
+
+A picture of an expression is laid over the neutral one with an error of place
+(`reconstruction.correspondence.expression_alignment`), so that a pixel shows the color of skin beside it. That is
+the picture's own error, where a face that holds still has errors that its pictures share.
+
+Light that slopes evenly makes a misplaced picture brighter or darker all around alike. Who follows
+how the light changes from picture to picture (`reconstruction.facial_color.light_change`) has taken that off:
+what is left is the slopes that are finer than the window in which it is followed.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from reconstruction.chromophores import model_error
+from reconstruction.correspondence.expression_alignment import Alignment
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.floating[Any]]
+
+AROUND_PX: Final = 1.0
+"""Standard deviation of the window that squares of slopes are averaged in, px: over single pixels
+noise would count as slope."""
+SCALE: Final = 3.3
+"""Variance of what moved faces' colors differ by from still ones' over what place and slope give:
+so that, with noise, 68 % lie in the 68 % ellipse. Sites of the color filter array stand elsewhere
+on the skin's texture, and pixels are interpolated. Of 13 moved subjects of seeds 0 to 16, maps 192
+px across, each alone holds 64 to 72 %."""
+WITHOUT_BRIGHTNESS: Final = np.eye(3) - 1.0 / 3.0
+"""Takes the mean of the channels away."""
+
+
+def own_error(
+    rgb: Image,
+    variance: Image,
+    valid: NDArray[np.bool_],
+    alignment: Alignment,
+    *,
+    light_window_px: float | None = None,
+) -> Floats:
+    """Return the covariance of each pixel's relative error by its place, (H, W, 3, 3).
+
+    Parameters
+    ----------
+    rgb, variance
+        (H, W, 3): the picture as it was laid over the neutral one, linear camera RGB, and its
+        noise, which is no slope.
+    valid
+        (H, W): where it means something; 0 elsewhere.
+    alignment
+        How it was laid over.
+    light_window_px
+        Standard deviation of the window, px, in which changes of light are followed and so are no
+        error, above 0. None: they are not followed.
+
+    Returns
+    -------
+    ndarray of float64
+        With the brightness that skin and its shading have beside the pixel, but for what changes
+        as slowly as the window.
+
+    Notes
+    -----
+    A pixel that is off by d, of variance `error_px`^2 / 2 along each axis, errs by the slope of
+    log color times d; `SCALE` is what it is short of.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> skin = 0.3 + 0.1 * gaussian_filter(rng.random((40, 40)), 1.5)[..., None] * [1.0, 2.0, 3.0]
+    >>> rows, columns = np.indices((40, 40))
+    >>> still = Alignment(
+    ...     np.stack([columns, rows], axis=-1).astype(np.float32), np.ones((40, 40), bool),
+    ...     np.zeros((40, 40), np.float32), np.zeros((40, 40), np.float32),
+    ...     np.ones((40, 40), bool), 0.0, {}, 0.0, "landmarks", (40, 40),
+    ... )
+    >>> float(own_error(skin, 0.0 * skin, np.ones((40, 40), bool), still).max())
+    0.0
+    """
+    if light_window_px is not None and not 0.0 < light_window_px < np.inf:
+        raise ValueError(f"light_window_px: got {light_window_px}, expected above 0, or None")
+    good = model_error.usable_pixels(rgb, valid, variance)
+    safe = np.where(good[..., None], rgb, 1.0).astype(np.float64)
+    noise = np.where(good[..., None], variance / safe**2, 0.0)
+    place = np.square(alignment.error_px.astype(np.float64))
+    covariance = 0.5 * place[..., None, None] * _slopes(np.log(safe), noise, good, light_window_px)
+    covariance += (SCALE - 1.0) * (WITHOUT_BRIGHTNESS @ covariance @ WITHOUT_BRIGHTNESS)
+    return np.where(good[..., None, None], covariance, 0.0)
+
+
+def _slopes(
+    log_rgb: Floats, noise: Floats, good: NDArray[np.bool_], window_px: float | None
+) -> Floats:
+    """Return the sum over both axes of the slopes' outer products, per px^2, (H, W, 3, 3)."""
+    outer = np.zeros((*good.shape, 3, 3))
+    count = np.zeros(good.shape)
+    for axis in (0, 1):
+        # neighbors themselves: differences over two pixels leave out what is as fine as one
+        here, after = (
+            tuple(part if a == axis else slice(None) for a in (0, 1))
+            for part in (slice(None, -1), slice(1, None))
+        )
+        whole = good[here] & good[after]
+        slope = np.where(whole[..., None], log_rgb[after] - log_rgb[here], 0.0)
+        if window_px is not None:
+            slope = np.where(whole[..., None], slope - _even(slope, whole, window_px), 0.0)
+        products = slope[..., :, None] * slope[..., None, :]
+        by_noise = np.where(whole[..., None], noise[after] + noise[here], 0.0)
+        products -= by_noise[..., :, None] * np.eye(3)
+        for side in (here, after):
+            outer[side] += products
+            count[side] += whole
+    known = np.maximum(gaussian_filter(count, AROUND_PX, mode="constant"), 1e-6)
+    for i in range(3):
+        for j in range(i, 3):
+            smooth = gaussian_filter(outer[..., i, j], AROUND_PX, mode="constant")
+            outer[..., i, j] = outer[..., j, i] = 2.0 * smooth / known
+    # slopes that noise hides are 0, in each direction of color
+    values, vectors = np.linalg.eigh(outer)
+    return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ vectors.swapaxes(-1, -2))
+
+
+def _even(slope: Floats, known: NDArray[np.bool_], window_px: float) -> Floats:
+    """Return the slope of brightness averaged over a window, (..., 1), for all channels alike."""
+    weight = gaussian_filter(known.astype(np.float64), window_px, mode="constant")
+    total = gaussian_filter(slope.mean(axis=-1), window_px, mode="constant")
+    return np.asarray(total / np.maximum(weight, 1e-6))[..., None]

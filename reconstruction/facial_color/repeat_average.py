@@ -1,0 +1,114 @@
+"""The mean picture of repeats, and how far it errs: by noise, or by what repeats differ more.
+
+Repeats that differ by more than their noise say how far skin or pose repeat. What counts is their
+color: flashes repeat to some thousandths of their energy, which makes a whole picture brighter or
+darker, and how bright a pixel is is left open by those who take chromophores from it
+(`reconstruction.facial_color.shared_melanin`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+Image = NDArray[np.floating[Any]]
+Mask = NDArray[np.bool_]
+
+_ENOUGH = 200_000
+"""Pixels that tell a median to a quarter of a percent."""
+
+
+def average(
+    rgb: Image, variance: Image, valid: Mask
+) -> tuple[NDArray[np.float32], NDArray[np.float32], Mask]:
+    """Return the mean of repeats where any is valid, and the variance of the mean.
+
+    Parameters
+    ----------
+    rgb
+        (R, H, W, 3): linear camera RGB of R repeats, aligned; finite, and positive where valid.
+    variance
+        (R, H, W, 3): its noise.
+    valid
+        (R, H, W).
+
+    Returns
+    -------
+    mean : ndarray of float32, shape (H, W, 3)
+        0 where no repeat is valid.
+    variance : ndarray of float32, shape (H, W, 3)
+        That of noise, larger by `excess` where repeats differ by more than that.
+    valid : ndarray of bool, shape (H, W)
+        Any repeat is.
+
+    Raises
+    ------
+    ValueError
+        When shapes do not fit.
+
+    Examples
+    --------
+    >>> noise = 0.01 * np.random.default_rng(0).standard_normal((4, 50, 50, 3))
+    >>> mean, variance, _ = average(
+    ...     0.5 + noise, np.full_like(noise, 1e-4), np.ones((4, 50, 50), bool))
+    >>> bool(abs(mean.mean() - 0.5) < 1e-3), bool(abs(variance.mean() / 2.5e-5 - 1.0) < 0.1)
+    (True, True)
+    """
+    if rgb.ndim != 4 or rgb.shape[-1] != 3 or variance.shape != rgb.shape:
+        raise ValueError(
+            f"rgb, variance: expected shape (R, H, W, 3), got {rgb.shape} and {variance.shape}"
+        )
+    if valid.shape != rgb.shape[:-1] or valid.dtype != np.bool_:
+        raise ValueError(
+            f"valid: expected bool of {rgb.shape[:-1]}, got {valid.dtype} of {valid.shape}"
+        )
+    kept = valid[..., None]
+    count = valid.sum(axis=0)
+    many = np.maximum(count, 1)[..., None]
+    mean = np.where(kept, rgb, 0.0).sum(axis=0, dtype=np.float64) / many
+    noise = np.where(kept, variance, 0.0).sum(axis=0, dtype=np.float64) / np.square(many)
+    noise *= excess(rgb, variance, valid)
+    return mean.astype(np.float32), noise.astype(np.float32), np.asarray(count > 0)
+
+
+def excess(rgb: Image, variance: Image, valid: Mask) -> float:
+    """Return the variance of what colors of repeats differ by over that of noise, at least 1.
+
+    Of the whole picture: what one pixel's few repeats scatter by is known poorly. It is the median
+    pixel's, so that the few that were laid over others wrongly, which have an error of their own
+    (`reconstruction.facial_color.registration_error`), do not count for all.
+
+    Parameters
+    ----------
+    rgb, variance, valid
+        As of `average`.
+
+    Examples
+    --------
+    >>> noise = 0.01 * np.random.default_rng(0).standard_normal((3, 40, 40, 3))
+    >>> everywhere = np.ones((3, 40, 40), bool)
+    >>> flashes = np.array([1.0, 1.02, 0.98])[:, None, None, None]
+    >>> [round(excess(flashes * (0.5 + k * noise), np.full_like(noise, 1e-4), everywhere))
+    ...  for k in (1.0, 3.0)]
+    [1, 9]
+    """
+    repeats = len(rgb)
+    whole = valid.all(axis=0)
+    whole &= ((rgb > 0.0) & (variance > 0.0)).all(axis=(0, -1))
+    some = np.flatnonzero(whole)
+    if repeats < 2 or not some.size:
+        return 1.0
+    some = some[:: -(-some.size // _ENOUGH)]
+    seen = rgb.reshape(repeats, -1, 3)[:, some].astype(np.float64)  # (R, n, 3)
+    off = seen / seen.mean(axis=0) - 1.0
+    weight = np.square(seen) / variance.reshape(repeats, -1, 3)[:, some]
+    # what each repeat and each channel have of their own, by least squares; exact where noise is a
+    # factor of the repeat times one of the channel
+    off -= ((weight * off).sum(axis=-1) / weight.sum(axis=-1))[..., None]
+    off -= (weight * off).sum(axis=0) / weight.sum(axis=0)
+    squares = (weight * np.square(off)).sum(axis=(0, -1))
+    free = 2 * (repeats - 1)  # of three channels one is brightness, of all repeats one is the mean
+    return max(1.0, float(np.median(squares) / chi2.median(free)))

@@ -1,0 +1,121 @@
+"""A hemoglobin rig carried from one face's picture to another's by landmarks.
+
+Two faces that were not photographed alike share no map space: where the rig's stored maps lie on
+the other face is told by points that have the same name on both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from model.facial_color import HemoglobinRig, StateMaps
+from model.facial_color.coarse_maps import Cells
+from reconstruction.correspondence import landmark_field
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Points = Mapping[str, tuple[float, float]]
+
+LANDMARK_STDERR_PX = 2.0
+"""Of landmarks on two different people, along each axis: what corresponds is not sharp."""
+FEWEST = 4
+_PARTS = ("scale", "bias", "scale_stderr", "bias_stderr", "misfit")
+
+
+class RigTransferError(ValueError):
+    """Landmarks that tell nothing of where one face lies on another."""
+
+
+def carried(
+    rig: HemoglobinRig, shape: tuple[int, int], *, landmarks_rig: Points, landmarks_onto: Points
+) -> HemoglobinRig:
+    """Return a rig as it lies on another face's picture, to be applied to that face's blood.
+
+    Parameters
+    ----------
+    rig
+        In the map space of its own face.
+    shape
+        Rows and columns of the other face's maps.
+    landmarks_rig, landmarks_onto
+        Named points (x, y) of both faces, px of their maps; those of the same name are used.
+
+    Returns
+    -------
+    HemoglobinRig
+        Of the other face's size; its neutral map is the smooth mean of the rig's. Use
+        `HemoglobinRig.applied_to` with the other face's blood. Valid where the rig's own maps
+        are, and where the landmarks tell the place to within the rig's radius; within it the
+        statistics hardly change, so that the error of place adds nothing to theirs.
+
+    Raises
+    ------
+    RigTransferError
+        For fewer than `FEWEST` common names, or points on one line.
+    """
+    names = sorted(set(landmarks_rig) & set(landmarks_onto))
+    if len(names) < FEWEST:
+        raise RigTransferError(
+            f"landmarks: {len(names)} names are in both tables, expected at least {FEWEST}"
+        )
+    onto = np.array([landmarks_onto[name] for name in names], np.float64)
+    own = np.array([landmarks_rig[name] for name in names], np.float64)
+    try:
+        field = landmark_field.fit(onto, own, stderr_px=LANDMARK_STDERR_PX)
+    except landmark_field.LandmarkFieldError as error:
+        raise RigTransferError(f"landmarks: {error}") from error
+    stored = (min(rig.neutral_mean.shape[0], shape[0]), min(rig.neutral_mean.shape[1], shape[1]))
+    place = _centres(shape, stored)
+    moved, unsure_px = field.at(place.reshape(-1, 2))
+    source = place + moved.reshape(place.shape)
+    told = unsure_px.reshape(stored) <= rig.radius_px
+    cell = np.stack(
+        [
+            (source[..., k] + 0.5) * rig.neutral_mean.shape[1 - k] / rig.neutral.shape[1 - k] - 0.5
+            for k in (1, 0)
+        ]
+    )
+    mean, seen = _sampled(rig.neutral_mean, rig.neutral_mean_valid, cell)
+    here = seen & told
+    states: dict[str, StateMaps] = {}
+    for name, state in rig.states.items():
+        sampled = {part: _sampled(getattr(state, part), state.valid, cell) for part in _PARTS}
+        good = np.logical_and.reduce([here, *(seen for _, seen in sampled.values())])
+        maps = {part: np.where(good, values, 0.0) for part, (values, _) in sampled.items()}
+        states[name] = StateMaps(
+            **maps, valid=good, prior=state.prior, storage_rms=state.storage_rms,
+            storage_largest=state.storage_largest,
+        )  # fmt: skip
+    (neutral,) = Cells(shape, stored).refine(np.where(here, mean, 0.0), valid=here)
+    valid = np.isfinite(neutral)
+    size = float(np.median(np.hypot(*np.gradient(source[..., 0]))))
+    per_cell = shape[1] / stored[1]
+    return HemoglobinRig(
+        neutral=np.where(valid, neutral, 0.0),
+        valid=valid,
+        neutral_stderr=np.zeros(shape),
+        neutral_mean=np.where(here, mean, 0.0),
+        states=states,
+        radius_px=rig.radius_px * per_cell / max(size, 1e-9),
+        global_states=rig.global_states,
+    )
+
+
+def _centres(shape: tuple[int, int], stored: tuple[int, int]) -> Floats:
+    """Return where the cells' centres lie on the map, (h, w, 2) as (x, y) px."""
+    rows, columns = (
+        (np.arange(few) + 0.5) * full / few - 0.5 for full, few in zip(shape, stored, strict=True)
+    )
+    return np.stack(np.meshgrid(columns, rows), axis=-1)
+
+
+def _sampled(values: Floats, valid: Mask, cell: Floats) -> tuple[Floats, Mask]:
+    """Return a stored map at places (2, h, w), rows first, and where it is known there."""
+    share = ndimage.map_coordinates(valid.astype(np.float64), cell, order=1, cval=0.0)
+    total = ndimage.map_coordinates(np.where(valid, values, 0.0), cell, order=1, cval=0.0)
+    known = share > 0.5
+    return np.where(known, total / np.where(known, share, 1.0), 0.0), known

@@ -1,0 +1,406 @@
+"""One melanin for all states of a face, and each state's blood under it.
+
+Expressions change the blood of skin, not its melanin (Jimenez et al. 2010, section 3.1). A state's
+picture alone leaves melanin and blood with errors that hang together: where melanin is taken too
+high, blood is too low. Seen together, the states have one melanin, whose noise goes down with
+their number, and changes of blood no longer carry the difference of two melanins.
+
+How it is done. The shading of each state is free, so that a color has two numbers left. All colors
+of a pixel, each taken back to the states' mean blood, are averaged; that color goes through the
+same weighing of all solutions as a single picture (`reconstruction.chromophores.posterior`), with
+the prior of the light and the model's error counted once. Given melanin, each state's blood is
+fitted to its own color. Where the light changes smoothly from state to state the colors of many
+pixels tell how, and a pixel's brightness then tells its blood too. The model's error is nearly the
+same in all states of a pixel: averaging does not reduce it, and differences are nearly free of it.
+Standard errors carry both.
+
+References
+----------
+Jimenez et al. 2010, doi:10.1145/1866158.1866167, section 3.1
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.color_table import ColorTable
+from reconstruction.chromophores import (
+    ChromophoreError,
+    dark_spots,
+    invert,
+    model_covariance,
+    without_brightness,
+)
+from reconstruction.chromophores import face as face_chromophores
+from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores.inversion import RELATIVE_NOISE
+from reconstruction.chromophores.posterior import FINEST, WeighedChromophores
+from reconstruction.chromophores.shading_prior import ShadingPrior
+from reconstruction.chromophores.start import LOWEST
+from reconstruction.facial_color import light_change
+
+Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+OWN_SHARE = 0.01
+"""Part of the model error's variance that is each state's own: 0.0001 to 0.007 between simulated
+pictures of the same unmoved face in neutral, smile, fear and exercise, seeds 0 to 3."""
+SHADING_WINDOW_PX = 3.0
+"""Window for the light's changes on moving faces: wider ones blur the shadows that move with them,
+narrower ones average less."""
+MISFIT = 4.0
+"""Standard errors from which on a state's color does not belong to the pixel's melanin."""
+_TASK_PIXELS = 2048
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SharedMelanin:
+    """One melanin and S bloods; maps have the pixels' shape (...), those of states (S, ...)."""
+
+    melanin: Map
+    """Volume fraction of melanin in the epidermis; NaN where no state is usable."""
+    stderr_melanin: Map
+    """Its standard error, with noise, model error and second solutions."""
+    noise_stderr_melanin: Map
+    """The part of noise alone: what another set of pictures would differ by."""
+    hemoglobin: Map
+    """(S, ...): volume fraction of blood in the dermis; NaN where the state is not usable."""
+    stderr_hemoglobin: Map
+    """(S, ...): its standard error."""
+    noise_stderr_hemoglobin: Map
+    """(S, ...): the part of noise alone."""
+    change: Map
+    """(S, ...): blood less that of the reference state."""
+    stderr_change: Map
+    """(S, ...): its standard error; what the two have in common is left out of it."""
+    shading: Map
+    """(S, ...): light on the pixel over that on a white tile."""
+    residual: Map
+    """(S, ...): root of the weighted square sum of what the color leaves, in standard errors of the
+    state's own noise: of one number with free light, of two with light that changes smoothly."""
+    valid: Mask
+    """At least one state is usable, and the mean color belongs to the table."""
+    valid_states: Mask
+    """(S, ...): usable, and `valid`."""
+    reference: int
+    """State that changes are taken from."""
+
+    @property
+    def misfits(self) -> Mask:
+        """(S, ...): the color does not belong to the pixel's melanin: misplaced, or a highlight."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.valid_states & (self.residual > MISFIT))
+
+
+def weigh(
+    rgb: ArrayLike,
+    table: ColorTable,
+    *,
+    prior: ShadingPrior,
+    variance: ArrayLike | None = None,
+    model_error: ArrayLike | None = None,
+    valid: ArrayLike | None = None,
+    reference: int = 0,
+    shading_window_px: float | None = None,
+    own_share: float = OWN_SHARE,
+    own_error: ArrayLike | None = None,
+    one_face: bool = False,
+) -> SharedMelanin:
+    """Estimate one melanin and the blood of every state, pixel by pixel.
+
+    Parameters
+    ----------
+    rgb : array_like, shape (S, ..., 3)
+        Diffuse light of S states over that of a white tile, linear camera RGB, aligned.
+    table : ColorTable
+        Of the camera and the light that took the pictures.
+    prior : ShadingPrior
+        How the pixels' shading is distributed; of a pixel's mean over the states.
+    variance : array_like, optional
+        Noise variance of `rgb`, broadcast to its shape. None: 1 percent. A misplaced pixel is
+        brighter or darker rather than of another color: that is the light's, not the noise's.
+    model_error : array_like, optional
+        Relative error of the table's colors, as of `reconstruction.chromophores.invert`; or a
+        covariance for each pixel, shape (..., 3, 3).
+    valid : array_like of bool, shape (S, ...), optional
+        Where each state may be used; a state that is not leaves out.
+    reference : int
+        State that changes are taken from, such as neutral.
+    shading_window_px : float, optional
+        How smoothly the light on a pixel changes between states: it is taken from colors, averaged
+        by a Gaussian of so many px, best `SHADING_WINDOW_PX`; pixels may be off it by as much as
+        their colors and their neighbors' show. Pixels must be (H, W) then. None: the light is free
+        in each pixel and state.
+    own_share : float
+        Part of the model error's variance that is each state's own, 0...1.
+    own_error : array_like, shape (S, ..., 3, 3), optional
+        Covariance of what each state's relative color errs by beside all that, such as where it
+        was misplaced (`reconstruction.facial_color.registration_error`). None: nothing.
+    one_face : bool
+        Whether the pixels are one person's skin whose light a white tile told, but for where the
+        face stands: each is then weighed by what all of them tell together of its melanin and
+        blood (`reconstruction.chromophores.face`).
+
+    Returns
+    -------
+    SharedMelanin
+
+    Raises
+    ------
+    reconstruction.chromophores.ChromophoreError
+        When shapes do not fit.
+
+    Examples
+    --------
+    >>> from model import color_table
+    >>> from reconstruction.chromophores.shading_prior import lognormal
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
+    >>> color = 0.8 * table.lookup([[0.02], [0.02]], [[0.03], [0.05]])
+    >>> found = weigh(color, table, prior=lognormal(0.7, 0.6), variance=(2e-3 * color) ** 2)
+    >>> f"{found.melanin[0]:.3f}", f"{found.change[1, 0]:.3f}"
+    ('0.020', '0.020')
+    """
+    from reconstruction.facial_color import (
+        shared_melanin_kernels as kernels,  # compiled when imported
+    )
+
+    colors = np.asarray(rgb, np.float32)
+    if colors.ndim < 2 or colors.shape[-1] != 3 or not colors.shape[0]:
+        raise ChromophoreError(f"rgb: expected shape (S, ..., 3), got {colors.shape}")
+    states, shape = colors.shape[0], colors.shape[1:-1]
+    if not -states <= reference < states:
+        raise ChromophoreError(f"reference: expected a state 0 to {states - 1}, got {reference}")
+    if shading_window_px is not None and (len(shape) != 2 or not shading_window_px > 0.0):
+        raise ChromophoreError(
+            f"shading_window_px: expected above 0 and rgb (S, H, W, 3), got {shading_window_px} "
+            f"and {colors.shape}"
+        )
+    if not 0.0 <= own_share <= 1.0:
+        raise ChromophoreError(f"own_share: expected 0 to 1, got {own_share}")
+    colors = colors.reshape(states, -1, 3)
+    usable = _usable(colors, valid, (states, *shape))
+    relative = _relative_variance(colors, variance, (states, *shape, 3), usable)
+    usable &= np.isfinite(relative).all(axis=-1)
+    log_rgb = np.log(np.where(usable[..., None], colors, 1.0), dtype=np.float32)
+    relative = np.where(usable[..., None], relative, 1.0).astype(np.float32)
+
+    each_error, usual = _model_errors(model_error, shape, usable)
+    common = each_error * (1.0 - own_share)
+    owns = _own_errors(own_error, own_share * usual + FINEST**2, (states, *shape), usable)
+    cells = np.ascontiguousarray(table.cells, np.float64)
+    mean, mean_variance = _mean_color(log_rgb, relative, usable, table, cells, owns)
+    mean_rgb = np.exp(mean)
+    mean_error = _with_mean_of(owns, relative, usable, common)
+    found = _weighed(
+        mean_rgb, table, prior, mean_variance * mean_rgb**2, mean_error,
+        shape if one_face else None,
+    )  # fmt: skip
+    ends = np.array([table.c_m_max, table.c_hd_max])
+    begin = _fractions(np.stack([found.melanin, found.hemoglobin], axis=-1), ends)
+    # dm = 3 end a^2 da
+    stderr = found.stderr_melanin / (3.0 * ends[0] * np.maximum(begin[:, 0], LOWEST) ** 2)
+    good: Mask = np.asarray(usable & np.isfinite(found.melanin))
+    fixed = (np.ascontiguousarray(begin, np.float32),
+             np.where(np.isfinite(stderr), stderr, 0.0).astype(np.float32))  # fmt: skip
+
+    weighed_by = np.ascontiguousarray(without_brightness(common))
+
+    def fit(log_change: Map, stiffness: Map) -> tuple[Map, Map]:
+        pixels = mean.shape[0]
+        of_pixels = np.empty((len(kernels.PIXEL_MAPS), pixels), np.float32)
+        of_states = np.empty((len(kernels.STATE_MAPS), states, pixels), np.float32)
+        kernels.blood_of_states(
+            log_rgb, relative, good, mean, log_change, stiffness, *fixed,
+            weighed_by, owns, cells,
+            float(ends[0]), float(ends[1]), reference % states, of_pixels, of_states, _TASK_PIXELS,
+        )  # fmt: skip
+        return of_pixels, of_states
+
+    free = np.zeros(good.shape, np.float32)
+    pixel_maps, state_maps = fit(free, free)
+    if shading_window_px is not None and states > 1:
+        log_change, stiffness = light_change.smooth(
+            state_maps[6], state_maps[7], good & (state_maps[5] < MISFIT), shape, shading_window_px
+        )
+        pixel_maps, state_maps = fit(log_change, np.where(good, stiffness, 0.0).astype(np.float32))
+    named = {
+        name: state_maps[k].reshape(states, *shape) for k, name in enumerate(kernels.STATE_MAPS)
+    }
+    shading = np.exp(named.pop("log_shading"))
+    del named["log_shading_variance"]
+    each: Mask = np.asarray(usable & found.valid)
+    return SharedMelanin(
+        melanin=found.melanin.reshape(shape),
+        stderr_melanin=found.stderr_melanin.reshape(shape),
+        noise_stderr_melanin=pixel_maps[0].reshape(shape),
+        **named,
+        shading=shading,
+        valid=found.valid.reshape(shape),
+        valid_states=each.reshape(states, *shape),
+        reference=reference % states,
+    )
+
+
+def _weighed(
+    rgb: Map,
+    table: ColorTable,
+    prior: ShadingPrior,
+    variance: Map,
+    model_error: NDArray[np.float64],
+    face_shape: tuple[int, ...] | None,
+) -> WeighedChromophores:
+    """Weigh all solutions of colors (n, 3); those of one face, of such a shape, by it."""
+    known = partial(chromophore_posterior.weigh, rgb, table, prior=prior, variance=variance,
+                    model_error=model_error)  # fmt: skip
+    face = None
+    if face_shape is not None:
+        face = face_chromophores.in_known_light(
+            rgb, table, variance=variance, model_error=model_error
+        )
+    by_face = known(face=face)
+    if face is None or face_shape is None:
+        return by_face
+    alone = known()
+    spots = dark_spots.lighter_by_itself(by_face, alone)
+    if len(face_shape) == 2:
+        dark = dark_spots.darker_than_around(
+            rgb.reshape(*face_shape, 3), variance=variance.reshape(*face_shape, 3)
+        )
+        spots |= dark.reshape(-1)
+    return dark_spots.either(by_face, alone, spots)
+
+
+def _model_errors(
+    model_error: ArrayLike | None, shape: tuple[int, ...], usable: Mask
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return covariances of the pixels (n or 1, 3, 3), and the usual variances of channels (3,).
+
+    Usual is the median: where a picture is finer than its pixels, errors are many times as large.
+    """
+    given = np.asarray(0.0 if model_error is None else model_error, np.float64)
+    if given.ndim < 3:
+        one = model_covariance(model_error, default_noise=False)
+        return one[None], np.diag(one)
+    if given.shape != (*shape, 3, 3):
+        raise ChromophoreError(
+            f"model_error: expected shape {(*shape, 3, 3)} for the pixels, got {given.shape}"
+        )
+    flat = given.reshape(-1, 3, 3)
+    seen = flat[usable.any(axis=0)]
+    usual = np.median(np.einsum("nii->ni", seen), axis=0) if len(seen) else np.zeros(3)
+    return flat, usual
+
+
+_UPPER = np.triu_indices(3)
+
+
+def _own_errors(
+    own_error: ArrayLike | None,
+    least: NDArray[np.float64],
+    shape: tuple[int, ...],
+    usable: Mask,
+) -> NDArray[np.float64]:
+    """Return upper triangles of the states' own covariances, (S, n or 1, 6)."""
+    diagonal = np.diag(least)[_UPPER]
+    if own_error is None:
+        return np.ascontiguousarray(np.broadcast_to(diagonal, (shape[0], 1, 6)))
+    given = np.asarray(own_error, np.float64)
+    if given.shape != (*shape, 3, 3):
+        raise ChromophoreError(
+            f"own_error: expected shape {(*shape, 3, 3)} for states and pixels, got {given.shape}"
+        )
+    flat = given.reshape(shape[0], -1, 3, 3)[..., _UPPER[0], _UPPER[1]]
+    if not (np.isfinite(flat[usable]).all() and (flat[usable][:, [0, 3, 5]] >= 0.0).all()):
+        raise ChromophoreError("own_error: expected finite covariances without negative variances")
+    return np.ascontiguousarray(np.where(usable[..., None], flat, 0.0) + diagonal)
+
+
+def _with_mean_of(
+    owns: NDArray[np.float64], relative: Map, usable: Mask, common: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return what the mean color of the states errs by beside noise, (3, 3) or (n, 3, 3)."""
+    if owns.shape[1] == 1:
+        own = np.zeros((3, 3))
+        own[_UPPER] = owns[0, 0]
+        most = max(int(usable.sum(axis=0).max(initial=0)), 1)
+        return np.asarray((common if len(common) > 1 else common[0]) + own / most)
+    # each state's part in the mean, as `shared_melanin_kernels.mean_color` takes it
+    share = usable / (relative.sum(axis=-1) + owns[..., [0, 3, 5]].sum(axis=-1))
+    share /= np.maximum(share.sum(axis=0), 1e-300)
+    mean = (np.square(share)[..., None] * owns).sum(axis=0)
+    whole = np.empty((len(mean), 3, 3))
+    whole[(slice(None), *_UPPER)] = mean
+    whole[(slice(None), *_UPPER[::-1])] = mean
+    return np.asarray(whole + common)
+
+
+def _mean_color(
+    log_rgb: Map,
+    relative: Map,
+    usable: Mask,
+    table: ColorTable,
+    cells: NDArray[np.float64],
+    owns: NDArray[np.float64],
+) -> tuple[Map, Map]:
+    """Return the states' mean log color, as of skin with their mean blood, and its variance."""
+    from reconstruction.facial_color import (
+        shared_melanin_kernels as kernels,  # compiled when imported
+    )
+
+    count = np.maximum(usable.sum(axis=0), 1)[:, None]
+    keep = usable[..., None]
+    plain = np.where(keep, log_rgb, 0.0).sum(axis=0) / count
+    noise = np.where(keep, relative, 0.0).sum(axis=0) / count**2
+    seen: Mask = np.asarray(usable.any(axis=0))
+    rgb = np.where(seen[:, None], np.exp(plain), np.nan).astype(np.float32)
+    first = invert(rgb, table, variance=noise * rgb**2)
+    ends = np.array([table.c_m_max, table.c_hd_max])
+    begin = _fractions(np.stack([first.melanin, first.hemoglobin], axis=-1), ends)
+    mean, variance = np.empty_like(plain, np.float32), np.empty_like(plain, np.float32)
+    kernels.mean_color(
+        log_rgb, relative, np.ascontiguousarray(usable), begin.astype(np.float32), owns, cells,
+        mean, variance, _TASK_PIXELS,
+    )  # fmt: skip
+    return mean, variance
+
+
+def _fractions(values: Map, ends: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return volume fractions as fractions of the table's axes; NaN as a tenth of the ends."""
+    known = np.where(np.isfinite(values), values, 0.001 * ends)
+    return np.asarray(np.clip(np.cbrt(known / ends), LOWEST, 1.0), np.float64)
+
+
+def _usable(colors: Map, valid: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
+    good = np.isfinite(colors).all(axis=-1)
+    with np.errstate(invalid="ignore"):
+        good &= (colors > 0.0).all(axis=-1)
+    if valid is None:
+        return np.asarray(good)
+    given = np.asarray(valid)
+    if given.dtype != np.bool_ or given.shape != shape:
+        raise ChromophoreError(
+            f"valid: expected bool of shape {shape}, got {given.dtype} of {given.shape}"
+        )
+    return np.asarray(good & given.reshape(good.shape))
+
+
+def _relative_variance(
+    colors: Map, variance: ArrayLike | None, shape: tuple[int, ...], usable: Mask
+) -> Map:
+    if variance is None:
+        return np.full(colors.shape, RELATIVE_NOISE**2, np.float32)
+    values = np.asarray(variance, np.float32)
+    try:
+        values = np.broadcast_to(values, shape).reshape(colors.shape)
+    except ValueError as error:
+        raise ChromophoreError(
+            f"variance: expected a shape that broadcasts to {shape}, got {values.shape}"
+        ) from error
+    with np.errstate(invalid="ignore"):
+        if (values[usable] < 0.0).any():
+            raise ChromophoreError("variance: got a negative one")
+    return (values / np.square(np.where(usable[..., None], colors, 1.0))).astype(np.float32)

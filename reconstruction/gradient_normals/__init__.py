@@ -1,0 +1,17 @@
+"""Normals from polarized spherical-gradient patterns."""
+
+from reconstruction.gradient_normals.estimation import Roughness, estimate_roughness, from_patterns
+from reconstruction.gradient_normals.lobe_response import SphereLights, SphereLightsError
+from reconstruction.gradient_normals.noise import SensorNoise
+from reconstruction.gradient_normals.patterns import GradientError, MissingPatterns
+
+__all__ = [
+    "GradientError",
+    "MissingPatterns",
+    "Roughness",
+    "SensorNoise",
+    "SphereLights",
+    "SphereLightsError",
+    "estimate_roughness",
+    "from_patterns",
+]

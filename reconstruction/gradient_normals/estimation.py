@@ -1,0 +1,508 @@
+"""Normals from pictures under full light, gradients and their complements, two polarizations.
+
+Under light that grows along an axis, a reflection is brighter the further its lobe points that way:
+the pictures are the lobe's first moments, and their vector points along its axis (Ma et al. 2007,
+doi 10.2312/EGWR/EGSR07/183-194; complements: Wilson et al. 2010, doi 10.1145/1731047.1731055). For
+the specular reflection, which is what parallel polarizers show more than crossed ones, that is the
+mirror direction, and the normal half way between it and the view. For the diffuse one it is the
+normal. With `SphereLights` the vector is not taken at its word, but looked up in what these very
+lights show of this lobe (:mod:`reconstruction.gradient_normals.lobe_response`).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+
+from model.fresnel import ETA_SKIN
+from reconstruction.gradient_normals import kernels, lobe_response
+from reconstruction.gradient_normals.channels import channel_count, joined, sliced, summed
+from reconstruction.gradient_normals.lobe_response import (
+    Response,
+    SphereLights,
+    SphereLightsError,
+    frame_of,
+)
+from reconstruction.gradient_normals.moments import (
+    Reflection,
+    prepare,
+    with_filter,
+    with_shared_dark,
+)
+from reconstruction.gradient_normals.noise import SensorNoise
+from reconstruction.gradient_normals.patterns import GradientError, Key, MissingPatterns, collect
+from reconstruction.normal_maps import NormalMaps
+from reconstruction.tiles import map_tiles
+
+__all__ = [
+    "GradientError", "MissingPatterns", "Roughness", "SensorNoise", "SphereLights",
+    "SphereLightsError", "estimate_roughness", "from_patterns",
+]  # fmt: skip
+
+_log = logging.getLogger(__name__)
+
+Floating = NDArray[np.floating]
+Variance = float | SensorNoise | Mapping[Key, ArrayLike] | None
+Valid = NDArray[np.bool_] | Mapping[Key, NDArray[np.bool_]] | None
+
+NEEDED = 3.0
+"""Length of the moment vector over its standard error, below which a pixel has no normal."""
+LEAKY = 0.02
+"""Median leakage from which polarizers do not cross well: 8 degrees off."""
+CONTRADICTION = 3.0
+"""Mean square of residuals over their variance from which pictures are said not to fit together."""
+ALPHAS = (0.03, 0.06, 0.12, 0.24, 0.48, 0.9)
+"""Ladder on which a roughness is searched."""
+
+
+@dataclass(frozen=True, slots=True)
+class Roughness:
+    """The roughness that a map's lobes have on the whole.
+
+    Attributes
+    ----------
+    alpha : float
+        GGX roughness of the lobe within a (smoothed) pixel, whatever makes it: facets, relief that
+        the optics do not resolve, the smoothing.
+    stderr : float
+        Standard error of `alpha`.
+    pixels : int
+        How many it was computed from.
+    """
+
+    alpha: float
+    stderr: float
+    pixels: int
+
+
+def from_patterns(
+    patterns: Mapping[Key, ArrayLike],
+    *,
+    component: Literal["specular", "diffuse"] = "specular",
+    view: ArrayLike = (0.0, 0.0, 1.0),
+    variance: Variance = None,
+    valid: Valid = None,
+    saturation: float | None = None,
+    lights: SphereLights | None = None,
+    alpha: float | Roughness | None = None,
+    eta: float = ETA_SKIN,
+    points_mm: ArrayLike | None = None,
+    smooth_px: float = 0.0,
+    smooth_crossed_px: float | None = None,
+    wiener: bool = False,
+    executor: Executor | None = None,
+) -> NormalMaps:
+    """Compute normals from pictures under a sphere's patterns.
+
+    Parameters
+    ----------
+    patterns : mapping of (str, str) to array_like, shape (H, W) or (H, W, C)
+        Linear pictures by pattern ("full", "x", "y", "z", "-x", "-y", "-z", "dark") and polarizer
+        ("parallel", "crossed"), one unit, all at one level and exposure. With dark frames among
+        them, these are subtracted; without, the pictures are taken to be without dark level. Any
+        set that tells full light and three gradients will do, as full, x, y, z or x, -x, y, z; NaN
+        where there is no sample.
+    component : "specular" or "diffuse"
+        Which reflection. Specular needs both polarizers; its channels are added up, as it has no
+        color. Diffuse needs crossed pictures; channels have a normal each.
+    view : array_like, shape (3,) or (H, W, 3)
+        Unit vectors to the camera, rig frame (y up).
+    variance : float, SensorNoise, or mapping like `patterns` of arrays or numbers, optional
+        Of the samples. None: estimated from how redundant patterns contradict each other; where
+        none are redundant, noise stays unknown, and standard errors are pi.
+    valid : ndarray of bool, shape (H, W), or mapping like `patterns`, optional
+        Samples to use.
+    saturation : float, optional
+        Value from which a sample counts as saturated, before the dark frame is subtracted.
+    lights : SphereLights, optional
+        The lights as they are. None: an even sphere of light all around, and narrow lobes.
+    alpha : float or Roughness, optional
+        GGX roughness of the facets within a pixel, for specular normals with `lights`. None:
+        estimated over the map (:func:`estimate_roughness`).
+    eta : float
+        Refractive index of the surface, with `lights`.
+    points_mm : array_like, shape (H, W, 2) or (H, W, 3), optional
+        Where the pixels are on the patch, rig frame, with lights at a finite distance: directions
+        to the lights then follow. Give `view` by pixel, too.
+    smooth_px : float
+        Standard deviation of a Gaussian that the moments are smoothed by before anything that is
+        not linear is done to them, px. The optics' own blur is a good choice; noise falls about
+        as 1 / (3.5 smooth_px).
+    smooth_crossed_px : float, optional
+        The same of the crossed pictures, where skin glows with less detail; default `smooth_px`.
+    wiener : bool
+        Filter the moments, instead, by what share of each spatial frequency is signal
+        (:mod:`reconstruction.gradient_normals.wiener`): as much as noise and optics ask for. Standard
+        errors then hold the detail that is lost, too.
+    executor : Executor, optional
+        Threads to map tiles of rows over; default one thread a core, at most 8.
+
+    Returns
+    -------
+    NormalMaps
+        Shape (H, W), or (H, W, C) for diffuse normals of C channels; float64 where a picture is
+        float64, else float32. `albedo` is, with `lights`, what is reflected over what a dielectric
+        of `eta` (specular) or a white interior below it (diffuse) would, in units of a white
+        diffuser facing the view in full light; without `lights` the full light itself.
+        `stderr_rad` holds the noise, and what `lights` and `alpha` say about their own errors
+        (these are alike in neighbouring pixels).
+
+    Raises
+    ------
+    MissingPatterns
+        Where patterns do not tell the moments, or one polarizer's pictures are not there.
+    GradientError, SphereLightsError
+        For arrays, settings and lights that do not fit.
+
+    Notes
+    -----
+    Cast shadows and light between furrows are not corrected. Diffuse light leaves a smooth surface
+    partly polarized; with `lights` the part that parallel less crossed keeps is taken out. An
+    analyser that is off by an angle d in both states costs cos 2d of the specular signal and turns
+    no normal; nothing in the pictures tells it, so leakage has to be calibrated.
+
+    Examples
+    --------
+    >>> n = np.array([0.1, 0.2, 0.97]) / np.linalg.norm([0.1, 0.2, 0.97])
+    >>> r = 2 * n[2] * n - [0, 0, 1]
+    >>> gray = {name: np.full((2, 2), 0.5) for name in ("full", "x", "y", "z")}
+    >>> pictures = {(name, "crossed"): image for name, image in gray.items()}
+    >>> for name, w in zip(gray, (1, *(1 + r) / 2)):
+    ...     pictures[name, "parallel"] = gray[name] + 0.1 * w
+    >>> bool(np.allclose(from_patterns(pictures).normals[0, 0], n))
+    True
+    """
+    if component not in ("specular", "diffuse"):
+        raise GradientError(f"component: got {component!r}, expected 'specular' or 'diffuse'")
+    settings: dict[str, Any] = {
+        "component": component, "view": view, "lights": lights, "alpha": alpha, "eta": eta,
+        "points_mm": points_mm, "smooth_px": smooth_px, "smooth_crossed_px": smooth_crossed_px,
+        "wiener": wiener, "executor": executor,
+    }  # fmt: skip
+    channels = channel_count(patterns)
+    if channels is not None and component == "specular":
+        whole = summed(patterns, variance=variance, valid=valid, saturation=saturation)
+        return from_patterns(whole[0], variance=whole[1], **settings)
+    if channels is not None:
+        return joined(
+            [
+                from_patterns(
+                    sliced(patterns, k), variance=sliced(variance, k), valid=sliced(valid, k),
+                    saturation=saturation, **settings,
+                )
+                for k in range(channels)
+            ]
+        )  # fmt: skip
+    reflection = _reflection(
+        patterns, component, variance, valid, saturation, lights, smooth_px, smooth_crossed_px
+    )
+    shape = reflection.shape
+    middle, each_view = _views(view, shape)
+    places = _places(points_mm, shape, middle, lights)
+    if lights is None:
+        if alpha is not None:
+            raise GradientError("alpha: got it without lights, expected both or neither")
+        table = Response(np.zeros((0, 0, 0)), 0.0, 1.0, frame_of(middle))
+    elif component == "diffuse":
+        table = lobe_response.diffuse(lights, view=middle, eta=eta, near=places is not None)
+    else:
+        if alpha is None:
+            alpha = _roughness(reflection, lights, middle, eta)
+        known = alpha if isinstance(alpha, Roughness) else Roughness(float(alpha), 0.0, 0)
+        table = lobe_response.specular(
+            lights, view=middle, alpha=known.alpha, eta=eta, near=places is not None,
+            alpha_stderr=known.stderr,
+        )  # fmt: skip
+    if wiener:
+        reflection = with_filter(reflection)
+    return _maps(reflection, table, _analyser(lights, table), eta, each_view, places, executor)
+
+
+def estimate_roughness(
+    patterns: Mapping[Key, ArrayLike],
+    *,
+    lights: SphereLights,
+    view: ArrayLike = (0.0, 0.0, 1.0),
+    variance: Variance = None,
+    valid: Valid = None,
+    saturation: float | None = None,
+    eta: float = ETA_SKIN,
+    smooth_px: float = 0.0,
+    smooth_crossed_px: float | None = None,
+) -> Roughness:
+    """Estimate the roughness that makes the map's specular moment vectors as long as they are.
+
+    Over the full light the vector is the shorter, the wider the lobe. Parameters are those of
+    :func:`from_patterns`; so are the errors.
+
+    Returns
+    -------
+    Roughness
+        At an end of the range searched, 0.03 to 0.9, where the lobes are beyond it, with a warning
+        in the log.
+
+    Raises
+    ------
+    GradientError
+        Where no pixel has a specular signal.
+    """
+    if channel_count(patterns) is not None:
+        patterns, variance = summed(patterns, variance=variance, valid=valid, saturation=saturation)
+        valid = saturation = None
+    reflection = _reflection(
+        patterns, "specular", variance, valid, saturation, lights, smooth_px, smooth_crossed_px
+    )
+    found = _roughness(reflection, lights, _views(view, reflection.shape)[0], eta)
+    if found.pixels == 0:
+        raise GradientError("patterns: no pixel has a specular signal above its noise")
+    return found
+
+
+def _reflection(
+    patterns: Mapping[Key, ArrayLike],
+    component: Literal["specular", "diffuse"],
+    variance: Variance,
+    valid: Valid,
+    saturation: float | None,
+    lights: SphereLights | None,
+    smooth_px: float,
+    smooth_crossed_px: float | None,
+) -> Reflection:
+    noise = variance if isinstance(variance, SensorNoise) else None
+    stacks = collect(
+        patterns,
+        variance=None if isinstance(variance, SensorNoise) else variance,
+        valid=valid,
+        saturation=saturation,
+    )
+    leakage = 0.0
+    if lights is not None:
+        # lights near Brewster's angle reflect next to nothing, most of it crossed: not a mean
+        leakage = float(np.median(lights.leakage[lights.intensities > 0]))
+        if leakage > LEAKY:
+            _warn_of_leakage(round(leakage, 4))
+    return prepare(
+        with_shared_dark(stacks), component, noise=noise, leakage=leakage, smooth_px=smooth_px,
+        smooth_crossed_px=smooth_crossed_px,
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=64)
+def _warn_of_leakage(leakage: float) -> None:
+    """Say once for all pictures of one sphere how much passes crossed polarizers."""
+    _log.warning(
+        "polarizers leak: crossed pictures hold %.1f %% of the specular reflection, as if the"
+        " analyser were %.0f degrees off; corrected, at the price of signal",
+        100.0 * leakage,
+        np.degrees(np.arctan(np.sqrt(leakage))),
+    )
+
+
+def _views(view: ArrayLike, shape: tuple[int, int]) -> tuple[Floating, Floating]:
+    """Return the mean view (3,), and every pixel's (P, 3) or none (0, 3)."""
+    v = np.asarray(view, np.float64)
+    if v.shape not in ((3,), (*shape, 3)):
+        raise GradientError(f"view: got shape {v.shape}, expected (3,) or {(*shape, 3)}")
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    if not (np.abs(length - 1.0) < 0.01).all():
+        raise GradientError("view: expected unit vectors, got lengths other than 1")
+    v = v / length
+    if v.ndim == 1:
+        return v, np.zeros((0, 3))
+    middle = v.reshape(-1, 3).mean(axis=0)
+    return middle / np.linalg.norm(middle), v.reshape(-1, 3)
+
+
+def _places(
+    points_mm: ArrayLike | None,
+    shape: tuple[int, int],
+    middle: Floating,
+    lights: SphereLights | None,
+) -> Floating | None:
+    """Return the pixels' places (P, 2) along the frame's first two axes, mm."""
+    if points_mm is None:
+        return None
+    if lights is None or not np.isfinite(lights.distance_mm):
+        raise GradientError("points_mm: got them without lights of finite distance_mm")
+    points = np.asarray(points_mm, np.float64)
+    if points.shape not in ((*shape, 2), (*shape, 3)) or not np.isfinite(points).all():
+        raise GradientError(
+            f"points_mm: got shape {points.shape}, expected finite {(*shape, 2)} or {(*shape, 3)}"
+        )
+    flat = points.reshape(-1, points.shape[-1])
+    if points.shape[-1] == 2:
+        flat = np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
+    if np.linalg.norm(flat, axis=1).max() > 0.2 * lights.distance_mm:
+        raise GradientError(
+            "points_mm: got points farther from the middle than a fifth of the lights' distance;"
+            " directions to the lights are followed to first order only"
+        )
+    return np.asarray(flat @ frame_of(middle)[:2].T)
+
+
+def _analyser(lights: SphereLights | None, table: Response) -> Floating:
+    """Return the analyser's axis in the frame of the view, (2,)."""
+    if lights is None:
+        return np.zeros(2)
+    return np.asarray(table.frame[:2] @ np.asarray(lights.analyser))
+
+
+def _grid(table: Response) -> NDArray[np.float64]:
+    """Return places for the search to begin at, see :func:`gradient_kernels.starts`."""
+    if table.coefficients.size == 0:
+        return np.zeros((2, 2, 2))
+    lines = int(np.clip(3.0 / table.step, 65, 257))
+    grid = np.empty((lines, lines, 2))
+    kernels.starts(table.coefficients, table.least, table.step, grid)
+    return grid
+
+
+def _inverted(
+    reflection: Reflection,
+    moments: tuple[Floating, Floating],
+    table: Response,
+    grid: Floating,
+    analyser: Floating,
+    eta: float,
+    view: Floating,
+    place: Floating,
+) -> NDArray[np.float64]:
+    out = np.empty((moments[0].shape[1], kernels.NORMAL_COLUMNS))
+    kernels.invert(
+        *moments, table.frame, reflection.component == "specular", table.coefficients, table.least,
+        table.step, grid, analyser, eta, view, place, reflection.told > 0, NEEDED,
+        1e-5 if reflection.kind == np.float32 else 1e-9, out,
+    )  # fmt: skip
+    return out
+
+
+def _roughness(
+    reflection: Reflection, lights: SphereLights, middle: Floating, eta: float
+) -> Roughness:
+    rows = list(reflection.tiles())
+    height, width = reflection.shape
+    if len(rows) > 8:  # some strips tell as much as all
+        rows = [slice(r.start, min(r.start + 16, r.stop)) for r in rows[:: len(rows) // 8]]
+    columns = max(1, height * width // 65_536)
+    picked = []
+    for span in rows:
+        parallel, crossed = reflection.moments(span)
+        good = np.flatnonzero(np.isfinite(parallel[0]) & np.isfinite(crossed[0]))
+        good = good[:: min(columns, 8)]
+        picked.append((parallel[:, good], crossed[:, good]))
+    moments = (
+        np.ascontiguousarray(np.concatenate([a for a, _ in picked], axis=1)),
+        np.ascontiguousarray(np.concatenate([b for _, b in picked], axis=1)),
+    )
+
+    def excess(log_alpha: float) -> tuple[float, Floating]:
+        """Return how much longer the vectors are than this roughness makes them, each and all."""
+        table = lobe_response.specular(lights, view=middle, alpha=float(np.exp(log_alpha)), eta=eta)
+        found = _inverted(
+            reflection, moments, table, _grid(table), _analyser(lights, table), eta,
+            np.zeros((0, 3)), np.zeros((0, 2)),
+        )  # fmt: skip
+        # no vector is longer than its light; a lobe that falls between lights has no length at all
+        length = found[:, kernels.CONCENTRATION]
+        good = (found[:, kernels.STATUS] == kernels.GOOD) & (length >= 0.0) & (length <= 1.0)
+        if not good.any():
+            return float("nan"), np.zeros(0)
+        light = found[good, kernels.ALBEDO]
+        each = light * (
+            found[good, kernels.CONCENTRATION_SEEN] - found[good, kernels.CONCENTRATION]
+        )
+        return float(each.sum() / max(light.sum(), 1e-300)), each / max(light.sum(), 1e-300)
+
+    ladder = np.log(ALPHAS)
+    steps = [excess(a) for a in ladder]
+    pixels = max(len(each) for _, each in steps)
+    if pixels == 0:
+        return Roughness(ALPHAS[len(ALPHAS) // 2], ALPHAS[len(ALPHAS) // 2], 0)
+    values = np.array([value for value, _ in steps])
+    change = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
+    if change.size == 0:
+        best = int(np.nanargmin(np.abs(values)))
+        _log.warning(
+            "roughness: lobes are %s than any of roughness %g to %g; %g is taken",
+            "narrower" if values[best] > 0.0 else "wider", ALPHAS[0], ALPHAS[-1], ALPHAS[best],
+        )  # fmt: skip
+        return Roughness(ALPHAS[best], ALPHAS[best], pixels)
+    low, high = ladder[change[0]], ladder[change[0] + 1]
+    root = float(brentq(lambda a: excess(a)[0], low, high, xtol=2e-3))
+    value, each = excess(root)
+    slope = (excess(root + 0.02)[0] - value) / 0.02
+    spread = float(np.sqrt(np.sum((each - each.mean()) ** 2)))
+    alpha = float(np.exp(root))
+    stderr = alpha * spread / max(slope, 1e-9) if len(each) >= 8 else alpha
+    return Roughness(alpha, min(stderr, alpha), len(each))
+
+
+def _maps(
+    reflection: Reflection,
+    table: Response,
+    analyser: Floating,
+    eta: float,
+    view: Floating,
+    places: Floating | None,
+    executor: Executor | None,
+) -> NormalMaps:
+    height, width = reflection.shape
+    kind = reflection.kind
+    normals = np.zeros((height, width, 3), kind)
+    flats = [np.zeros((height, width), kind) for _ in range(4)]
+    valid, used = np.zeros((height, width), bool), np.zeros((height, width), np.int32)
+    grid = _grid(table)
+
+    def solve(rows: slice) -> tuple[float, float]:
+        span = slice(rows.start * width, rows.stop * width)
+        moments = reflection.moments(rows)
+        found = _inverted(
+            reflection, moments, table, grid, analyser, eta, view[span] if len(view) else view,
+            np.zeros((0, 2)) if places is None else places[span],
+        ).reshape(-1, width, kernels.NORMAL_COLUMNS)  # fmt: skip
+        good = found[..., kernels.STATUS] == kernels.GOOD
+        valid[rows] = good
+        normals[rows] = found[..., :3]
+        misfit, count = np.zeros(good.size), np.zeros(good.size)
+        chi = free = 0.0
+        for one in moments:
+            if one.shape[1]:
+                misfit += one[kernels.MISFIT]
+                count += one[kernels.USED]
+                told = np.isfinite(one[kernels.CHI])
+                chi += float(one[kernels.CHI][told].sum())
+                free += float(one[kernels.FREE][told].sum())
+        residual = np.sqrt(misfit / np.maximum(count, 1)).reshape(good.shape)
+        for flat, values, none in (
+            (flats[0], found[..., kernels.ALBEDO], 0.0),
+            (flats[1], residual, 0.0),
+            (flats[2], found[..., kernels.STDERR], np.pi),
+            (flats[3], found[..., kernels.STDERR_ALBEDO], np.inf),
+        ):
+            flat[rows] = np.where(good, values, none)
+        used[rows] = count.reshape(good.shape)
+        return chi, free
+
+    tiles = list(reflection.tiles())
+    if executor is not None or len(tiles) < 2:
+        contradiction = list(map_tiles(solve, tiles, executor=executor))
+    else:
+        with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+            contradiction = list(map_tiles(solve, tiles, executor=pool))
+    chi, free = (sum(part) for part in zip(*contradiction, strict=True))
+    if reflection.judged and free and chi > CONTRADICTION * free:
+        _log.warning(
+            "patterns contradict each other: residuals of redundant pictures are %.1f times their"
+            " noise; did subject or light change between them?",
+            np.sqrt(chi / free),
+        )
+    return NormalMaps(normals, flats[0], flats[1], valid, flats[2], flats[3], used)

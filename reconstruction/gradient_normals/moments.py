@@ -1,0 +1,293 @@
+"""Moments of a reflection under a sphere's patterns, by tiles of rows, smoothed or not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.gradient_normals import kernels
+from reconstruction.gradient_normals.noise import SensorNoise, estimate_noise
+from reconstruction.gradient_normals.patterns import GradientError, MissingPatterns, Stack, require
+from reconstruction.gradient_normals.wiener import filtered
+
+Floating = NDArray[np.floating]
+
+TILE_PIXELS = 65_536
+_VALUES = slice(kernels.C_0, kernels.V_0)
+_SPREAD = slice(kernels.V_0, kernels.CHI)
+_VARIANCES = (
+    (kernels.V_0, 0, 0), (kernels.V_XX, 1, 1), (kernels.V_YY, 2, 2), (kernels.V_ZZ, 3, 3),
+    (kernels.V_XY, 1, 2), (kernels.V_XZ, 1, 3), (kernels.V_YZ, 2, 3),
+)  # fmt: skip
+"""Rows of variances, and which moments they are of."""
+REACH_SIGMA = 3.5
+"""Where a smoothing kernel ends, in its standard deviations."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reflection:
+    """What is needed to compute the moments of a component, tile by tile.
+
+    Attributes
+    ----------
+    component : "specular" or "diffuse"
+    parallel : Stack or None
+        None for diffuse moments of crossed pictures alone.
+    crossed : Stack
+    noise : SensorNoise or None
+        None where the stacks hold variances, or nothing is known.
+    told : int
+        0: noise is unknown; 1: the stacks' variances; 2: `noise`.
+    judged : bool
+        Whether the noise was given, and residuals can be judged by it.
+    leakage : float
+        Of the specular reflection what passes crossed, over parallel; for diffuse moments.
+    smooth_px : tuple of float
+        Standard deviations of the Gaussians, parallel and crossed, px.
+    kind : dtype
+        float32 or float64.
+    clean : tuple of ndarray, shape (4, H, W), or None
+        Filtered moments, parallel and crossed, that replace the pictures' own.
+    shares : tuple of ndarray, shape (2, 4), or None
+        Variance of what is to be inverted, over that of the pictures' own parallel and crossed
+        moments, with `clean`.
+    """
+
+    component: Literal["specular", "diffuse"]
+    parallel: Stack | None
+    crossed: Stack
+    noise: SensorNoise | None
+    told: int
+    judged: bool
+    leakage: float
+    smooth_px: tuple[float, float]
+    kind: Any
+    clean: tuple[Floating, Floating] | None = None
+    shares: tuple[Floating, Floating] | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.crossed.shape
+
+    def tiles(self) -> Iterator[slice]:
+        """Yield slices of rows that cover the pictures."""
+        height, width = self.shape
+        step = max(1, TILE_PIXELS // width)
+        for start in range(0, height, step):
+            yield slice(start, min(start + step, height))
+
+    def moments(self, rows: slice) -> tuple[Floating, Floating]:
+        """Return what is to be inverted (MOMENT_ROWS, P), and what is to be taken off it.
+
+        The second one is (MOMENT_ROWS, 0) where nothing is.
+        """
+        crossed = self._of(self.crossed, rows, self.smooth_px[1])
+        if self.parallel is None:
+            if self.clean is not None:
+                self._replace(crossed, crossed, rows)
+            return crossed, crossed[:, :0]
+        parallel = self._of(self.parallel, rows, self.smooth_px[0])
+        if self.component == "specular":
+            if self.clean is not None:
+                self._replace(parallel, crossed, rows)
+            return parallel, crossed
+        k = self.leakage / (1.0 - self.leakage)
+        cleaned = crossed.copy()
+        cleaned[_VALUES] -= k * (parallel[_VALUES] - crossed[_VALUES])
+        cleaned[_SPREAD] = (1.0 + k) ** 2 * crossed[_SPREAD] + k**2 * parallel[_SPREAD]
+        if self.clean is not None:
+            self._replace(cleaned, cleaned, rows)
+        return cleaned, crossed[:, :0]
+
+    def _replace(self, first: Floating, second: Floating, rows: slice) -> None:
+        """Put filtered moments in, and all of their variance into the first."""
+        if self.clean is None or self.shares is None:
+            return
+        lost = ~np.isfinite(first[0]) | ~np.isfinite(second[0])
+        a, b = (np.sqrt(share) for share in self.shares)
+        for row, i, j in _VARIANCES:
+            first[row] *= a[i] * a[j]
+            if second is not first:
+                first[row] += b[i] * b[j] * second[row]
+                second[row] = 0.0
+        for moments, clean in ((first, self.clean[0]), (second, self.clean[1])):
+            moments[_VALUES] = clean[:, rows].reshape(4, -1)
+            moments[: kernels.CHI, lost] = np.nan
+
+    def _of(self, stack: Stack, rows: slice, sigma: float) -> Floating:
+        taps = _taps(sigma).astype(self.kind)
+        reach = len(taps) - 1
+        start, stop = max(0, rows.start - reach), min(self.shape[0], rows.stop + reach)
+        y = stack.samples(slice(start, stop), self.kind)
+        noise = stack.variances(slice(start, stop), self.kind)
+        height, width = y.shape[1:]
+        out = np.empty((kernels.MOMENT_ROWS, height * width), self.kind)
+        # a view that repeats itself keeps doing so
+        flat = (
+            np.broadcast_to(noise[:, :1, 0], (len(y), height * width))
+            if noise.strides[2] == 0
+            else noise.reshape(len(y), -1)
+        )
+        gain, read = (self.noise.gain, self.noise.read_variance) if self.noise else (0.0, 1.0)
+        kernels.moments(y.reshape(len(y), -1), flat, gain, read, self.told, stack.dark, out)
+        if reach:
+            _smooth(out.reshape(-1, height, width), taps)
+        inner = out.reshape(-1, height, width)[:, rows.start - start : rows.stop - start]
+        return np.ascontiguousarray(inner).reshape(kernels.MOMENT_ROWS, -1)
+
+
+def _taps(sigma: float) -> NDArray[np.float64]:
+    """Return a Gaussian's taps from its middle outward, the whole kernel's sum 1."""
+    if sigma == 0.0:
+        return np.ones(1)
+    k = np.arange(int(np.ceil(REACH_SIGMA * sigma)) + 1)
+    taps = np.exp(-0.5 * (k / sigma) ** 2)
+    return np.asarray(taps / (2.0 * taps.sum() - taps[0]))
+
+
+def _smooth(moments: Floating, taps: Floating) -> None:
+    """Smooth moments (MOMENT_ROWS, H, W) in place over their valid pixels; variances follow."""
+    mask = np.isfinite(moments[kernels.C_0])
+    if not mask.any():
+        return
+    line, found = np.empty_like(moments[0]), np.empty_like(moments[0])
+    share = np.empty_like(moments[0])
+    kernels.smooth(np.ones_like(share), taps, mask, share, line)
+    share[~mask] = 1.0
+    squared = taps * taps
+    for row in range(kernels.CHI):
+        mean = row < kernels.V_0
+        kernels.smooth(moments[row], taps if mean else squared, mask, found, line)
+        moments[row] = found / share if mean else found / share**2
+        moments[row][~mask] = np.nan
+
+
+def prepare(
+    stacks: Mapping[str, Stack],
+    component: Literal["specular", "diffuse"],
+    *,
+    noise: SensorNoise | None,
+    leakage: float,
+    smooth_px: float,
+    smooth_crossed_px: float | None,
+) -> Reflection:
+    """Check that the pictures tell the component, and what is known of their noise.
+
+    Parameters
+    ----------
+    stacks
+        By polarization; with variances, or with `noise`, or neither.
+    component, noise, leakage
+        See :class:`Reflection`.
+    smooth_px, smooth_crossed_px
+        Standard deviations of the Gaussians.
+
+    Raises
+    ------
+    MissingPatterns
+        Where a polarization, or patterns of it, are missing.
+    """
+    for name, sigma in (("smooth_px", smooth_px), ("smooth_crossed_px", smooth_crossed_px or 0.0)):
+        if not 0.0 <= sigma <= 100.0:
+            raise GradientError(f"{name}: got {sigma}, expected pixels in [0, 100]")
+    wanted = ("parallel", "crossed") if component == "specular" else ("crossed",)
+    for polarizer in wanted:
+        if polarizer not in stacks:
+            raise MissingPatterns(
+                f"patterns: got no {polarizer} pictures; {component} normals need"
+                f" {' and '.join(wanted)} ones, full, x, y, z at least"
+                + (
+                    ": parallel pictures hold both reflections, and crossed ones tell the diffuse"
+                    if component == "specular"
+                    else ""
+                )
+            )
+        require(stacks[polarizer].pictures, polarizer=polarizer, purpose=f"{component} normals")
+    used = {name: stacks[name] for name in wanted}
+    parallel = stacks.get("parallel")
+    if component == "diffuse" and (leakage == 0.0 or parallel is None or parallel.redundant < 0):
+        parallel = None
+    elif parallel is not None:
+        used["parallel"] = parallel
+    judged = noise is not None or used["crossed"].variance is not None
+    told = 1 if used["crossed"].variance is not None else 2
+    if told == 2:
+        noise = noise or estimate_noise(used)
+        told = 0 if noise is None else 2
+    kinds = {image.dtype for stack in used.values() for image in stack.pictures.values()}
+    return Reflection(
+        component, parallel, stacks["crossed"], noise if told == 2 else None, told, judged, leakage,
+        (smooth_px, smooth_px if smooth_crossed_px is None else smooth_crossed_px),
+        np.float64 if np.dtype(np.float64) in kinds else np.float32,
+    )  # fmt: skip
+
+
+def with_filter(reflection: Reflection) -> Reflection:
+    """Return the reflection with its moments filtered by what share of each frequency is signal.
+
+    Diffuse moments are filtered first, and what is left of the parallel ones without them next:
+    skin glows with less detail than it mirrors.
+
+    Raises
+    ------
+    GradientError
+        Where the noise is not known.
+    """
+    if not reflection.told:
+        raise GradientError(
+            "wiener: noise is unknown, as no patterns are redundant; give variance, or smooth_px"
+        )
+    height, width = reflection.shape
+    two = reflection.component == "specular"
+    raw = [np.empty((4, height, width), reflection.kind) for _ in range(2 if two else 1)]
+    noise = np.zeros((2, 4))
+    count = 0
+    for rows in reflection.tiles():
+        for number, moments in enumerate(reflection.moments(rows)[: len(raw)]):
+            raw[number][:, rows] = moments[_VALUES].reshape(4, -1, width)
+            good = np.isfinite(moments[0])
+            noise[number] += moments[kernels.V_0 : kernels.V_ZZ + 1][:, good].sum(axis=1)
+            count += int(good.sum()) if number == 0 else 0
+    noise /= max(count, 1)
+    valid = np.isfinite(raw[0][0]) & np.isfinite(raw[-1][0])
+    shares = np.ones((2, 4))
+    for m in range(4):
+        base = raw[-1][m]
+        glow, kept = filtered(base, noise[len(raw) - 1, m], valid)
+        if not two:
+            raw[0][m], shares[0, m] = glow, kept
+            continue
+        spark, left = filtered(raw[0][m] - glow, noise[0, m] + kept * noise[1, m], valid)
+        raw[0][m], raw[1][m] = spark + glow, glow
+        shares[:, m] = left, left * kept
+    return replace(reflection, clean=(raw[0], raw[-1]), shares=(shares[0], shares[1]))
+
+
+def with_shared_dark(stacks: Mapping[str, Stack]) -> dict[str, Stack]:
+    """Give a dark frame that was taken in one polarization only to the other, too.
+
+    The analyser does not change it where no other light is about. Its noise then counts in both,
+    though it cancels in their difference: standard errors err to the large side.
+    """
+    out = dict(stacks)
+    dark = [name for name, stack in stacks.items() if stack.dark]
+    if len(stacks) == 2 and len(dark) == 1:
+        source = stacks[dark[0]]
+        other = next(name for name in stacks if name != dark[0])
+        stack = stacks[other]
+        variance = stack.variance
+        if variance is not None and source.variance is not None:
+            variance = {**variance, "dark": source.variance["dark"]}
+        valid = dict(stack.valid)
+        if "dark" in source.valid:
+            valid["dark"] = source.valid["dark"]
+        out[other] = replace(
+            stack, pictures={**stack.pictures, "dark": source.pictures["dark"]},
+            variance=variance, valid=valid,
+        )  # fmt: skip
+    return out

@@ -1,0 +1,284 @@
+"""Errors of fitted kernels: what another patch of the same skin and size would change.
+
+Blocks of the map tell how its histogram scatters, neighboring buckets and neighboring blocks
+together; histograms drawn with that scatter tell how far the best kernel moves.
+
+Where both histograms are of one piece of skin, as neutral and strained maps of a session are, they
+scatter together: a furrow more than usual is in both, and moves the kernel by little. Then both
+are drawn with the same factor on each piece of skin, pieces matched by the place on the skin, and
+each kernel with the scatter of its own histogram: a kernel that deepens furrows scatters more than
+one that does not. Else the target is drawn as of other skin.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.kernel_fit.neutral_relief import Relief
+from reconstruction.kernel_fit.search import Buckets, Found
+from reconstruction.normal_histogram import blocks as normal_blocks
+from reconstruction.normal_histogram import kernels
+from reconstruction.normal_histogram.block_errors import LEAST_BLOCKS
+
+Floats = NDArray[np.float64]
+
+DRAWS = 200
+"""Histograms drawn for the standard errors."""
+MOST_DRAWN = 64
+"""Nearly-as-good kernels among which each draw finds its best."""
+DRAWN_WITHIN = 3.0
+"""They are taken from within so many standard errors of the distance."""
+MOST_PAIRED = 140
+"""The same of histograms of one piece of skin."""
+PAIRED_PX = 1_000_000
+"""Of maps with more normals the valley is shorter, and fewer are taken, down to `MOST_DRAWN`: on
+1000 x 1000 pixels each takes 0.02 s."""
+PAIRED_WITHIN = 4.0
+"""The same of histograms of one piece of skin, whose valley is wider than their scatter."""
+WITHIN = 0.6827, 0.95
+"""Shares of draws within the half widths of intervals that are told."""
+GAUSSIAN_95 = 1.959964
+"""Half width of a Gaussian's interval of the second share over that of the first."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlockCounts:
+    """Counts of a convolved relief's normals by blocks of its map.
+
+    Attributes
+    ----------
+    counts : ndarray of float64, shape (blocks, buckets)
+    growth : float
+        By how much larger the variance of the mean squared slope is than that of independent
+        blocks, because neighbors are alike.
+    """
+
+    counts: Floats
+    growth: float
+
+    @property
+    def samples(self) -> int:
+        """Normals counted."""
+        return int(self.counts.sum())
+
+    @property
+    def occupied(self) -> int:
+        """Buckets that hold anything; at least 1."""
+        return max(1, int(np.count_nonzero(self.counts.sum(axis=0))))
+
+    @property
+    def effective_samples(self) -> float:
+        """Independent samples that would be as noisy."""
+        return max(1.0, normal_blocks.effective_number(self.counts, self.samples) / self.growth)
+
+    def residuals(self) -> Floats:
+        """Return each block's part in the error of the shares, (blocks, buckets).
+
+        With independent unit normal factors on the blocks, the sum scatters as the shares do over
+        other patches of the same skin, neighboring buckets together.
+        """
+        sizes = self.counts.sum(axis=1)
+        counts = self.counts[sizes > 0]
+        n = len(counts)
+        return np.asarray(
+            normal_blocks.residuals_of(counts) * math.sqrt(n / max(n - 1, 1) * self.growth)
+        )
+
+    def noise(self, target: Floats, target_samples: float) -> float:
+        """Return the standard error of the distance to a target of so many effective samples."""
+        effective, residuals = self.effective_samples, self.residuals()
+        signs = np.sign(self.counts.sum(axis=0) / self.samples - target)
+        # a sum of signs has a variance of at most 1 an independent sample; or what blocks show
+        own = max(1.0 / effective, float(np.sum((residuals @ signs) ** 2)))
+        return math.sqrt(own * (1.0 + effective / target_samples))
+
+    def scatter(self, target_samples: float) -> Floats:
+        """Return the parts of blocks in the error of both histograms, as of `residuals`."""
+        return self.residuals() * math.sqrt(1.0 + self.effective_samples / target_samples)
+
+
+def of_kernel(relief: Relief, buckets: Buckets, alpha: float, sigma_um: float) -> BlockCounts:
+    """Count the normals of a relief that a kernel has changed, in blocks of its map.
+
+    Parameters
+    ----------
+    relief, buckets
+        Of the search.
+    alpha, sigma_um
+        The kernel; sigma in um.
+    """
+    shape = (relief.code.shape[0], relief.code.shape[1])
+    blocks = normal_blocks.BLOCKS
+    group, groups = normal_blocks.block_of(relief.places, shape, blocks)
+    da, db = relief.change(sigma_um)
+    a, b = relief.along + np.float32(alpha) * da, relief.across + np.float32(alpha) * db
+    counts = kernels.count_in_groups(-a, -b, group, groups, buckets.bins, buckets.limit)
+    steep = 1.0 + a * a + b * b
+    growth = [
+        normal_blocks.block_error(m * m / steep, group, groups, shape, blocks)[1] for m in (a, b)
+    ]
+    return BlockCounts(np.asarray(counts, np.float64), 0.5 * (growth[0] + growth[1]))
+
+
+def nearly_as_good(
+    found: Found, alphas: Floats, sigmas_um: Floats, noise: float
+) -> NDArray[np.int64]:
+    """Return the kernels that are no further than `noise` from the best, (K, 2).
+
+    Parameters
+    ----------
+    found, alphas, sigmas_um
+        Of the search.
+    noise : float
+        In units of the distance.
+
+    Returns
+    -------
+    ndarray of int64
+        Indices (sigma, alpha), the best first, then by distance, the gentler of equals first.
+    """
+    distance = found.distance
+    i, j = np.nonzero(distance <= distance[found.best] + noise)
+    first = (i == found.best[0]) & (j == found.best[1])
+    order = np.lexsort((sigmas_um[i], np.abs(alphas[j]), distance[i, j], ~first))
+    return np.stack([i, j], axis=1)[order]
+
+
+@dataclass(frozen=True, slots=True)
+class HalfWidths:
+    """Half widths of intervals about the best kernel.
+
+    Attributes
+    ----------
+    alpha, sigma_um : tuple of float
+        Of 68.27 and 95 %; the second is at least a Gaussian's.
+    """
+
+    alpha: tuple[float, float]
+    sigma_um: tuple[float, float]
+
+
+def widths_of_best(
+    relief: Relief,
+    buckets: Buckets,
+    found: Found,
+    alphas: Floats,
+    sigmas_um: Floats,
+    *,
+    noise: float,
+    scatter: Floats,
+    rng: np.random.Generator,
+) -> HalfWidths:
+    """Return ways of the best kernel that most drawn histograms of other skin stay within.
+
+    Not their root mean square: a long valley leads few of them far away.
+
+    Parameters
+    ----------
+    relief, buckets, found, alphas, sigmas_um
+        Of the search.
+    noise : float
+        Standard error of the distance.
+    scatter : ndarray, shape (blocks, buckets)
+        Of `BlockCounts.scatter`.
+    rng
+        Draws the histograms.
+    """
+    near = nearly_as_good(found, alphas, sigmas_um, DRAWN_WITHIN * noise)
+    some = near[np.unique(np.linspace(0, len(near) - 1, MOST_DRAWN).round().astype(int))]
+    gap = found.shares(relief, buckets, sigmas_um, alphas, some) - buckets.target
+    used = np.flatnonzero(gap.any(axis=0) | scatter.any(axis=0))
+    gap, scatter = gap[:, used], scatter[:, used]
+    best = np.empty(DRAWS, int)
+    for draw in range(DRAWS):
+        moved = rng.standard_normal(len(scatter)) @ scatter
+        best[draw] = int(np.argmin(np.abs(gap + moved).sum(axis=1)))
+    return _widths(alphas, sigmas_um, some, best)
+
+
+def widths_of_pair(
+    relief: Relief,
+    buckets: Buckets,
+    found: Found,
+    alphas: Floats,
+    sigmas_um: Floats,
+    *,
+    noise: float,
+    target_blocks: Floats,
+    growth: float,
+    rng: np.random.Generator,
+) -> HalfWidths | None:
+    """Return ways of the best kernel that most drawn pairs of histograms of one skin stay within.
+
+    Parameters
+    ----------
+    relief, buckets, found, alphas, sigmas_um, noise, rng
+        As of `widths_of_best`.
+    target_blocks : ndarray, shape (blocks, buckets)
+        Counts behind the target in the skin of each block of the relief, of `of_kernel`.
+    growth : float
+        Of `BlockCounts`. Of the relief's roughness, not of its difference from the target's: how
+        many furrows a patch has is what the next patch differs by.
+
+    Returns
+    -------
+    HalfWidths or None
+        None where fewer than `block_errors.LEAST_BLOCKS` blocks are in both maps.
+    """
+    shape = (relief.code.shape[0], relief.code.shape[1])
+    group, groups = normal_blocks.block_of(relief.places, shape, normal_blocks.BLOCKS)
+    ours = np.bincount(group, minlength=groups)
+    both = np.flatnonzero((ours > 0) & (target_blocks.sum(axis=1) > 0))
+    if len(both) < LEAST_BLOCKS:
+        return None
+    theirs = normal_blocks.residuals_of(target_blocks[both])
+    factors = rng.standard_normal((DRAWS, len(both)))
+    factors = np.float32(math.sqrt(len(both) / (len(both) - 1) * growth)) * factors
+    factors = factors.astype(np.float32)
+    near = nearly_as_good(found, alphas, sigmas_um, PAIRED_WITHIN * noise)
+    # dense about the best, sparse where hardly a draw comes
+    most = max(MOST_DRAWN, min(MOST_PAIRED, MOST_PAIRED * PAIRED_PX // relief.places.size))
+    steps = np.linspace(0.0, 1.0, most) ** 1.5 * (len(near) - 1)
+    some = near[np.unique(steps.round().astype(int))]
+    distance = np.empty((DRAWS, len(some)), np.float32)
+    for i in np.unique(some[:, 0]).tolist():
+        da, db = relief.change(float(sigmas_um[i]))
+        for column in np.flatnonzero(some[:, 0] == i).tolist():
+            alpha = np.float32(alphas[some[column, 1]])
+            counts = kernels.count_in_groups(
+                -(relief.along + alpha * da), -(relief.across + alpha * db),
+                group, groups, buckets.bins, buckets.limit,
+            )  # fmt: skip
+            gap = counts.sum(axis=0) / relief.places.size - buckets.target
+            apart = normal_blocks.residuals_of(np.asarray(counts[both], np.float64)) - theirs
+            used = np.flatnonzero((gap != 0.0) | apart.any(axis=0))
+            moved = factors @ apart[:, used].astype(np.float32)
+            distance[:, column] = np.abs(gap[used].astype(np.float32) + moved).sum(axis=1)
+    return _widths(alphas, sigmas_um, some, distance.argmin(axis=1))
+
+
+def of_grid(widths: HalfWidths, alphas: Floats, sigmas_um: Floats) -> HalfWidths:
+    """Return half widths with the grid's own: a step over sqrt(12), as of an even error."""
+    step = [float(np.diff(g).min()) if g.size > 1 else 0.0 for g in (alphas, sigmas_um)]
+    (alpha, alpha_95), (sigma, sigma_95) = (
+        tuple(math.hypot(w, factor * s / math.sqrt(12.0)) for w, factor in zip(
+            told, (1.0, GAUSSIAN_95), strict=True))
+        for told, s in zip((widths.alpha, widths.sigma_um), step, strict=True)
+    )  # fmt: skip
+    return HalfWidths((alpha, alpha_95), (sigma, sigma_95))
+
+
+def _widths(
+    alphas: Floats, sigmas_um: Floats, some: NDArray[np.int64], best: NDArray[np.intp]
+) -> HalfWidths:
+    """Return quantiles of how far draws' best kernels are from the best, which is the first."""
+    i, j = some[best].T
+    ways = np.abs([alphas[j] - alphas[some[0, 1]], sigmas_um[i] - sigmas_um[some[0, 0]]])
+    (alpha, sigma), (alpha_95, sigma_95) = np.quantile(ways, WITHIN, axis=1).tolist()
+    return HalfWidths(
+        (alpha, max(alpha_95, GAUSSIAN_95 * alpha)), (sigma, max(sigma_95, GAUSSIAN_95 * sigma))
+    )

@@ -1,0 +1,199 @@
+"""A neutral relief as fits of kernels take it: its axis of strain along the rows, and convolved.
+
+What is fixed, here and in `model.microstructure`:
+
+- G is the continuous Gaussian at whole pixels within 4 sigmas, divided by its sum. Well below a
+  pixel it is the delta function: then alpha means nothing, and all such kernels are tied.
+- At the map's border the relief is mirrored about the edges of the outermost pixels.
+- Holes are filled linearly along the axis before the convolution; a pixel of a hole is no sample.
+- Stretching divides slopes along the axis by r, and those across it by ``stretch_across``.
+- Normals come from central differences, one-sided where one neighbour is missing
+  (`relief_slopes.slopes`), in single precision: of 10,000 samples fewer than one comes into
+  another bucket than in double precision.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model.microstructure import gaussian_weights
+from reconstruction.normal_histogram import kernels
+from reconstruction.normal_histogram.relief_slopes import SlopeError, pixel_sides, stencil
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Axis = Literal["x", "y", 0, 1]
+
+
+class KernelFitError(ValueError):
+    """A relief, target or setting that no kernel can be fitted to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Relief:
+    """A neutral relief with its axis of strain along the rows, and the samples of its slopes.
+
+    Attributes
+    ----------
+    height_um : ndarray of float32, shape (H, W)
+        About its mean; holes filled along the rows.
+    code : ndarray of uint8, shape (H, W)
+        Where slopes are taken, of `relief_slopes.stencil`.
+    right_um, down_um : float
+        Deformed distance to the next column and row along the histogram's axes, signed.
+    pixel_um : float
+        Neutral side of a pixel along the rows, for sigma.
+    """
+
+    height_um: Float32
+    code: NDArray[np.uint8]
+    right_um: float
+    down_um: float
+    pixel_um: float
+    places: NDArray[np.int64] = field(init=False)
+    """(N,) pixels with slopes, y * W + x."""
+    starts: NDArray[np.int64] = field(init=False)
+    """(H,) samples in the rows before."""
+    along: Float32 = field(init=False)
+    """(N,) minus the neutral relief's slopes after stretching."""
+    across: Float32 = field(init=False)
+
+    def __post_init__(self) -> None:
+        """List the samples and their slopes."""
+        known = self.code > 0
+        in_row = known.sum(axis=1)
+        object.__setattr__(self, "places", np.flatnonzero(known))
+        object.__setattr__(self, "starts", (np.cumsum(in_row) - in_row).astype(np.int64))
+        along, across = self._leans(self.height_um)
+        object.__setattr__(self, "along", along)
+        object.__setattr__(self, "across", across)
+
+    def _leans(self, height: Float32) -> tuple[Float32, Float32]:
+        """Return minus the slopes of heights at the samples, along and across: (N,), (N,)."""
+        a, b = np.empty(self.places.size, np.float32), np.empty(self.places.size, np.float32)
+        right, down = np.float32(self.right_um), np.float32(self.down_um)
+        kernels.leans(height, self.code, self.starts, right, down, a, b)
+        return a, b
+
+    def weights(self, sigma_um: float) -> Float32:
+        """Return the discrete Gaussian's right half, from the middle on; they sum to 1 mirrored."""
+        return gaussian_weights(sigma_um / self.pixel_um).astype(np.float32)
+
+    def change(self, sigma_um: float) -> tuple[Float32, Float32]:
+        """Return what a Gaussian of sigma changes the samples' slopes by: (N,), (N,)."""
+        moved = np.empty_like(self.height_um)
+        kernels.blurred_less_itself(self.height_um, self.weights(sigma_um), moved)
+        return self._leans(moved)
+
+
+def relief_of(
+    neutral_height_um: ArrayLike,
+    *,
+    stretch: float,
+    axis: Axis,
+    pixel_um: float | tuple[float, float],
+    stretch_across: float = 1.0,
+    valid: ArrayLike | None = None,
+    y_up: bool = True,
+) -> Relief:
+    """Return a neutral relief, its axis of strain turned into rows, with its samples.
+
+    Parameters
+    ----------
+    neutral_height_um, stretch, axis, pixel_um, stretch_across, valid, y_up
+        As of `kernel_fit.fit_kernel`.
+
+    Raises
+    ------
+    KernelFitError
+        Without a single slope, for what is no map, mask or pixel, a stretch that is not finite
+        and positive, or another axis.
+    """
+    for name, r in (("stretch", stretch), ("stretch_across", stretch_across)):
+        if not (math.isfinite(r) and r > 0):
+            raise KernelFitError(f"{name}: got {r}, expected a finite ratio above 0")
+    if axis not in ("x", "y", 0, 1):
+        raise KernelFitError(f'axis: got {axis!r}, expected "x", "y", 1 or 0')
+    along_y = axis in ("y", 0)
+    try:
+        code = stencil(neutral_height_um, valid)
+        down, right = pixel_sides(pixel_um)
+    except SlopeError as error:
+        raise KernelFitError(f"of the neutral relief, {error}") from error
+    if not code.any():
+        raise KernelFitError("neutral_height_um: got no pixel with a slope, expected at least one")
+    height = np.asarray(neutral_height_um, np.float64)
+    good = _usable(height, valid)
+    if along_y:
+        height, good = height.T, good.T
+        code = stencil(np.ascontiguousarray(height), good)
+    filled = _filled(height, good).astype(np.float32)
+    to_top = -1.0 if y_up else 1.0
+    if along_y:
+        return Relief(filled, code, to_top * down * stretch, right * stretch_across, down)
+    return Relief(filled, code, right * stretch, to_top * down * stretch_across, right)
+
+
+def _usable(height: Floats, valid: ArrayLike | None) -> NDArray[np.bool_]:
+    """Return which heights are finite and not masked; shapes have been checked."""
+    good = np.isfinite(height)
+    return good if valid is None else good & np.asarray(valid, bool)
+
+
+def _filled(height: Floats, good: NDArray[np.bool_]) -> Floats:
+    """Return heights about their mean, with holes filled linearly along the rows."""
+    filled = np.where(good, height - height[good].mean(), 0.0)
+    columns = np.arange(height.shape[1])
+    for y in np.flatnonzero(~good.all(axis=1) & good.any(axis=1)):
+        filled[y] = np.interp(columns, columns[good[y]], filled[y, good[y]])
+    return filled
+
+
+def convolved(
+    height_um: ArrayLike,
+    alpha: float,
+    sigma_um: float,
+    *,
+    axis: Axis,
+    pixel_um: float | tuple[float, float],
+    valid: ArrayLike | None = None,
+) -> Floats:
+    """Return a map convolved along one axis with eq. (6)'s kernel, as the search does it.
+
+    Parameters
+    ----------
+    height_um : array_like, shape (H, W)
+        um; those that are not finite count as not valid.
+    alpha, sigma_um : float
+        Strength, and standard deviation in um, above 0.
+    axis, pixel_um, valid
+        As of `kernel_fit.fit_kernel`.
+
+    Returns
+    -------
+    ndarray of float64, shape (H, W)
+        um; heights that are not valid come back as they were.
+
+    Raises
+    ------
+    KernelFitError
+        As of :func:`relief_of`.
+
+    Examples
+    --------
+    >>> furrow = np.tile([0.0, 0.0, -4.0, 0.0, 0.0], (3, 1))
+    >>> convolved(furrow, 1.0, 8.0, axis="x", pixel_um=10.0)[0].round(2)
+    array([-0.09, -0.91, -1.99, -0.91, -0.09])
+    """
+    relief = relief_of(height_um, stretch=1.0, axis=axis, pixel_um=pixel_um, valid=valid)
+    moved = np.empty_like(relief.height_um)
+    kernels.blurred_less_itself(relief.height_um, relief.weights(sigma_um), moved)
+    if axis in ("y", 0):
+        moved = moved.T
+    height = np.asarray(height_um, np.float64)
+    return np.where(_usable(height, valid), height + alpha * moved.astype(np.float64), height)

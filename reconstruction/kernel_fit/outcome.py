@@ -1,0 +1,219 @@
+"""What a search for a kernel found: the kernel with its noise, its valley and a finer minimum."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction import normal_histogram
+from reconstruction.kernel_fit import errors as kernel_errors
+from reconstruction.kernel_fit import search as kernel_search
+from reconstruction.kernel_fit.neutral_relief import Relief
+from reconstruction.kernel_fit.search import Buckets, Found
+from reconstruction.normal_histogram.statistics import SAMPLES_PER_BUCKET
+
+Floats = NDArray[np.float64]
+
+FINER_ALPHA, FINER_SIGMA = 10, 5
+"""The refinement's steps are so much smaller than the grid's, within one step to either side."""
+
+
+@dataclass(frozen=True, slots=True)
+class KernelFit:
+    """A kernel of eq. (6) for one axis and stretch, and how well it is told.
+
+    Attributes
+    ----------
+    alpha : float
+        Strength, the grid's best; 0 where not `valid`.
+    sigma_um : float
+        Standard deviation, um, the grid's best.
+    distance : float
+        Eq. (7)'s sum over buckets at the best kernel, 0...2.
+    near_best : ndarray of float64, shape (K, 3)
+        alpha, sigma_um and distance of the kernels whose distance is within `noise` of the best,
+        the best first, then by distance: the flat valley around the minimum. Distances of kernels
+        that a hierarchical search dropped are estimates from a sample.
+    valid : bool
+        There is a minimum: distances over the grid differ by more than `noise`.
+    noise : float
+        Standard error of the distance, from the effective numbers of samples of both histograms.
+    floor : float
+        Mean distance of two histograms of one surface with such numbers of samples.
+    distance_before : float
+        Eq. (7)'s sum for the neutral relief, only stretched.
+    alpha_refined, sigma_refined_um, distance_refined : float
+        The best on a grid finer by ten in alpha and five in sigma, a step to either side.
+    alpha_stderr, sigma_stderr_um : float
+        How far the best moves in 68 % of cases when both histograms are drawn anew, with the
+        scatter that blocks of the map show, neighbors together: what another patch of the same
+        skin and size would change; at least a grid step over sqrt(12). Infinite where not `valid`.
+        With `target_blocks` both are drawn together, as of one piece of skin; else as if the
+        target were of other skin. alpha and sigma make up for one another, so that their errors
+        are not Gaussian.
+    alpha_95, sigma_95_um : float
+        Half widths of 95 % intervals, of the same draws; at least 1.96 standard errors. More where
+        a long valley leads some draws far away.
+    alpha_interval, sigma_interval_um : tuple of float
+        Least and largest of `near_best`.
+    at_edge : bool
+        The best kernel is at an end of the grid in alpha or sigma.
+    aliased : bool
+        Too few samples for the buckets (`normal_statistics.SAMPLES_PER_BUCKET`).
+    samples : int
+        Slopes of the neutral relief.
+    effective_samples : float
+        Independent samples that would be as noisy.
+    search : str
+        "exhaustive" or "hierarchical".
+    miss_probability : float
+        Chance at most that the exhaustive search's result is another one.
+    passes : float
+        Kernels evaluated, in units of all pixels; 59,899 for an exhaustive search.
+    reason : str
+        Why not `valid`; empty otherwise.
+    """
+
+    alpha: float
+    sigma_um: float
+    distance: float
+    near_best: Floats
+    valid: bool
+    noise: float
+    floor: float
+    distance_before: float
+    alpha_refined: float
+    sigma_refined_um: float
+    distance_refined: float
+    alpha_stderr: float
+    sigma_stderr_um: float
+    alpha_95: float
+    sigma_95_um: float
+    alpha_interval: tuple[float, float]
+    sigma_interval_um: tuple[float, float]
+    at_edge: bool
+    aliased: bool
+    samples: int
+    effective_samples: float
+    search: str
+    miss_probability: float
+    passes: float
+    reason: str = ""
+
+
+def described(
+    relief: Relief,
+    buckets: Buckets,
+    alphas: Floats,
+    sigmas_um: Floats,
+    found: Found,
+    *,
+    search: str,
+    target_samples: float | None,
+    target_blocks: Floats | None,
+    rng: np.random.Generator,
+) -> KernelFit:
+    """Return what a search found, with its noise, its valley and a finer minimum.
+
+    Parameters
+    ----------
+    relief, buckets, alphas, sigmas_um, found
+        Of the search; sigmas in um.
+    search : str
+        Its name.
+    target_samples : float or None
+        Effective number of samples behind the target; None: as many as behind the relief.
+    target_blocks : ndarray, shape (blocks, bins ** 2 + 1), or None
+        Counts behind the target in the skin of each block of the relief, where it is of the same
+        piece of skin.
+    rng
+        Draws histograms for the standard errors.
+    """
+    start = relief.along, relief.across
+    samples = relief.places.size
+    still = np.zeros(samples, np.float32)
+    before = float(buckets.distances(start, (still, still), np.zeros(1))[0])
+    i, j = found.best
+    alpha, sigma, distance = float(alphas[j]), float(sigmas_um[i]), float(found.distance[i, j])
+    blocks = kernel_errors.of_kernel(relief, buckets, alpha, sigma)
+    effective, occupied = blocks.effective_samples, blocks.occupied
+    theirs = effective if target_samples is None else float(target_samples)
+    noise = blocks.noise(buckets.target, theirs)
+    floor = normal_histogram.noise_floor(buckets.target, effective, theirs)
+    rows, columns = kernel_errors.nearly_as_good(found, alphas, sigmas_um, noise).T
+    near = np.stack([alphas[columns], sigmas_um[rows], found.distance[rows, columns]], axis=1)
+    reason = ""
+    if np.ptp(relief.along) == 0.0 and np.ptp(relief.across) == 0.0:
+        reason = "the neutral relief is flat: every kernel leaves it so"
+    elif occupied == 1 and np.count_nonzero(buckets.target) == 1 and distance in (0.0, 2.0):
+        reason = "one bucket holds everything"
+    elif float(found.distance.max()) - distance <= noise:
+        reason = "the distance does not depend on the kernel beyond its noise"
+    refined = (alpha, sigma, distance)
+    told = kernel_errors.HalfWidths((math.inf, math.inf), (math.inf, math.inf))
+    if not reason:
+        refined = _refined(relief, buckets, alphas, sigmas_um, (i, j), distance)
+        pair = None
+        if target_blocks is not None:
+            pair = kernel_errors.widths_of_pair(
+                relief, buckets, found, alphas, sigmas_um,
+                noise=noise, target_blocks=target_blocks, growth=blocks.growth, rng=rng,
+            )  # fmt: skip
+        told = pair or kernel_errors.widths_of_best(
+            relief, buckets, found, alphas, sigmas_um,
+            noise=noise, scatter=blocks.scatter(theirs), rng=rng,
+        )  # fmt: skip
+        told = kernel_errors.of_grid(told, alphas, sigmas_um)
+    return KernelFit(
+        alpha=alpha if not reason else 0.0,
+        sigma_um=sigma,
+        distance=distance if not reason else before,
+        near_best=near,
+        valid=not reason,
+        noise=noise,
+        floor=floor,
+        distance_before=before,
+        alpha_refined=refined[0] if not reason else 0.0,
+        sigma_refined_um=refined[1],
+        distance_refined=refined[2] if not reason else before,
+        alpha_stderr=told.alpha[0],
+        sigma_stderr_um=told.sigma_um[0],
+        alpha_95=told.alpha[1],
+        sigma_95_um=told.sigma_um[1],
+        alpha_interval=(float(near[:, 0].min()), float(near[:, 0].max())),
+        sigma_interval_um=(float(near[:, 1].min()), float(near[:, 1].max())),
+        at_edge=i in (0, sigmas_um.size - 1) or j in (0, alphas.size - 1),
+        aliased=samples / occupied < SAMPLES_PER_BUCKET,
+        samples=samples,
+        effective_samples=effective,
+        search=search,
+        miss_probability=0.0 if found.exact.all() else kernel_search.MISS,
+        passes=found.passes,
+        reason=reason,
+    )
+
+
+def _refined(
+    relief: Relief, buckets: Buckets, alphas: Floats, sigmas: Floats, best: tuple[int, int],
+    distance: float,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return the best of a finer grid that spans one step to either side, within the grid."""
+    i, j = best
+    result = (float(alphas[j]), float(sigmas[i]), distance)
+    fine_alpha = _finer(alphas, j, FINER_ALPHA)
+    for sigma in _finer(sigmas, i, FINER_SIGMA):
+        change = relief.change(float(sigma))
+        found = buckets.distances((relief.along, relief.across), change, fine_alpha)
+        k = int(np.argmin(found))
+        if found[k] < result[2] - kernel_search.TIE:
+            result = (float(fine_alpha[k]), float(sigma), float(found[k]))
+    return result
+
+
+def _finer(grid: Floats, i: int, finer: int) -> Floats:
+    low, high = grid[max(i - 1, 0)], grid[min(i + 1, grid.size - 1)]
+    steps = finer * (int(i > 0) + int(i < grid.size - 1))
+    return np.linspace(low, high, steps + 1)

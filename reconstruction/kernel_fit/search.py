@@ -1,0 +1,340 @@
+"""The search of eq. (7): the kernel on a grid whose relief has normals distributed as a target.
+
+Slopes are linear in alpha, so one convolution and one pass serve all alphas of one sigma. The
+exhaustive search passes over all of the grid. The hierarchical one evaluates the grid on growing
+random samples of pixels, drops what is shown to be worse than a kernel already evaluated on all
+pixels, and evaluates what is left on all pixels.
+
+Why a drop is right: for numbers ``s_b`` within [-1, 1] the distance ``sum |H_b - h_b|`` is at least
+``sum s_b (H_b - h_b)``, and ``sum s_b h_b`` is the mean over pixels of ``s`` at the pixel's bucket.
+With s chosen before they are drawn, a mean over m pixels drawn without replacement out of M is
+above the mean of all by more than ``sqrt(2 ln(1/p) (1 - (m - 1) / M) / m)`` with a chance of at
+most p (Serfling 1974). s is the sign of H - h, of the kernel itself on the pixels drawn before, or
+of a nearby kernel on all pixels. p is so small that over all tests of a search the chance of
+dropping the best kernel is at most `MISS`.
+
+References
+----------
+Nagano et al. 2015, ACM Trans. Graph. 34(4), 109. doi:10.1145/2766894
+Serfling 1974, Probability Inequalities for the Sum in Sampling without Replacement, Ann. Statist.
+2(1), 39. doi:10.1214/aos/1176342611
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.kernel_fit.neutral_relief import Relief
+from reconstruction.normal_histogram import kernels
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+MISS = 1e-6
+"""Chance at most that a hierarchical search drops the exhaustive search's result."""
+ROUNDING = 2e-4
+"""Distance granted to rounding: on samples, sums of single precision are taken in another order."""
+TIE = 1e-12
+"""Distances that differ by less are tied."""
+FIRST_SAMPLE = 16_384
+GROWTH = 5.6
+"""From one sample to the next. On 2000 x 2000 pixels these took the fewest evaluations of what was
+tried, with samples whose neighbourhoods stay below `WINDOW_BYTES`."""
+LARGEST_SAMPLE = 0.35
+"""Share of all pixels from which all are taken."""
+WINDOW_BYTES = 300_000_000
+"""Most memory for the neighbourhoods of sampled pixels; beyond, whole maps are convolved."""
+ANCHORS = 6
+"""Kernels evaluated on all pixels between two samples."""
+KEPT_BYTES = 100_000_000
+"""Most memory for counts of kernels evaluated on all pixels, which standard errors need again."""
+
+
+class KernelSearchError(ValueError):
+    """A search for kernels without anything to search."""
+
+
+@dataclass(frozen=True, slots=True)
+class Buckets:
+    """The target of a search.
+
+    Attributes
+    ----------
+    target : ndarray of float64, shape (bins ** 2 + 1,)
+        Shares, axes (across, along) made flat, then the share beyond the limit.
+    bins, limit
+        As of `normal_histogram.histogram`.
+    """
+
+    target: Floats
+    bins: int
+    limit: float
+
+    def count(
+        self, start: tuple[Float32, Float32], change: tuple[Float32, Float32], alphas: Floats
+    ) -> NDArray[np.int32]:
+        """Count the samples of each alpha, in parts: (parts, A, bins ** 2 + 1)."""
+        given = alphas.astype(np.float32)
+        parts = kernels.threads()
+        return kernels.count_kernels(*start, *change, given, self.bins, self.limit, parts)
+
+    def distances(
+        self, start: tuple[Float32, Float32], change: tuple[Float32, Float32], alphas: Floats
+    ) -> Floats:
+        """Return eq. (7)'s sum for each alpha."""
+        return kernels.distances(self.count(start, change, alphas), self.target)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What a search knows of its grid; arrays have the shape (sigmas, alphas).
+
+    Attributes
+    ----------
+    distance : ndarray
+        Of eq. (7): exact over all pixels where `exact`, elsewhere from the largest sample that
+        the kernel was evaluated on, less the best kernel's excess on the same sample.
+    exact : ndarray of bool
+    best : tuple of int
+        Indices (sigma, alpha) of the least exact distance. Ties go to the gentlest kernel: least
+        |alpha|, then least sigma, then the blurring one.
+    passes : float
+        Kernels evaluated, in units of all pixels.
+    counts : dict of (int, int) to ndarray of int32, shape (bins ** 2 + 1,)
+        Of some of the exact kernels, by their indices (sigma, alpha).
+    """
+
+    distance: Floats
+    exact: Bools
+    best: tuple[int, int]
+    passes: float
+    counts: dict[tuple[int, int], NDArray[np.int32]] = field(default_factory=dict)
+
+    def shares(self, relief: Relief, buckets: Buckets, sigmas_um: Floats, alphas: Floats,
+               wanted: NDArray[np.int64]) -> Floats:  # fmt: skip
+        """Return histograms of kernels, (K, buckets), counting what the search has not kept.
+
+        Parameters
+        ----------
+        relief, buckets, sigmas_um, alphas
+            Of the search.
+        wanted : ndarray, shape (K, 2)
+            Indices (sigma, alpha).
+        """
+        out = np.empty((len(wanted), buckets.target.size))
+        missing = []
+        for row, (i, j) in enumerate(wanted.tolist()):
+            kept = self.counts.get((i, j))
+            if kept is None:
+                missing.append(row)
+            else:
+                out[row] = kept
+        rows = np.array(missing, int)
+        for i in np.unique(wanted[rows, 0]):
+            some = rows[wanted[rows, 0] == i]
+            start = relief.along, relief.across
+            change = relief.change(float(sigmas_um[i]))
+            out[some] = buckets.count(start, change, alphas[wanted[some, 1]]).sum(axis=0)
+        return out / relief.places.size
+
+
+def gentlest(distance: Floats, alphas: Floats, sigmas_um: Floats) -> tuple[int, int]:
+    """Return the indices of the least distance, (S, A), ties by the rule of :class:`Found`.
+
+    Raises
+    ------
+    KernelSearchError
+        Where the grid is empty, or there is not one distance a kernel.
+    """
+    if not distance.size or distance.shape != (sigmas_um.size, alphas.size):
+        raise KernelSearchError(
+            f"distance: got shape {distance.shape} for {sigmas_um.size} sigmas and {alphas.size} "
+            "alphas, expected one distance a kernel, of one kernel at least"
+        )
+    i, j = np.nonzero(distance <= distance.min() + TIE)
+    order = np.lexsort((-alphas[j], sigmas_um[i], np.abs(alphas[j])))
+    return int(i[order[0]]), int(j[order[0]])
+
+
+def exhaustive(relief: Relief, buckets: Buckets, alphas: Floats, sigmas_um: Floats) -> Found:
+    """Evaluate all kernels of the grid on all pixels."""
+    start = relief.along, relief.across
+    distance = np.empty((sigmas_um.size, alphas.size))
+    with kernels.threads_for(relief.places.size * distance.size):
+        for i, sigma in enumerate(sigmas_um):
+            distance[i] = buckets.distances(start, relief.change(float(sigma)), alphas)
+    best = gentlest(distance, alphas, sigmas_um)
+    return Found(distance, np.ones(distance.shape, bool), best, float(distance.size))
+
+
+def hierarchical(
+    relief: Relief,
+    buckets: Buckets,
+    alphas: Floats,
+    sigmas_um: Floats,
+    *,
+    first_sample: int = FIRST_SAMPLE,
+    rng: np.random.Generator,
+) -> Found:
+    """Find what :func:`exhaustive` does, but for a chance of `MISS`; see the module's text.
+
+    Parameters
+    ----------
+    relief, buckets
+        What is convolved, and what it shall come to.
+    alphas, sigmas_um : ndarray, shapes (A,), (S,)
+        The grid.
+    first_sample : int
+        Pixels that all kernels are evaluated on; grows by `GROWTH` from one round to the next.
+    rng
+        Draws the pixels. The result does not depend on it, but for the chance `MISS`.
+    """
+    pixels = relief.places.size
+    if first_sample >= LARGEST_SAMPLE * pixels:
+        return exhaustive(relief, buckets, alphas, sigmas_um)
+    sizes = [first_sample]
+    while sizes[-1] * GROWTH < LARGEST_SAMPLE * pixels:
+        sizes.append(int(sizes[-1] * GROWTH))
+    with kernels.threads_for(first_sample * alphas.size * sigmas_um.size):
+        return _Race(relief, buckets, alphas, sigmas_um).run(sizes, rng)
+
+
+class _Race:
+    """State of a hierarchical search."""
+
+    def __init__(self, relief: Relief, buckets: Buckets, alphas: Floats, sigmas: Floats) -> None:
+        shape = (sigmas.size, alphas.size)
+        self.relief, self.buckets, self.alphas, self.sigmas = relief, buckets, alphas, sigmas
+        self.low = np.zeros(shape)  # distances are at least this
+        self.guess = np.full(shape, np.inf)  # on the largest sample so far
+        self.level = np.zeros(shape, int)  # which sample that was
+        self.exact = np.zeros(shape, bool)
+        self.distance = np.full(shape, np.inf)  # exact ones
+        self.counts: dict[tuple[int, int], NDArray[np.int32]] = {}
+        self.signs: list[Floats] = []  # of target - histogram, of kernels evaluated on all pixels
+        self.passes = 0.0
+
+    def run(self, sizes: list[int], rng: np.random.Generator) -> Found:
+        pixels = self.relief.places.size
+        order = rng.permutation(pixels)[: sizes[-1]]
+        tests = self.low.size * len(sizes) * (1 + ANCHORS)
+        log = math.log(tests / MISS)
+        before = sizes[0] // 2
+        for number, size in enumerate(sizes):
+            if not self._open.any():
+                break
+            self._sample(order[:size], before, log, number)
+            before = size
+            self._anchor()
+        self._finish()
+        best = gentlest(self.distance, self.alphas, self.sigmas)
+        # a sample's distance is larger than that of all, alike for kernels that are alike
+        excess = np.zeros(len(sizes))
+        for number in range(len(sizes)):
+            both = self.exact & (self.level == number)
+            if both.any():
+                excess[number] = np.median((self.guess - self.distance)[both])
+            elif number:
+                excess[number] = excess[number - 1] / math.sqrt(GROWTH)
+        distance = np.where(self.exact, self.distance, self.guess - excess[self.level])
+        distance[~self.exact] = np.maximum(distance[~self.exact], self.distance[best])
+        return Found(distance, self.exact, best, self.passes, self.counts)
+
+    @property
+    def _open(self) -> Bools:
+        """Kernels that may still be the best, and are not evaluated on all pixels."""
+        return ~self.exact & (self.low <= self.distance.min())
+
+    def _sample(self, chosen: NDArray[np.int64], before: int, log: float, number: int) -> None:
+        relief, target = self.relief, self.buckets.target
+        pixels, m = relief.places.size, chosen.size
+        rest, fresh = pixels - before, m - before
+        # Serfling's bound, of the mean over what was not drawn before
+        slack = math.sqrt(2.0 * log * (1.0 - (fresh - 1) / rest) / fresh) * rest / pixels + ROUNDING
+        signs = np.array(self.signs).reshape(-1, target.size)
+        start = relief.along[chosen], relief.across[chosen]
+        old = start[0][:before], start[1][:before]
+        new = start[0][before:], start[1][before:]
+        change = _SampledChange(relief, chosen, self.sigmas[self._open.any(axis=1)].max())
+        for i in np.flatnonzero(self._open.any(axis=1)):
+            j = np.flatnonzero(self._open[i])
+            da, db = change.at(float(self.sigmas[i]))
+            first = self.buckets.count(old, (da[:before], db[:before]), self.alphas[j])
+            second = self.buckets.count(new, (da[before:], db[before:]), self.alphas[j])
+            found = kernels.bounds(first, second, target, before, fresh, pixels, signs)
+            self.guess[i, j], low = found.T
+            self.level[i, j] = number
+            self.low[i, j] = np.maximum(self.low[i, j], low - slack)
+            self.passes += j.size * m / pixels
+
+    def _anchor(self) -> None:
+        """Evaluate the best guess with its neighbours, and the best at sigmas spread over all."""
+        self.signs = []
+        best = int(np.argmin(np.where(self.exact, np.inf, self.guess)))
+        i, j = divmod(best, self.alphas.size)
+        self._evaluate(i, np.arange(max(j - 4, 0), min(j + 5, self.alphas.size)), j)
+        rows = np.flatnonzero(self._open.any(axis=1))
+        if rows.size == 0:
+            return
+        spread = np.linspace(0, rows.size - 1, ANCHORS - 1).round().astype(int)
+        for i in np.unique(rows[spread]).tolist():
+            if self._open[i].any():
+                j = int(np.argmin(np.where(self._open[i], self.guess[i], np.inf)))
+                self._evaluate(i, np.array([j]), j)
+
+    def _evaluate(self, i: int, j: NDArray[np.int64], keep: int | None = None) -> None:
+        relief = self.relief
+        counts = self.buckets.count(
+            (relief.along, relief.across), relief.change(float(self.sigmas[i])), self.alphas[j]
+        )
+        self.distance[i, j] = kernels.distances(counts, self.buckets.target)
+        self.exact[i, j] = True
+        self.passes += j.size
+        whole = counts.sum(axis=0, dtype=np.int32)
+        for row, column in enumerate(j.tolist()):
+            if (len(self.counts) + 1) * whole[row].nbytes <= KEPT_BYTES:
+                self.counts[i, column] = whole[row]
+        if keep is not None:
+            shares = whole[list(j).index(keep)] / relief.places.size
+            self.signs.append(np.sign(self.buckets.target - shares))
+
+    def _finish(self) -> None:
+        """Evaluate the open ones, most promising sigma first."""
+        while self._open.any():
+            hope = np.where(self._open, self.guess, np.inf).min(axis=1)
+            i = int(np.argmin(hope))
+            self._evaluate(i, np.flatnonzero(self._open[i]))
+
+
+class _SampledChange:
+    """What Gaussians change the slopes of some pixels by."""
+
+    SIZE = 1024
+
+    def __init__(self, relief: Relief, chosen: NDArray[np.int64], most_um: float) -> None:
+        self.relief, self.chosen = relief, chosen
+        reach = relief.weights(float(most_um)).size - 1
+        blocks = -(-chosen.size // self.SIZE)
+        self.small = 8 * blocks * reach * self.SIZE <= WINDOW_BYTES
+        if self.small:
+            self.along = np.zeros((blocks, reach, self.SIZE), np.float32)
+            self.across = np.zeros_like(self.along)
+            right, down = np.float32(relief.right_um), np.float32(relief.down_um)
+            kernels.windows(
+                relief.height_um, relief.code, relief.places[chosen], right, down,
+                self.along, self.across,
+            )  # fmt: skip
+
+    def at(self, sigma_um: float) -> tuple[Float32, Float32]:
+        """Return both changes, in the order of the chosen pixels."""
+        if not self.small:
+            a, b = self.relief.change(sigma_um)
+            return a[self.chosen], b[self.chosen]
+        da, db = np.empty(self.chosen.size, np.float32), np.empty(self.chosen.size, np.float32)
+        kernels.weighed(self.along, self.across, self.relief.weights(sigma_um), da, db)
+        return da, db

@@ -1,0 +1,21 @@
+"""Lumitexels: visible (light, view) samples of surface points."""
+
+from reconstruction.lumitexels.samples import (
+    Camera,
+    Lights,
+    Lumitexels,
+    Surface,
+    Visibility,
+    gather,
+    visibility,
+)
+
+__all__ = [
+    "Camera",
+    "Lights",
+    "Lumitexels",
+    "Surface",
+    "Visibility",
+    "gather",
+    "visibility",
+]

@@ -1,0 +1,250 @@
+"""Lumitexels: all that was seen of one surface point, over views and lights.
+
+The samples of a point are BRDF values with their variances, their directions to light and camera,
+and a mask of those that count: the point faces both, nothing stands between, the pixel is good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reconstruction.lumitexels.ray_casting import RayCaster
+
+Floats = NDArray[np.floating]
+Bools = NDArray[np.bool_]
+
+MIN_COSINE: Final = 0.1
+"""A point seen or lit at a flatter angle gives no sample: 84 degrees."""
+OFFSET_MM: Final = 0.1
+"""Shadow rays start so far above the surface."""
+
+__all__ = [
+    "Camera",
+    "Lights",
+    "Lumitexels",
+    "Surface",
+    "Visibility",
+    "gather",
+    "visibility",
+]
+
+
+class Camera(Protocol):
+    """What is needed of a calibrated camera."""
+
+    @property
+    def center_mm(self) -> NDArray[np.float64]:
+        """Centre of projection, shape (3,), mm."""
+
+    def project(self, points_mm: ArrayLike) -> NDArray[np.float64]:
+        """Return columns and rows, shape (N, 2), px; NaN behind the camera."""
+
+
+class Lights(Protocol):
+    """What is needed of calibrated lights."""
+
+    @property
+    def position_mm(self) -> NDArray[np.float64]:
+        """Positions, shape (L, 3), mm."""
+
+    def irradiance(self, points_mm: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return unit directions to the lights and the signal of a white that faces them.
+
+        Both of shape (L, P, 3); the second is the irradiance across the direction over pi, in the
+        unit of the images.
+        """
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """Points that samples are gathered for."""
+
+    points_mm: NDArray[np.float32]
+    """Shape (P, 3), rig frame, mm."""
+    normals: NDArray[np.float32]
+    """Unit, outward, shape (P, 3)."""
+
+    def __post_init__(self) -> None:
+        for name in ("points_mm", "normals"):
+            array = np.ascontiguousarray(getattr(self, name), np.float32)
+            if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
+                raise ValueError(f"{name}: got shape {array.shape}, expected (P, 3) finite numbers")
+            object.__setattr__(self, name, array)
+        if len(self.points_mm) != len(self.normals):
+            raise ValueError(
+                f"normals: got {len(self.normals)}, expected one a point, {len(self.points_mm)}"
+            )
+        length = np.linalg.norm(self.normals, axis=1)
+        if len(length) and np.abs(length - 1).max() > 1e-3:
+            raise ValueError(
+                f"normals: got lengths {length.min():g} to {length.max():g}, expected 1"
+            )
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.points_mm)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lumitexels:
+    """Samples of P points; M = views x lights, the lights of a view together."""
+
+    f: NDArray[np.float32]
+    """BRDF samples, shape (P, M, 3), 1/sr: radiance / (normal irradiance cos theta); 0 where not
+    valid."""
+    variance: NDArray[np.float32]
+    """Of `f`, shape (P, M, 3), 1/sr^2; infinite where not valid."""
+    light_dir: NDArray[np.float32]
+    """Unit vectors from point to light, shape (P, M, 3), in the frame of the points."""
+    view_dir: NDArray[np.float32]
+    """Unit vectors from point to camera, shape (P, M, 3)."""
+    cos_light: NDArray[np.float32]
+    """Cosine between the surface's normal and `light_dir`, shape (P, M)."""
+    cos_view: NDArray[np.float32]
+    """Cosine between the surface's normal and `view_dir`, shape (P, M)."""
+    light: NDArray[np.int32]
+    """Index of the light of each sample, shape (M,)."""
+    view: NDArray[np.int32]
+    """Index of the view of each sample, shape (M,)."""
+    valid: Bools
+    """Samples that count, shape (P, M)."""
+
+    @property
+    def counts(self) -> NDArray[np.intp]:
+        """Valid samples of each point, shape (P,)."""
+        return np.count_nonzero(self.valid, axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visibility:
+    """Which points face, and are not hidden from, each light and each camera."""
+
+    light: Bools
+    """Shape (L, P)."""
+    view: Bools
+    """Shape (V, P)."""
+
+
+def visibility(
+    surface: Surface,
+    caster: RayCaster,
+    *,
+    cameras_mm: ArrayLike,
+    lights_mm: ArrayLike,
+    light_radius_mm: float = 0.0,
+    offset_mm: float = OFFSET_MM,
+    min_cosine: float = MIN_COSINE,
+) -> Visibility:
+    """Find by rays which points see which cameras and lights.
+
+    Parameters
+    ----------
+    surface : Surface
+    caster : RayCaster
+        What may stand in between, as a rule the whole mesh.
+    cameras_mm, lights_mm : array_like, shape (V, 3), (L, 3)
+    light_radius_mm : float
+        With a radius > 0, four points of a light's rim must be seen: samples in half shadow do
+        not count.
+    offset_mm : float
+        Height above the surface at which rays start.
+    min_cosine : float
+        Least cosine to the normal.
+    """
+
+    def seen(target: Floats) -> Bools:
+        way = target - surface.points_mm
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        way /= length
+        facing = np.flatnonzero(np.einsum("pk,pk->p", way, surface.normals) > min_cosine)
+        start = surface.points_mm[facing] + np.float32(offset_mm) * surface.normals[facing]
+        out = np.zeros(len(surface), np.bool_)
+        out[facing] = ~caster.blocked(start, way[facing], length[facing, 0])
+        return out
+
+    lights = np.asarray(lights_mm, np.float32).reshape(-1, 3)
+    view = [seen(c) for c in np.asarray(cameras_mm, np.float32).reshape(-1, 3)]
+    light = []
+    for target in lights:
+        ends = _rim(target, light_radius_mm) if light_radius_mm > 0 else [target]
+        light.append(np.logical_and.reduce([seen(end) for end in ends]))
+    none = np.zeros((0, len(surface)), np.bool_)
+    return Visibility(np.array(light) if light else none, np.array(view) if view else none)
+
+
+def _rim(center: Floats, radius: float) -> list[Floats]:
+    """Return four points of the rim of a disc that faces the origin."""
+    axis = center / np.linalg.norm(center)
+    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    side /= np.linalg.norm(side)
+    other = np.cross(axis, side)
+    return [np.asarray(center + radius * way, np.float32) for way in (side, other, -side, -other)]
+
+
+Image = tuple[Floats, Floats, Bools | None]
+"""Signal and its variance, shape (H, W, 3), and the pixels that are good or None for all."""
+
+
+def gather(
+    surface: Surface,
+    *,
+    cameras: Sequence[Camera],
+    lights: Lights,
+    images: Callable[[int, int], Image | None],
+    caster: RayCaster,
+    poses: ArrayLike | None = None,
+    binning: int = 1,
+    light_radius_mm: float = 0.0,
+    offset_mm: float = OFFSET_MM,
+) -> Lumitexels:
+    """Gather the lumitexels of a surface that fit into memory (about 60 bytes a sample).
+
+    Parameters
+    ----------
+    surface : Surface
+    cameras : sequence of Camera
+    lights : Lights
+    images : callable
+        Returns signal, variance and good pixels (or None) of view and light by their indices, or
+        None where there is no such frame.
+    caster : RayCaster
+        What may cast shadows.
+    poses : array_like, shape (L, 4, 4) or (V L, 4, 4), optional
+        Motion of the subject: matrices that take the points to where they were in each frame.
+    binning : int
+        Camera pixels along each side of an image pixel: 2 for images of 2 x 2 cells.
+    light_radius_mm, offset_mm : float
+        See `visibility`.
+
+    Returns
+    -------
+    Lumitexels
+
+    See Also
+    --------
+    reconstruction.lumitexels.store.LumitexelStore : for any number of points.
+    """
+    from reconstruction.lumitexels.store import LumitexelStore
+
+    store = LumitexelStore(
+        surface,
+        cameras=cameras,
+        lights=lights,
+        caster=caster,
+        poses=poses,
+        binning=binning,
+        light_radius_mm=light_radius_mm,
+        offset_mm=offset_mm,
+        dtype=np.float32,
+    )
+    for view in range(len(cameras)):
+        for light in range(store.light_count):
+            image = images(view, light)
+            if image is not None:
+                store.add(view, light, *image)
+    return store.chunk(0, len(surface))

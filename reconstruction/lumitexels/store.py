@@ -1,0 +1,368 @@
+"""Samples of many surface points, written image by image and read point by point.
+
+Each image is read once. What it shows of the points that its camera sees is one row of that
+camera's table, on disk where a folder is given; a chunk of points reads its columns of all rows.
+Memory holds one image, one row and one chunk, however many points there are. Without a folder the
+tables are in memory, and so are the chunks of a small surface, which every estimate asks for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from reconstruction.lumitexels.ray_casting import RayCaster
+from reconstruction.lumitexels.samples import (
+    MIN_COSINE,
+    OFFSET_MM,
+    Bools,
+    Camera,
+    Floats,
+    Lights,
+    Lumitexels,
+    Surface,
+    visibility,
+)
+
+SAMPLE_BYTES: Final = 57
+"""Of one sample of `Lumitexels`."""
+KEPT_BYTES: Final = 2**28
+"""Up to this size chunks are kept for the next estimate, unless the tables are on disk."""
+
+
+class LumitexelStore:
+    """Lumitexels of a surface while its images come in, and after.
+
+    Parameters
+    ----------
+    surface : Surface
+        Points in the frame of the reconstruction.
+    cameras : sequence of Camera
+    lights : Lights
+    caster : RayCaster
+        What may cast shadows.
+    poses : array_like, shape (L, 4, 4) or (V L, 4, 4), optional
+        Motion of the subject: takes the points to where they were, by light (all cameras expose
+        together) or by frame. Needs `lights` to be a dataclass with ``position_mm`` and, where
+        the lights have one, ``axis``. Shadows are those of the pose at rest.
+    binning : int
+        Camera pixels along each side of an image pixel: 2 for images of 2 x 2 cells.
+    light_radius_mm, offset_mm : float
+        See `reconstruction.lumitexels.visibility`.
+    folder : Path, optional
+        Existing folder for the tables; in memory by default.
+    dtype : dtype
+        Of the tables. float16 holds 0.05 %, well below the noise of a sample, of values that are
+        scaled row by row.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        *,
+        cameras: Sequence[Camera],
+        lights: Lights,
+        caster: RayCaster,
+        poses: ArrayLike | None = None,
+        binning: int = 1,
+        light_radius_mm: float = 0.0,
+        offset_mm: float = OFFSET_MM,
+        folder: Path | None = None,
+        dtype: DTypeLike = np.float16,
+    ) -> None:
+        self.surface = surface
+        self.light_count = len(lights.position_mm)
+        self._cameras, self._lights, self._binning = tuple(cameras), lights, binning
+        self._poses = _checked_poses(poses, len(cameras), self.light_count)
+        if binning < 1:
+            raise ValueError(f"binning: got {binning}, expected at least 1")
+        seen = visibility(
+            surface,
+            caster,
+            cameras_mm=np.array([camera.center_mm for camera in cameras]).reshape(-1, 3),
+            lights_mm=lights.position_mm,
+            light_radius_mm=light_radius_mm,
+            offset_mm=offset_mm,
+        )
+        self._lit = np.packbits(seen.light, axis=0, bitorder="little")  # (L / 8, P)
+        self._rows = [np.flatnonzero(row).astype(np.int32) for row in seen.view]
+        self._scale = np.zeros((len(cameras), self.light_count, 2), np.float32)
+        self._kept_bytes = KEPT_BYTES if folder is None else 0
+        self._kept: dict[tuple[int, int], Lumitexels] = {}
+        self._tables = [
+            _table(folder, view, (self.light_count, 2, len(rows), 3), np.dtype(dtype))
+            for view, rows in enumerate(self._rows)
+        ]
+
+    @property
+    def view_count(self) -> int:
+        """Number of cameras."""
+        return len(self._cameras)
+
+    def seen_by(self, view: int) -> NDArray[np.int32]:
+        """Return the indices of the points that a camera sees."""
+        return self._rows[view]
+
+    def add(
+        self,
+        view: int,
+        light: int,
+        signal: Floats,
+        variance: Floats,
+        good: Bools | None = None,
+        *,
+        response: Callable[[Floats], Floats] | None = None,
+    ) -> None:
+        """Take what one image shows of the points.
+
+        Parameters
+        ----------
+        view, light : int
+            Indices into cameras and lights.
+        signal, variance : ndarray, shape (H, W, 3)
+            In the unit of the lights' irradiance, and its square.
+        good : ndarray of bool, shape (H, W), optional
+            Pixels that may be used; all by default. What is not finite is never used.
+        response : callable, optional
+            Returns the camera's own gain, shape (N, 3), at camera pixels, shape (N, 2); the
+            signal is divided by it.
+        """
+        if signal.shape != variance.shape or signal.ndim != 3 or signal.shape[-1] != 3:
+            raise ValueError(
+                f"signal: got shapes {signal.shape} and {variance.shape}, expected (H, W, 3) twice"
+            )
+        if good is not None and good.shape != signal.shape[:2]:
+            raise ValueError(f"good: got shape {good.shape}, expected {signal.shape[:2]}")
+        self._kept.clear()
+        points = self.surface.points_mm[self._rows[view]]
+        pose = self._pose(view, light)
+        if pose is not None:
+            points = points @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3].astype(np.float32)
+        pixels = self._cameras[view].project(points)
+        xy = (pixels - 0.5 * (self._binning - 1)) / self._binning
+        usable = np.ones(signal.shape[:2], np.bool_) if good is None else good
+        row = np.empty((2, len(points), 3), np.float32)
+        _sample(
+            np.ascontiguousarray(signal, np.float32),
+            np.ascontiguousarray(variance, np.float32),
+            np.ascontiguousarray(usable),
+            np.ascontiguousarray(xy, np.float32),
+            row,
+        )
+        if response is not None:
+            row /= np.asarray(response(pixels), np.float32)
+        for kind in range(2):
+            values = np.abs(row[kind])
+            top = float(np.max(values, where=np.isfinite(values), initial=0.0))
+            self._scale[view, light, kind] = top if top > 0 else 1.0
+        self._tables[view][light] = row / self._scale[view, light, :, None, None]
+
+    def chunks(self, size: int) -> Iterator[tuple[slice, Lumitexels]]:
+        """Yield the lumitexels of all points, at most `size` at a time (about 60 B a sample)."""
+        if size < 1:
+            raise ValueError(f"size: got {size}, expected at least 1")
+        for start in range(0, len(self.surface), size):
+            stop = min(start + size, len(self.surface))
+            yield slice(start, stop), self.chunk(start, stop)
+
+    def chunk(self, start: int, stop: int) -> Lumitexels:
+        """Return the lumitexels of the points from `start` to before `stop`, not to be changed."""
+        part = (start, stop)
+        if part in self._kept:
+            return self._kept[part]
+        found = self._chunk(start, stop)
+        samples = sum(kept.valid.size for kept in (found, *self._kept.values()))
+        if SAMPLE_BYTES * samples <= self._kept_bytes:
+            self._kept[part] = found
+        return found
+
+    def _chunk(self, start: int, stop: int) -> Lumitexels:
+        count, views, lights = stop - start, len(self._cameras), self.light_count
+        points = self.surface.points_mm[start:stop].astype(np.float64)
+        normals = self.surface.normals[start:stop]
+        f = np.zeros((count, views, lights, 3), np.float32)
+        variance = np.full((count, views, lights, 3), np.inf, np.float32)
+        light_dir = np.empty((count, views, lights, 3), np.float32)
+        view_dir = np.empty((count, views, lights, 3), np.float32)
+        cosines = np.empty((2, count, views, lights), np.float32)
+        valid = np.zeros((count, views, lights), np.bool_)
+        lit = np.unpackbits(self._lit[:, start:stop], axis=0, bitorder="little", count=lights)
+        geometry: tuple[Floats, Floats] | None = None
+        for view in range(views):
+            if geometry is None or self._differs_by_view():
+                geometry = self._light_geometry(view, points)
+            first, last = np.searchsorted(self._rows[view], (start, stop))
+            _assemble(
+                np.asarray(self._tables[view][:, :, first:last]).astype(np.float32),
+                self._scale[view],
+                self._rows[view][first:last] - start,
+                lit,
+                *geometry,
+                self._view_geometry(view, points),
+                normals,
+                (f[:, view], variance[:, view], light_dir[:, view], view_dir[:, view]),
+                (cosines[0, :, view], cosines[1, :, view]),
+                valid[:, view],
+            )
+        samples = views * lights
+        return Lumitexels(
+            f.reshape(count, samples, 3),
+            variance.reshape(count, samples, 3),
+            light_dir.reshape(count, samples, 3),
+            view_dir.reshape(count, samples, 3),
+            cosines[0].reshape(count, samples),
+            cosines[1].reshape(count, samples),
+            np.tile(np.arange(lights, dtype=np.int32), views),
+            np.repeat(np.arange(views, dtype=np.int32), lights),
+            valid.reshape(count, samples),
+        )
+
+    def _pose(self, view: int, light: int) -> NDArray[np.float64] | None:
+        return None if self._poses is None else self._poses[view, light]
+
+    def _differs_by_view(self) -> bool:
+        return self._poses is not None and bool((self._poses != self._poses[:1]).any())
+
+    def _light_geometry(self, view: int, points: Floats) -> tuple[Floats, Floats]:
+        """Return directions and irradiance, shape (L, P, 3) each, in the frame of the points."""
+        lights = self._lights if self._poses is None else _moved(self._lights, self._poses[view])
+        direction, white = lights.irradiance(points)
+        return (
+            np.ascontiguousarray(direction, np.float32),
+            np.ascontiguousarray(white, np.float32),
+        )
+
+    def _view_geometry(self, view: int, points: Floats) -> NDArray[np.float32]:
+        """Return unit vectors to the camera, shape (1 or L, P, 3), in the frame of the points."""
+        center = self._cameras[view].center_mm[None]
+        if self._poses is not None:
+            center = _back(self._poses[view], center[0])
+        way = center[:, None] - points[None]
+        way /= np.linalg.norm(way, axis=-1, keepdims=True)
+        return np.ascontiguousarray(way, np.float32)
+
+
+def _table(
+    folder: Path | None, view: int, shape: tuple[int, ...], dtype: np.dtype[Any]
+) -> NDArray[Any]:
+    """Return a table of NaN; on disk it is sparse until it is written."""
+    if folder is None or 0 in shape:
+        return np.full(shape, np.nan, dtype)
+    table = np.lib.format.open_memmap(
+        folder / f"view{view:03d}.npy", mode="w+", dtype=dtype, shape=shape
+    )
+    # a row that never comes has scale 0, which _assemble takes for no sample
+    return table
+
+
+def _checked_poses(poses: ArrayLike | None, views: int, lights: int) -> NDArray[np.float64] | None:
+    if poses is None:
+        return None
+    given = np.asarray(poses, np.float64)
+    if given.shape == (lights, 4, 4):
+        given = np.broadcast_to(given, (views, lights, 4, 4))
+    elif given.shape == (views * lights, 4, 4):
+        given = given.reshape(views, lights, 4, 4)
+    else:
+        raise ValueError(
+            f"poses: got shape {given.shape}, expected ({lights}, 4, 4) or ({views * lights}, 4, 4)"
+        )
+    turn = given[..., :3, :3]
+    if not np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(3), atol=1e-6):
+        raise ValueError("poses: got matrices that are no rigid motions")
+    return given
+
+
+def _back(poses: NDArray[np.float64], point: Floats) -> NDArray[np.float64]:
+    """Return where a fixed point of the rig lies for the subject, shape (L, 3)."""
+    return np.asarray(np.einsum("lji,lj->li", poses[:, :3, :3], point - poses[:, :3, 3]))
+
+
+def _moved(lights: Lights, poses: NDArray[np.float64]) -> Lights:
+    """Return the lights as they stand for the subject in each one's own frame."""
+    names = getattr(lights, "__dataclass_fields__", {})
+    if "position_mm" not in names:
+        raise TypeError(f"lights: got {type(lights).__name__}, expected a dataclass, to move them")
+    held: Any = lights
+    turn, shift = poses[:, :3, :3], poses[:, :3, 3]
+    changes: dict[str, Any] = {
+        "position_mm": np.einsum("lji,lj->li", turn, held.position_mm - shift)
+    }
+    if "axis" in names:
+        changes["axis"] = np.einsum("lji,lj->li", turn, held.axis)
+    moved: Lights = replace(held, **changes)
+    return moved
+
+
+@njit(cache=True, nogil=True)
+def _sample(signal, variance, good, xy, row):  # type: ignore[no-untyped-def]
+    """Sample an image bilinearly at xy; NaN where one of the pixels is missing or bad."""
+    height, width = good.shape
+    for p in range(xy.shape[0]):
+        x, y = xy[p, 0], xy[p, 1]
+        inside = x >= 0.0 and y >= 0.0 and x <= width - 1 and y <= height - 1
+        if not inside:  # NaN too
+            row[:, p] = np.nan
+            continue
+        i, j = min(int(y), height - 2), min(int(x), width - 2)
+        b, a = np.float32(y - i), np.float32(x - j)
+        row[:, p] = 0.0
+        for di in range(2):
+            for dj in range(2):
+                weight = (b if di else 1 - b) * (a if dj else 1 - a)
+                if weight <= 0.0:
+                    continue
+                if not good[i + di, j + dj]:
+                    row[:, p] = np.nan
+                for c in range(3):
+                    row[0, p, c] += weight * signal[i + di, j + dj, c]
+                    row[1, p, c] += weight * weight * variance[i + di, j + dj, c]
+        for c in range(3):
+            row[1, p, c] = np.sqrt(row[1, p, c])
+
+
+@njit(cache=True, parallel=True)
+def _assemble(  # type: ignore[no-untyped-def]
+    table, scale, rows, lit, light_dir, white, view_dir, normals, out, cosines, valid
+):
+    """Divide the samples of one view by irradiance and cosine, and mask those that do not count."""
+    f, variance, light_out, view_out = out
+    cos_light, cos_view = cosines
+    lights, points = lit.shape
+    slot = np.full(points, -1, np.int32)
+    for k in range(len(rows)):
+        slot[rows[k]] = k
+    for p in prange(points):
+        for m in range(lights):
+            v = view_dir[m if view_dir.shape[0] > 1 else 0, p]
+            cl, cv = np.float32(0.0), np.float32(0.0)
+            for c in range(3):
+                light_out[p, m, c] = light_dir[m, p, c]
+                view_out[p, m, c] = v[c]
+                cl += light_dir[m, p, c] * normals[p, c]
+                cv += v[c] * normals[p, c]
+            cos_light[p, m], cos_view[p, m] = cl, cv
+            k = slot[p]
+            if k < 0 or not lit[m, p] or scale[m, 0] == 0.0:
+                continue
+            if cl <= MIN_COSINE or cv <= MIN_COSINE:
+                continue
+            fine = True
+            for c in range(3):
+                signal = table[m, 0, k, c]
+                spread = table[m, 1, k, c]
+                fine &= np.isfinite(signal) and np.isfinite(spread) and white[m, p, c] > 0.0
+            if not fine:
+                continue
+            valid[p, m] = True
+            for c in range(3):
+                over = np.float32(1.0) / (np.float32(np.pi) * white[m, p, c] * cl)
+                f[p, m, c] = table[m, 0, k, c] * scale[m, 0] * over
+                spread = table[m, 1, k, c] * scale[m, 1] * over
+                variance[p, m, c] = spread * spread

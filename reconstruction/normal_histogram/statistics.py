@@ -1,0 +1,178 @@
+"""Statistics of a map's normals: their histogram with its noise, and variances with errors.
+
+References
+----------
+Nagano et al. 2015, ACM Trans. Graph. 34(4), 109. doi:10.1145/2766894
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reconstruction.normal_histogram import kernels
+from reconstruction.normal_histogram.blocks import BLOCKS, block_error, block_of, effective_number
+from reconstruction.normal_histogram.counting import check_buckets, shares_of
+from reconstruction.normal_histogram.relief_slopes import (
+    SlopeError,
+    slopes,
+    slopes_of_normals,
+    turned,
+)
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+SAMPLES_PER_BUCKET = 16.0
+"""Mean number of samples in an occupied bucket below which a histogram is called aliased: its
+distance from another one of the same surface is then above 0.8 * sqrt(2 / 16) = 28 %."""
+
+
+@dataclass(frozen=True, slots=True)
+class NormalStatistics:
+    """A histogram with its noise, and the variances of the normals (Nagano2015, fig. 9).
+
+    Attributes
+    ----------
+    histogram : ndarray, shape (bins, bins)
+        Axes (n_y, n_x), or (n_t, n_s) of turned axes; sums to 1.
+    samples, outside : int
+        Normals counted, and those beyond the limit.
+    effective_samples : float
+        Independent samples that would be as noisy: neighbouring normals are alike. From the
+        differences between blocks of the map, and how alike neighboring blocks are; at most
+        `samples`.
+    occupied : int
+        Buckets that hold anything.
+    samples_per_bucket : float
+        Samples a bucket, averaged over occupied buckets with equal weight.
+    aliased : bool
+        `samples_per_bucket` is below `SAMPLES_PER_BUCKET`: distances then show chance.
+    variance_x, variance_y : float
+        Of n_x and n_y (n_s, n_t on turned axes) about their means, over all samples.
+    stderr_x, stderr_y : float
+        Standard errors of the variances, of what another patch of the same skin and size would
+        show (`reconstruction.normal_histogram.block_errors`); infinite below five blocks.
+    """
+
+    histogram: Floats
+    samples: int
+    outside: int
+    effective_samples: float
+    occupied: int
+    samples_per_bucket: float
+    aliased: bool
+    variance_x: float
+    variance_y: float
+    stderr_x: float
+    stderr_y: float
+
+
+def measure(
+    height: ArrayLike,
+    *,
+    pixel: float | tuple[float, float],
+    bins: int = 64,
+    limit: float = 1.0,
+    y_up: bool = True,
+    valid: ArrayLike | None = None,
+    angle_rad: float = 0.0,
+    blocks: int = BLOCKS,
+) -> NormalStatistics:
+    """Return the histogram of a relief's normals, its noise and the normals' variances.
+
+    Parameters
+    ----------
+    height, pixel, bins, limit, y_up, valid, angle_rad
+        As of `normal_histogram.histogram`.
+    blocks : int
+        The map is cut into ``blocks ** 2`` parts, whose scatter gives the standard errors; they
+        must be longer than the relief is correlated with itself.
+
+    Returns
+    -------
+    NormalStatistics
+
+    Raises
+    ------
+    HistogramError
+        Without a single sample within the limit, and for buckets that are none.
+    SlopeError
+        For what is no map of real numbers, no mask or no pixel.
+
+    Examples
+    --------
+    >>> ridges = np.tile([0.0, 3.0, 0.0, 0.0], (40, 10))  # um: ridges 20 um apart
+    >>> found = measure(ridges, pixel=5.0)
+    >>> found.samples, found.occupied, round(found.variance_x, 4), found.variance_y
+    (1600, 4, 0.0458, 0.0)
+    """
+    a, b, known = slopes(height, pixel=pixel, y_up=y_up, valid=valid)
+    return _measured(*turned(a, b, angle_rad), known, bins, limit, blocks)
+
+
+def measure_normals(
+    normals: ArrayLike,
+    *,
+    bins: int = 64,
+    limit: float = 1.0,
+    valid: ArrayLike | None = None,
+    angle_rad: float = 0.0,
+    blocks: int = BLOCKS,
+) -> NormalStatistics:
+    """Return what :func:`measure` does, of a map of normals.
+
+    Parameters
+    ----------
+    normals : array_like, shape (H, W, 3)
+        As of `relief_slopes.slopes_of_normals`.
+    bins, limit, valid, angle_rad, blocks
+        As of :func:`measure`.
+
+    Returns
+    -------
+    NormalStatistics
+
+    Raises
+    ------
+    HistogramError, SlopeError
+        As of :func:`measure`.
+    """
+    if np.ndim(normals) != 3:
+        raise SlopeError(f"normals: got shape {np.shape(normals)}, expected (H, W, 3)")
+    a, b, known = slopes_of_normals(normals, valid=valid)
+    return _measured(*turned(a, b, angle_rad), known, bins, limit, blocks)
+
+
+def _measured(
+    a: Floats, b: Floats, known: Bools, bins: int, limit: float, blocks: int
+) -> NormalStatistics:
+    group, groups = block_of(np.flatnonzero(known), (known.shape[0], known.shape[1]), blocks)
+    p, q = a[known], b[known]
+    check_buckets(bins, limit)
+    counts = kernels.count_in_groups(p, q, group, groups, bins, float(limit))
+    outside = int(counts[:, -1].sum())
+    counts = counts[:, :-1]
+    shares = shares_of(counts.sum(axis=0)).reshape(bins, bins)
+    w = 1.0 / np.sqrt(1.0 + p * p + q * q)
+    x, y = -p * w, -q * w
+    shape = (known.shape[0], known.shape[1])
+    errors = [block_error((m - m.mean()) ** 2, group, groups, shape, blocks) for m in (x, y)]
+    growth = 0.5 * (errors[0][1] + errors[1][1])
+    samples = int(counts.sum())
+    occupied = int(np.count_nonzero(shares))
+    return NormalStatistics(
+        histogram=shares,
+        samples=samples,
+        outside=outside,
+        effective_samples=max(1.0, effective_number(counts.astype(np.float64), samples) / growth),
+        occupied=occupied,
+        samples_per_bucket=samples / occupied,
+        aliased=samples / occupied < SAMPLES_PER_BUCKET,
+        variance_x=float(np.var(x)),
+        variance_y=float(np.var(y)),
+        stderr_x=errors[0][0],
+        stderr_y=errors[1][0],
+    )

@@ -1,0 +1,318 @@
+"""Height of a surface from its normals.
+
+The slopes that the normals give are integrated by weighted least squares over any mask, for
+parallel rays or a pinhole camera. See `discontinuity_integration` for surfaces that jump,
+`height_filters` for what follows, `height_errors` for standard errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft, ndimage
+
+from reconstruction.normal_integration import slope_fields
+from reconstruction.normal_integration.height_filters import denoise_slopes
+from reconstruction.normal_integration.slope_fields import Perspective, SlopeField
+from reconstruction.normal_integration.weighted_poisson import (
+    Convergence,
+    Hierarchy,
+    IntegrationError,
+    solve,
+)
+from reconstruction.normal_maps import NormalMaps
+
+__all__ = [
+    "HeightMap", "IntegrationError", "NotConverged", "Perspective", "Settings", "integrate",
+    "integrate_map",
+]  # fmt: skip
+
+Floats = NDArray[np.float64]
+Floating = NDArray[np.floating]
+Method = Literal["auto", "multigrid", "dct"]
+
+
+class NotConverged(IntegrationError, ArithmeticError):
+    """The equations were not solved to the tolerance within the iterations allowed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Effort of an integration.
+
+    Attributes
+    ----------
+    tolerance : float
+        Residual of the normal equations over their right side, in (0, 1).
+    iterations : int
+        Most conjugate gradient iterations, >= 1.
+    order : int
+        Of the quadrature between pixels: 4, or 2 for the mean of two neighbours.
+    """
+
+    tolerance: float = 1e-5
+    iterations: int = 1000
+    order: int = 4
+
+    def __post_init__(self) -> None:
+        """Refuse settings out of range."""
+        for name, good, expected in (
+            ("tolerance", 0.0 < self.tolerance < 1.0, "in (0, 1)"),
+            ("iterations", self.iterations >= 1, "at least 1"),
+            ("order", self.order in (2, 4), "2 or 4"),
+        ):
+            if not good:
+                raise IntegrationError(
+                    f"Settings.{name}: got {getattr(self, name)}, expected {expected}"
+                )
+
+
+@dataclass(frozen=True, slots=True)
+class HeightMap:
+    """A height with what is known about it.
+
+    Attributes
+    ----------
+    height : ndarray, shape (H, W)
+        Towards the camera (+z), in the unit of `pixel`; mean 0 over each connected part, whose
+        constant normals cannot tell; 0 where `valid` is False.
+    valid : ndarray of bool, shape (H, W)
+        Pixels that were asked for and whose normal faces the camera.
+    part : ndarray of int32, shape (H, W)
+        Number of the connected part (by rows and columns, not diagonally), from 1; 0 outside.
+    convergence : Convergence
+    """
+
+    height: Floating
+    valid: NDArray[np.bool_]
+    part: NDArray[np.int32]
+    convergence: Convergence
+
+
+def integrate(
+    normals: Floating | NormalMaps,
+    *,
+    pixel: float = 1.0,
+    valid: NDArray[np.bool_] | None = None,
+    stderr_rad: ArrayLike | None = None,
+    y_up: bool = True,
+    camera: Perspective | None = None,
+    method: Method = "auto",
+    denoise: float = 0.0,
+    settings: Settings | None = None,
+) -> Floating:
+    """Return the height whose slopes fit those of the normals best.
+
+    Parameters
+    ----------
+    normals : ndarray, shape (..., H, W, 3), or NormalMaps of (H, W)
+        Outward, any length but 0, z towards the camera. Of `NormalMaps`, `valid` and
+        `stderr_rad` are taken where not given here (`valid` besides). Maps of a stack are
+        integrated each by itself.
+    pixel : float
+        Size of a pixel on the surface; its unit is that of the height. Under perspective, at the
+        mean height, so that the camera's distance is `pixel * focal_px`.
+    valid : ndarray of bool, shape (..., H, W), optional
+        Pixels to integrate. Those whose normal is 0, not finite or more than 88.8 degrees from
+        the ray are left out besides.
+    stderr_rad : float or ndarray, shape (..., H, W), optional
+        Standard error of the normals, rad (root mean square angle). Slopes then count by the
+        inverse of the variance it gives them, which rises towards the horizon. A thousandth and
+        a thousandfold of the median are the least and the most that count. None: all slopes alike.
+    y_up : bool
+        Whether n_y > 0 leans to the image's top (row 0); False: to its bottom.
+    camera : Perspective, optional
+        None: parallel rays.
+    method : {"auto", "multigrid", "dct"}
+        "dct" needs a full rectangle without standard errors, which "auto" solves that way.
+    denoise : float
+        Strength of `height_filters.denoise_slopes` before integration, 0: none, 1: by the
+        stated noise; needs standard errors.
+    settings : Settings, optional
+
+    Returns
+    -------
+    ndarray, shape (..., H, W)
+        In the unit of `pixel`, float32 for normals in float32, else float64; mean 0 over each
+        connected part, 0 outside.
+
+    Raises
+    ------
+    IntegrationError
+        For shapes or settings that do not fit, or without any usable normal.
+    NotConverged
+        Where the iterations do not suffice.
+
+    Notes
+    -----
+    Minimises sum a_e (h_q - h_p - d_e)^2 over neighbours p, q with d_e the integral of slope
+    between them (Quéau, Durou and Aujol 2018, doi 10.1007/s10851-017-0773-x, for the problem
+    and its variants). Fields with curl are projected: their part without a height is dropped.
+
+    Examples
+    --------
+    A plane that falls by a tenth to the right and rises to the top, on pixels of 5 um:
+
+    >>> import numpy as np
+    >>> normals = np.broadcast_to([0.1, -0.2, 1.0], (3, 4, 3))
+    >>> height = integrate(normals, pixel=5.0)
+    >>> np.round(np.diff(height, axis=1)[0], 6), np.round(np.diff(height, axis=0)[:, 0], 6)
+    (array([-0.5, -0.5, -0.5]), array([-1., -1.]))
+    """
+    if not isinstance(normals, NormalMaps):
+        stack = np.asarray(normals)
+        if stack.ndim > 3:
+            masks = _for_each("valid", valid, stack.shape[:-1])
+            errors = _for_each("stderr_rad", stderr_rad, stack.shape[:-1])
+            out = np.empty(stack.shape[:-1], np.float32 if stack.dtype == np.float32 else float)
+            for at in np.ndindex(stack.shape[:-3]):
+                out[at] = integrate(
+                    stack[at], pixel=pixel, valid=masks(at), stderr_rad=errors(at), y_up=y_up,
+                    camera=camera, method=method, denoise=denoise, settings=settings,
+                )  # fmt: skip
+            return out
+    found = integrate_map(
+        normals, pixel=pixel, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera,
+        method=method, denoise=denoise, settings=settings,
+    )  # fmt: skip
+    if not found.convergence.converged:
+        raise NotConverged(
+            f"iterations: residual {found.convergence.residual:.1e} after "
+            f"{found.convergence.iterations}; allow more, or a larger tolerance"
+        )
+    return found.height
+
+
+def _for_each(
+    name: str, values: Any, shape: tuple[int, ...]
+) -> Callable[[tuple[int, ...]], NDArray[Any] | None]:
+    """Return what belongs to each map of a stack: None, a number, or a part of an array."""
+    if values is None:
+        return lambda at: None
+    given = np.asarray(values)
+    if not given.ndim:
+        return lambda at: given
+    try:
+        spread = np.broadcast_to(given, shape)
+    except ValueError:
+        raise IntegrationError(f"{name}: got shape {given.shape}, expected {shape}") from None
+    return lambda at: spread[at]
+
+
+def integrate_map(
+    normals: Floating | NormalMaps,
+    *,
+    pixel: float = 1.0,
+    valid: NDArray[np.bool_] | None = None,
+    stderr_rad: ArrayLike | None = None,
+    y_up: bool = True,
+    camera: Perspective | None = None,
+    method: Method = "auto",
+    denoise: float = 0.0,
+    settings: Settings | None = None,
+) -> HeightMap:
+    """Return the height as `integrate` does, with mask, parts and how well it was solved.
+
+    Parameters
+    ----------
+    normals, pixel, valid, stderr_rad, y_up, camera, method, denoise, settings
+        As of `integrate`.
+
+    Returns
+    -------
+    HeightMap
+
+    Raises
+    ------
+    IntegrationError
+        As of `integrate`; equations that were not solved are told by `convergence` instead.
+    """
+    if not 0.0 < pixel < np.inf:
+        raise IntegrationError(f"pixel: got {pixel}, expected above 0 and finite")
+    chosen = settings or Settings()
+    slopes = slope_fields.from_normals(
+        normals, valid=valid, stderr_rad=stderr_rad, y_up=y_up, camera=camera
+    )
+    if denoise:
+        slopes = denoise_slopes(slopes, strength=denoise)
+    plain = slopes.variance_x.size == 1 and bool(slopes.valid.all())
+    if method == "dct" and not plain:
+        raise IntegrationError(
+            'method: got "dct" with a mask or standard errors, expected "multigrid"'
+        )
+    if method not in ("auto", "multigrid", "dct"):
+        raise IntegrationError(f"method: got {method!r}, expected auto, multigrid or dct")
+    if plain and method != "multigrid":
+        relief, convergence = _by_cosines(slopes, chosen), Convergence(0, 0.0, True)
+    else:
+        relief, convergence = _by_multigrid(slopes, chosen)
+    part = parts(slopes.valid)
+    kind = np.asarray(normals.normals if isinstance(normals, NormalMaps) else normals).dtype
+    height = to_height(relief, part, pixel=pixel, camera=camera)
+    return HeightMap(
+        height.astype(np.float32) if kind == np.float32 else height,
+        slopes.valid, part, convergence,
+    )  # fmt: skip
+
+
+def _by_multigrid(slopes: SlopeField, settings: Settings) -> tuple[Floats, Convergence]:
+    ax, ay, dx, dy = slope_fields.edges(slopes, order=settings.order)
+    x = np.zeros(dx.shape)
+    convergence = solve(
+        Hierarchy(ax, ay), dx, dy, x,
+        tolerance=settings.tolerance, iterations=settings.iterations,
+    )  # fmt: skip
+    return x[1:-1, 1:-1], convergence
+
+
+def _by_cosines(slopes: SlopeField, settings: Settings) -> Floats:
+    """Solve the same equations on a full rectangle, whose eigenvectors are cosines."""
+    _, _, dx, dy = slope_fields.edges(slopes, order=settings.order)
+    b = dx[1:-1, :-2] - dx[1:-1, 1:-1] + dy[:-2, 1:-1] - dy[1:-1, 1:-1]
+    rows, columns = b.shape
+    waves = fft.dctn(b, type=2, norm="ortho", workers=2, overwrite_x=True)
+    of_row = 4.0 * np.sin(0.5 * np.pi * np.arange(rows) / rows) ** 2
+    of_column = 4.0 * np.sin(0.5 * np.pi * np.arange(columns) / columns) ** 2
+    of_row[0] = np.inf if rows * columns == 1 else of_row[0]
+    eigenvalues = of_row[:, None] + of_column[None, :]
+    eigenvalues[0, 0] = np.inf  # the constant
+    waves /= eigenvalues
+    return np.asarray(fft.idctn(waves, type=2, norm="ortho", workers=2, overwrite_x=True))
+
+
+def parts(valid: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Return the number of each pixel's connected part, from 1; 0 where not valid."""
+    if valid.all():
+        return np.ones(valid.shape, np.int32)
+    return np.asarray(ndimage.label(valid)[0], np.int32)
+
+
+def to_height(
+    relief: Floats, part: NDArray[np.int32], *, pixel: float, camera: Perspective | None
+) -> Floats:
+    """Return height from a solution in pixels: mean 0 over each part, 0 outside.
+
+    Under perspective the solution is -f log(depth) with a free constant in each part.
+    """
+    relief = _centered(relief, part)
+    if camera is None:
+        return np.asarray(pixel * relief)
+    depth = np.exp(relief / -camera.focal_px)
+    away = -camera.focal_px * pixel
+    return _centered(away * (depth / _means(depth, part)[part]), part)
+
+
+def _means(values: Floats, part: NDArray[np.int32]) -> Floats:
+    count = np.bincount(part.ravel())
+    total = np.bincount(part.ravel(), weights=values.ravel())
+    return np.asarray(total / np.maximum(count, 1))
+
+
+def _centered(values: Floats, part: NDArray[np.int32]) -> Floats:
+    if part[0, 0] == 1 and (part == 1).all():
+        return np.asarray(values - values.mean())
+    return np.asarray(np.where(part > 0, values - _means(values, part)[part], 0.0))

@@ -1,0 +1,267 @@
+"""Slopes of a surface from its normals, with their variances, and differences between pixels.
+
+A normal n seen along the ray with direction -w gives the slopes -n_x / (n . w) and -n_y / (n . w),
+in pixels of height a pixel; w = (0, 0, 1) for parallel rays. Under perspective the same slopes
+are those of -f log(depth), with f in pixels (Quéau, Durou and Aujol 2018,
+doi 10.1007/s10851-017-0773-x, section 2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, NDArray
+
+from reconstruction.normal_integration.weighted_poisson import IntegrationError
+from reconstruction.normal_maps import NormalMaps
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+GRAZING = 0.02
+"""Least cosine between normal and ray of a pixel that is used: 88.9 degrees."""
+SPAN = 1e3
+"""Standard errors count as at most so many times, and at least one over that of, their median."""
+_APART = 10.0
+"""Variance over that of an edge's own pixels from which pixels beyond them are not asked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Perspective:
+    """A pinhole camera that looks along -z, rows of pixels along x.
+
+    Attributes
+    ----------
+    focal_px : float
+        Distance of the sensor over the size of its pixels, > 0.
+    center_px : tuple of float
+        (column, row) of the principal point; the middle of pixel (0, 0) is (0, 0).
+    """
+
+    focal_px: float
+    center_px: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        """Refuse what is no camera."""
+        if not 0.0 < self.focal_px < np.inf:
+            raise IntegrationError(
+                f"Perspective.focal_px: got {self.focal_px}, expected above 0 and finite"
+            )
+        if len(self.center_px) != 2 or not np.isfinite(self.center_px).all():
+            raise IntegrationError(
+                f"Perspective.center_px: got {self.center_px}, expected two finite numbers"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class SlopeField:
+    """Slopes at pixels; where `valid` is False they are 0.
+
+    Attributes
+    ----------
+    gx, gy : ndarray, shape (H, W), float64
+        Change of height, in pixels, to the next column and to the next row (downwards).
+    variance_x, variance_y : ndarray, shape (H, W) or (1, 1), float32
+        Of the slopes, relative to one another where `scale` is 0; (1, 1): all the same.
+    facing : ndarray, shape (H, W), float32
+        Cosine between normal and ray, as far as the ray is the view's axis: n . w.
+    valid : ndarray of bool, shape (H, W)
+    scale : float
+        Variance of angles that variances are to be multiplied by, rad^2; 0 where none is known.
+    """
+
+    gx: Floats
+    gy: Floats
+    variance_x: Float32
+    variance_y: Float32
+    facing: Float32
+    valid: NDArray[np.bool_]
+    scale: float
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _slopes(n, relative, cx, cy, per_focal, up, gx, gy, vx, vy, facing, valid):  # type: ignore[no-untyped-def]
+    """Write slopes and variances of the pixels that are valid, and drop those that have none.
+
+    ``relative``: variance of angles, (H, W) or (1, 1), read where vx is (H, W).
+    """
+    rows, columns = gx.shape
+    weighted = vx.shape[0] == rows and vx.shape[1] == columns
+    mapped = relative.size > 1
+    for i in prange(rows):
+        for j in range(columns):
+            good = valid[i, j]
+            x = np.float64(n[i, j, 0])
+            y = up * np.float64(n[i, j, 1])
+            z = np.float64(n[i, j, 2])
+            wx, wy = (cx - j) * per_focal, (i - cy) * per_focal
+            length2 = x * x + y * y + z * z
+            m = z + x * wx + y * wy
+            w2 = 1.0 + wx * wx + wy * wy
+            good = good and length2 > 0.0 and length2 < np.inf
+            good = good and m > 0.0 and m * m > GRAZING * GRAZING * length2 * w2
+            valid[i, j] = good
+            if not good:
+                gx[i, j], gy[i, j], facing[i, j] = 0.0, 0.0, 0.0
+                if weighted:
+                    vx[i, j], vy[i, j] = 1.0, 1.0
+                continue
+            gx[i, j], gy[i, j] = -x / m, y / m
+            facing[i, j] = m / np.sqrt(length2)
+            if weighted:
+                given = relative[i, j] if mapped else relative[0, 0]
+                a = 0.5 * given * length2 / (m * m * m * m)
+                vx[i, j] = a * (m * m - 2.0 * m * x * wx + x * x * w2)
+                vy[i, j] = a * (m * m - 2.0 * m * y * wy + y * y * w2)
+
+
+def from_normals(
+    normals: NDArray[np.floating] | NormalMaps,
+    *,
+    valid: NDArray[np.bool_] | None = None,
+    stderr_rad: ArrayLike | None = None,
+    y_up: bool = True,
+    camera: Perspective | None = None,
+) -> SlopeField:
+    """Return the slopes of normals, see `normal_integration.integrate` for the parameters.
+
+    Raises
+    ------
+    IntegrationError
+        For shapes that do not fit, negative standard errors, or no usable pixel at all.
+    """
+    if isinstance(normals, NormalMaps):
+        n = np.asarray(normals.normals)
+        if n.shape[:-1] == np.shape(normals.valid):
+            valid = normals.valid if valid is None else valid & normals.valid
+        if stderr_rad is None:
+            stderr_rad = normals.stderr_rad
+    else:
+        n = np.asarray(normals)
+    if n.ndim != 3 or n.shape[2] != 3 or n.size == 0:
+        raise IntegrationError(f"normals: got shape {n.shape}, expected (H, W, 3)")
+    if n.dtype not in (np.float32, np.float64):
+        n = n.astype(np.float64)
+    shape = n.shape[:2]
+    if valid is None:
+        good = np.ones(shape, bool)
+    else:
+        if np.shape(valid) != shape:
+            raise IntegrationError(f"valid: got shape {np.shape(valid)}, expected {shape}")
+        good = np.array(valid, bool)
+    relative, scale = _relative_variance(stderr_rad, good)
+    small = (1, 1) if relative is None else shape
+    gx, gy = np.empty(shape), np.empty(shape)
+    facing = np.empty(shape, np.float32)
+    vx, vy = np.ones(small, np.float32), np.ones(small, np.float32)
+    cx, cy = camera.center_px if camera else (0.0, 0.0)
+    _slopes(
+        n, np.ones((1, 1), np.float32) if relative is None else relative, float(cx), float(cy),
+        1.0 / camera.focal_px if camera else 0.0, 1.0 if y_up else -1.0,
+        gx, gy, vx, vy, facing, good,
+    )  # fmt: skip
+    if not good.any():
+        raise IntegrationError(
+            f"valid: got no pixel with a normal that faces the camera among {shape[0]} x {shape[1]}"
+        )
+    return SlopeField(gx, gy, vx, vy, facing, good, scale)
+
+
+def _relative_variance(
+    stderr_rad: ArrayLike | None, good: NDArray[np.bool_]
+) -> tuple[Float32 | None, float]:
+    """Return the variance of angles over their median, within bounds, and that median."""
+    if stderr_rad is None:
+        return None, 0.0
+    sigma = np.asarray(stderr_rad, np.float64)
+    if sigma.shape not in ((), good.shape):
+        raise IntegrationError(
+            f"stderr_rad: got shape {sigma.shape}, expected a number or {good.shape}"
+        )
+    some = sigma[good] if sigma.ndim else sigma.reshape(1)
+    if np.isnan(some).any() or (some < 0.0).any():
+        raise IntegrationError("stderr_rad: got NaN or below 0 at valid pixels, expected >= 0")
+    positive = some[(some > 0.0) & (some < np.inf)]
+    if positive.size == 0:  # nothing told apart
+        return None, 0.0
+    middle = float(np.median(positive))
+    if sigma.ndim == 0:
+        return np.ones((1, 1), np.float32), middle**2
+    with np.errstate(invalid="ignore"):
+        within = np.clip(sigma / middle, 1.0 / SPAN, SPAN)
+    return (within * within).astype(np.float32), middle**2
+
+
+@njit(cache=True, inline="always")
+def _difference(before, a, b, after, has_before, has_after):  # type: ignore[no-untyped-def]
+    """Return the integral of slope from a to b, by the polynomial through the pixels there are."""
+    if has_before and has_after:
+        return (13.0 * (a + b) - (before + after)) / 24.0
+    if has_before:
+        return (5.0 * b + 8.0 * a - before) / 12.0
+    if has_after:
+        return (5.0 * a + 8.0 * b - after) / 12.0
+    return 0.5 * (a + b)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _edges(gx, gy, vx, vy, valid, smooth, ax, ay, dx, dy):  # type: ignore[no-untyped-def]
+    """Write weights and differences of the edges; the arrays have an empty border of one."""
+    rows, columns = gx.shape
+    weighted = vx.shape[0] == rows and vx.shape[1] == columns
+    for i in prange(rows):
+        for j in range(columns):
+            if not valid[i, j]:
+                continue
+            if j + 1 < columns and valid[i, j + 1]:
+                v = vx[i, j] + vx[i, j + 1] if weighted else np.float32(2.0)
+                before = smooth and j > 0 and valid[i, j - 1]
+                after = smooth and j + 2 < columns and valid[i, j + 2]
+                if weighted:
+                    before = before and vx[i, j - 1] < _APART * v
+                    after = after and vx[i, j + 2] < _APART * v
+                ax[i + 1, j + 1] = np.float32(2.0) / v
+                dx[i + 1, j + 1] = _difference(
+                    gx[i, j - 1] if before else 0.0, gx[i, j], gx[i, j + 1],
+                    gx[i, j + 2] if after else 0.0, before, after,
+                )  # fmt: skip
+            if i + 1 < rows and valid[i + 1, j]:
+                v = vy[i, j] + vy[i + 1, j] if weighted else np.float32(2.0)
+                before = smooth and i > 0 and valid[i - 1, j]
+                after = smooth and i + 2 < rows and valid[i + 2, j]
+                if weighted:
+                    before = before and vy[i - 1, j] < _APART * v
+                    after = after and vy[i + 2, j] < _APART * v
+                ay[i + 1, j + 1] = np.float32(2.0) / v
+                dy[i + 1, j + 1] = _difference(
+                    gy[i - 1, j] if before else 0.0, gy[i, j], gy[i + 1, j],
+                    gy[i + 2, j] if after else 0.0, before, after,
+                )  # fmt: skip
+
+
+def edges(field: SlopeField, *, order: int = 4) -> tuple[Float32, Float32, Floats, Floats]:
+    """Return weights and wanted differences of the edges between pixels.
+
+    Parameters
+    ----------
+    field : SlopeField
+    order : int
+        4: by the cubic through four pixels in a row (three or two at borders); what is left of a
+        wave of theta radians a pixel is 1 - 11 theta^4 / 720. 2: the mean of two pixels, which
+        leaves 1 - theta^2 / 12.
+
+    Returns
+    -------
+    tuple of ndarray, shape (H + 2, W + 2)
+        (ax, ay) float32, (dx, dy) float64, as `weighted_poisson.solve` takes them.
+    """
+    shape = (field.gx.shape[0] + 2, field.gx.shape[1] + 2)
+    ax, ay = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    dx, dy = np.zeros(shape), np.zeros(shape)
+    _edges(
+        field.gx, field.gy, field.variance_x, field.variance_y, field.valid, order == 4,
+        ax, ay, dx, dy,
+    )  # fmt: skip
+    return ax, ay, dx, dy

@@ -1,0 +1,190 @@
+"""Heights whose differences along a grid's edges fit given ones best, by weighted least squares.
+
+Minimises sum a_e (x_q - x_p - d_e)^2 over the edges e = (p, q) of a grid of pixels. Its normal
+equations are solved by conjugate gradients with a multigrid cycle as preconditioner, without a
+matrix. See `integration_kernels` for the multigrid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import get_num_threads, set_num_threads
+from numpy.typing import NDArray
+
+from reconstruction.normal_integration import multigrid_coarsening as coarsening
+from reconstruction.normal_integration import multigrid_kernels as kernels
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+COARSEST = 6
+"""Nodes a side at which a grid is not made coarser any more."""
+_COARSEST_SWEEPS = 12
+_SMALL = 1 << 16
+"""Nodes of a level below which one thread does it."""
+_REDUCTION = 1e-4
+"""Of the residual by float32 steps, before it is computed anew."""
+
+
+class IntegrationError(ValueError):
+    """Normals, masks or settings that no height can be computed from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Convergence:
+    """How a solution was reached."""
+
+    iterations: int
+    """Of the conjugate gradients."""
+    residual: float
+    """Norm of the normal equations' residual over that of their right side, in float64."""
+    converged: bool
+    """Whether `residual` is at most the tolerance."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Level:
+    A: Float32
+    """Planes of `integration_kernels`; of the finest level (3, ...): edges, one over diagonal."""
+    P: Float32
+    b: Float32
+    x: Float32
+
+
+class Hierarchy:
+    """The grids of a multigrid, made from the weights of the finest grid's edges.
+
+    Parameters
+    ----------
+    ax, ay : ndarray, shape (H + 2, W + 2), float32
+        Weight of the edge from node [i, j] to [i, j + 1] and to [i + 1, j], >= 0; pixel (0, 0)
+        stands at [1, 1]. Edges that would leave the picture have weight 0.
+    """
+
+    def __init__(self, ax: Float32, ay: Float32) -> None:
+        inverse = np.zeros_like(ax)
+        coarsening.invert_diagonal(ax, ay, inverse)
+        self.ax, self.ay, self.inverse = ax, ay, inverse
+        self.levels: list[_Level] = []
+        none = np.zeros((1, 1), np.float32)
+        e, s, se, sw, inv, diagonals = ax, ay, none, none, inverse, False
+        rows, columns = ax.shape[0] - 2, ax.shape[1] - 2
+        while max(rows, columns) > COARSEST:
+            rows, columns = (rows + 1) // 2, (columns + 1) // 2
+            shape = (rows + 2, columns + 2)
+            P = np.zeros((8, *shape), np.float32)
+            coarsening.interpolate_edges(e, s, se, sw, inv, diagonals, P)
+            coarsening.interpolate_middles(e, s, se, sw, inv, diagonals, P)
+            A = np.zeros((5, *shape), np.float32)
+            coarsening.coarsen(e, s, se, sw, inv, diagonals, P, A)
+            self.levels.append(
+                _Level(A, P, np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+            )
+            e, s, se, sw, inv = A
+            diagonals = True
+
+    def cycle(self, b: Float32, x: Float32) -> None:
+        """Write x, about A^-1 b: one V cycle, symmetric in the sense that CG needs."""
+        ax, ay, inverse = self.ax, self.ay, self.inverse
+        kernels.smooth_from_zero(ax, ay, inverse, b, x)
+        if self.levels:
+            top = self.levels[0]
+            kernels.restrict_even(ax, ay, inverse, b, x, top.P, top.b)
+            self._coarse_cycle(0)
+            kernels.prolong_even(top.P, top.x, inverse, x)
+        else:
+            for _ in range(_COARSEST_SWEEPS):
+                kernels.smooth(ax, ay, inverse, b, x, 0)
+                kernels.smooth(ax, ay, inverse, b, x, 1)
+            for _ in range(_COARSEST_SWEEPS):
+                kernels.smooth(ax, ay, inverse, b, x, 1)
+                kernels.smooth(ax, ay, inverse, b, x, 0)
+        kernels.smooth(ax, ay, inverse, b, x, 1)
+        kernels.smooth(ax, ay, inverse, b, x, 0)
+
+    def _coarse_cycle(self, depth: int) -> None:
+        level = self.levels[depth]
+        threads = get_num_threads()
+        if threads > 1 and level.b.size < _SMALL:
+            set_num_threads(1)  # waiting for one another would take longer than the work
+            try:
+                self._coarse_cycle(depth)
+            finally:
+                set_num_threads(threads)
+            return
+        A, b, x = level.A, level.b, level.x
+        x.fill(0.0)
+        last = depth + 1 == len(self.levels)
+        for _ in range(_COARSEST_SWEEPS if last else 1):
+            kernels.smooth_coarse(A, b, x, 1, 1)
+            kernels.smooth_coarse(A, b, x, 2, 1)
+        if not last:
+            below = self.levels[depth + 1]
+            kernels.restrict(A, b, x, below.P, below.b)
+            self._coarse_cycle(depth + 1)
+            kernels.prolong(below.P, below.x, A, x)
+        for _ in range(_COARSEST_SWEEPS if last else 1):
+            kernels.smooth_coarse(A, b, x, 2, 2)
+            kernels.smooth_coarse(A, b, x, 1, 2)
+
+
+def solve(
+    hierarchy: Hierarchy,
+    dx: Floats,
+    dy: Floats,
+    x: Floats,
+    *,
+    tolerance: float = 1e-5,
+    iterations: int = 200,
+) -> Convergence:
+    """Solve for x in place, from where it stands.
+
+    Parameters
+    ----------
+    hierarchy : Hierarchy
+        Of the edges' weights; it gives the preconditioner and the equations.
+    dx, dy : ndarray, shape (H + 2, W + 2), float64
+        Difference wanted along the edges of `Hierarchy.ax` and `Hierarchy.ay`, finite.
+    x : ndarray, shape (H + 2, W + 2), float64
+        Where to begin, and the solution. Its constant in each connected part is arbitrary.
+    tolerance : float
+        Of the residual's norm over that of the right side, and of the error's energy as the
+        preconditioner sees it.
+    iterations : int
+        Most iterations in all.
+
+    Returns
+    -------
+    Convergence
+    """
+    ax, ay = hierarchy.ax, hierarchy.ay
+    r, z, p, q = (np.zeros(ax.shape, np.float32) for _ in range(4))
+    pair, sums = np.zeros((2, ax.shape[0])), np.zeros(ax.shape[0])
+    done, energy, found = 0, 0.0, np.inf
+    while True:
+        kernels.residual(ax, ay, dx, dy, x, r, pair)
+        norm, given = (float(np.sqrt(total)) for total in pair.sum(axis=1))
+        before, found = found, norm / given if given > 0.0 else 0.0
+        if found <= tolerance or done >= iterations or not found < 0.5 * before:
+            return Convergence(done, found, found <= tolerance)
+        # r is rounded: what it gains in constants must stay small beside it
+        goal = max(0.9 * tolerance * given, _REDUCTION * norm)
+        left, rz = norm, 0.0
+        while done < iterations:
+            hierarchy.cycle(r, z)
+            kernels.inner(r, z, sums)
+            old, rz = rz, float(sums.sum())
+            energy = energy or rz
+            enough = rz <= max(tolerance**2 * energy, (_REDUCTION * norm / given) ** 2 * energy)
+            if not rz > 0.0 or (left <= goal and enough):
+                break
+            kernels.direction(z, p, np.float32(rz / old if old > 0.0 else 0.0), ax, ay, q, sums)
+            p, q = q, p
+            curvature = float(sums.sum())
+            if not curvature > 0.0:
+                break
+            kernels.advance(p, rz / curvature, ax, ay, x, r, sums)
+            left = float(np.sqrt(sums.sum()))
+            done += 1

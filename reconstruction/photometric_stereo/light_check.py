@@ -1,0 +1,220 @@
+"""Whether a list of lights belongs to its images: order, dead lights, strengths, by shading alone.
+
+A matte object under N lights spans a space of three images; a list in the wrong order does not
+explain it. Whatever turns all directions alike (a mirrored axis) explains the shading as well and
+is not seen here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reconstruction.normal_maps import PhotometricStereoError
+from reconstruction.photometric_stereo.estimation import estimate_normals
+
+Floats = NDArray[np.float64]
+
+SAMPLE_POINTS = 1500
+DEAD = 0.05
+"""Strength, relative to the median light, below which a light gave none."""
+CLEARLY = 0.7
+"""A different order is named when it leaves less than this part of the listed order's misfit."""
+FITS = 0.15
+"""Misfit over mean brightness up to which shading counts as explained."""
+
+
+@dataclass(frozen=True, slots=True)
+class LightCheck:
+    """What shading says about a list of lights.
+
+    Attributes
+    ----------
+    order : str
+        "as listed", or the name of the order that fits clearly better, or "unknown" where none
+        that was tried explains the shading.
+    permutation : ndarray of int, shape (N,)
+        Row of the list for each image under that order.
+    misfit : dict of str to float
+        Mean absolute residual over mean brightness, per order that was tried.
+    strength : ndarray, shape (N,)
+        Of each light, relative to their median, under that order; 0 for a dead one.
+    dead : ndarray of bool, shape (N,)
+    points : int
+        How many were looked at.
+    """
+
+    order: str
+    permutation: NDArray[np.intp]
+    misfit: dict[str, float]
+    strength: Floats
+    dead: NDArray[np.bool_]
+    points: int
+
+
+def check(
+    intensity: NDArray[np.floating],
+    light_directions: ArrayLike,
+    *,
+    valid: NDArray[np.bool_] | None = None,
+    names: Sequence[str] | None = None,
+    rng: np.random.Generator,
+) -> LightCheck:
+    """Compare a list of directions with the shading it should explain.
+
+    Parameters
+    ----------
+    intensity : ndarray, shape (N, ...)
+        Linear samples of one channel.
+    light_directions : array_like, shape (N, 3)
+        In the order to be checked.
+    valid : ndarray of bool, shape (N, ...) or (...), optional
+        Samples or points to use.
+    names : sequence of str, optional
+        Of the images, in their order here: then the order that sorting these as plain text gives
+        (1, 10, 11, 2) is tried too.
+    rng : Generator
+        Chooses the points that are looked at.
+
+    Returns
+    -------
+    LightCheck
+
+    Raises
+    ------
+    PhotometricStereoError
+        Where fewer than four lights gave light, or no point is lit by enough of them.
+    """
+    stack = np.asarray(intensity)
+    lights = stack.shape[0]
+    directions = np.asarray(light_directions, np.float64)
+    if directions.shape != (lights, 3):
+        raise PhotometricStereoError(
+            f"light_directions: got shape {directions.shape}, expected ({lights}, 3)"
+        )
+    samples, usable = _chosen(stack, valid, rng)
+    # a light from the side leaves most points dark, a dead one all of them
+    top = np.array(
+        [np.quantile(row[ok], 0.99) if ok.any() else 0.0
+         for row, ok in zip(samples, usable, strict=True)]
+    )  # fmt: skip
+    dead = ~(top > DEAD * float(np.median(top)))
+    if np.count_nonzero(~dead) < 4:
+        raise PhotometricStereoError(
+            f"intensity: got light from {np.count_nonzero(~dead)} of {lights} lights, expected at"
+            " least 4 to compare an order with the shading"
+        )
+    misfit: dict[str, float] = {}
+    orders = _orders(lights, names)
+    for name, permutation in orders.items():
+        misfit[name] = _misfit(samples, directions[permutation], usable, dead)
+    best = min(misfit, key=lambda name: misfit[name])
+    listed = misfit["as listed"]
+    order = best if misfit[best] < CLEARLY * listed else "as listed"
+    permutation = orders[order]
+    strength = _strength(samples, directions[permutation], usable, dead)
+    if misfit[order] > FITS:
+        order = "unknown"
+    return LightCheck(order, permutation, misfit, strength, dead, samples.shape[1])
+
+
+def _chosen(
+    stack: NDArray[np.floating], valid: NDArray[np.bool_] | None, rng: np.random.Generator
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return samples (N, P) of points of middling to full brightness, and which are usable."""
+    lights, shape = stack.shape[0], stack.shape[1:]
+    flat = stack.reshape(lights, -1)
+    mask = np.ones(flat.shape[1], bool)
+    each = None
+    if valid is not None:
+        given = np.asarray(valid)
+        if given.shape == shape:
+            mask = given.reshape(-1)
+        elif given.shape == (lights, *shape):
+            each = given.reshape(lights, -1)
+            mask = np.count_nonzero(each, axis=0) * 2 > lights
+        else:
+            raise PhotometricStereoError(
+                f"valid: got shape {given.shape}, expected {shape} or {(lights, *shape)}"
+            )
+    places = np.flatnonzero(mask)
+    if places.size > 20 * SAMPLE_POINTS:
+        places = np.sort(rng.choice(places, 20 * SAMPLE_POINTS, replace=False))
+    level = np.median(flat[:, places].astype(np.float64), axis=0)
+    level = np.where(np.isfinite(level), level, 0.0)
+    seen = level > 0
+    if not seen.any():
+        raise PhotometricStereoError("intensity: no point is lit by half of the lights")
+    places = places[seen & (level >= np.quantile(level[seen], 0.3))]
+    if places.size > SAMPLE_POINTS:
+        places = np.sort(rng.choice(places, SAMPLE_POINTS, replace=False))
+    samples = flat[:, places].astype(np.float64)
+    usable = np.isfinite(samples)
+    if each is not None:
+        usable &= each[:, places]
+    return np.where(usable, samples, 0.0), usable
+
+
+def _orders(lights: int, names: Sequence[str] | None) -> dict[str, NDArray[np.intp]]:
+    """Return what lists are mistaken for, each the list's row for every image."""
+    index = np.arange(lights, dtype=np.intp)
+    text = np.array(sorted(range(lights), key=str), np.intp)
+    inverse = np.empty_like(text)
+    inverse[text] = index
+    orders = {
+        "as listed": index,
+        "reversed": index[::-1].copy(),
+        "shifted by one": np.roll(index, 1),
+        "shifted by one backwards": np.roll(index, -1),
+        "sorted as text": text,
+        "sorted as numbers": inverse,
+        "every second one first": np.concatenate([index[::2], index[1::2]]),
+        "the halves exchanged": np.roll(index, lights // 2),
+    }
+    if names is not None:
+        by_name = np.array(sorted(range(lights), key=lambda k: names[k]), np.intp)
+        ranks = np.empty_like(by_name)
+        ranks[by_name] = index
+        orders["sorted by file name"] = ranks
+    distinct: dict[str, NDArray[np.intp]] = {}
+    for name, order in orders.items():
+        if not any(np.array_equal(order, known) for known in distinct.values()):
+            distinct[name] = order
+    return distinct
+
+
+def _fit(
+    samples: Floats, directions: Floats, usable: NDArray[np.bool_], dead: NDArray[np.bool_]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the shading fitted under living lights (N, P), and the points that have it."""
+    alive = ~dead
+    found = estimate_normals(samples[alive], directions[alive], valid=usable[alive], robust=True)
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.maximum(unit @ (found.normals * found.albedo[:, None]).T, 0.0), found.valid
+
+
+def _misfit(
+    samples: Floats, directions: Floats, usable: NDArray[np.bool_], dead: NDArray[np.bool_]
+) -> float:
+    shading, valid = _fit(samples, directions, usable, dead)
+    counted = usable & ~dead[:, None]
+    size = float(np.mean(samples[counted]))
+    # a point without a fit is explained by nothing
+    residual = np.where(valid[None], np.abs(samples - shading), samples)
+    return float(np.mean(residual[counted])) / size
+
+
+def _strength(
+    samples: Floats, directions: Floats, usable: NDArray[np.bool_], dead: NDArray[np.bool_]
+) -> Floats:
+    shading, valid = _fit(samples, directions, usable, dead)
+    strength = np.zeros(len(samples))
+    for light in np.flatnonzero(~dead):
+        seen = valid & usable[light] & (shading[light] > 0.2 * np.max(shading, axis=0))
+        if seen.any():
+            strength[light] = np.median(samples[light, seen] / shading[light, seen])
+    middle = np.median(strength[strength > 0]) if (strength > 0).any() else 1.0
+    return strength / middle

@@ -1,0 +1,1 @@
+"""The pipeline: recipes that turn a session into an appearance."""

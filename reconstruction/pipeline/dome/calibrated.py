@@ -1,0 +1,154 @@
+"""The dome as it is calibrated, or as drawn, with the images it took."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration import geometry
+from capture.calibration.geometry import CameraPose
+from capture.calibration.lights import LightTable
+from reconstruction.pipeline.dome.images import DomeImage, DomeImages
+from reconstruction.pipeline.evidence import Evidence
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dome:
+    """The dome as calibrated, or as drawn, with the images it took."""
+
+    images: DomeImages
+    cameras: tuple[CameraPose, ...]
+    table: LightTable
+    """The lights, one row for each of ``images.lights``."""
+    lights: LightTable
+    """One row for each of ``images.captures``."""
+    response: tuple[NDArray[np.float32], ...]
+    """Response of each camera at the pixels of its images, (h, w, 3)."""
+    absolute: bool
+    """Whether the lights' intensities are known, and so the albedo."""
+    tell: Callable[[str, float], None]
+    """Says how far a stage is."""
+
+    @property
+    def pixel_mm(self) -> float:
+        """Size of an image's pixel on the subject, mm."""
+        sizes = [
+            2.0 * float(np.linalg.norm(camera.center_mm)) / float(camera.matrix[0, 0])
+            for camera in self.cameras
+        ]
+        return float(np.median(sizes))
+
+    def image(self, view: int, capture: int) -> DomeImage:
+        """Return what a camera saw in one of ``images.captures``, freed of its own response."""
+        light, exposure = self.images.captures[capture]
+        image = self.images.image(self.images.views[view], light, exposure)
+        response = self.response[view]
+        return DomeImage(image.rgb / response, image.variance / response**2, image.valid)
+
+
+def seen_from(dome: Dome, rotation: NDArray[np.float64], shift_mm: NDArray[np.float64]) -> Dome:
+    """Return the dome in the frame of a mesh that stands in it at ``rotation @ p + shift_mm``.
+
+    Parameters
+    ----------
+    dome
+        In the rig frame.
+    rotation
+        (3, 3), from the mesh's frame to the rig's.
+    shift_mm
+        (3,).
+    """
+
+    def table(lights: LightTable) -> LightTable:
+        return dataclasses.replace(
+            lights,
+            position_mm=(lights.position_mm - shift_mm) @ rotation,
+            axis=lights.axis @ rotation,
+        )
+
+    cameras = tuple(
+        dataclasses.replace(
+            camera,
+            rotation=camera.rotation @ rotation,
+            translation_mm=camera.translation_mm + camera.rotation @ shift_mm,
+        )
+        for camera in dome.cameras
+    )
+    return dataclasses.replace(
+        dome, cameras=cameras, table=table(dome.table), lights=table(dome.lights)
+    )
+
+
+def calibrated(evidence: Evidence, images: DomeImages) -> Dome:
+    """Return the dome of a session's images; what no calibration says is taken as drawn.
+
+    Parameters
+    ----------
+    evidence
+        Session and calibrations; it notes what is assumed, and which lights are dead.
+    images
+        Those of the session that are to be used.
+
+    Raises
+    ------
+    CalibrationError
+        When a calibration is damaged, of another rig or device, or out of date.
+    """
+    rig = evidence.session.rig
+    views = [rig.view(name) for name in images.views]
+    serials = [view.serial for view in views]
+    found = evidence.load("geometry", serials, "the cameras stand as the rig's file draws them")
+    if found is None:
+        cameras = tuple(CameraPose.nominal(view) for view in views)
+    else:
+        poses = geometry.poses_from(found, rig.subset(views=images.views))
+        cameras = tuple(poses[view.name] for view in views)
+    lit = evidence.load(
+        "lights", images.lights,
+        "the lights stand and shine as the rig's file draws them; the albedo has no absolute scale",
+    )  # fmt: skip
+    lights_rig = rig.subset(lights=images.lights)
+    lights = LightTable.nominal(lights_rig)
+    # a calibration from spheres alone says nothing of strengths, one from the plate none of places
+    nominal: dict[str, str] = {}
+    if lit is not None:
+        lights = LightTable.from_calibration(lit, lights_rig)
+        nominal = {k: lit.notes[k] for k in ("positions", "intensities") if k in lit.notes}
+        evidence.assumed += [f"the lights' {what} are {why}" for what, why in nominal.items()]
+    dead = [name for name, good in zip(lights.names, lights.valid, strict=True) if not good]
+    if dead:
+        evidence.noted["lights_left_out"] = dead
+    response = tuple(_response(lights, camera) for camera in cameras)
+    absolute = lit is not None and "intensities" not in nominal
+    return Dome(images, cameras, lights, lights, response, absolute, evidence.tell)
+
+
+def apart(dome: Dome) -> Dome:
+    """Return the dome with each exposure an image of its own, as a moving head needs them."""
+    images = dome.images.apart()
+    order = [images.lights.index(light) for light, _ in images.captures]
+    names = [f"{name} {exposure}" for name, exposure in images.captures]
+    return dataclasses.replace(dome, images=images, lights=rows(dome.table, order, names))
+
+
+def rows(lights: LightTable, order: list[int], names: list[str]) -> LightTable:
+    """Return a table with the rows of another in a given order, also more than once."""
+    kept = {
+        field: getattr(lights, field)[order]
+        for field in (
+            "position_mm", "intensity", "exponent", "axis", "valid",
+            "position_stderr_mm", "intensity_stderr", "exponent_stderr",
+        )
+    }  # fmt: skip
+    return dataclasses.replace(lights, names=tuple(names), **kept)
+
+
+def _response(lights: LightTable, camera: CameraPose) -> NDArray[np.float32]:
+    width, height = camera.image_size
+    row, column = np.mgrid[0 : height // 2, 0 : width // 2]
+    pixels = 2.0 * np.stack([column, row], axis=-1) + 0.5
+    return lights.response(camera.serial, pixels, camera.image_size).astype(np.float32)

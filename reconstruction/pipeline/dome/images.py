@@ -1,0 +1,234 @@
+"""High-dynamic-range images of a dome session: one camera and one light at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture import hdr, raw
+from capture.session import FrameRecord, Session
+from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.pipeline.hold_out import NOTHING, HoldOut
+
+__all__ = ["DomeImage", "DomeImages", "SensorNoise"]
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class SensorNoise:
+    """Conversion gain, electrons per DN, and read noise, electrons rms, of one camera."""
+
+    gain: float
+    read_noise: float
+
+    @staticmethod
+    def of(frame: raw.RawFrame) -> SensorNoise:
+        """Read them off the frame's own noise profile.
+
+        Raises
+        ------
+        EvidenceError
+            Where the frame has none.
+        """
+        if frame.noise_profile is None:
+            raise EvidenceError(
+                f"{frame.path}: does not say how noisy the sensor is; calibrate the sensor"
+            )
+        scale, offset = frame.noise_profile
+        span = frame.white - float(np.mean(frame.black))
+        gain = 1.0 / max(scale * span, 1e-12)
+        return SensorNoise(gain, float(np.sqrt(offset)) * span * gain)
+
+
+@dataclass(frozen=True, slots=True)
+class DomeImage:
+    """What one camera sees by one light.
+
+    Attributes
+    ----------
+    rgb
+        (h, w, 3) float32, camera RGB, fraction of full scale per second of light at level 1;
+        one pixel for each 2 x 2 cell of the sensor.
+    variance
+        Of ``rgb``.
+    valid
+        (h, w) bool; False where every exposure is saturated.
+    """
+
+    rgb: Float32
+    variance: Float32
+    valid: NDArray[np.bool_]
+
+    @staticmethod
+    def from_sensor_px(pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return where positions on the sensor, (..., 2) column and row in px, lie in ``rgb``.
+
+        Examples
+        --------
+        >>> DomeImage.from_sensor_px(np.array([[0.5, 0.5], [2.5, 4.5]])).tolist()
+        [[0.0, 0.0], [1.0, 2.0]]
+        """
+        return (np.asarray(pixels, np.float64) - 0.5) / 2.0
+
+
+class DomeImages:
+    """Reads, and merges, the exposures of a dome session when an image is asked for; keeps none.
+
+    Parameters
+    ----------
+    session
+        Of the dome, open for reading.
+    noise
+        Calibrated gain and read noise by camera serial; a camera that is not named is taken at
+        the word of its own frames.
+    kind
+        "olat" for the subject; "white", "mirror" for targets with one light at a time.
+    merge
+        Whether the exposures of a light make one image. Those of a subject that moves do not:
+        they were taken seconds apart.
+    without
+        Names of lights and views whose frames are left out.
+
+    Attributes
+    ----------
+    views, lights
+        Names, in the rig's order, of those that the session holds frames of.
+    captures
+        The images that each view has: light and exposure, -1 for all of them merged.
+
+    Raises
+    ------
+    EvidenceError
+        When the session holds no such frames.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        noise: dict[str, SensorNoise] | None = None,
+        kind: str = "olat",
+        merge: bool = True,
+        without: HoldOut = NOTHING,
+    ) -> None:
+        self._session = session
+        self._noise = dict(noise or {})
+        self._kind, self._without = kind, without
+        self._shots: dict[tuple[str, str], list[FrameRecord]] = {}
+        for record in session.frames(kind):
+            key = record.camera, str(record.index["light"])
+            if without.holds(key[1], key[0]):
+                continue
+            self._shots.setdefault(key, []).append(record)
+        if not self._shots:
+            raise EvidenceError(f"{session.path}: has no frames of kind {kind!r}")
+        views = {view for view, _ in self._shots}
+        lights = {light for _, light in self._shots}
+        self.views = tuple(v.name for v in session.rig.views if v.name in views)
+        self.lights = tuple(x.name for x in session.rig.lights if x.name in lights)
+        exposures = sorted(
+            {int(r.index.get("exposure", 0)) for s in self._shots.values() for r in s}
+        )
+        kept = [-1] if merge else exposures
+        self.captures = tuple((light, exposure) for exposure in kept for light in self.lights)
+        self._darks: dict[str, tuple[Float32, Float32] | None] = {}
+
+    def apart(self) -> DomeImages:
+        """Return the same images with each exposure one of its own."""
+        return DomeImages(
+            self._session, noise=self._noise, kind=self._kind, merge=False, without=self._without
+        )
+
+    def times_s(self, view: str, light: str, exposure: int = -1) -> tuple[float, ...]:
+        """Return when the box lit the frames of an image, s on the box's clock.
+
+        Frames that no box lit, as imported ones, have NaN.
+        """
+        times = (record.line.t_box_s for record in self._of(view, light, exposure))
+        return tuple(math.nan if time is None else time for time in times)
+
+    def image(self, view: str, light: str, exposure: int = -1) -> DomeImage:
+        """Return what a camera sees by a light, the darks subtracted.
+
+        Parameters
+        ----------
+        view, light
+            Names.
+        exposure
+            Which one; -1 merges all.
+
+        Raises
+        ------
+        EvidenceError
+            Where the session lacks that image.
+        """
+        shots = self._of(view, light, exposure)
+        frames = [self._session.read(record) for record in shots]
+        levels = [float(record.settings.get("level", 1.0)) for record in shots]
+        values, variance, good = self._merge(view, frames, levels)
+        dark = self._dark(view)
+        if dark is not None:
+            values -= dark[0]
+            variance += dark[1]
+        linear = raw.interpolate(values, variance, good, frames[0].pattern, demosaic="centered")
+        return DomeImage(linear.rgb, linear.variance, linear.valid)
+
+    def _of(self, view: str, light: str, exposure: int) -> list[FrameRecord]:
+        shots = self._shots.get((view, light), [])
+        if exposure >= 0:
+            shots = [record for record in shots if record.index.get("exposure", 0) == exposure]
+        if not shots:
+            raise EvidenceError(f"{self._session.path}: lacks camera {view}, light {light}")
+        return shots
+
+    def _dark(self, view: str) -> tuple[Float32, Float32] | None:
+        """Return the rate of what is seen without any LED, and its variance."""
+        if view not in self._darks:
+            records = [r for r in self._session.frames("dark") if r.camera == view]
+            self._darks[view] = None
+            if records:
+                frames = [self._session.read(record) for record in records]
+                values, variance, _ = self._merge(view, frames, [1.0] * len(frames))
+                self._darks[view] = values, variance
+        return self._darks[view]
+
+    def _merge(
+        self, view: str, frames: Sequence[raw.RawFrame], levels: Sequence[float]
+    ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
+        """Merge mosaics to fractions of full scale per second at level 1."""
+        first = frames[0]
+        serial = self._session.rig.view(view).serial
+        noise = self._noise.get(serial) or SensorNoise.of(first)
+        times = []
+        for frame, level in zip(frames, levels, strict=True):
+            if frame.cfa.shape != first.cfa.shape or frame.pattern != first.pattern:
+                raise EvidenceError(f"{frame.path}: differs in size or pattern from {first.path}")
+            if frame.exposure_s is None:
+                raise EvidenceError(f"{frame.path}: does not say its exposure time")
+            times.append(frame.exposure_s * level)
+        values = np.zeros(first.cfa.shape, np.float32)
+        variance = np.zeros_like(values)
+        good = np.zeros(values.shape, bool)
+        # one black level for all colors, as a rule: then the mosaic is merged as a whole
+        whole = len(set(first.black)) == 1
+        for cell, black in enumerate(first.black[:1] if whole else first.black):
+            part = slice(cell // 2, None, 2), slice(cell % 2, None, 2)
+            part = (slice(None), slice(None)) if whole else part
+            rate, spread, valid = hdr.merge(
+                [frame.cfa[part] for frame in frames],
+                times,
+                gain=noise.gain,
+                read_noise=noise.read_noise,
+                black=black,
+                white=first.white,
+            )
+            span = np.float32(first.white - black)
+            values[part] = np.where(valid, rate / span, 0.0)
+            variance[part] = np.where(valid, spread / span**2, 0.0)
+            good[part] = valid
+        return values, variance, good

@@ -1,0 +1,82 @@
+"""Where a mesh of the face stands in the dome, from its images under one light each."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.pipeline.dome.calibrated import Dome, rows
+from reconstruction.pipeline.evidence import EvidenceError
+from reconstruction.scan import registration as scan_registration
+from reconstruction.scan.registration import RigidFit
+from reconstruction.scan.repair import TriangleMesh
+
+ALIGNING_LIGHTS: Final = 40
+"""Lights whose images say where the mesh is."""
+SIGNAL: Final = 5.0
+"""Times its noise from which on a pixel shows something."""
+
+
+def register(dome: Dome, mesh: TriangleMesh) -> RigidFit:
+    """Lay a mesh onto the images of a dome; see `reconstruction.scan.registration.align`.
+
+    Parameters
+    ----------
+    dome
+        Calibrated, with its images.
+    mesh
+        Clean, within about 10 mm and 5 degrees of where the face is.
+
+    Raises
+    ------
+    EvidenceError
+        No light stands before the face, or the mesh is not found in the images.
+    """
+    chosen = spread(dome.lights.position_mm, dome.lights.valid, ALIGNING_LIGHTS)
+    shares = []
+
+    def stacks(view: int) -> NDArray[np.float32]:
+        layers = []
+        for capture in chosen:
+            image = dome.image(view, capture)
+            gray = image.rgb.mean(axis=-1)
+            noise = np.sqrt(image.variance.sum(axis=-1)) / 3.0
+            seen = image.valid & (gray > SIGNAL * noise)
+            shares.append((np.mean(~image.valid), np.mean(seen)))
+            layers.append(np.where(image.valid, gray, np.nan))
+        return np.asarray(layers, np.float32)
+
+    try:
+        return scan_registration.align(
+            mesh,
+            cameras=dome.cameras,
+            lights=rows(dome.lights, chosen, [dome.lights.names[k] for k in chosen]),
+            stacks=stacks,
+            binning=2,
+            rng=np.random.default_rng(0),
+        )
+    except scan_registration.RegistrationError as exc:
+        lost, seen = 100.0 * np.mean(shares, axis=0)
+        raise EvidenceError(
+            f"surface: the scan was not found in the images: {exc}; {lost:.1f} % of their pixels "
+            f"are saturated in every exposure, {seen:.1f} % are brighter than their noise"
+        ) from exc
+
+
+def spread(position_mm: NDArray[np.float64], usable: NDArray[np.bool_], count: int) -> list[int]:
+    """Choose lights that light the face, each next one the farthest from those before."""
+    way = position_mm / np.linalg.norm(position_mm, axis=1, keepdims=True)
+    front = np.flatnonzero(usable & (way[:, 2] > -0.1))
+    if not len(front):
+        raise EvidenceError("lights: none that can be used stands before the face")
+    chosen = [int(front[np.argmax(way[front, 2])])]
+    nearest = way[front] @ way[chosen[0]]
+    while len(chosen) < min(count, len(front)):
+        best = int(front[np.argmin(nearest)])
+        if best in chosen:
+            break
+        chosen.append(best)
+        nearest = np.maximum(nearest, way[front] @ way[best])
+    return chosen

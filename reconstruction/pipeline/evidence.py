@@ -1,0 +1,206 @@
+"""What a reconstruction stands on: a session, its calibrations, what is assumed without them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from capture.calibration import store as calibration_store
+from capture.calibration.record import KINDS
+from capture.session import Session
+from reconstruction.pipeline.hold_out import NOTHING, HoldOut
+
+TELL_S = 5.0
+"""Seconds between two lines about the same stage."""
+
+
+class EvidenceError(ValueError):
+    """A session that cannot be reconstructed as asked."""
+
+
+@dataclass(slots=True)
+class Evidence:
+    """A session and a folder of calibrations; keeps account of what was read and what assumed.
+
+    Attributes
+    ----------
+    session
+        Open for reading.
+    calibration
+        CALIBRATION/ folder; None: everything is assumed.
+    state
+        Which state of the subject.
+    repeat
+        Which of its repeats; None: all of them together.
+    on_date
+        The date that calibrations must be valid on.
+    assumed
+        What was taken for granted for want of a calibration, one line each.
+    scan
+        PLY of the face in mm that takes the place of the session's own; None: the session's.
+    basis
+        Folder of MERL tables to fit surface lobes with; None: the generated dielectrics.
+    landmarks
+        Table of places on the face's texture; None: those that are known.
+    hold_out
+        Lights and views of a dome that no fit may see.
+    rank
+        Common lobes of a dome's points; None: as many as usual.
+    hashes
+        SHA-256 of everything that was read, by what it is.
+    noted
+        JSON values that belong into the record of the maps.
+    progress
+        Called with a line of text now and then while a stage runs.
+    """
+
+    session: Session
+    calibration: Path | None
+    state: str
+    on_date: date
+    scan: bytes | None = None
+    basis: Path | None = None
+    landmarks: Path | None = None
+    repeat: int | None = None
+    hold_out: HoldOut = NOTHING
+    rank: int | None = None
+    assumed: list[str] = field(default_factory=list)
+    hashes: dict[str, str] = field(default_factory=dict)
+    noted: dict[str, Any] = field(default_factory=dict)
+    progress: Callable[[str], None] | None = None
+    _told_at: float = 0.0
+
+    def tell(self, stage: str, done: float) -> None:
+        """Say how far a stage is, 0 to 1, every few seconds at most."""
+        now = time.monotonic()
+        if self.progress is not None and now - self._told_at >= TELL_S:
+            self._told_at = now
+            self.progress(f"{stage}: {100 * done:.0f} %")
+
+    @staticmethod
+    def of(
+        session: Session,
+        calibration: str | Path | None,
+        *,
+        state: str,
+        on_date: date | None,
+        scan: str | Path | None = None,
+        basis: str | Path | None = None,
+        landmarks: str | Path | None = None,
+    ) -> Evidence:
+        """Begin with what the session itself says that it assumed.
+
+        Raises
+        ------
+        EvidenceError
+            When ``calibration`` or ``basis`` is no folder, the first holds no calibration or
+            those of other rigs alone, or ``scan`` is no PLY.
+        """
+        if calibration is not None and not Path(calibration).is_dir():
+            raise EvidenceError(
+                f"calibration: {calibration} is no folder; `skinrig calibrate` makes one"
+            )
+        if calibration is not None:
+            _require_some(Path(calibration), session.rig.name)
+        hashes = {"session": session.content_hash}
+        mesh = None if scan is None else Path(scan).read_bytes()
+        if mesh is not None and not mesh.startswith(b"ply"):
+            raise EvidenceError(
+                f"scan: got no PLY mesh in {scan}; `skinrig import mesh` takes .obj and .ply"
+            )
+        if mesh is not None:
+            hashes["scan"] = hashlib.sha256(mesh).hexdigest()
+        tables = None if basis is None else Path(basis)
+        if tables is not None:
+            hashes["basis"] = _digest_of(tables)
+        places = None if landmarks is None else Path(landmarks)
+        if places is not None:
+            hashes["landmarks"] = hashlib.sha256(places.read_bytes()).hexdigest()
+        return Evidence(
+            session=session,
+            calibration=None if calibration is None else Path(calibration),
+            state=state,
+            on_date=on_date or session.manifest.created_at.date(),
+            assumed=[str(text) for text in session.manifest.extra.get("assumed", [])],
+            scan=mesh,
+            basis=tables,
+            landmarks=places,
+            hashes=hashes,
+        )
+
+    def load(
+        self, kind: str, serials: Sequence[str], otherwise: str
+    ) -> calibration_store.Calibration | None:
+        """Return the calibration of a kind, or None and note what is assumed instead.
+
+        Parameters
+        ----------
+        kind
+            "white", "color", "geometry", ...
+        serials
+            Devices that it must be of.
+        otherwise
+            What is assumed where the folder holds none of that kind.
+
+        Raises
+        ------
+        CalibrationError
+            When it is damaged, of another rig or device, or out of date.
+        """
+        if self.calibration is not None:
+            try:
+                found = calibration_store.load(self.calibration, kind)
+            except calibration_store.CalibrationMissing:
+                pass
+            else:
+                calibration_store.require(
+                    found,
+                    rig=self.session.rig.name,
+                    serials=list(serials),
+                    on_date=self.on_date,
+                    kind=kind,
+                )
+                content = (self.calibration / f"{kind}.json").read_bytes()
+                self.hashes[f"calibration {kind}"] = hashlib.sha256(content).hexdigest()
+                return found
+        self.assumed.append(otherwise)
+        return None
+
+
+def _require_some(folder: Path, rig: str) -> None:
+    """Refuse a folder without a calibration of a rig: else everything would be assumed."""
+    files = [path for kind in KINDS if (path := folder / f"{kind}.json").is_file()]
+    if not files:
+        raise EvidenceError(
+            f"calibration: {folder} holds none, expected {', '.join(KINDS)} or some of them "
+            "(.json); `skinrig calibrate` makes them"
+        )
+    rigs = set()
+    for path in files:
+        try:
+            rigs.add(str(json.loads(path.read_bytes())["rig"]))
+        except (ValueError, KeyError, TypeError):
+            return  # what is wrong with it is said where it is needed
+    if rig not in rigs:
+        raise EvidenceError(
+            f"calibration: those in {folder} were made on rig {', '.join(sorted(rigs))}, the "
+            f"session is of rig {rig}; leave --calibration out, or give that rig's folder"
+        )
+
+
+def _digest_of(folder: Path) -> str:
+    """Return the hash of a folder's tables, their names and contents."""
+    if not folder.is_dir():
+        raise EvidenceError(f"basis: {folder} is no folder; give one with MERL .binary files")
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.binary")):
+        digest.update(path.name.encode() + b"\0")
+        with open(path, "rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()

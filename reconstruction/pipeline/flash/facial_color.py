@@ -1,0 +1,439 @@
+"""A hemoglobin rig from a subject's flash sessions: align, invert together, take statistics.
+
+Every image is laid over the first neutral one; repeats of a state are averaged; all states share
+one melanin; the blood that is left makes the rig of `model.facial_color`.
+
+References
+----------
+Jimenez et al. 2010, doi:10.1145/1866158.1866167, sections 3 and 4
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import color_table
+from model.facial_color import HemoglobinRig
+from model.skin import UNITS, SkinMap
+from model.tissue_optics.layers import ANISOTROPY_SKIN
+from reconstruction.chromophores import model_error, shading_prior
+from reconstruction.chromophores.detectability import detectable
+from reconstruction.correspondence import expression_alignment
+from reconstruction.correspondence.expression_alignment import Alignment
+from reconstruction.facial_color import registration_error as misplacement
+from reconstruction.facial_color import repeat_average, repeatability, shared_melanin
+from reconstruction.facial_color.repeatability import Drift, Repeatability, RepeatabilityError
+from reconstruction.facial_color.shared_melanin import SharedMelanin
+from reconstruction.pipeline.flash.stages import EXPOSURE_SPREAD
+from reconstruction.pipeline.flash.state_images import NEUTRAL, Landmarks, StateImage, Subject
+
+Mask = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+
+CORRELATED_PX: Final = 3.0
+"""Pixels whose noise goes together after demosaicing and interpolation."""
+RADIUS_SHARE: Final = 1 / 32
+"""Radius of the disc over the larger side of the map, where none is given."""
+
+
+class FacialColorFitError(ValueError):
+    """Sessions that no hemoglobin rig can be fitted to."""
+
+
+class UnknownBloodError(FacialColorFitError):
+    """Skin whose colors nowhere tell its blood at rest."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlignedImage:
+    """One image laid over the neutral one.
+
+    Attributes
+    ----------
+    image
+        Where it comes from.
+    rgb, variance
+        (H, W, 3): diffuse reflectance and its variance; 0 where not ``valid``.
+    valid
+        (H, W).
+    alignment
+        How it was laid over; None for the image that the others are laid over.
+    """
+
+    image: StateImage
+    rgb: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    valid: Mask
+    alignment: Alignment | None
+
+
+@dataclass(frozen=True, slots=True)
+class Repeats:
+    """How far repeats of states agree, each image inverted by itself.
+
+    Attributes
+    ----------
+    hemoglobin
+        Repeats against states.
+    melanin_drift
+        Of melanin over the time of capture, by region; empty where it cannot be told.
+    """
+
+    hemoglobin: Repeatability
+    melanin_drift: tuple[Drift, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FacialColorFit:
+    """What sessions of one subject give.
+
+    Attributes
+    ----------
+    rig
+        Of all states.
+    melanin
+        Shared by the states; its standard error holds noise and model error.
+    hemoglobin
+        Blood of each state over the neutral image, with standard errors.
+    changes
+        Blood of each state less the neutral, with the standard error of the difference.
+    aligned
+        Every image.
+    shared
+        The joint inversion.
+    repeats
+        How far states repeat; None where none was captured twice.
+    left_out
+        What was not used, and why.
+    """
+
+    rig: HemoglobinRig
+    melanin: SkinMap
+    hemoglobin: Mapping[str, SkinMap]
+    changes: Mapping[str, SkinMap]
+    aligned: tuple[AlignedImage, ...]
+    shared: SharedMelanin
+    repeats: Repeats | None
+    left_out: tuple[tuple[str, str], ...]
+
+
+def fit(
+    subject: Subject,
+    *,
+    radius_px: float | None = None,
+    landmarks: Mapping[str, Landmarks] | None = None,
+    stored_size: int | None = 256,
+    progress: Callable[[str], None] | None = None,
+) -> FacialColorFit:
+    """Fit the hemoglobin rig of a subject.
+
+    Parameters
+    ----------
+    subject
+        Images of at least the neutral and one other state.
+    radius_px
+        Radius of the disc of eq. (1), px of the maps; None: a 32nd of the larger side.
+    landmarks
+        Named points of each state's images, px of the maps; None: features are matched. A state
+        without any is laid over by features.
+    stored_size
+        Cells a side of the stored scale and bias maps.
+    progress
+        Called with one line a step.
+
+    Returns
+    -------
+    FacialColorFit
+
+    Raises
+    ------
+    FacialColorFitError
+        When there is no state beside the neutral, or none that can be laid over it.
+    """
+    states = subject.states
+    if len(states) < 2:
+        raise FacialColorFitError(
+            "sessions: show the neutral state alone, expected at least one other to make a rig of"
+        )
+    tell = progress or (lambda _: None)
+    base = subject.of(NEUTRAL)[0]
+    shape = base.maps["diffuse"].values.shape[:2]
+    radius = max(shape) * RADIUS_SHARE if radius_px is None else radius_px
+    aligned, left_out = _align(subject, base, landmarks or {}, tell)
+    kept = [state for state in states if any(one.image.state == state for one in aligned)]
+    if len(kept) < 2:
+        reasons = "; ".join(f"{what}: {why}" for what, why in left_out)
+        raise FacialColorFitError(f"sessions: no state could be laid over the neutral: {reasons}")
+    tell("one melanin for all states")
+    of_states = [[one for one in aligned if one.image.state == state] for state in kept]
+    averages = [_average(images) for images in of_states]
+    table = color_table.build(subject.camera, subject.illuminant, anisotropy=ANISOTROPY_SKIN)
+    prior = shading_prior.of_faces()
+    if not subject.has_white:
+        prior = prior.broadened(EXPOSURE_SPREAD)
+    shared = shared_melanin.weigh(
+        np.stack([average[0] for average in averages]),
+        table,
+        prior=prior,
+        variance=np.stack([average[1] for average in averages]),
+        model_error=_model_error(averages),
+        own_error=np.stack([_own_error(images) for images in of_states]),
+        valid=np.stack([average[2] for average in averages]),
+        shading_window_px=shared_melanin.SHADING_WINDOW_PX,
+        one_face=subject.has_white,
+    )
+    blood = {state: _blood(shared, k) for k, state in enumerate(kept)}
+    if not _valid(blood[NEUTRAL]).any():
+        raise UnknownBloodError(
+            "blood at rest: expected pixels that tell it, got a standard error of more than half "
+            "of it all over the face, as of very dark skin or little light; take more light, or "
+            "melanin alone: skinrig reconstruct --want melanin"
+        )
+    tell("scale and bias maps")
+    rig = HemoglobinRig.from_maps(
+        np.where(_valid(blood[NEUTRAL]), blood[NEUTRAL].values, np.nan),
+        {
+            state: np.where(_valid(blood[state]), blood[state].values, np.nan)
+            for state in kept
+            if state != NEUTRAL
+        },
+        radius_px=radius,
+        valid={state: _valid(blood[state]) for state in kept},
+        stderr={
+            state: np.where(
+                _valid(blood[state]), shared.noise_stderr_hemoglobin[kept.index(state)], np.nan
+            )
+            for state in kept
+        },
+        stored_size=stored_size,
+    )
+    good = detectable(shared.melanin, shared.stderr_melanin, shared.valid)
+    melanin = SkinMap(
+        np.where(good, shared.melanin, 0.0), UNITS["melanin"],
+        np.where(good, shared.stderr_melanin, 0.0), good, f"shared by {len(kept)} states",
+    )  # fmt: skip
+    return FacialColorFit(
+        rig=rig,
+        melanin=melanin,
+        hemoglobin=blood,
+        changes={state: _change(shared, k) for k, state in enumerate(kept) if state != NEUTRAL},
+        aligned=tuple(aligned),
+        shared=shared,
+        repeats=_repeats(aligned, timed=subject.timed),
+        left_out=tuple(left_out),
+    )
+
+
+def _align(
+    subject: Subject,
+    base: StateImage,
+    landmarks: Mapping[str, Landmarks],
+    tell: Callable[[str], None],
+) -> tuple[list[AlignedImage], list[tuple[str, str]]]:
+    """Lay every image over the first neutral one."""
+    found: list[AlignedImage] = []
+    left_out: list[tuple[str, str]] = []
+    fixed = base.maps["diffuse"]
+    for image in subject.images:
+        diffuse = image.maps["diffuse"]
+        if image is base:
+            found.append(_aligned(image, diffuse, None))
+            continue
+        tell(f"lay {image.name} over the neutral image")
+        marks = landmarks.get(image.state), landmarks.get(NEUTRAL)
+        both = marks[0] is not None and marks[1] is not None
+        try:
+            alignment = expression_alignment.align(
+                _light(diffuse), _light(fixed),
+                landmarks_moving=marks[0] if both else None,
+                landmarks_neutral=marks[1] if both else None,
+                valid_moving=_valid(diffuse), valid_neutral=_valid(fixed),
+            )  # fmt: skip
+        except expression_alignment.AlignmentError as error:
+            left_out.append((image.name, str(error)))
+            continue
+        found.append(_aligned(image, alignment.warp_map(diffuse, place=False), alignment))
+    return found, left_out
+
+
+def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
+    """Compare repeats; None where no state has any, or too little of the face is known in all."""
+    states = [one.image.state for one in aligned]
+    if len(set(states)) == len(states) or "hemoglobin" not in aligned[0].image.maps:
+        return None
+
+    def over(name: str) -> tuple[NDArray[np.float32], NDArray[np.float32], Mask]:
+        values, errors, good = [], [], []
+        for one in aligned:
+            found, noise = one.image.maps[name], one.image.maps[f"{name}_noise_stderr"]
+            both, error = (found.values, _valid(found)), noise.values
+            if one.alignment is not None:
+                error = one.alignment.warp_stderr(found.values, noise.values, _valid(found))
+                both = one.alignment.warp(*both)
+            values.append(both[0])
+            errors.append(error)
+            good.append(both[1])
+        return np.stack(values), np.stack(errors), np.stack(good)
+
+    blood, blood_error, blood_good = over("hemoglobin")
+    melanin, melanin_error, melanin_good = over("melanin")
+    try:
+        compared = repeatability.compare(
+            blood, states, stderr=blood_error, valid=blood_good, correlated_px=CORRELATED_PX
+        )
+    except RepeatabilityError:
+        return None
+    if not timed:
+        return Repeats(compared, ())
+    try:
+        drifts = repeatability.drift(
+            melanin, states, [one.image.captured_s for one in aligned], stderr=melanin_error,
+            valid=melanin_good, correlated_px=CORRELATED_PX,
+        )  # fmt: skip
+    except RepeatabilityError:
+        drifts = ()
+    return Repeats(compared, drifts)
+
+
+def _light(diffuse: SkinMap) -> NDArray[np.float32]:
+    return np.where(_valid(diffuse)[..., None], diffuse.values, np.nan).astype(np.float32)
+
+
+def _aligned(image: StateImage, diffuse: SkinMap, alignment: Alignment | None) -> AlignedImage:
+    stderr = np.zeros_like(diffuse.values) if diffuse.stderr is None else diffuse.stderr
+    good = _valid(diffuse) & (diffuse.values > 0).all(axis=-1)
+    return AlignedImage(
+        image, np.where(good[..., None], diffuse.values, 0.0),
+        np.where(good[..., None], stderr**2, 0.0), good, alignment,
+    )  # fmt: skip
+
+
+def _average(
+    images: list[AlignedImage],
+) -> tuple[NDArray[np.float32], NDArray[np.float32], Mask]:
+    return repeat_average.average(
+        np.stack([one.rgb for one in images]),
+        np.stack([one.variance for one in images]),
+        np.stack([one.valid for one in images]),
+    )
+
+
+def _model_error(averages: list[tuple[NDArray[np.float32], NDArray[np.float32], Mask]]) -> Floats:
+    """Return each pixel's model error: the mean of what those states tell that show it."""
+    total = np.zeros((*averages[0][2].shape, 3, 3))
+    count = np.zeros(averages[0][2].shape)
+    for rgb, variance, valid in averages:
+        good = model_error.usable_pixels(rgb, valid)
+        total += np.where(good[..., None, None], model_error.of_picture(rgb, variance, valid), 0.0)
+        count += good
+    mean = total / np.maximum(count, 1.0)[..., None, None]
+    return np.where((count > 0)[..., None, None], mean, model_error.color_errors().transport)
+
+
+def _own_error(images: list[AlignedImage]) -> Floats:
+    """Return what a state's mean color errs by as its images were laid over another.
+
+    Repeats move alike and err alike: their mean errs as one of them.
+    """
+    total = np.zeros((*images[0].valid.shape, 3, 3))
+    count = np.zeros(images[0].valid.shape)
+    for one in images:
+        count += one.valid
+        if one.alignment is not None:
+            total += misplacement.own_error(
+                one.rgb, one.variance, one.valid, one.alignment,
+                light_window_px=shared_melanin.SHADING_WINDOW_PX,
+            )  # fmt: skip
+    return np.asarray(total / np.maximum(count, 1.0)[..., None, None])
+
+
+def _blood(shared: SharedMelanin, k: int) -> SkinMap:
+    good = shared.valid_states[k] & ~shared.misfits[k]
+    good &= detectable(shared.hemoglobin[k], shared.stderr_hemoglobin[k], good)
+    return SkinMap(
+        np.where(good, shared.hemoglobin[k], 0.0), UNITS["hemoglobin"],
+        np.where(good, shared.stderr_hemoglobin[k], 0.0), good,
+        "given the melanin that all states share",
+    )  # fmt: skip
+
+
+def _change(shared: SharedMelanin, k: int) -> SkinMap:
+    both = shared.valid_states[k] & shared.valid_states[shared.reference]
+    good = both & ~shared.misfits[k] & np.isfinite(shared.stderr_change[k])
+    return SkinMap(
+        np.where(good, shared.change[k], 0.0), UNITS["hemoglobin"],
+        np.where(good, shared.stderr_change[k], 0.0), good,
+        "less the neutral state; errors that both share are left out",
+    )  # fmt: skip
+
+
+def _valid(skin_map: SkinMap) -> Mask:
+    shape = skin_map.values.shape[:2]
+    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
+
+
+def alignment_document(fit: FacialColorFit) -> list[dict[str, Any]]:
+    """Return how each image was laid over the neutral one, as JSON values."""
+    rows = []
+    for one in fit.aligned:
+        if one.alignment is None:
+            continue
+        found = one.alignment
+        error = found.error_px[found.valid]
+        rows.append(
+            {
+                "state": one.image.state,
+                "repeat": one.image.repeat,
+                "session": one.image.session,
+                "by": found.by,
+                "landmark_rms_px": _number(found.landmark_rms_px),
+                "median_error_px": _number(np.median(error)) if error.size else None,
+                "folded_fraction": found.folded_fraction,
+                "valid_fraction": float(found.valid.mean()),
+            }
+        )
+    return rows
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def repeats_document(fit: FacialColorFit) -> dict[str, Any] | None:
+    """Return how far states repeat, as JSON values; None where nothing was repeated."""
+    if fit.repeats is None:
+        return None
+    regions = [
+        {
+            "region": one.name,
+            "pixels": one.pixels,
+            "within": one.within,
+            "between": one.between,
+            "correlation": _number(one.correlation),
+            "correlation_stderr": _number(one.correlation_stderr),
+            "p_value": one.p_value,
+            "scatters": bool(one.scatters),
+            "change_to_scatter": _number(one.change_to_scatter),
+        }
+        for one in fit.repeats.hemoglobin.regions
+    ]
+    drifts = [
+        {
+            "region": one.name,
+            "slope_per_minute": one.slope_per_minute,
+            "slope_stderr": one.slope_stderr,
+            "p_value": one.p_value,
+            "drifts": bool(one.drifts),
+        }
+        for one in fit.repeats.melanin_drift
+    ]
+    return {
+        "false_alarm": fit.repeats.hemoglobin.false_alarm,
+        "hemoglobin": regions,
+        "melanin_drift": drifts,
+    }

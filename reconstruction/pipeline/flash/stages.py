@@ -1,0 +1,403 @@
+"""The flash rig's stages: parallel and crossed frames to chromophores and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture import raw
+from capture.calibration.color import ColorMatrix
+from capture.calibration.color.matrix import from_calibration as color_matrix_from
+from capture.calibration.color.white import WhiteReference
+from capture.calibration.polarization import PolarizationCalibration
+from capture.calibration.sensor import SensorCalibration
+from capture.calibration.sensor.noise_model import QUANTIZATION_DN2
+from capture.session import FrameRecord, Session
+from model import color_table
+from model.skin import UNITS, SkinMap
+from model.tissue_optics.layers import ANISOTROPY_SKIN
+from reconstruction import polarization
+from reconstruction.chromophores import dark_spots, model_error, shading_prior, tsumura
+from reconstruction.chromophores import face as face_chromophores
+from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores.detectability import detectable
+from reconstruction.pipeline import graph as stages
+from reconstruction.pipeline.evidence import Evidence, EvidenceError
+
+REVISION = 7
+"""Grows when the code of a stage changes its result, so that older maps are computed again."""
+
+MAPS = (
+    "melanin", "hemoglobin", "shading", "residual", "gamut_distance",
+    "diffuse", "specular", "picture", "specular_picture",
+    "tsumura_melanin", "tsumura_hemoglobin",
+    "melanin_noise_stderr", "hemoglobin_noise_stderr",
+)  # fmt: skip
+"""Maps that can be made of a flash session."""
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """Linear light on superpixels: rgb and variance (H, W, 3), valid (H, W)."""
+
+    rgb: Float32
+    variance: Float32
+    valid: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """What the stages read, and what they have to assume for want of a calibration."""
+
+    session: Session
+    state: str
+    repeat: int | None
+    sensor: SensorCalibration | None
+    white: WhiteReference | None
+    polarization: PolarizationCalibration | None
+    color: ColorMatrix | None
+    neutral: NDArray[np.float64] | None
+    """Camera RGB of a white surface, as the color matrix was fitted to."""
+    camera: str
+    """Name of the spectral sensitivities that the color table is built for."""
+    illuminant: str
+    hashes: Mapping[str, str]
+
+
+def graph(evidence: Evidence) -> list[stages.Stage]:
+    """Return the stages that a flash session can go through; see `stages.run`."""
+    inputs = inputs_of(evidence)
+    base = {"revision": REVISION, "inputs": dict(sorted(inputs.hashes.items()))}
+    table = base | {"camera": inputs.camera, "illuminant": inputs.illuminant}
+    return [
+        stages.Stage(
+            "frames", (), ("parallel", "crossed"), lambda: _frames(inputs),
+            base | {"state": inputs.state, "repeat": inputs.repeat},
+        ),
+        stages.Stage(
+            "separation", ("parallel", "crossed"), ("diffuse", "specular"),
+            lambda parallel, crossed: _separate(inputs, parallel, crossed), base,
+        ),
+        stages.Stage(
+            "chromophores", ("diffuse",),
+            ("melanin", "hemoglobin", "shading", "residual", "gamut_distance",
+             "melanin_noise_stderr", "hemoglobin_noise_stderr"),
+            lambda diffuse: _chromophores(inputs, diffuse), table | model_error.identity(),
+        ),
+        stages.Stage(
+            "tsumura", ("diffuse",), ("tsumura_melanin", "tsumura_hemoglobin"),
+            lambda diffuse: _tsumura(diffuse), base,
+        ),
+        stages.Stage(
+            "pictures", ("diffuse", "specular"), ("picture", "specular_picture"),
+            lambda diffuse, specular: _pictures(inputs, diffuse, specular), table,
+        ),
+    ]  # fmt: skip
+
+
+def inputs_of(evidence: Evidence) -> Inputs:
+    """Return what the stages of a flash session read, and note what is assumed."""
+    session = evidence.session
+    shots = session.frames("subject", state=evidence.state)
+    view = session.rig.view(shots[0].camera) if shots else session.rig.views[0]
+    imported = "photographs" in session.manifest.extra
+
+    sensor = evidence.load(
+        "sensor", [view.serial], "the frames are as noisy as they say of themselves"
+    )
+    white = evidence.load(
+        "white",
+        [view.serial],
+        "the light is even and white is what the file's own white balance says"
+        if imported
+        else "the light is even and a white tile would fill 80 % of the range",
+    )
+    malus = evidence.load("polarization", [view.serial], "the polarizers are perfect")
+    matrix = evidence.load(
+        "color", [view.serial], "pictures show balanced camera RGB as if it were linear sRGB"
+    )
+    illuminant = session.rig.lights[0].illuminant
+    evidence.noted["color_table"] = {
+        "camera": view.spectral_sensitivity, "illuminant": illuminant
+    }  # fmt: skip
+    return Inputs(
+        session=session,
+        state=evidence.state,
+        repeat=evidence.repeat,
+        sensor=SensorCalibration.from_calibration(sensor, view.serial) if sensor else None,
+        white=WhiteReference.from_calibration(white, view.serial) if white else None,
+        polarization=PolarizationCalibration.from_calibration(malus, view.serial)
+        if malus
+        else None,
+        color=color_matrix_from(matrix, view.serial) if matrix else None,
+        neutral=matrix.quantity(view.serial, "white_rgb").value if matrix else None,
+        camera=view.spectral_sensitivity,
+        illuminant=illuminant,
+        hashes=evidence.hashes,
+    )
+
+
+def _frames(inputs: Inputs) -> Mapping[str, Any]:
+    """Average the repeats of each polarizer state and subtract the darks."""
+    session = inputs.session
+    linear_light, dark, dark_variance = _light_without_darks(inputs)
+    images: dict[str, Image | None] = {}
+    for polarizer in ("parallel", "crossed"):
+        which: dict[str, str | int | float] = {"state": inputs.state, "polarizer": polarizer}
+        if inputs.repeat is not None:
+            which["repeat"] = inputs.repeat
+        shots = session.frames("subject", **which)
+        linear = [linear_light(record) for record in shots]
+        if not linear:
+            images[polarizer] = None
+            continue
+        if any(image.rgb.shape != linear[0].rgb.shape for image in linear):
+            raise EvidenceError(f"{polarizer} frames: differ in size, expected one camera setting")
+        power = [float(record.settings.get("power", 1.0)) for record in shots]
+        total = sum(power)
+        rgb: NDArray[Any] = np.asarray(
+            np.sum([image.rgb for image in linear], axis=0, dtype=np.float64)
+        )
+        rgb -= len(linear) * dark
+        variance: NDArray[Any] = np.asarray(
+            np.sum([image.variance for image in linear], axis=0, dtype=np.float64)
+        )
+        variance += len(linear) ** 2 * dark_variance
+        images[polarizer] = Image(
+            (rgb / total).astype(np.float32),
+            (variance / total**2).astype(np.float32),
+            np.logical_and.reduce([image.valid for image in linear]),
+        )
+    if images["crossed"] is None:
+        crossed = session.frames("subject", polarizer="crossed")
+        states = sorted({str(record.index.get("state")) for record in crossed})
+        lacking = f"has no crossed frame of state {inputs.state!r}"
+        if "photographs" in session.manifest.extra:  # whose polarizers nobody was asked for
+            lacking = f"has no photograph of state {inputs.state!r}"
+        there = "none at all: is it finished?"
+        if states:
+            there = f"those of {', '.join(states)}: choose one of them (--state {states[0]})"
+        raise EvidenceError(f"{session.path}: {lacking}; it has {there}")
+    return images
+
+
+def _light_without_darks(
+    inputs: Inputs,
+) -> tuple[
+    Callable[[FrameRecord], raw.LinearImage],
+    NDArray[np.float64] | float,
+    NDArray[np.float64] | float,
+]:
+    """Return how to read a frame's light, and the mean dark frame with its variance."""
+    session = inputs.session
+    # the cells of an imported picture are its pixels; a sensor's sites stand beside each other
+    imported = "photographs" in session.manifest.extra
+    demosaic: raw.Demosaic = "superpixel" if imported else "centered"
+    gain, read_noise = _noise(inputs.sensor)
+
+    def linear_light(record: FrameRecord) -> raw.LinearImage:
+        frame = session.read(record)
+        return raw.linear_rgb(frame, demosaic=demosaic, gain=gain, read_noise=read_noise)
+
+    darks = [linear_light(record) for record in session.frames("dark")]
+    if not darks:
+        return linear_light, 0.0, 0.0
+    dark = np.mean([d.rgb for d in darks], axis=0, dtype=np.float64)
+    dark_variance = np.mean([d.variance for d in darks], axis=0, dtype=np.float64) / len(darks)
+    return linear_light, dark, dark_variance
+
+
+def diffuse_of_each(inputs: Inputs, records: Sequence[FrameRecord]) -> Iterator[SkinMap]:
+    """Yield the diffuse reflectance that each of some crossed frames shows alone."""
+    linear_light, dark, dark_variance = _light_without_darks(inputs)
+    for record in records:
+        image = linear_light(record)
+        power = float(record.settings.get("power", 1.0))
+        crossed = Image(
+            ((image.rgb - dark) / power).astype(np.float32),
+            ((image.variance + dark_variance) / power**2).astype(np.float32),
+            image.valid,
+        )
+        yield _separate(inputs, None, crossed)["diffuse"]
+
+
+def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None, None]:
+    """Return gain (electrons per DN) and read noise with rounding, electrons; or leave both open.
+
+    What the camera was measured to do goes before what its frames say of themselves.
+    """
+    if sensor is None:
+        return None, None
+    gain = float(sensor.mean_gain_e_per_dn().value)
+    read = float(sensor.mean_read_noise_e().value)
+    return gain, float(np.hypot(read, gain * np.sqrt(QUANTIZATION_DN2)))
+
+
+def _separate(inputs: Inputs, parallel: Image | None, crossed: Image) -> Mapping[str, SkinMap]:
+    """Split into diffuse and specular light, relative to a white tile in the same place."""
+    white = inputs.white
+    if parallel is None:
+        diffuse = Image(2 * crossed.rgb, 4 * crossed.variance, crossed.valid)
+        specular = np.zeros_like(crossed.rgb)
+        specular_error = np.zeros_like(crossed.rgb)
+        specular_valid = np.zeros(crossed.valid.shape, bool)
+    else:
+        leak = inputs.polarization.crossed_leak() if inputs.polarization is not None else None
+        separated = polarization.separate(
+            np.where(parallel.valid[..., None], parallel.rgb, np.nan),
+            np.where(crossed.valid[..., None], crossed.rgb, np.nan),
+            extinction=None if leak is None else 1.0 / np.maximum(leak, 1e-9),
+            variance=(parallel.variance, crossed.variance),
+        )
+        if separated.stderr is None or separated.stderr_specular is None:
+            raise EvidenceError("separation: gave no standard errors; give it variances")
+        specular = separated.specular.astype(np.float32)
+        specular_error = separated.stderr_specular.astype(np.float32)
+        specular_valid = np.asarray(separated.valid)
+        # a highlight that saturates the parallel image leaves the crossed one usable
+        alone = crossed.valid & ~specular_valid
+        rgb = np.where(alone[..., None], 2 * crossed.rgb, separated.diffuse)
+        variance = np.where(alone[..., None], 4 * crossed.variance, np.square(separated.stderr))
+        diffuse = Image(rgb, variance, crossed.valid)
+    if white is not None:
+        reflectance, variance, valid = white.balance(diffuse.rgb, variance=diffuse.variance)
+        level = white.signal
+    else:
+        level = np.full_like(diffuse.rgb, _assumed_white(inputs))
+        reflectance, variance = diffuse.rgb / level, diffuse.variance / level**2
+        valid = np.ones(diffuse.valid.shape, bool)
+    dim = (reflectance < DARKEST_SIGMAS * np.sqrt(variance)).any(axis=-1)
+    valid = valid & diffuse.valid & ~dim
+    return {
+        "diffuse": _map3(reflectance, np.sqrt(variance), valid, "white tile in its place = 1"),
+        "specular": _map3(
+            specular / level, specular_error / level, specular_valid & valid,
+            "specular light over that of a white tile",
+        ),
+    }  # fmt: skip
+
+
+DARKEST_SIGMAS = 5.0
+"""Signal over noise below which a pixel is background, not skin."""
+ASSUMED_WHITE = 0.8
+"""Share of the range that a white tile is taken to fill when no white reference is at hand."""
+
+
+def _assumed_white(inputs: Inputs) -> Float32:
+    record = inputs.session.frames("subject", state=inputs.state)[0]
+    neutral = inputs.session.read(record).neutral
+    level = np.full(3, ASSUMED_WHITE)
+    if neutral is not None:
+        level = ASSUMED_WHITE * np.asarray(neutral, float) / max(neutral)
+    return level.astype(np.float32)
+
+
+def _map3(
+    values: NDArray[Any], stderr: NDArray[Any], valid: NDArray[np.bool_], description: str
+) -> SkinMap:
+    good = valid & np.isfinite(values).all(axis=-1) & np.isfinite(stderr).all(axis=-1)
+    keep = good[..., None]
+    return SkinMap(
+        np.where(keep, values, 0.0), "1", np.where(keep, stderr, 0.0), good,
+        f"camera RGB, {description}",
+    )  # fmt: skip
+
+
+def _valid(skin_map: SkinMap) -> NDArray[np.bool_]:
+    shape = skin_map.values.shape[:2]
+    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid
+
+
+def _stderr(skin_map: SkinMap) -> Float32:
+    return np.zeros_like(skin_map.values) if skin_map.stderr is None else skin_map.stderr
+
+
+def _chromophores(inputs: Inputs, diffuse: SkinMap) -> Mapping[str, SkinMap]:
+    table = color_table.build(inputs.camera, inputs.illuminant, anisotropy=ANISOTROPY_SKIN)
+    prior = shading_prior.of_faces()
+    if inputs.white is None:
+        prior = prior.broadened(EXPOSURE_SPREAD)
+    rgb = np.where(_valid(diffuse)[..., None], diffuse.values, np.nan)
+    variance = np.square(_stderr(diffuse))
+    errors = model_error.of_picture(diffuse.values, variance, _valid(diffuse))
+    # of a face in light of unknown strength its pixels together tell no more
+    face = None if inputs.white is None else face_chromophores.in_known_light(
+        rgb, table, variance=variance, model_error=errors
+    )  # fmt: skip
+    known = partial(chromophore_posterior.weigh, rgb, table, prior=prior)
+    found = by_face = known(face=face, variance=variance, model_error=errors)
+    noise_alone = known(face=face, variance=variance)
+    if face is not None:  # moles, lips and lids may be no skin of that face's usual kind
+        alone = known(variance=variance, model_error=errors)
+        spots = dark_spots.darker_than_around(rgb, variance=variance)
+        spots |= dark_spots.lighter_by_itself(by_face, alone)
+        found = dark_spots.either(by_face, alone, spots)
+        noise_alone = dark_spots.either(noise_alone, known(variance=variance, valid=spots), spots)
+    usable = found.valid
+
+    def chromophore(name: str) -> dict[str, SkinMap]:
+        values, stderr = (getattr(found, key) for key in (name, f"stderr_{name}"))
+        without_model_error = getattr(noise_alone, f"stderr_{name}")
+        # spots are wide on purpose; they say nothing of what is known of the skin around them
+        good = detectable(
+            getattr(by_face, name), getattr(by_face, f"stderr_{name}"),
+            usable & np.isfinite(without_model_error),
+        )  # fmt: skip
+        why = "invalid where noise and model error leave it unknown"
+        return {
+            name: SkinMap(
+                np.where(good, values, 0.0), UNITS[name], np.where(good, stderr, 0.0), good, why
+            ),
+            name + NOISE_STDERR: SkinMap(
+                np.where(good, without_model_error, 0.0), UNITS[name], valid=good,
+                description="standard error that noise alone would leave, without model error",
+            ),
+        }  # fmt: skip
+
+    return {
+        **chromophore("melanin"),
+        **chromophore("hemoglobin"),
+        "shading": SkinMap(np.where(usable, found.shading, 0.0), "1", valid=usable),
+        "residual": SkinMap(np.where(usable, found.residual, 0.0), "1", valid=usable),
+        "gamut_distance": SkinMap(
+            np.nan_to_num(found.gamut_distance), "1",
+            description="how far the color lies outside the model's, relative",
+        ),
+    }  # fmt: skip
+
+
+NOISE_STDERR = "_noise_stderr"
+"""Ending of the maps of the standard errors that noise alone would leave."""
+EXPOSURE_SPREAD = 1.0
+"""Spread of log exposure when no white tile was captured and the exposure is not known."""
+
+
+def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:
+    valid = _valid(diffuse) & (diffuse.values > 0).all(axis=-1)
+    found = tsumura.tsumura_ica(diffuse.values, valid)
+    note = "independent component of optical density, no absolute scale"
+    return {
+        f"tsumura_{name}": SkinMap(
+            np.where(found.valid, getattr(found, name), 0.0), "1", valid=found.valid,
+            description=note,
+        )
+        for name in ("melanin", "hemoglobin")
+    }  # fmt: skip
+
+
+def _pictures(inputs: Inputs, diffuse: SkinMap, specular: SkinMap) -> Mapping[str, SkinMap]:
+    """Show diffuse and specular light in linear sRGB."""
+    picture = diffuse.values.astype(np.float64)
+    if inputs.color is not None and inputs.neutral is not None:
+        picture = inputs.color.to_linear_srgb(picture * inputs.neutral)
+    return {
+        "picture": SkinMap(picture.astype(np.float32), "1", valid=diffuse.valid),
+        "specular_picture": SkinMap(specular.values, "1", valid=specular.valid),
+    }

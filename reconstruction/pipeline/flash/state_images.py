@@ -1,0 +1,202 @@
+"""What flash sessions show of one subject: every state and repeat, reconstructed alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from capture.session import Session
+from model.skin import SkinMap
+from reconstruction.pipeline import graph as stages
+from reconstruction.pipeline.evidence import Evidence, EvidenceError
+from reconstruction.pipeline.flash import stages as flash_stages
+
+NEUTRAL = "neutral"
+ONCE = ("diffuse",)
+REPEATED = (*ONCE, "melanin", "hemoglobin", "melanin_noise_stderr", "hemoglobin_noise_stderr")
+"""Where states are repeated each image's own chromophores tell how far they repeat."""
+
+Landmarks = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StateImage:
+    """One parallel and crossed pair of one state.
+
+    Attributes
+    ----------
+    state
+        Name of the state.
+    repeat
+        Number of the pair within its session and state.
+    session
+        Index of the session among those given.
+    captured_s
+        When the crossed image was taken, seconds since the first session began.
+    maps
+        Diffuse reflectance; where any state is repeated also the chromophores as they follow from
+        this image alone, and their errors by noise.
+    """
+
+    state: str
+    repeat: int
+    session: int
+    captured_s: float
+    maps: Mapping[str, SkinMap]
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"{self.state}, repeat {self.repeat} of session {self.session}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Subject:
+    """All that was captured of one subject.
+
+    Attributes
+    ----------
+    images
+        In the order of capture.
+    inputs
+        SHA-256 of everything that was read.
+    assumed
+        What was taken for granted for want of a calibration.
+    source, seed
+        Of the sessions.
+    camera, illuminant
+        Names of the spectra that the color table is built for.
+    has_white
+        Whether the exposure is known from a white tile.
+    consent
+        What the subject of each measured session agreed to, as in its session.json.
+    timed
+        Whether times are those of capture: of photographs only that of their import is known.
+    """
+
+    images: tuple[StateImage, ...]
+    inputs: Mapping[str, str]
+    assumed: tuple[str, ...]
+    source: str
+    seed: int | None
+    camera: str
+    illuminant: str
+    has_white: bool
+    timed: bool
+    consent: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states, neutral first."""
+        names = list(dict.fromkeys(image.state for image in self.images))
+        return (NEUTRAL, *(name for name in names if name != NEUTRAL))
+
+    def of(self, state: str) -> list[StateImage]:
+        """Return a state's images."""
+        return [image for image in self.images if image.state == state]
+
+
+def read(
+    sessions: Sequence[Path],
+    *,
+    calibration: Path | None,
+    on_date: date | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Subject:
+    """Reconstruct every state and repeat of flash sessions.
+
+    Parameters
+    ----------
+    sessions
+        SESSION/ folders of one subject and one camera, with a neutral state among them.
+    calibration
+        CALIBRATION/ folder; None: everything is assumed.
+    on_date
+        The date that calibrations must be valid on; None: that of each session.
+    progress
+        Called with one line before each image.
+
+    Raises
+    ------
+    EvidenceError
+        When a session shows no subject, no state is neutral, or sizes or cameras differ.
+    """
+    if not sessions:
+        raise EvidenceError("sessions: got none, expected at least one of the flash rig")
+    opened = [Session.open(path) for path in sessions]
+    start = min(session.manifest.created_at for session in opened)
+    images: list[StateImage] = []
+    inputs: dict[str, str] = {}
+    assumed: dict[str, None] = {}
+    table: set[tuple[str, str]] = set()
+    has_white = True
+    pairs = [_pairs(session, path) for path, session in zip(sessions, opened, strict=True)]
+    named = [state for group in pairs for state, _, _ in group]
+    if NEUTRAL not in named:  # told before minutes are spent on images
+        raise EvidenceError(
+            f"sessions: show {', '.join(sorted(set(named)))}, expected a state {NEUTRAL!r} that "
+            "the others are laid over"
+        )
+    maps = REPEATED if len(set(named)) < len(named) else ONCE
+    for number, (path, session) in enumerate(zip(sessions, opened, strict=True)):
+        began_s = (session.manifest.created_at - start).total_seconds()
+        for state, repeat, since_s in pairs[number]:
+            if progress is not None:
+                progress(f"{path.name}: {state}, repeat {repeat}")
+            evidence = Evidence.of(session, calibration, state=state, on_date=on_date)
+            evidence.repeat = repeat
+            found = stages.run(flash_stages.graph(evidence), list(maps)).products
+            images.append(
+                StateImage(state, repeat, number, began_s + since_s, MappingProxyType(dict(found)))
+            )
+            inputs |= {
+                f"session {number}" if key == "session" else key: value
+                for key, value in evidence.hashes.items()
+            }
+            assumed |= dict.fromkeys(evidence.assumed)
+            spectra = evidence.noted["color_table"]
+            table.add((str(spectra["camera"]), str(spectra["illuminant"])))
+            has_white = has_white and "calibration white" in evidence.hashes
+    if len(table) > 1:
+        raise EvidenceError(f"sessions: of {len(table)} cameras or lights, expected one of each")
+    shapes = {image.maps["diffuse"].values.shape for image in images}
+    if len(shapes) > 1:
+        raise EvidenceError(f"sessions: images of sizes {sorted(shapes)}, expected one size")
+    ((camera, illuminant),) = table
+    simulated = any(session.source == "simulated" for session in opened)
+    return Subject(
+        images=tuple(sorted(images, key=lambda image: image.captured_s)),
+        inputs=inputs,
+        assumed=tuple(assumed),
+        source="simulated" if simulated else "measured",
+        seed=opened[0].seed,
+        camera=camera,
+        illuminant=illuminant,
+        has_white=has_white,
+        timed=not any("photographs" in session.manifest.extra for session in opened),
+        consent=tuple(s.manifest.to_json()["subject"] for s in opened if s.source == "measured"),
+    )
+
+
+def _pairs(session: Session, path: Path) -> list[tuple[str, int, float]]:
+    """Return state, repeat and seconds since the first frame of each crossed image."""
+    crossed = session.frames("subject", polarizer="crossed")
+    if not crossed:
+        raise EvidenceError(
+            f"{path}: has no crossed frame of a subject, expected a session of the flash rig"
+        )
+    first = min(record.line.t_host_s for record in session.frames())
+    return [
+        (
+            str(record.index["state"]),
+            int(record.index.get("repeat", 0)),
+            float(np.float64(record.line.t_host_s - first)),
+        )
+        for record in crossed
+    ]

@@ -1,0 +1,218 @@
+"""Pictures of a gradient-sphere session: one state of the skin at a time, darks subtracted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture import raw
+from capture.session import FrameRecord, Session
+from reconstruction.pipeline.dome.images import SensorNoise
+from reconstruction.pipeline.evidence import EvidenceError
+
+__all__ = ["GradientImages", "Patterns", "SkinState", "state_name"]
+
+Float32 = NDArray[np.float32]
+Key = tuple[str, str]
+
+
+def state_name(angle_deg: float, step: int) -> str:
+    """Return what a state of the skin is called: the caliper's angle, and its step.
+
+    Examples
+    --------
+    >>> state_name(0, 0), state_name(45, -2), state_name(90, 3)
+    ('a000_n0', 'a045_m2', 'a090_p3')
+    """
+    side = "n" if step == 0 else "m" if step < 0 else "p"
+    return f"a{round(angle_deg):03d}_{side}{abs(step)}"
+
+
+@dataclass(frozen=True, slots=True)
+class SkinState:
+    """What the caliper was set to while one series of patterns was taken."""
+
+    name: str
+    angle_deg: float
+    """Of the jaws' axis, from +x towards +y."""
+    step: int
+    """Of the caliper; 0 neutral, below 0 compressed."""
+    reading_mm: float
+    """Distance of the jaws that the box reports; NaN where it says nothing."""
+    force_n: float
+    """Force on the jaws that the box reports, N; NaN where it says nothing."""
+
+    @property
+    def angle_rad(self) -> float:
+        """The angle in radians."""
+        return math.radians(self.angle_deg)
+
+
+@dataclass(frozen=True, slots=True)
+class Patterns:
+    """The pictures of one state.
+
+    Attributes
+    ----------
+    values, variance
+        By pattern and polarizer, (H, W) float32, fraction of full scale; darks are subtracted.
+    valid
+        (H, W) bool; False where a picture is saturated.
+    """
+
+    values: Mapping[Key, Float32]
+    variance: Mapping[Key, Float32]
+    valid: NDArray[np.bool_]
+
+    def crossed(self) -> Float32:
+        """Return the light from inside the skin: all crossed pictures together.
+
+        Raises
+        ------
+        EvidenceError
+            When there is none.
+        """
+        return self._sum("crossed")
+
+    def parallel(self) -> Float32:
+        """Return all pictures with parallel polarizers together, as `crossed`."""
+        return self._sum("parallel")
+
+    def _sum(self, polarizer: str) -> Float32:
+        chosen = [
+            picture
+            for (pattern, turned), picture in self.values.items()
+            if turned == polarizer and pattern != "dark"
+        ]
+        if not chosen:
+            raise EvidenceError(f"state: has no lit picture with {polarizer} polarizers")
+        return np.mean(chosen, axis=0, dtype=np.float32)
+
+
+class GradientImages:
+    """Reads the states of a session of the gradient sphere, one when it is asked for.
+
+    Parameters
+    ----------
+    session
+        Open for reading.
+    noise
+        Calibrated gain and read noise; None takes each frame at its own word.
+
+    Attributes
+    ----------
+    states : tuple of SkinState
+        In the order of capture; the first is a neutral one.
+
+    Raises
+    ------
+    EvidenceError
+        When the session holds no such frames, or no neutral state to compare with.
+    """
+
+    def __init__(self, session: Session, *, noise: SensorNoise | None = None) -> None:
+        self._session = session
+        self._noise = noise
+        self._records: dict[str, dict[Key, list[FrameRecord]]] = {}
+        found: dict[str, SkinState] = {}
+        for record in session.frames("gradient"):
+            index = record.index
+            angle, step = float(index["angle"]), int(index["caliper"])
+            name = state_name(angle, step)
+            actual = record.actual
+            found.setdefault(
+                name,
+                SkinState(
+                    name, angle, step,
+                    float(actual.get("aperture_mm", math.nan)),
+                    float(actual.get("force_n", math.nan)),
+                ),
+            )  # fmt: skip
+            key = str(index["pattern"]), str(index["polarizer"])
+            self._records.setdefault(name, {}).setdefault(key, []).append(record)
+        if not found:
+            raise EvidenceError(f"{session.path}: has no frames of kind 'gradient'")
+        states = list(found.values())
+        first = next((state for state in states if state.step == 0), None)
+        if first is None:
+            raise EvidenceError(
+                f"{session.path}: has no neutral state, caliper step 0, that the others "
+                "could be compared with"
+            )
+        self.states = (first, *(state for state in states if state is not first))
+        self._dark: Float32 | None = None
+        self._dark_variance = 0.0
+
+    @property
+    def neutral(self) -> SkinState:
+        """The first neutral state, which all strain is told against."""
+        return self.states[0]
+
+    def of(self, state: SkinState) -> Patterns:
+        """Return the pictures of a state.
+
+        Frames of one pattern are averaged.
+
+        Raises
+        ------
+        EvidenceError
+            When frames differ in size.
+        """
+        values: dict[Key, Float32] = {}
+        variance: dict[Key, Float32] = {}
+        valid: NDArray[np.bool_] | None = None
+        dark = self._darkness()
+        for key, records in self._records[state.name].items():
+            if key[0] == "dark":
+                continue
+            mean, spread, good = self._mean(records)
+            if dark is not None:
+                mean = mean - dark
+            values[key] = mean
+            variance[key] = spread + np.float32(self._dark_variance)
+            valid = good if valid is None else valid & good
+            if mean.shape != next(iter(values.values())).shape:
+                raise EvidenceError(f"state {state.name}: its frames differ in size")
+        if valid is None:
+            raise EvidenceError(f"state {state.name}: has no lit picture")
+        return Patterns(values, variance, valid)
+
+    def _mean(self, records: Sequence[FrameRecord]) -> tuple[Float32, Float32, NDArray[np.bool_]]:
+        total: Float32 | None = None
+        for record in records:
+            frame = self._session.read(record)
+            noise = self._noise
+            value, spread, good = raw.linear_mono(
+                frame,
+                gain=None if noise is None else noise.gain,
+                read_noise=None if noise is None else noise.read_noise,
+            )
+            if total is None:
+                total, variance, valid = value, spread, good
+            else:
+                total, variance, valid = total + value, variance + spread, valid & good
+        if total is None:
+            raise EvidenceError("a pattern has no frame")
+        count = np.float32(len(records))
+        return total / count, variance / count**2, valid
+
+    def _darkness(self) -> Float32 | None:
+        """Return the mean of all frames without light, with the fixed pattern of the sensor."""
+        if self._dark is None:
+            records = [
+                record
+                for by_key in self._records.values()
+                for (pattern, _), some in by_key.items()
+                if pattern == "dark"
+                for record in some
+            ]
+            records += self._session.frames("dark")
+            if not records:
+                return None
+            self._dark, spread, _ = self._mean(records)
+            self._dark_variance = float(np.mean(spread))
+        return self._dark

@@ -1,0 +1,380 @@
+"""The gradient sphere's stages: patterns to normals, heights, strain, histograms and kernels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from capture.calibration.led_sphere.lights import SphereFilms, SphereLightTable
+from capture.calibration.sensor import SensorCalibration
+from capture.session import Session
+from model.skin import UNITS, SkinMap
+from reconstruction.gradient_normals import Roughness, estimate_roughness, from_patterns
+from reconstruction.gradient_normals.lobe_response import SphereLights
+from reconstruction.normal_integration import integrate_map, relief_errors
+from reconstruction.normal_integration.height_filters import high_pass
+from reconstruction.normal_integration.lens_restoration import Aperture, Restored, restore
+from reconstruction.normal_integration.slope_fields import Perspective
+from reconstruction.normal_maps import NormalMaps
+from reconstruction.pipeline import graph as stages
+from reconstruction.pipeline.dome.images import SensorNoise
+from reconstruction.pipeline.evidence import Evidence
+from reconstruction.pipeline.gradient.images import GradientImages, Patterns, SkinState
+from reconstruction.pipeline.gradient.skin_strain import StateStrain, measure_states, skin_mask
+from reconstruction.pipeline.gradient.strain_kernels import (
+    count_normals,
+    fit_kernels,
+    histogram_document,
+)
+
+REVISION = 7
+"""Grows when the code of a stage changes its result, so that older maps are computed again."""
+
+MAPS = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")
+"""What can be made of a session of the gradient sphere; see `products` for what it stands for."""
+STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE = "strain.json", "histograms.json", "kernels.json"
+FILES = (STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE)
+
+CUTOFF_UM = 1000.0
+"""What is longer is bulge, not relief (Nagano et al. 2015, section 4)."""
+SMOOTH_PX = 1.0
+"""Of the pictures before the roughness of facets is estimated: the lens resolves three pixels."""
+CROSSED_SMOOTH_PX = 2.0
+"""Of the crossed pictures, which hold half the noise and less detail."""
+DIFFUSE_SMOOTH_PX = 2.0
+WAVELENGTH_UM = 0.535
+"""Of a white LED's light behind a monochrome sensor, its mean."""
+STDERR_SAMPLES = 6
+STDERR_SIGMA_PX = 8.0
+Float32 = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+
+def products(session: Session) -> Mapping[str, tuple[str, ...]]:
+    """Return the maps and files that each name of :data:`MAPS` stands for in a session."""
+    states = GradientImages(session).states
+    neutral = states[0].name
+    return {
+        "normals": tuple(f"normals_{state.name}" for state in states),
+        "height": tuple(f"height_{state.name}" for state in states),
+        "diffuse_normals": (f"diffuse_normals_{neutral}",),
+        "crossed": tuple(f"crossed_{state.name}" for state in states),
+        "strain": (STRAIN_FILE,),
+        "histograms": (HISTOGRAM_FILE,),
+        "kernels": (KERNEL_FILE,),
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """The session, its camera, and its lights as far as they are known."""
+
+    images: GradientImages
+    pixel_um: float
+    """Of skin, in the middle of the field."""
+    focal_px: float
+    camera_mm: NDArray[np.float64]
+    """Centre of projection, shape (3,)."""
+    lights: SphereLights
+    lens: Aperture
+
+    def points_mm(self, shape: tuple[int, int]) -> Float32:
+        """Return where the pixels are on the plane z = 0, shape (H, W, 2)."""
+        rows, columns = np.mgrid[0 : shape[0], 0 : shape[1]]
+        x = (columns - (shape[1] - 1) / 2) * (self.pixel_um / 1e3)
+        y = ((shape[0] - 1) / 2 - rows) * (self.pixel_um / 1e3)
+        return np.stack([x, y], axis=-1).astype(np.float32)
+
+    def views(self, shape: tuple[int, int]) -> Float32:
+        """Return unit vectors from the pixels' places to the camera, shape (H, W, 3)."""
+        points = self.points_mm(shape)
+        way = np.concatenate([-points, np.zeros((*shape, 1), np.float32)], axis=-1)
+        way += self.camera_mm.astype(np.float32)
+        return way / np.linalg.norm(way, axis=-1, keepdims=True)
+
+    def perspective(self, shape: tuple[int, int]) -> Perspective:
+        """Return the camera's rays."""
+        return Perspective(self.focal_px, ((shape[1] - 1) / 2, (shape[0] - 1) / 2))
+
+
+def graph(evidence: Evidence) -> list[stages.Stage]:
+    """Return the stages that a session of the gradient sphere can go through."""
+    rig = _rig(evidence)
+    base = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+    states = rig.images.states
+    neutral = rig.images.neutral
+    heights = tuple(f"height_{state.name}" for state in states)
+    made = [
+        stages.Stage(
+            "strain", (), ("_strains", STRAIN_FILE), lambda: _strain(evidence, rig), base
+        ),
+        stages.Stage("facets", (), ("_facets",), lambda: _facets(evidence, rig), base),
+        stages.Stage(
+            f"diffuse normals {neutral.name}", (), (f"diffuse_normals_{neutral.name}",),
+            lambda: _diffuse(rig), base,
+        ),
+        stages.Stage(
+            "histograms", ("_strains", *heights), (HISTOGRAM_FILE, "_histograms"),
+            lambda **made: _histograms(rig, made), base,
+        ),
+        stages.Stage(
+            "kernels", ("_strains", "_histograms", *heights), (KERNEL_FILE,),
+            lambda **made: _kernels(evidence, rig, made), base,
+        ),
+    ]  # fmt: skip
+    for state in states:
+        made.append(
+            stages.Stage(
+                f"crossed {state.name}", (), (f"crossed_{state.name}",),
+                partial(_crossed, rig, state), base,
+            )
+        )  # fmt: skip
+        made.append(
+            stages.Stage(
+                f"normals {state.name}", ("_facets",),
+                (f"normals_{state.name}", f"_restored_{state.name}"),
+                partial(_normals, rig, state), base,
+            )
+        )  # fmt: skip
+        made.append(
+            stages.Stage(
+                f"height {state.name}", (f"_restored_{state.name}",), (f"height_{state.name}",),
+                partial(_height, rig, state), base,
+            )
+        )  # fmt: skip
+    return made
+
+
+def _rig(evidence: Evidence) -> Rig:
+    session = evidence.session
+    shots = session.frames("gradient")
+    view = session.rig.view(shots[0].camera) if shots else session.rig.views[0]
+    sensor = evidence.load(
+        "sensor", [view.serial], "the frames are as noisy as they say of themselves"
+    )
+    noise = None
+    if sensor is not None:
+        known = SensorCalibration.from_calibration(sensor, view.serial)
+        noise = SensorNoise(float(known.gain_e_per_dn.value[0]), float(known.read_noise_e.value[0]))
+    pixel_um = view.pixel_um * view.distance_mm / view.focal_mm
+    evidence.noted["pixel_um"] = pixel_um
+    images = GradientImages(session, noise=noise)
+    evidence.noted["states"] = [state.name for state in images.states]
+    return Rig(
+        images, pixel_um, view.focal_px, np.array(view.position_mm),
+        _lights(evidence, view.serial),
+        Aperture.of(
+            f_number=view.f_number, magnification=view.pixel_um / pixel_um,
+            wavelength_um=WAVELENGTH_UM, pixel_um=pixel_um,
+        ),
+    )  # fmt: skip
+
+
+def _lights(evidence: Evidence, serial: str) -> SphereLights:
+    """Return the sphere's lights as calibrated, or as the rig's file describes them."""
+    rig = evidence.session.rig
+    names = [light.name for light in rig.lights]
+    place = np.array([light.position_mm for light in rig.lights], np.float64)
+    nominal = SphereLightTable.nominal(rig)
+    found = evidence.load("lights", names, "the lights stand and shine as the rig file says")
+    table = nominal if found is None else SphereLightTable.from_calibration(found, rig)
+    leak = evidence.load(
+        "polarization", [*names, serial], "crossed polarizers stop all that the surface reflects"
+    )
+    leakage = np.zeros(len(names))
+    leakage_stderr = np.zeros(len(names))
+    axis_deg = rig.views[0].analyser_axis_deg
+    axis_rad = math.radians(90.0 if axis_deg is None else axis_deg)
+    if leak is not None:
+        films = SphereFilms.from_calibration(leak, rig, serial)
+        leakage, leakage_stderr = films.leakage, films.leakage_stderr
+        axis_rad += films.misalignment_rad
+    return SphereLights(
+        table.directions,
+        intensities=table.intensities,
+        leakage=leakage,
+        analyser=(math.cos(axis_rad), math.sin(axis_rad), 0.0),
+        programmed=nominal.directions,
+        distance_mm=float(np.mean(np.linalg.norm(place, axis=1))),
+        intensity_stderr=table.intensities_stderr,
+        leakage_stderr=leakage_stderr,
+    )
+
+
+def _strain(evidence: Evidence, rig: Rig) -> Mapping[str, Any]:
+    found = measure_states(rig.images)
+    lost = [each.state.name for each in found if not each.usable]
+    if lost:
+        evidence.assumed.append(
+            f"strain of {', '.join(lost)}: no texture could be followed; these states are left out "
+            "of histograms and kernels"
+        )
+    document = {
+        "schema": "skinrig.strain/1",
+        "neutral": rig.images.neutral.name,
+        "pixel_um": rig.pixel_um,
+        "states": [each.document(rig.pixel_um) for each in found],
+    }
+    return {"_strains": found, STRAIN_FILE: stages.document_bytes(document)}
+
+
+def _crossed(rig: Rig, state: SkinState) -> Mapping[str, SkinMap]:
+    patterns = rig.images.of(state)
+    lit = [key for key in patterns.values if key[1] == "crossed"]
+    variance = np.sum([patterns.variance[key] for key in lit], axis=0) / len(lit) ** 2
+    return {
+        f"crossed_{state.name}": SkinMap(
+            patterns.crossed(), "1", np.sqrt(variance), patterns.valid,
+            "light from inside the skin, mean of all crossed pictures, fraction of full scale",
+        )
+    }  # fmt: skip
+
+
+def _patterns_normals(
+    rig: Rig,
+    patterns: Patterns,
+    component: Literal["specular", "diffuse"],
+    *,
+    smooth_px: float = 0.0,
+    wiener: bool = False,
+    alpha: Roughness | None = None,
+) -> NormalMaps:
+    shape = patterns.valid.shape
+    return from_patterns(
+        patterns.values,
+        component=component,
+        view=rig.views((shape[0], shape[1])),
+        variance=patterns.variance,
+        valid=patterns.valid,
+        lights=rig.lights,
+        points_mm=rig.points_mm((shape[0], shape[1])),
+        smooth_px=smooth_px,
+        smooth_crossed_px=None if wiener or component == "diffuse" else CROSSED_SMOOTH_PX,
+        wiener=wiener,
+        alpha=alpha,
+    )
+
+
+def _facets(evidence: Evidence, rig: Rig) -> Mapping[str, Roughness]:
+    """Estimate the roughness of facets below a pixel, once: strain turns facets, not their own."""
+    patterns = rig.images.of(rig.images.neutral)
+    shape = patterns.valid.shape
+    found = estimate_roughness(
+        patterns.values, lights=rig.lights, view=rig.views((shape[0], shape[1])),
+        variance=patterns.variance, valid=patterns.valid, smooth_px=SMOOTH_PX,
+    )  # fmt: skip
+    evidence.noted["alpha"] = {"value": found.alpha, "stderr": found.stderr}
+    return {"_facets": found}
+
+
+def _normals(rig: Rig, state: SkinState, **made: Any) -> Mapping[str, Any]:
+    """Return normals as the lens shows them, and the slopes of the surface before the lens."""
+    patterns = rig.images.of(state)
+    skin = skin_mask(patterns.crossed())
+    facets: Roughness = made["_facets"]
+    smooth = _patterns_normals(rig, patterns, "specular", wiener=True, alpha=facets)
+    sharp = _patterns_normals(rig, patterns, "specular", alpha=facets)
+    # noise takes single pixels of steep furrows beyond what a lobe can tell; a hole there would cut
+    # the height, so that the filtered normal stands in
+    normals = np.where(sharp.valid[..., None], sharp.normals, smooth.normals)
+    known = (sharp.valid | smooth.valid) & skin
+    restored = restore(normals, lens=rig.lens, valid=known)
+    return {
+        f"normals_{state.name}": _normal_map(
+            smooth, skin, "of the surface's reflection", relief=True
+        ),
+        f"_restored_{state.name}": (restored, known, smooth.stderr_rad),
+    }
+
+
+def _diffuse(rig: Rig) -> Mapping[str, SkinMap]:
+    state = rig.images.neutral
+    patterns = rig.images.of(state)
+    found = _patterns_normals(rig, patterns, "diffuse", smooth_px=DIFFUSE_SMOOTH_PX)
+    skin = skin_mask(patterns.crossed())
+    what = "of the light from inside the skin, which spreads over tenths of a millimetre"
+    return {f"diffuse_normals_{state.name}": _normal_map(found, skin, what)}
+
+
+def _normal_map(found: NormalMaps, skin: Bools, what: str, *, relief: bool = False) -> SkinMap:
+    valid = found.valid & skin
+    # of each of the two directions across the normal, as everywhere
+    stderr = np.where(valid, found.stderr_rad / math.sqrt(2.0), np.pi).astype(np.float32)
+    if relief:
+        stderr = relief_errors.of_normals(found.normals, stderr, valid)
+    return SkinMap(
+        np.asarray(found.normals, np.float32),
+        UNITS["normals"],
+        np.repeat(stderr[..., None], 3, axis=2),
+        valid,
+        f"unit normals {what}, rig frame, +x right, +y up, +z to the camera; errors in rad",
+    )
+
+
+def _height(rig: Rig, state: SkinState, **made: Any) -> Mapping[str, SkinMap]:
+    """Integrate what the lens's blur was taken out of; remove what is wider than a millimetre."""
+    restored: Restored
+    valid: Bools
+    restored, valid, stderr_rad = made[f"_restored_{state.name}"]
+    shape = valid.shape
+    settings: dict[str, Any] = {
+        "pixel": rig.pixel_um, "camera": rig.perspective((shape[0], shape[1])),
+        # steep walls of furrows, dim and partly hidden, count less
+        "stderr_rad": stderr_rad,
+    }  # fmt: skip
+    found = integrate_map(restored.normals, valid=valid, **settings)
+    height = high_pass(found.height, pixel=rig.pixel_um, cutoff=CUTOFF_UM, valid=found.valid)
+    by_noise = _height_stderr(restored, found.valid, settings)
+    stderr = relief_errors.of_height(height, by_noise, found.valid)
+    return {
+        f"height_{state.name}": SkinMap(
+            height.astype(np.float32), "um", stderr, found.valid,
+            f"height towards the camera, the lens's blur undone as far as noise allows, without "
+            f"what is longer than {CUTOFF_UM / 1e3:g} mm",
+        )
+    }  # fmt: skip
+
+
+def _height_stderr(restored: Restored, valid: Bools, settings: Mapping[str, Any]) -> Float32:
+    """Return the standard error of a height by what fields of noise become on the same way."""
+    rng = np.random.default_rng(0)
+    total = np.zeros(valid.shape)
+    for _ in range(STDERR_SAMPLES):
+        x, y = restored.noise_field(rng)
+        field = np.stack([-x, -y, np.ones_like(x)], axis=-1)
+        found = integrate_map(field, valid=valid, **settings)
+        rough = high_pass(
+            found.height, pixel=settings["pixel"], cutoff=CUTOFF_UM, valid=found.valid
+        )
+        total += rough.astype(np.float64) ** 2
+    # the noise is about the same everywhere: its variance varies slowly, borders aside
+    weight = ndimage.gaussian_filter(valid.astype(float), STDERR_SIGMA_PX)
+    even = ndimage.gaussian_filter(total, STDERR_SIGMA_PX) / np.maximum(weight, 1e-3)
+    return np.where(valid, np.sqrt(even / STDERR_SAMPLES), np.inf).astype(np.float32)
+
+
+def _histograms(rig: Rig, made: Mapping[str, Any]) -> Mapping[str, Any]:
+    strains: list[StateStrain] = made["_strains"]
+    found = count_normals(strains, _heights(strains, made), pixel_um=rig.pixel_um)
+    document = histogram_document(strains, found)
+    return {"_histograms": found, HISTOGRAM_FILE: stages.document_bytes(document)}
+
+
+def _kernels(evidence: Evidence, rig: Rig, made: Mapping[str, Any]) -> Mapping[str, Any]:
+    strains: list[StateStrain] = made["_strains"]
+    document = fit_kernels(
+        strains, _heights(strains, made), made["_histograms"], pixel_um=rig.pixel_um,
+        tell=lambda share: evidence.tell("kernels", share),
+    )  # fmt: skip
+    return {KERNEL_FILE: stages.document_bytes(document)}
+
+
+def _heights(strains: list[StateStrain], made: Mapping[str, Any]) -> dict[str, SkinMap]:
+    return {each.state.name: made[f"height_{each.state.name}"] for each in strains}

@@ -1,0 +1,326 @@
+"""Histograms of the normals of strained skin, and the kernels that make them of neutral skin's."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from model.microstructure import KernelTableError
+from model.skin import SkinMap
+from reconstruction.kernel_fit import fit_kernel
+from reconstruction.kernel_fit.fit import ALPHAS, SIGMAS_UM
+from reconstruction.kernel_fit.outcome import KernelFit
+from reconstruction.kernel_fit.table import KernelTableFitError, direction_dependence, fit_table
+from reconstruction.normal_histogram.blocks import BLOCKS, block_counts, grid_of
+from reconstruction.normal_histogram.statistics import NormalStatistics, measure
+from reconstruction.pipeline.gradient.skin_strain import StateStrain
+
+LEAST_SAMPLES = 1000
+"""Fewer pixels make no histogram."""
+LEAST_STRAIN = 0.01
+"""A state nearer to neutral than this has no kernel of its own: it would be that of the noise."""
+LINE_POINTS = 61
+FULL_GRID_PX = 1_000_000
+"""Patches of fewer pixels tell kernels no finer than by `COARSER` steps of the paper's grid."""
+COARSER = 3
+HIDDEN = 0.1
+"""Of a variance, what pictures hide: slopes that do not come back, and those longer than a levelled
+patch. The root mean square over both axes of six patches of 0.8 mm at rest, at r = 0.8 and at 1.19
+(seeds 0 to 5). It is no scatter: states and patches have it alike, and how much it is the pictures
+do not tell (what the lens's transfer takes is given back by then)."""
+
+Float32 = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+
+def count_normals(
+    strains: Sequence[StateStrain], heights: Mapping[str, SkinMap], *, pixel_um: float
+) -> dict[str, NormalStatistics]:
+    """Count the normals of every state on axes along and across its jaws.
+
+    Parameters
+    ----------
+    strains
+        Of every state; the first is the neutral one.
+    heights
+        By the name of the state, um.
+    pixel_um
+        Size of a pixel.
+
+    Returns
+    -------
+    dict
+        By the name of the state; states with too few pixels are missing.
+    """
+    found: dict[str, NormalStatistics] = {}
+    for each in strains:
+        height = heights[each.state.name]
+        both = _valid(height) & _common(each, strains[0], heights, there=True)
+        if np.count_nonzero(both) >= LEAST_SAMPLES:
+            found[each.state.name] = measure(
+                height.values, pixel=pixel_um, valid=both, angle_rad=each.state.angle_rad
+            )
+    return found
+
+
+def histogram_document(
+    strains: Sequence[StateStrain], found: Mapping[str, NormalStatistics]
+) -> dict[str, Any]:
+    """Return the histograms as a document.
+
+    Standard errors of its variances hold what another patch of the same skin and size would show,
+    and `HIDDEN`; of histograms and variances alike the relief is the one that heights show.
+    """
+    return {
+        "schema": "skinrig.histograms/1",
+        "axes": "rows n across the jaws, columns n along them, each -1 to 1",
+        "states": [
+            {
+                "name": each.state.name, "angle_deg": each.state.angle_deg,
+                "counts": one.histogram, "samples": one.samples, "outside": one.outside,
+                "effective_samples": one.effective_samples,
+                "samples_per_bucket": one.samples_per_bucket, "aliased": one.aliased,
+                "variance_s": one.variance_x,
+                "variance_s_stderr": math.hypot(one.stderr_x, HIDDEN * one.variance_x),
+                "variance_t": one.variance_y,
+                "variance_t_stderr": math.hypot(one.stderr_y, HIDDEN * one.variance_y),
+            }
+            for each in strains
+            if (one := found.get(each.state.name)) is not None
+        ],
+    }  # fmt: skip
+
+
+def _common(
+    each: StateStrain, neutral: StateStrain, heights: Mapping[str, SkinMap], *, there: bool
+) -> Bools:
+    """Return which pixels show skin that both the state and the neutral one show.
+
+    Parameters
+    ----------
+    there
+        Whether pixels of the state are meant; else those of the neutral one.
+    """
+    both = [heights[one.state.name] for one in (neutral, each)]
+    shape = both[0].values.shape[:2]
+    if not each.usable:
+        return np.ones(shape, bool)
+    seen = _valid(both[0 if there else 1]).astype(np.uint8)
+    affine = each.strain.affine_px((shape[0], shape[1]))
+    # a pixel of the state shows what the neutral picture has where the map leads back to
+    back = affine if not there else _inverse(affine)
+    return ndimage.map_coordinates(seen, _moved(back, shape), order=0, cval=0) > 0
+
+
+def _moved(affine: NDArray[np.float64], shape: tuple[int, ...]) -> list[NDArray[np.float64]]:
+    """Return the rows and columns that a map of pixels (column, row) takes each pixel to."""
+    columns, rows = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
+    return [affine[1, 0] * columns + affine[1, 1] * rows + affine[1, 2],
+            affine[0, 0] * columns + affine[0, 1] * rows + affine[0, 2]]  # fmt: skip
+
+
+def _skin_blocks(
+    each: StateStrain, height: SkinMap, *, pixel_um: float, there: Bools
+) -> NDArray[np.int64]:
+    """Count a state's normals in the skin of each block of the neutral map turned to its jaws.
+
+    Parameters
+    ----------
+    each, height
+        The state.
+    pixel_um
+        Size of a pixel.
+    there
+        (H, W): pixels of the state to count.
+
+    Returns
+    -------
+    ndarray, shape (rows, columns, bins, bins)
+        As `fit_kernel` takes them.
+    """
+    shape = (there.shape[0], there.shape[1])
+    row, column = _moved(_inverse(each.strain.affine_px(shape)), shape)
+    # from the neutral map to the one that `_along_x` has turned
+    c, s = math.cos(each.state.angle_rad), math.sin(each.state.angle_rad)
+    middle = (shape[1] - 1) / 2, (shape[0] - 1) / 2
+    x, y = column - middle[0], middle[1] - row
+    row, column = middle[1] - (c * y - s * x), middle[0] + (c * x + s * y)
+    grid = grid_of(shape, BLOCKS)
+    down, right = (
+        np.floor((place + 0.5) * parts / side).astype(np.int64)
+        for place, parts, side in zip((row, column), grid, shape, strict=True)
+    )
+    inside = (down >= 0) & (down < grid[0]) & (right >= 0) & (right < grid[1])
+    block = np.where(inside, down * grid[1] + right, -1)
+    counts = block_counts(
+        height.values, block, grid[0] * grid[1], pixel=pixel_um, valid=there,
+        angle_rad=each.state.angle_rad,
+    )  # fmt: skip
+    return counts.reshape(*grid, *counts.shape[1:])
+
+
+def _inverse(affine: NDArray[np.float64]) -> NDArray[np.float64]:
+    linear = np.linalg.inv(affine[:, :2])
+    return np.column_stack([linear, -linear @ affine[:, 2]])
+
+
+def _along_x(height: NDArray[np.float32], valid: Bools, angle_rad: float) -> tuple[Float32, Bools]:
+    """Turn a map so that the jaws' axis lies along its rows."""
+    if abs(math.sin(angle_rad)) < 1e-9:
+        return height, valid
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    rows, columns = np.indices(height.shape)
+    middle = np.array([(height.shape[1] - 1) / 2, (height.shape[0] - 1) / 2])
+    x, y = columns - middle[0], middle[1] - rows
+    places = [middle[1] - (s * x + c * y), middle[0] + (c * x - s * y)]
+    turned = ndimage.map_coordinates(height, places, order=3, mode="nearest")
+    # a cubic spline reaches over two pixels, and what it reaches must be valid
+    solid = ndimage.binary_erosion(valid, iterations=2, border_value=0)
+    return turned, ndimage.map_coordinates(solid.astype(np.uint8), places, order=0, cval=0) > 0
+
+
+def fit_kernels(
+    strains: Sequence[StateStrain],
+    heights: Mapping[str, SkinMap],
+    statistics: Mapping[str, NormalStatistics],
+    *,
+    pixel_um: float,
+    tell: Callable[[float], None],
+) -> dict[str, Any]:
+    """Fit a kernel to every strained state, and lines to the kernels of each angle.
+
+    Parameters
+    ----------
+    strains, heights, pixel_um
+        As of `count_normals`.
+    statistics
+        What it returned.
+    tell
+        Called with the share that is done.
+
+    Returns
+    -------
+    dict
+        The document.
+    """
+    neutral = strains[0]
+    height = heights[neutral.state.name]
+    todo = [
+        each
+        for each in strains[1:]
+        if each.usable
+        and each.state.name in statistics
+        and abs(each.stretch_s[0] - 1.0) >= LEAST_STRAIN
+    ]
+    fits = []
+    for number, each in enumerate(todo):
+        tell(number / len(todo))
+        seen = _valid(height) & _common(each, neutral, heights, there=False)
+        turned, inside = _along_x(height.values, seen, each.state.angle_rad)
+        if np.count_nonzero(inside) < LEAST_SAMPLES:
+            continue
+        target, strained = statistics[each.state.name], heights[each.state.name]
+        there = _valid(strained) & _common(each, neutral, heights, there=True)
+        every = 1 if np.count_nonzero(inside) >= FULL_GRID_PX else COARSER
+        fit = fit_kernel(
+            turned, target.histogram, stretch=each.stretch_s[0], axis="x", pixel_um=pixel_um,
+            valid=inside, stretch_across=each.stretch_t[0], alphas=ALPHAS[::every],
+            sigmas_um=SIGMAS_UM[::every], target_samples=target.effective_samples,
+            target_blocks=_skin_blocks(each, strained, pixel_um=pixel_um, there=there),
+        )  # fmt: skip
+        fits.append(_entry(each, fit))
+    angles = sorted({fit["angle_deg"] for fit in fits})
+    tables = [table for angle in (None, *angles) if (table := _table(fits, angle)) is not None]
+    return {
+        "schema": "skinrig.kernels/1",
+        "fits": fits,
+        "tables": tables,
+        "direction": _direction(fits),
+    }
+
+
+def _entry(each: StateStrain, fit: KernelFit) -> dict[str, Any]:
+    return {
+        "name": each.state.name, "angle_deg": each.state.angle_deg,
+        "stretch_s": each.stretch_s[0], "stretch_s_stderr": each.stretch_s[1],
+        "stretch_t": each.stretch_t[0],
+        "alpha": fit.alpha, "alpha_stderr": fit.alpha_stderr,
+        "sigma_um": fit.sigma_um, "sigma_stderr_um": fit.sigma_stderr_um,
+        "alpha_95": fit.alpha_95, "sigma_95_um": fit.sigma_95_um,
+        "alpha_interval": fit.alpha_interval, "sigma_interval_um": fit.sigma_interval_um,
+        "alpha_refined": fit.alpha_refined, "sigma_refined_um": fit.sigma_refined_um,
+        "distance": fit.distance, "distance_before": fit.distance_before,
+        "distance_noise": fit.noise, "noise_floor": fit.floor,
+        "near_best_count": len(fit.near_best), "at_edge": fit.at_edge, "aliased": fit.aliased,
+        "search": fit.search, "valid": fit.valid, "reason": fit.reason,
+    }  # fmt: skip
+
+
+def _table(fits: Sequence[Mapping[str, Any]], angle: float | None) -> dict[str, Any] | None:
+    """Fit lines to the kernels of one angle, or of all; None where there are too few."""
+    chosen = [fit for fit in fits if fit["valid"] and angle in (None, fit["angle_deg"])]
+    if angle is not None and len({fit["angle_deg"] for fit in fits}) < 2:
+        return None
+    try:
+        found = fit_table(
+            [fit["stretch_s"] for fit in chosen],
+            [fit["alpha"] for fit in chosen],
+            [fit["sigma_um"] for fit in chosen],
+        )
+    except (KernelTableFitError, KernelTableError):  # too few points, or lines that reach sigma 0
+        return None
+    low, high = found.table.stretch_range
+    r = np.linspace(low, high, LINE_POINTS)
+    lines = {
+        "compression": found.table.sigma_compression_um,
+        "stretch": found.table.sigma_stretch_um,
+    }
+    sigma = np.full(r.size, np.nan)
+    for side, line in lines.items():
+        if line is not None:
+            part = r < 1.0 if side == "compression" else r >= 1.0
+            sigma[part] = line[0] * r[part] + line[1]
+    return {
+        "name": "all angles" if angle is None else f"{angle:.0f} degrees",
+        "alpha_breaks": found.table.alpha_breaks, "alpha_lines": found.table.alpha_lines,
+        "sigma_compression_um": found.table.sigma_compression_um,
+        "sigma_stretch_um": found.table.sigma_stretch_um,
+        "stretch_range": (low, high), "alpha_rms": found.alpha_rms,
+        "sigma_rms_um": found.sigma_rms_um,
+        "lines": {
+            "stretch": r, "alpha": np.clip(found.table.unlimited_alpha(r), -2.0, 1.0),
+            "sigma_um": sigma,
+        },
+    }  # fmt: skip
+
+
+def _direction(fits: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Return how kernels depend on the direction of stretch; None where it cannot be told."""
+    chosen = [fit for fit in fits if fit["valid"]]
+    columns = {
+        key: [fit[key] for fit in chosen] for key in ("stretch_s", "alpha", "sigma_um", "angle_deg")
+    }
+    try:
+        table = fit_table(columns["stretch_s"], columns["alpha"], columns["sigma_um"]).table
+        found = direction_dependence(
+            table, columns["stretch_s"], columns["alpha"], columns["sigma_um"],
+            np.radians(columns["angle_deg"]),
+        )  # fmt: skip
+    except (KernelTableFitError, KernelTableError):
+        return None
+    return {
+        "angle_deg": np.degrees(found.angle_rad), "alpha_offset": found.alpha_offset,
+        "alpha_stderr": found.alpha_stderr, "sigma_offset_um": found.sigma_offset_um,
+        "sigma_stderr_um": found.sigma_stderr_um, "p_alpha": found.p_alpha,
+        "p_sigma": found.p_sigma,
+    }  # fmt: skip
+
+
+def _valid(skin_map: SkinMap) -> Bools:
+    shape = skin_map.values.shape[:2]
+    return np.ones(shape, bool) if skin_map.valid is None else skin_map.valid

@@ -1,0 +1,296 @@
+"""Stages of pictures under listed lights, without a calibrated rig: normals and albedo."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture import raw
+from capture.session import Session
+from capture.session.frames import FrameRecord
+from model.skin import UNITS, SkinMap
+from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
+from reconstruction.photometric_stereo import estimate_normals, light_check
+from reconstruction.pipeline import graph as stages
+from reconstruction.pipeline.evidence import Evidence, EvidenceError
+
+REVISION = 2
+"""Grows when the code of a stage changes its result, so that older maps are computed again."""
+
+MAPS = ("normals", "albedo", "residual")
+"""Maps that can be made of pictures with a light list."""
+
+MEMORY_BYTES = 2**30
+"""Size of a stack from which on it lies in a file and not in memory."""
+UNEVEN = 0.2
+"""Relative strength that a light may be off before it is named."""
+OUTLIER_SIGMAS = 4.0
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Stack:
+    """Gray pictures under each light, over exposure and strength of the light."""
+
+    gray: Float32
+    """(N, H, W)."""
+    usable: NDArray[np.bool_]
+    """(N, H, W)."""
+    inside: NDArray[np.bool_]
+    """(H, W)."""
+    records: tuple[FrameRecord, ...]
+    gain: NDArray[np.float64]
+    """(N, 3): what the values of each frame were multiplied with, per channel."""
+    folder: Any
+    """Keeps the file of a large stack alive."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lights:
+    """Lights that agree with the shading."""
+
+    vectors: NDArray[np.float64]
+    """(N, 3) in the order of the stack: directions, or positions in mm where near."""
+    near: bool
+    mm_per_px: float
+    alive: NDArray[np.bool_]
+
+
+def graph(evidence: Evidence) -> list[stages.Stage]:
+    """Return the stages that a session with a light list can go through; see `stages.run`."""
+    base = {"revision": REVISION, "inputs": dict(sorted(evidence.hashes.items()))}
+    return [
+        stages.Stage("stack", (), ("stack",), lambda: {"stack": _stack(evidence.session)}, base),
+        stages.Stage(
+            "lights", ("stack",), ("lights",), lambda stack: {"lights": _lights(evidence, stack)},
+            base,
+        ),
+        stages.Stage(
+            "normals", ("stack", "lights"), ("normals", "residual", "gray_albedo"),
+            lambda stack, lights: _normals(evidence, stack, lights), base,
+        ),
+        stages.Stage(
+            "albedo", ("stack", "lights", "normals", "gray_albedo"), ("albedo",),
+            lambda stack, lights, normals, gray_albedo: _albedo(
+                evidence.session, stack, lights, normals, gray_albedo
+            ),
+            base,
+        ),
+    ]  # fmt: skip
+
+
+def _linear(frame: raw.RawFrame) -> tuple[Float32, NDArray[np.bool_]]:
+    """Return values (H, W, C) over the range, and which are not saturated (H, W)."""
+    if frame.pattern == "MONO":
+        (black,) = frame.black
+        values = (frame.cfa.astype(np.float32) - black) / np.float32(frame.white - black)
+        return values[..., None], frame.cfa < frame.white
+    image = raw.linear_rgb(frame, demosaic="superpixel")
+    return image.rgb, image.valid
+
+
+def _stack(session: Session) -> Stack:
+    records = tuple(session.frames("olat"))
+    if len(records) < 3:
+        raise EvidenceError(
+            f"{session.path}: has {len(records)} frames under a light each, expected 3"
+        )
+    exposures = [
+        float(r.settings.get("exposure_s", 0.0)) * float(r.settings.get("iso", 100.0))
+        for r in records
+    ]
+    gain = np.ones((len(records), 3))
+    if all(e > 0 for e in exposures):
+        gain *= (np.median(exposures) / np.array(exposures))[:, None]
+    listed = session.manifest.extra.get("light_list")
+    strength = listed.get("intensity") if isinstance(listed, dict) else None
+    if strength is not None:
+        level = np.asarray(strength, np.float64)
+        gain /= level / level.mean()
+    gray: Any = None
+    usable: Any = None
+    folder: Any = None
+    for number, record in enumerate(records):
+        values, good = _linear(session.read(record))
+        if gray is None:
+            shape = (len(records), *good.shape)
+            if 4 * int(np.prod(shape)) > MEMORY_BYTES:
+                folder = tempfile.TemporaryDirectory(prefix="skinrig-")
+                at = Path(folder.name)
+                gray = np.memmap(at / "gray", np.float32, "w+", shape=shape)
+                usable = np.memmap(at / "usable", np.bool_, "w+", shape=shape)
+            else:
+                gray, usable = np.empty(shape, np.float32), np.empty(shape, bool)
+        factor = gain[number, : values.shape[2]].astype(np.float32)
+        gray[number] = (values * factor).mean(axis=-1)
+        usable[number] = good
+    inside = np.ones(gray.shape[1:], bool)
+    if "mask.png" in session.attachments():
+        import cv2
+
+        data = np.frombuffer(session.attachment("mask.png"), np.uint8)
+        mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+        if mask is None or mask.shape != inside.shape:
+            raise EvidenceError(f"{session.path}: its mask does not fit its pictures")
+        inside = np.asarray(mask > 127)
+    return Stack(gray, usable, inside, records, gain, folder)
+
+
+def _lights(evidence: Evidence, stack: Stack) -> Lights:
+    """Take the list's lights if the shading agrees, else the order that it agrees with."""
+    session = evidence.session
+    listed = session.manifest.extra["light_list"]
+    if not isinstance(listed, dict):
+        raise EvidenceError(f"{session.path}: its light list is no table")
+    vectors = np.array(
+        [session.rig.light(str(r.index["light"])).position_mm for r in stack.records], np.float64
+    )
+    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    near = bool(listed.get("near", False))
+    scale = float(listed.get("mm_per_px") or 1.0)
+    alive = np.ones(len(vectors), bool)
+    try:
+        found = light_check.check(
+            stack.gray, unit, valid=stack.usable & stack.inside, rng=np.random.default_rng(0)
+        )
+    except PhotometricStereoError as error:
+        evidence.assumed.append(f"the lights belong to their pictures ({error})")
+        return Lights(vectors, near, scale, alive)
+    best = f"{100 * min(found.misfit.values()):.1f} %"
+    as_listed = f"{100 * found.misfit['as listed']:.1f} %"
+    if found.order == "unknown":
+        evidence.assumed.append(
+            "the light list is right, though no order of it explains the shading"
+            f" (misfit {as_listed}): the object shines, or these are not its lights"
+        )
+    elif found.order != "as listed":
+        vectors = vectors[found.permutation]
+        evidence.assumed.append(
+            f"the light list is {found.order}: the shading's misfit is {as_listed} as listed and"
+            f" {best} so; it was used so"
+        )
+    alive = ~found.dead
+    for number in np.flatnonzero(found.dead):
+        evidence.assumed.append(f"light {number + 1} of the list gave no light and is left out")
+    off = np.flatnonzero(alive & (np.abs(found.strength - 1) > UNEVEN))
+    if off.size and found.order != "unknown":
+        worst = off[np.argmax(np.abs(found.strength[off] - 1))]
+        evidence.assumed.append(
+            f"lights are of one strength, though {off.size} differ by more than {UNEVEN:.0%}, most"
+            f" light {worst + 1} with {found.strength[worst]:.2f} of the middle one"
+        )
+    evidence.noted["light_check"] = {
+        "order": found.order,
+        "misfit": {name: round(value, 5) for name, value in found.misfit.items()},
+        "dead": [int(k) for k in np.flatnonzero(found.dead)],
+    }
+    return Lights(vectors, near, scale, alive)
+
+
+def _points_mm(shape: tuple[int, int], mm_per_px: float) -> NDArray[np.float64]:
+    """Return the places of pixels on the plane through the object's middle, (H, W, 3)."""
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(np.float64)
+    x, y = x - (shape[1] - 1) / 2, (shape[0] - 1) / 2 - y
+    return np.stack([mm_per_px * x, mm_per_px * y, np.zeros(shape)], axis=-1)
+
+
+def _estimate(stack: Stack, lights: Lights, *, robust: bool) -> NormalMaps:
+    alive = lights.alive
+    near: dict[str, Any] = {}
+    if lights.near:
+        near = {
+            "light_positions_mm": lights.vectors[alive],
+            "points_mm": _points_mm(stack.inside.shape, lights.mm_per_px),
+        }
+    usable = stack.usable & stack.inside
+    everything = bool(alive.all())
+    return estimate_normals(
+        stack.gray if everything else stack.gray[alive], lights.vectors[alive],
+        valid=usable if everything else usable[alive], robust=robust, **near,
+    )  # fmt: skip
+
+
+def _roughness_of_field(found: NormalMaps, both: NDArray[np.bool_]) -> float:
+    """Return how little the normals are those of a surface: the median curl of their slopes."""
+    z = np.maximum(found.normals[..., 2], 0.1)
+    p, q = -found.normals[..., 0] / z, -found.normals[..., 1] / z
+    curl = np.abs(np.diff(p, axis=0)[:, :-1] + np.diff(q, axis=1)[:-1])
+    inner = both[:-1, :-1] & both[1:, :-1] & both[:-1, 1:]
+    return float(np.median(curl[inner])) if inner.any() else float("inf")
+
+
+def _normals(evidence: Evidence, stack: Stack, lights: Lights) -> Mapping[str, Any]:
+    """Estimate normals both ways and keep those that are more of a surface's."""
+    found = {robust: _estimate(stack, lights, robust=robust) for robust in (True, False)}
+    both = found[True].valid & found[False].valid
+    curl = {robust: _roughness_of_field(maps, both) for robust, maps in found.items()}
+    robust = curl[True] <= curl[False]
+    evidence.noted["normals"] = {
+        "estimator": "robust" if robust else "least squares weighted by intensity",
+        "median_curl": {"robust": curl[True], "weighted": curl[False]},
+    }
+    best = found[robust]
+    valid = best.valid
+    n = np.where(valid[..., None], best.normals, 0.0)
+    # isotropic across the normal: each component has its share of the angle's error
+    each = best.stderr_rad[..., None] / np.sqrt(2.0) * np.sqrt(np.maximum(1.0 - n**2, 0.0))
+    relative = np.where(valid, best.residual / np.where(valid, best.albedo, 1.0), 0.0)
+    return {
+        "normals": SkinMap(
+            n, UNITS["normals"], np.where(valid[..., None], each, 0.0), valid,
+            "picture frame: x right, y up, z towards the camera",
+        ),
+        "residual": SkinMap(
+            relative, UNITS["residual"], None, valid, "root mean square misfit over albedo"
+        ),
+        "gray_albedo": best,
+    }  # fmt: skip
+
+
+def _albedo(
+    session: Session, stack: Stack, lights: Lights, normals: SkinMap, gray_albedo: NormalMaps
+) -> Mapping[str, SkinMap]:
+    """Fit each channel's albedo to the samples that agree with the gray fit."""
+    n, gray = normals.values, gray_albedo
+    above = np.zeros((), np.float64)
+    below = np.zeros(stack.inside.shape)
+    spread = OUTLIER_SIGMAS * gray.residual + 1e-6 * gray.albedo
+    points = _points_mm(stack.inside.shape, lights.mm_per_px) if lights.near else None
+    level = 1.0
+    if points is not None:
+        level = float(np.median(np.linalg.norm(lights.vectors, axis=1))) ** 2
+    for number in np.flatnonzero(lights.alive):
+        vector = lights.vectors[number]
+        if points is None:
+            shading = n @ (vector / np.linalg.norm(vector)).astype(np.float32)
+        else:
+            towards = vector - points
+            distance = np.linalg.norm(towards, axis=-1)
+            shading = level * np.sum(towards * n, axis=-1) / distance**3
+        agrees = np.abs(stack.gray[number] - gray.albedo * shading) <= spread
+        good = stack.usable[number] & agrees & (shading > 0.05) & gray.valid
+        weight = np.where(good, shading, 0.0)
+        values, _ = _linear(session.read(stack.records[number]))
+        above = above + weight[..., None] * values * stack.gain[number, : values.shape[2]]
+        below += weight * shading
+    valid = gray.valid & (below > 0)
+    albedo = above / np.where(valid, below, 1.0)[..., None]
+    albedo = np.where(valid[..., None], albedo, 0.0)
+    channels = albedo.shape[2]
+    error = np.minimum(gray.stderr_albedo, gray.albedo) * np.sqrt(channels)
+    errors = np.broadcast_to(np.where(valid, error, 0.0)[..., None], albedo.shape)
+    if channels == 1:
+        albedo, errors = albedo[..., 0], errors[..., 0]
+    return {
+        "albedo": SkinMap(
+            albedo.astype(np.float32), "1", np.ascontiguousarray(errors, np.float32), valid,
+            "over what the lights give a white surface, up to one factor",
+        )
+    }  # fmt: skip

@@ -1,0 +1,153 @@
+"""Frames of a fibre probe's session: darks, and one series of exposures for each placement."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.calibration.fiber.darks import CameraNoise, DarkModel, measure_darks
+from capture.calibration.fiber.merge import MergedSeries, merge_series
+from capture.plan.suction import Placement, placement_of
+from capture.session import FrameRecord, Session
+from reconstruction.pipeline.evidence import EvidenceError
+
+__all__ = ["Measurement", "ProbeImages", "measurement_name"]
+
+
+def measurement_name(placement: Placement) -> str:
+    """Return what the profile of one placement is called.
+
+    Examples
+    --------
+    >>> measurement_name(Placement("cheek", 22.5, 1))
+    'cheek_r1_a022.5'
+    """
+    return f"{placement.site}_r{placement.repeat}_a{placement.angle_deg:05.1f}"
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """One placement of the head, with what the box reported while it lasted."""
+
+    placement: Placement
+    brackets: int
+    """Exposures taken."""
+    level: float
+    """Of the source."""
+    suction_mbar: float
+    """Mean over the exposures; NaN where the box says nothing."""
+    camera_c: float
+    """The same of the camera's temperature, degrees Celsius."""
+
+    @property
+    def name(self) -> str:
+        """See `measurement_name`."""
+        return measurement_name(self.placement)
+
+
+class ProbeImages:
+    """Reads a probe's session, one series when it is asked for.
+
+    Parameters
+    ----------
+    session : Session
+        Open for reading.
+    noise : CameraNoise
+        Of its camera.
+    kind : str
+        Of the steps: "fibres" on skin, "phantom".
+
+    Attributes
+    ----------
+    measurements : tuple of Measurement
+        In the order of capture.
+
+    Raises
+    ------
+    EvidenceError
+        When the session holds no such frames.
+    """
+
+    def __init__(self, session: Session, *, noise: CameraNoise, kind: str = "fibres") -> None:
+        self._session = session
+        self._noise = noise
+        self._records: dict[Placement, list[FrameRecord]] = {}
+        for record in session.frames(kind):
+            placement = placement_of(record.step)
+            if placement is not None:
+                self._records.setdefault(placement, []).append(record)
+        if not self._records:
+            raise EvidenceError(f"{session.path}: has no frames of kind {kind!r}")
+        self.measurements = tuple(
+            Measurement(
+                placement, len(records), _level(records), _mean(records, "suction_mbar"),
+                _mean(records, "camera_c"),
+            )
+            for placement, records in self._records.items()
+        )  # fmt: skip
+        self._darks: DarkModel | None = None
+
+    @property
+    def darks(self) -> DarkModel:
+        """Bias and dark current of every pixel.
+
+        Raises
+        ------
+        EvidenceError
+            When the session has no dark frames.
+        """
+        if self._darks is None:
+            records = self._session.frames("dark")
+            if not records:
+                raise EvidenceError(
+                    f"{self._session.path}: has no frames of kind 'dark'; the camera's dark "
+                    "current is not known: capture with darks"
+                )
+            temperature = _mean(records, "camera_c")
+            self._darks = measure_darks(
+                [self._session.read(record).cfa for record in records],
+                [_exposure_s(record) for record in records],
+                noise=self._noise,
+                temperature_c=None if math.isnan(temperature) else temperature,
+            )
+        return self._darks
+
+    def merged(self, measurement: Measurement) -> MergedSeries:
+        """Return the frames of a measurement merged to light per second, darks subtracted."""
+        records = self._records[measurement.placement]
+        frames: list[NDArray[np.integer]] = [self._session.read(record).cfa for record in records]
+        known = not math.isnan(measurement.camera_c)
+        return merge_series(
+            frames,
+            [_exposure_s(record) for record in records],
+            darks=self.darks.at(measurement.camera_c if known else None),
+            noise=self._noise,
+            light_s=[_light_s(record) for record in records],
+        )
+
+
+def _exposure_s(record: FrameRecord) -> float:
+    return float(record.actual.get("exposure_s", record.settings["exposure_s"]))
+
+
+def _light_s(record: FrameRecord) -> float:
+    """Return how long the source shone into an exposure, s."""
+    exposure_s = _exposure_s(record)
+    return min(float(record.actual.get("open_s", exposure_s)), exposure_s)
+
+
+def _level(records: list[FrameRecord]) -> float:
+    levels = {float(record.settings.get("level", 1.0)) for record in records}
+    if len(levels) > 1:
+        raise EvidenceError(
+            f"step {records[0].step_id}: got levels {sorted(levels)} in one series, expected one"
+        )
+    return levels.pop()
+
+
+def _mean(records: list[FrameRecord], name: str) -> float:
+    told = [float(record.actual[name]) for record in records if name in record.actual]
+    return float(np.mean(told)) if told else math.nan

@@ -1,0 +1,320 @@
+"""Sessions and calibrations to maps: computes what is wanted, and records what it assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import date
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from capture.session import Session
+from model import store
+from model.skin import SkinAppearance, SkinMap
+from reconstruction.pipeline import graph as stages
+from reconstruction.pipeline import record as stage_record
+from reconstruction.pipeline.evidence import Evidence, EvidenceError
+from reconstruction.pipeline.hold_out import HoldOut
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What sessions of one kind can be made into."""
+
+    maps: tuple[str, ...]
+    """Names of the maps."""
+    graph: Callable[[Evidence], list[stages.Stage]]
+    files: tuple[str, ...] = ()
+    """Names of what is no map and goes along: meshes, tables."""
+    always: tuple[str, ...] = ()
+    """What the other maps mean nothing without."""
+    products: Callable[[Session], Mapping[str, tuple[str, ...]]] | None = None
+    """Where a name stands for more than itself, as for a map of each state: what for, by name."""
+    maps_of_rank: Callable[[int], tuple[str, ...]] | None = None
+    """Names of the maps where the number of lobes is chosen; None: this kind fits none."""
+
+    def expand(self, session: Session, want: Sequence[str]) -> list[str]:
+        """Return the maps and files that the wanted names stand for."""
+        meant = {} if self.products is None else self.products(session)
+        return [product for name in want for product in meant.get(name, (name,))]
+
+
+def _flash() -> Recipe:
+    from reconstruction.pipeline.flash import sequence as stages_of
+
+    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, products=stages_of.products)
+
+
+def _dome() -> Recipe:
+    from reconstruction.pipeline.dome import stages as stages_of
+
+    return Recipe(
+        stages_of.MAPS, stages_of.graph, stages_of.FILES, ("position",),
+        maps_of_rank=stages_of.maps_of,
+    )  # fmt: skip
+
+
+def _gradient() -> Recipe:
+    from reconstruction.pipeline.gradient import stages as stages_of
+
+    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, products=stages_of.products)
+
+
+def _probe() -> Recipe:
+    from reconstruction.pipeline.probe import stages as stages_of
+
+    return Recipe(stages_of.MAPS, stages_of.graph, stages_of.FILES, products=stages_of.products)
+
+
+def light_list() -> Recipe:
+    """Return the recipe of pictures under listed lights, imported without a rig."""
+    from reconstruction.pipeline import light_stack as stages_of
+
+    return Recipe(stages_of.MAPS, stages_of.graph)
+
+
+# kernels are compiled when a module is first imported: each rig imports its own only
+RECIPES: Mapping[str, Callable[[], Recipe]] = {
+    "subject": _flash,
+    "olat": _dome,
+    "gradient": _gradient,
+    "fibres": _probe,
+}
+"""By the kind of step that shows the subject."""
+
+
+def recipe_of(session: Session) -> Recipe:
+    """Return what can be made of a session.
+
+    Raises
+    ------
+    EvidenceError
+        When no step of its plan shows a subject.
+    """
+    if "light_list" in session.manifest.extra:
+        return light_list()
+    kinds = {step.kind for step in session.plan.steps}
+    for kind, recipe in RECIPES.items():
+        if kind in kinds:
+            return recipe()
+    raise EvidenceError(
+        f"{session.path}: shows {', '.join(sorted(kinds))}, expected steps of kind "
+        f"{' or '.join(RECIPES)}; `skinrig calibrate` takes sessions of targets"
+    )
+
+
+def reconstruct(
+    session: str | Path,
+    *,
+    want: Sequence[str],
+    out: str | Path,
+    calibration: str | Path | None = None,
+    state: str = "neutral",
+    on_date: date | None = None,
+    scan: str | Path | None = None,
+    basis: str | Path | None = None,
+    landmarks: str | Path | None = None,
+    hold_out: HoldOut | str | None = None,
+    rank: int | None = None,
+    truth: str = "",
+    progress: Callable[[str], None] | None = None,
+) -> stages.Outcome:
+    """Make the wanted maps of a session and write them to an APPEARANCE/ folder.
+
+    Parameters
+    ----------
+    session
+        SESSION/ folder.
+    want
+        Names of maps; which there are depends on the rig, see :data:`RECIPES`.
+    out
+        The folder. Maps in it that are still current, by the hash of all that they depend on,
+        are kept and not computed again.
+    calibration
+        CALIBRATION/ folder; without it assumptions take its place and are recorded.
+    state
+        Which state of the subject.
+    on_date
+        The date the calibrations must be valid on; None: that of the session.
+    scan
+        A mesh of the face, PLY in mm, instead of the one that a dome session holds.
+    basis
+        Folder of MERL ``.binary`` tables that surface lobes are fitted with, instead of the
+        generated dielectrics.
+    landmarks
+        Table "name,x,y" of places on a probe's translucency map, pixels from its top left; None:
+        forehead, cheek and chin of the simulated heads' texture.
+    hold_out
+        Lights and views of a dome session whose frames no fit sees, as
+        "lights=L007,L023,views=C03" or as parsed; what `skinrig render --against` compares with.
+    rank
+        Lobes that a dome's points share, 1 to 59; None: 4.
+    truth
+        Name of the TRUTH/ folder beside ``out``, for the report.
+    progress
+        Called with one line before each stage that runs.
+
+    Returns
+    -------
+    stages.Outcome
+        With what ran, what was reused, and what was left out and why.
+
+    Raises
+    ------
+    EvidenceError, stages.StageError, SessionError, CalibrationError
+        When frames are missing, a wanted map is unknown, or a file is damaged, of another rig
+        or out of date.
+    """
+    opened = Session.open(session)
+    recipe = recipe_of(opened)
+    store.require_free(out)
+    of_domes = {"hold-out": hold_out, "rank": rank, "scan": scan, "basis": basis}
+    given = [name for name, value in of_domes.items() if value is not None]
+    if given and recipe.maps_of_rank is None:
+        raise EvidenceError(
+            f"{', '.join(given)}: {opened.path} is no session of the dome; leave out what only it "
+            "takes"
+        )
+    for name, file in (("scan", scan), ("landmarks", landmarks)):
+        if file is not None and not Path(file).is_file():
+            raise EvidenceError(f"{name}: {file} is no file")
+    if rank is not None and rank < 1:
+        raise EvidenceError(f"rank: got {rank}, expected 1 or more")
+    if rank is not None and recipe.maps_of_rank is not None:
+        recipe = replace(recipe, maps=recipe.maps_of_rank(rank))
+    known = ", ".join(recipe.maps)
+    if not want:
+        raise EvidenceError(f"want: got nothing, expected names out of {known}")
+    unknown = [name for name in want if name not in recipe.maps]
+    if unknown:
+        raise EvidenceError(f"want: got {unknown[0]!r}, expected names out of {known}")
+    evidence = Evidence.of(
+        opened, calibration, state=state, on_date=on_date, scan=scan, basis=basis,
+        landmarks=landmarks,
+    )  # fmt: skip
+    evidence.progress = progress
+    evidence.rank = rank
+    if hold_out is not None:
+        evidence.hold_out = HoldOut.parse(hold_out) if isinstance(hold_out, str) else hold_out
+    graph = recipe.graph(evidence)
+    kept_names = recipe.expand(opened, (*recipe.maps, *recipe.files))
+    want = recipe.expand(opened, (*want, *recipe.always))
+    # a stage's other maps cost nothing more, and only whole stages can be reused
+    want = [
+        name
+        for stage in graph
+        if set(stage.makes) & set(want)
+        for name in stage.makes
+        if name in kept_names
+    ]
+    previous = _previous(Path(out))
+    outcome = stages.run(graph, list(want), cache=_Kept(graph, previous), progress=progress)
+    earlier = {} if previous is None else _recorded_keys(previous)
+    work = stage_record.record(graph, outcome, _made_keys(graph, previous, earlier))
+    outcome = replace(outcome, assumed=tuple(evidence.assumed), work=work)
+    # what the subject agreed to goes wherever the maps go
+    consent = [opened.manifest.to_json()["subject"]] if opened.source == "measured" else []
+    current = previous is not None and previous.parameters.get("consent", []) == consent
+    if not outcome.ran and previous is not None and current:
+        if set(want) <= set(_contents(previous)):
+            return outcome
+    keys = _all_keys(graph)
+    kept = {name: outcome.products[name] for name in want}
+    noted = dict(evidence.noted)
+    if previous is not None:
+        recorded = _recorded_keys(previous)
+        before = _contents(previous)
+        for stage in graph:
+            if recorded.get(stage.name) == keys[stage.name]:
+                for name in stage.makes:
+                    if name in before:
+                        kept.setdefault(name, before[name])
+        if dict(previous.inputs) == evidence.hashes:
+            names = previous.parameters.get("noted", [])
+            for name in names if isinstance(names, list) else []:
+                noted.setdefault(str(name), previous.parameters.get(str(name)))
+    appearance = SkinAppearance(
+        maps={name: value for name, value in kept.items() if isinstance(value, SkinMap)},
+        source=opened.source,
+        parameters={
+            "kind": "appearance",
+            "session": Path(session).name,
+            "state": state,
+            "truth": truth,
+            "stages": {stage.name: keys[stage.name] for stage in graph},
+            "work": [dict(entry) for entry in work],
+            "assumed": evidence.assumed,
+            "consent": consent,
+            "noted": sorted(noted),
+            **noted,
+        },
+        inputs=evidence.hashes,
+        versions={name: metadata.version(name) for name in ("skinrig", "numpy", "scipy", "numba")},
+        left_out=outcome.left_out,
+        files={name: value for name, value in kept.items() if isinstance(value, bytes)},
+        seed=opened.seed,
+    )
+    store.write(out, appearance)
+    return outcome
+
+
+class _Kept:
+    """Finished maps in an older APPEARANCE/ folder, by the hash of their stage."""
+
+    def __init__(self, graph: Sequence[stages.Stage], previous: SkinAppearance | None) -> None:
+        self._by_key: dict[str, Mapping[str, SkinMap | bytes]] = {}
+        if previous is None:
+            return
+        recorded = _recorded_keys(previous)
+        before = _contents(previous)
+        for stage in graph:
+            kept = {name: before[name] for name in stage.makes if name in before}
+            if stage.name in recorded and kept:
+                self._by_key[recorded[stage.name]] = kept
+
+    def load(self, key: str) -> Mapping[str, Any] | None:
+        return self._by_key.get(key)
+
+    def save(self, key: str, products: Mapping[str, Any]) -> None:
+        """Nothing: the finished folder is what is kept."""
+
+
+def _previous(out: Path) -> SkinAppearance | None:
+    if not (out / store.DOCUMENT).is_file():
+        return None
+    try:
+        return store.read(out)
+    except store.StoreError as error:
+        raise EvidenceError(
+            f"{error}; nothing was written: remove {out}, or name another, to make all anew"
+        ) from error
+
+
+def _contents(appearance: SkinAppearance) -> dict[str, SkinMap | bytes]:
+    """Return the maps and the files of an appearance by their names."""
+    return {**appearance.maps, **appearance.files}
+
+
+def _recorded_keys(appearance: SkinAppearance) -> dict[str, str]:
+    recorded = appearance.parameters.get("stages", {})
+    return {str(k): str(v) for k, v in recorded.items()} if isinstance(recorded, dict) else {}
+
+
+def _made_keys(
+    graph: Sequence[stages.Stage], previous: SkinAppearance | None, recorded: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the input hashes of the stages that an appearance holds something of."""
+    if previous is None:
+        return {}
+    before = _contents(previous)
+    made = {stage.name for stage in graph if any(name in before for name in stage.makes)}
+    return {name: key for name, key in recorded.items() if name in made}
+
+
+def _all_keys(graph: Sequence[stages.Stage]) -> dict[str, str]:
+    made_by = {product: stage.name for stage in graph for product in stage.makes}
+    keys: dict[str, str] = {}
+    for stage in stages.order(graph, [p for s in graph for p in s.makes]):
+        keys[stage.name] = stages.input_hash(stage, [keys[made_by[p]] for p in stage.needs])
+    return keys

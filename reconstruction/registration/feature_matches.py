@@ -1,0 +1,134 @@
+"""The same points of two pictures, found without anybody's landmarks.
+
+Scale-invariant features are matched by their descriptors both ways. Skin repeats itself, so that
+many matches are wrong: those that agree with a rough common motion are kept, and of these the ones
+that move about as their neighbors do.
+
+References
+----------
+Lowe 2004, Distinctive image features from scale-invariant keypoints,
+doi:10.1023/B:VISI.0000029664.99615.94
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.registration.tracking import RegistrationError
+
+Floats = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+MOST_FEATURES = 3000
+RATIO = 0.85
+"""A match whose second best is not clearly worse is left out (Lowe's ratio)."""
+ROUGH = 0.06
+"""How far a match may be off the common affine motion, as a part of the picture's diagonal."""
+NEIGHBORS = 8
+MOST_APART = 0.25
+"""How much a match may differ from its neighbors' motion, as a part of their distance ..."""
+LEAST_APART_PX = 1.5
+"""... and this much at any distance."""
+CELL = 24
+"""At most one match is kept in each cell of so many by so many over the picture."""
+LEAST_MATCHES = 12
+"""Fewer that agree may agree by chance."""
+
+
+class FeatureError(RegistrationError):
+    """Two pictures in which too few of the same points were found."""
+
+
+def match(
+    first: Bytes,
+    second: Bytes,
+    *,
+    valid: NDArray[np.bool_],
+    valid_second: NDArray[np.bool_],
+) -> tuple[Floats, Floats]:
+    """Find points that two pictures share.
+
+    Parameters
+    ----------
+    first, second : ndarray of uint8, (H, W)
+        Local contrast, as of `reconstruction.registration.evened`.
+    valid, valid_second : ndarray of bool
+        Where features may lie.
+
+    Returns
+    -------
+    points_px, moved_px : ndarray of float64, shape (K, 2)
+        Column and row in the first and in the second picture, K at least `LEAST_MATCHES`.
+
+    Raises
+    ------
+    FeatureError
+        When too few features agree on a motion.
+    """
+    finder = cv2.SIFT.create(nfeatures=MOST_FEATURES, contrastThreshold=0.02)
+    places, words = [], []
+    for image, mask in ((first, valid), (second, valid_second)):
+        keys, descriptors = finder.detectAndCompute(image, mask.astype(np.uint8) * 255)
+        places.append(np.array([key.pt for key in keys], np.float64).reshape(-1, 2))
+        words.append(descriptors)
+    if min(len(place) for place in places) < LEAST_MATCHES:
+        raise FeatureError(
+            f"features: found {len(places[0])} and {len(places[1])}, "
+            f"expected at least {LEAST_MATCHES} in both pictures; give landmarks"
+        )
+    pairs = _mutual(words[0], words[1])
+    one, two = places[0][pairs[:, 0]], places[1][pairs[:, 1]]
+    one, two = _smooth(one, two, float(np.hypot(*first.shape)))
+    if len(one) < LEAST_MATCHES:
+        raise FeatureError(
+            f"features: {len(one)} agree on a smooth motion, expected at least {LEAST_MATCHES}; "
+            "give landmarks"
+        )
+    return one, two
+
+
+def _mutual(words: Any, others: Any) -> NDArray[np.intp]:
+    """Return the pairs of descriptors that choose each other, and no second one nearly as much."""
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    there = matcher.knnMatch(words, others, k=2)
+    back = [m[0].trainIdx for m in matcher.knnMatch(others, words, k=1)]
+    pairs = [
+        (m[0].queryIdx, m[0].trainIdx)
+        for m in there
+        if len(m) == 2
+        and m[0].distance < RATIO * m[1].distance
+        and back[m[0].trainIdx] == m[0].queryIdx
+    ]
+    return np.array(pairs, np.intp).reshape(-1, 2)
+
+
+def _smooth(one: Floats, two: Floats, diagonal: float) -> tuple[Floats, Floats]:
+    """Keep matches that move with the whole, and about as their neighbors do."""
+    if len(one) < LEAST_MATCHES:
+        return one[:0], two[:0]
+    cv2.setRNGSeed(0)  # sampling is repeatable
+    _, inlier = cv2.estimateAffine2D(
+        one, two, method=cv2.RANSAC, ransacReprojThreshold=ROUGH * diagonal, maxIters=5000
+    )
+    kept = np.flatnonzero(np.asarray(inlier).reshape(-1) == 1)
+    one, two = one[kept], two[kept]
+    for _ in range(3):
+        if len(one) <= NEIGHBORS:
+            return one[:0], two[:0]
+        apart = np.linalg.norm(one[:, None] - one, axis=-1)
+        near = np.argsort(apart, axis=1, kind="stable")[:, 1 : NEIGHBORS + 1]
+        motion = two - one
+        middle = np.median(motion[near], axis=1)
+        far = np.median(np.take_along_axis(apart, near, axis=1), axis=1)
+        off = np.linalg.norm(motion - middle, axis=1)
+        good = off <= MOST_APART * far + LEAST_APART_PX
+        one, two = one[good], two[good]
+        if good.all():
+            break
+    cell = np.floor(one / (diagonal / np.sqrt(2.0) / CELL)).astype(int)
+    _, first = np.unique(cell, axis=0, return_index=True)
+    return one[np.sort(first)], two[np.sort(first)]

@@ -1,0 +1,440 @@
+"""How the head moved during a capture, from tracking frames of all cameras.
+
+Points of the scan are followed from a reference frame to every other in each camera; one rigid
+motion a frame explains all cameras' tracks together. What it does not explain is an expression,
+and a frame with much of that is not usable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reconstruction.registration import tracking as registration
+
+Floats = NDArray[np.float64]
+
+LEAST_COSINE = 0.4
+"""Cosine between normal and view below which a point is not tracked."""
+LEAST_TRACKS = 12
+"""Tracks below which a frame tells no motion."""
+TUKEY = 4.685
+OUTLIER_SIGMAS, OUTLIER_PX = 4.0, 0.3
+"""Residual, in the capture's usual scale and in px, from which a track moves on its own."""
+NONRIGID_SHARE = 0.05
+"""Share of such tracks, beyond the capture's usual one, from which a frame is not usable."""
+NONRIGID_AT_ALL = 0.3
+OFTEN = 1 / 3
+"""Part of the frames from which on a track that moves on its own is not one of the skin."""
+PART_MM = 15.0
+PART_TIMES = 2.5
+"""Residual of the worst part of a face over the capture's usual one, and over what is usual beside
+the frame's own residuals: from either on it is an expression."""
+BLOCK_PX = 32
+"""Side of the parts of an image whose tracks err alike."""
+_STEP_MM = 0.01
+_FINEST_PX = 1e-6
+_MAD = 1.1774100225154747  # median of the length of a unit normal vector in two dimensions
+
+
+class HeadMotionError(ValueError):
+    """Frames, cameras or points that no motion can be estimated from."""
+
+
+class Camera(Protocol):
+    """What is needed of a camera."""
+
+    @property
+    def center_mm(self) -> Floats:
+        """Centre of projection, (3,)."""
+
+    def project(self, points_mm: Floats) -> Floats:
+        """Return column and row (N, 2) of points (N, 3)."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeadMotion:
+    """Rigid motion of the head: a point x of the scan is at R x + t.
+
+    Attributes
+    ----------
+    times_s : ndarray, shape (T,)
+        Of the tracking frames, rising.
+    rotation_rad : ndarray, shape (T, 3)
+        Rotation vectors about the rig's origin.
+    translation_mm : ndarray, shape (T, 3)
+    stderr : ndarray, shape (T, 6)
+        Of rotation (rad) and translation (mm); 0 for the reference frame, infinite where a frame
+        tells no motion.
+    usable : ndarray of bool, shape (T,)
+        Enough tracks, and the face moved as a whole.
+    residual_px : ndarray, shape (T,)
+        Scale of what the rigid motion leaves of the tracks.
+    nonrigid : ndarray, shape (T,)
+        Share of the tracks that do not move with the head.
+    worst_part_px : ndarray, shape (T,)
+        Largest median residual of a part of the face, 15 mm across, seen by three tracks or more.
+    tracks : ndarray of int, shape (T,)
+    """
+
+    times_s: Floats
+    rotation_rad: Floats
+    translation_mm: Floats
+    stderr: Floats
+    usable: NDArray[np.bool_]
+    residual_px: Floats
+    nonrigid: Floats
+    worst_part_px: Floats
+    tracks: NDArray[np.intp]
+
+    def at(self, times_s: ArrayLike) -> tuple[Floats, Floats]:
+        """Return the motion between frames: rotation vectors (K, 3) and translations (K, 3).
+
+        Straight between usable frames; before the first and after the last as there.
+
+        Raises
+        ------
+        HeadMotionError
+            When no frame is usable.
+        """
+        when = np.atleast_1d(np.asarray(times_s, np.float64))
+        if not self.usable.any():
+            raise HeadMotionError("usable: got no frame that tells the motion, expected one")
+        known = self.times_s[self.usable]
+        turn, shift = (
+            np.stack([np.interp(when, known, row) for row in values[self.usable].T], axis=-1)
+            for values in (self.rotation_rad, self.translation_mm)
+        )
+        return turn, shift
+
+    def matrices(self, times_s: ArrayLike) -> Floats:
+        """Return the motion as (K, 4, 4) matrices that take points to where they were."""
+        turn, shift = self.at(times_s)
+        out = np.tile(np.eye(4), (len(turn), 1, 1))
+        out[:, :3, :3] = rotation_matrix(turn)
+        out[:, :3, 3] = shift
+        return out
+
+    def covered(self, times_s: ArrayLike) -> NDArray[np.bool_]:
+        """Return which times lie between two usable frames that follow each other, (K,)."""
+        when = np.atleast_1d(np.asarray(times_s, np.float64))
+        after = np.searchsorted(self.times_s, when, side="left")
+        exact = (after < len(self.times_s)) & (
+            self.times_s[np.minimum(after, len(self.times_s) - 1)] == when
+        )
+        low = np.where(exact, after, after - 1)
+        inside = (low >= 0) & (after < len(self.times_s))
+        low, high = np.maximum(low, 0), np.minimum(after, len(self.times_s) - 1)
+        return inside & self.usable[low] & self.usable[high]
+
+    def displacement_mm(self, points_mm: ArrayLike) -> Floats:
+        """Return how far points are from where the scan has them, root mean square, (T,)."""
+        points = np.asarray(points_mm, np.float64).reshape(-1, 3)
+        moved = points @ np.swapaxes(rotation_matrix(self.rotation_rad), -1, -2)
+        moved = moved + self.translation_mm[:, None] - points
+        return np.sqrt(np.mean(np.sum(moved**2, axis=-1), axis=-1))
+
+
+def rotation_matrix(vector_rad: ArrayLike) -> Floats:
+    """Return the rotation of a rotation vector (..., 3) as matrices (..., 3, 3), Rodrigues.
+
+    Examples
+    --------
+    >>> (rotation_matrix([0, 0, np.pi / 2]) @ [1, 0, 0]).round(6).tolist()
+    [0.0, 1.0, 0.0]
+    """
+    v = np.asarray(vector_rad, np.float64)
+    angle = np.linalg.norm(v, axis=-1)[..., None, None]
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    zero = np.zeros_like(x)
+    K = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
+    small = angle < 1e-8
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0, np.sin(safe) / safe)
+    b = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    return np.asarray(np.eye(3) + a * K + b * (K @ K))
+
+
+def estimate(
+    frames: Sequence[Sequence[NDArray[np.floating]]] | NDArray[np.floating],
+    cameras: Sequence[Camera],
+    points_mm: ArrayLike,
+    normals: ArrayLike,
+    times_s: ArrayLike,
+    *,
+    reference: int = 0,
+    tracks_per_camera: int = 300,
+    iterations: int = 12,
+) -> HeadMotion:
+    """Estimate the rigid motion of the head in every tracking frame.
+
+    Parameters
+    ----------
+    frames : sequence or ndarray, shape (T, C, H, W)
+        Linear images of one channel, all under the same lights; sizes may differ between cameras.
+    cameras : sequence of C cameras
+        With ``project(points_mm)`` and ``center_mm``.
+    points_mm, normals : array_like, shape (P, 3)
+        The scan's points and outward normals as the head is in the reference frame; some thousands
+        are enough.
+    times_s : array_like, shape (T,)
+        Of the frames, rising, s.
+    reference : int
+        Frame in which the head is where the scan has it.
+    tracks_per_camera : int
+        The most points to follow in each camera.
+    iterations : int
+        Gauss-Newton steps.
+
+    Returns
+    -------
+    HeadMotion
+
+    Raises
+    ------
+    HeadMotionError
+        For shapes that do not fit, times that do not rise, or too few points with texture.
+
+    Notes
+    -----
+    Standard errors take parts of an image as independent; what all tracks have in common, such as
+    the noise of the reference frame, is not in them.
+    """
+    points, outward, times = _checked(frames, cameras, points_mm, normals, times_s, reference)
+    chosen, evened = [], []
+    for number, camera in enumerate(cameras):
+        even = registration.evened(np.asarray(frames[reference][number]))
+        seen = _facing(points, outward, np.asarray(camera.center_mm, np.float64))
+        places = np.full((len(points), 2), np.nan)
+        places[seen] = camera.project(points[seen])
+        chosen.append(registration.textured(even, places, count=tracks_per_camera))
+        evened.append(even)
+    total = sum(len(rows) for rows in chosen)
+    if total < LEAST_TRACKS:
+        raise HeadMotionError(
+            f"points_mm: {total} points have texture in the reference frame, expected at least "
+            f"{LEAST_TRACKS}; light the tracking frames better or check the cameras' poses"
+        )
+    found = []
+    for time, pictures in enumerate(frames):
+        if time == reference:
+            found.append(_Pose(np.zeros(6), np.zeros(6), np.zeros(total)))
+            continue
+        found.append(_pose(pictures, cameras, points, chosen, evened, iterations))
+    return _judged(found, np.concatenate([points[rows] for rows in chosen]), times, reference)
+
+
+@dataclass(frozen=True, slots=True)
+class _Pose:
+    """Rotation vector and translation of one frame, and what they leave of each track."""
+
+    motion: Floats
+    stderr: Floats
+    residual_px: Floats
+    """Length, infinite for a track that was lost."""
+
+
+def _checked(
+    frames: Sequence[Sequence[NDArray[np.floating]]] | NDArray[np.floating],
+    cameras: Sequence[Camera],
+    points_mm: ArrayLike,
+    normals: ArrayLike,
+    times_s: ArrayLike,
+    reference: int,
+) -> tuple[Floats, Floats, Floats]:
+    points, outward = np.asarray(points_mm, np.float64), np.asarray(normals, np.float64)
+    times = np.asarray(times_s, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or outward.shape != points.shape:
+        raise HeadMotionError(
+            f"points_mm, normals: got shapes {points.shape} and {outward.shape}, expected (P, 3)"
+        )
+    if times.shape != (len(frames),) or (np.diff(times) <= 0).any():
+        raise HeadMotionError(
+            f"times_s: got shape {times.shape} for {len(frames)} frames, expected one rising time"
+            " each"
+        )
+    if any(len(pictures) != len(cameras) for pictures in frames) or not len(cameras):
+        raise HeadMotionError(f"frames: expected one picture of each of {len(cameras)} cameras")
+    if not 0 <= reference < len(frames):
+        raise HeadMotionError(f"reference: got {reference}, expected 0 to {len(frames) - 1}")
+    good = np.isfinite(points).all(axis=1) & np.isfinite(outward).all(axis=1)
+    return points[good], outward[good], times
+
+
+def _facing(points: Floats, normals: Floats, center: Floats) -> NDArray[np.bool_]:
+    towards = center - points
+    length = np.linalg.norm(towards, axis=1) * np.linalg.norm(normals, axis=1)
+    cosine = np.sum(towards * normals, axis=1) / np.where(length > 0, length, 1.0)
+    return np.asarray(cosine > LEAST_COSINE)
+
+
+def _pose(
+    pictures: Sequence[NDArray[np.floating]] | NDArray[np.floating],
+    cameras: Sequence[Camera],
+    points: Floats,
+    chosen: Sequence[NDArray[np.intp]],
+    evened: Sequence[NDArray[np.uint8]],
+    iterations: int,
+) -> _Pose:
+    seen: list[tuple[Camera, Floats, Floats]] = []
+    kept = []
+    for picture, camera, rows, even in zip(pictures, cameras, chosen, evened, strict=True):
+        start = np.asarray(camera.project(points[rows])) if len(rows) else np.zeros((0, 2))
+        tracks = registration.track(even, registration.evened(np.asarray(picture)), start)
+        kept.append(tracks.valid)
+        if tracks.valid.any():
+            seen.append((camera, points[rows][tracks.valid], tracks.points_px[tracks.valid]))
+    found = np.concatenate(kept)
+    left = np.full(found.size, np.inf)
+    if np.count_nonzero(found) < LEAST_TRACKS:
+        return _Pose(np.zeros(6), np.full(6, np.inf), left)
+    motion = np.zeros(6)
+    for _ in range(iterations):
+        r, J = _residuals(seen, motion)
+        length = np.linalg.norm(r, axis=1)
+        scale = max(float(np.median(length)) / _MAD, 1e-6)
+        w = np.maximum(1.0 - (length / (TUKEY * scale)) ** 2, 0.0) ** 2
+        A = np.einsum("n,nki,nkj->ij", w, J, J)
+        size = np.sqrt(np.maximum(np.diag(A), 1e-300))
+        A = A / np.outer(size, size) + 1e-9 * np.eye(6)
+        step = np.linalg.solve(A, np.einsum("n,nki,nk->i", w, J, r) / size) / size
+        motion = motion + step
+        if float(np.abs(step[:3]).max()) < 1e-8 and float(np.abs(step[3:]).max()) < 1e-6:
+            break
+    r, J = _residuals(seen, motion)
+    length = np.linalg.norm(r, axis=1)
+    scale = max(float(np.median(length)) / _MAD, 1e-6)
+    u2 = (length / (TUKEY * scale)) ** 2
+    stderr = _stderr(r, J, u2, _blocks(seen))
+    if not np.isfinite(stderr).all():
+        motion = np.zeros(6)
+    left[found] = length
+    return _Pose(motion, stderr, left)
+
+
+def _worst_part(points: Floats, length: Floats) -> float:
+    """Return the largest median residual of the parts of a face, 0 where none has three tracks.
+
+    Parts overlap by half, so that an expression lies in one of them as a whole.
+    """
+    worst = 0.0
+    for shift in (0.0, 0.5):
+        cell = np.floor(points / PART_MM + shift).astype(np.intp)
+        _, part, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+        part = part.reshape(-1)
+        for number in np.flatnonzero(count >= 3):
+            worst = max(worst, float(np.median(length[part == number])))
+    return worst
+
+
+def _blocks(seen: Sequence[tuple[Camera, Floats, Floats]]) -> NDArray[np.intp]:
+    """Return a number for each track: that of its camera's part of the image."""
+    names = [
+        np.stack([np.full(len(at), k), *(at // BLOCK_PX).T.astype(np.intp)], axis=1)
+        for k, (_, _, at) in enumerate(seen)
+    ]
+    _, block = np.unique(np.concatenate(names), axis=0, return_inverse=True)
+    return np.asarray(block.reshape(-1), np.intp)
+
+
+def _stderr(r: Floats, J: Floats, u2: Floats, block: NDArray[np.intp]) -> Floats:
+    """Return the standard errors (6,), infinite where the tracks do not tell the motion.
+
+    Tracks of one part of an image err alike: their windows overlap, their texture is foreshortened
+    alike. The pull of each part as a whole is what counts (Liang and Zeger 1986,
+    doi 10.1093/biomet/73.1.13), and no less than independent tracks would have.
+    """
+    kept = u2 < 1
+    w = np.where(kept, (1 - u2) ** 2, 0.0)
+    A = np.einsum("n,nki,nkj->ij", w, J, J)
+    size = np.sqrt(np.maximum(np.diag(A), 1e-300))
+    scaled = A / np.outer(size, size)
+    if np.linalg.eigvalsh(scaled)[0] < 1e-8:
+        return np.full(6, np.inf)
+    inverse = np.linalg.inv(scaled) / np.outer(size, size)
+    pull = np.einsum("n,nki,nk->ni", w, J, r)
+    together = np.zeros((int(block.max()) + 1, 6))
+    np.add.at(together, block, pull)
+    parts = np.unique(block[kept]).size
+    few = parts / (parts - 6) if parts > 7 else float(parts)
+    clustered = few * np.diag(inverse @ (together.T @ together) @ inverse)
+    # Huber (1981), section 7.6, with both coordinates of a track as samples
+    psi2 = float(np.sum(w[kept] ** 2 * np.sum(r[kept] ** 2, axis=1)))
+    slope = max(float(np.mean((1 - u2[kept]) * (1 - 3 * u2[kept]))), 0.1)
+    variance = psi2 / max(2 * int(np.count_nonzero(kept)) - 6, 1) / slope**2
+    plain = np.linalg.inv(np.einsum("nki,nkj->ij", J[kept] / size, J[kept] / size))
+    alone = variance * np.diag(plain) / size**2
+    return np.asarray(np.sqrt(np.maximum(clustered, alone)))
+
+
+def _residuals(
+    seen: Sequence[tuple[Camera, Floats, Floats]], motion: Floats
+) -> tuple[Floats, Floats]:
+    """Return what is left of the tracks (n, 2) and its derivative by the motion (n, 2, 6)."""
+    rows, slopes = [], []
+    R = rotation_matrix(motion[:3])
+    for camera, points, tracked in seen:
+        turned = points @ R.T
+        moved = turned + motion[3:]
+        rows.append(tracked - camera.project(moved))
+        by_place = np.empty((len(points), 2, 3))
+        for axis in range(3):
+            step = np.zeros(3)
+            step[axis] = _STEP_MM
+            ahead, behind = camera.project(moved + step), camera.project(moved - step)
+            by_place[:, :, axis] = (ahead - behind) / (2 * _STEP_MM)
+        # a small further turn w moves R x by w x (R x): columns e_k x (R x)
+        cross = np.cross(np.eye(3)[None], turned[:, None, :])
+        slopes.append(
+            np.concatenate([np.einsum("nij,nkj->nik", by_place, cross), by_place], axis=-1)
+        )
+    r, J = np.concatenate(rows), np.concatenate(slopes)
+    known = np.isfinite(r).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
+    # a point that a step took behind its camera pulls no more
+    return np.where(known[:, None], r, 1e6), np.where(known[:, None, None], J, 0.0)
+
+
+def _judged(found: Sequence[_Pose], points: Floats, times: Floats, reference: int) -> HeadMotion:
+    """Compare the frames with each other: what is usual is noise, what is not an expression."""
+    left = np.array([f.residual_px for f in found])
+    known = np.isfinite(left)
+    scales = np.array([_middle(row) / _MAD for row in left])
+    told = np.array([np.isfinite(f.stderr).all() for f in found])
+    others = told & (np.arange(len(found)) != reference)
+    far = left > max(OUTLIER_SIGMAS * _middle(scales[others]), OUTLIER_PX)
+    # what leaves the head in many frames is no expression but an edge that hides points
+    steady = np.ones(len(points), bool)
+    if np.count_nonzero(others) >= 4:
+        steady = np.mean(far[others], axis=0) <= OFTEN
+    share = np.mean(far[:, steady], axis=1) if steady.any() else np.ones(len(found))
+    worst = np.array(
+        [_worst_part(points[use], row[use]) for row, use in zip(left, known & steady, strict=True)]
+    )
+    usable = told & (share <= min(_middle(share[others]) + NONRIGID_SHARE, NONRIGID_AT_ALL))
+    # residuals grow as the head turns in its light, and the worst part's with them
+    own = worst / np.maximum(scales, _FINEST_PX)
+    usual = np.minimum(_middle(worst[others]), _middle(own[others]) * scales)
+    usable &= worst <= np.fmax(PART_TIMES * usual, OUTLIER_PX)
+    usable[reference] = True
+    motion = np.array([f.motion for f in found])
+    return HeadMotion(
+        times_s=times,
+        rotation_rad=motion[:, :3],
+        translation_mm=motion[:, 3:],
+        stderr=np.array([f.stderr for f in found]),
+        usable=usable,
+        residual_px=scales,
+        nonrigid=share,
+        worst_part_px=worst,
+        tracks=np.count_nonzero(known, axis=1),
+    )
+
+
+def _middle(values: Floats) -> float:
+    """Return the median of the finite values, 0 where there are none."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else 0.0

@@ -1,0 +1,368 @@
+"""How skin was stretched, sheared and moved between two pictures of it, with standard errors.
+
+Nagano et al. 2015 (doi 10.1145/2766894) take the stretch ratio from the caliper. Tape creeps and
+slips, so here it is the skin's own: an affine map between two pictures of its pigment, first by
+maximizing the enhanced correlation coefficient (Evangelidis and Psarakis 2008,
+doi 10.1109/TPAMI.2008.113) over a pyramid, then by least squares on many small windows that were
+followed separately, whose scatter, as alike as it is in neighbors, gives the standard errors
+(`reconstruction.registration.affine_fit`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.registration.affine_fit import fit_affine
+from reconstruction.registration.tracking import RegistrationError, evened, textured, track
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.floating]
+
+LEAST_SIDE_PX = 64
+COARSEST_PX = 48
+"""Shortest side of the pyramid's top."""
+WINDOW_PX = 25
+LEAST_WINDOWS = 12
+"""Fewer windows tell nothing of their own scatter: six numbers are fitted to them."""
+OUTLIER = 4.0
+"""Windows farther off the fit than this many robust standard deviations are left out."""
+MISMATCH_PX = 2.0
+"""Windows farther off the fit than this have followed something else."""
+ROUNDS = 3
+
+_FLIP = np.diag([1.0, -1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Strain:
+    """How skin in one picture became skin in another.
+
+    A point at x (mm or px from the image's middle, +x right, +y up) comes to ``gradient @ x +
+    shift``.
+
+    Attributes
+    ----------
+    gradient : ndarray of float64, shape (2, 2)
+        Deformation gradient F.
+    shift_px : ndarray of float64, shape (2,)
+        Of the image's middle, px, +y up.
+    covariance : ndarray of float64, shape (6, 6)
+        Of F row by row, then of the shift.
+    residual_px : float
+        Root mean square distance of windows from the affine map, px: noise, and what is not affine.
+    windows : int
+        Windows that the map was fitted to.
+    valid : bool
+        False when too few windows could be followed; the numbers then mean nothing.
+    """
+
+    gradient: Floats
+    shift_px: Floats
+    covariance: Floats
+    residual_px: float
+    windows: int
+    valid: bool
+
+    def along(self, angle_rad: float) -> tuple[float, float]:
+        """Return the stretch ratio of a line at an angle (+x towards +y), and its standard error.
+
+        Examples
+        --------
+        >>> made = Strain(np.diag([1.1, 0.95]), np.zeros(2), np.zeros((6, 6)), 0.0, 20, True)
+        >>> made.along(0.0)
+        (1.1, 0.0)
+        """
+        axis = np.array([math.cos(angle_rad), math.sin(angle_rad)])
+        moved = self.gradient @ axis
+        length = float(np.linalg.norm(moved))
+        slope = np.concatenate([np.outer(moved / length, axis).ravel(), np.zeros(2)])
+        return length, _stderr(slope, self.covariance)
+
+    def shear(self, angle_rad: float) -> tuple[float, float]:
+        """Return by how much less than a right angle is between two lines, rad, and its error.
+
+        The lines were at ``angle_rad`` and across it.
+        """
+
+        def closed(gradient: Floats) -> float:
+            c, s = math.cos(angle_rad), math.sin(angle_rad)
+            one, two = gradient @ [c, s], gradient @ [-s, c]
+            return math.asin(float(one @ two) / float(np.linalg.norm(one) * np.linalg.norm(two)))
+
+        return closed(self.gradient), self._error_of(closed)
+
+    @property
+    def rotation(self) -> tuple[float, float]:
+        """Rotation of the rigid part (polar decomposition), rad, +x towards +y, and its error."""
+
+        def turned(gradient: Floats) -> float:
+            return math.atan2(gradient[1, 0] - gradient[0, 1], gradient[0, 0] + gradient[1, 1])
+
+        return turned(self.gradient), self._error_of(turned)
+
+    def _error_of(self, value: Any) -> float:
+        slope = np.zeros(6)
+        for k in range(4):
+            step = np.zeros(4)
+            step[k] = 1e-6
+            apart = step.reshape(2, 2)
+            slope[k] = (value(self.gradient + apart) - value(self.gradient - apart)) / 2e-6
+        return _stderr(slope, self.covariance)
+
+    def affine_px(self, shape: tuple[int, int]) -> Floats:
+        """Return the map of pixels (column, row), first picture to second, shape (2, 3)."""
+        return _to_pixels(self.gradient, self.shift_px, shape)
+
+
+GUESSES = tuple(
+    np.diag([across, up])
+    for across in (1.0, 0.88, 1.14, 0.76, 1.28)
+    for up in (1.0, 0.88, 1.14, 0.76, 1.28)
+    if across != 1.0 or up != 1.0
+)
+"""Stretches along x and y that a search begins with when nothing is known."""
+
+
+def measure_strain(
+    first: Image,
+    second: Image,
+    *,
+    start: Floats | None = None,
+    start_shift_px: Floats | None = None,
+    valid: NDArray[np.bool_] | None = None,
+    valid_second: NDArray[np.bool_] | None = None,
+    count: int = 600,
+) -> Strain:
+    """Measure the affine deformation that took the skin of one picture to that of another.
+
+    Parameters
+    ----------
+    first, second : ndarray, shape (H, W)
+        Linear pictures in which the same skin can be recognized: light from inside the skin
+        (crossed polarizers), whose texture is pigment and moves with it. Row 0 is the top.
+    start : ndarray, shape (2, 2), optional
+        Deformation gradient to begin with, as from the state before or from the caliper's reading;
+        by default the identity, and where that leads nowhere a grid of stretches. It decides where
+        the search begins, not the result.
+    start_shift_px : ndarray, shape (2,), optional
+        Shift to begin with, px, +y up; by default the best one by phase correlation.
+    valid, valid_second : ndarray of bool, shape (H, W), optional
+        What is skin in each picture.
+    count : int
+        Most windows to follow.
+
+    Returns
+    -------
+    Strain
+
+    Raises
+    ------
+    RegistrationError
+        When pictures differ in shape or are too small.
+    """
+    if np.ndim(first) != 2 or np.shape(first) != np.shape(second):
+        raise RegistrationError(
+            f"second: got shape {np.shape(second)}, expected that of first, {np.shape(first)}"
+        )
+    height, width = np.shape(first)
+    if min(height, width) < LEAST_SIDE_PX:
+        raise RegistrationError(
+            f"first: got {width} x {height} px, expected {LEAST_SIDE_PX} x {LEAST_SIDE_PX} or more"
+        )
+    shape = (height, width)
+    one = evened(_filled(first, valid))
+    two = evened(_filled(second, valid_second))
+    mask = np.ones(shape, bool) if valid is None else valid
+    other = np.ones(shape, bool) if valid_second is None else valid_second
+    guesses = [np.eye(2), *GUESSES] if start is None else [np.asarray(start, np.float64)]
+    for gradient in guesses:
+        affine = _to_pixels(gradient, np.zeros(2), shape)
+        if start_shift_px is not None:
+            affine = _to_pixels(gradient, np.asarray(start_shift_px, np.float64), shape)
+        else:
+            affine[:, 2] += _phase_shift(one, two, affine, mask)
+        affine = _pyramid(one, two, affine, mask)
+        found = _by_windows(one, two, affine, mask, other, count)
+        if found.valid:
+            break
+    return found
+
+
+def _filled(image: Image, valid: NDArray[np.bool_] | None) -> Image:
+    """Put the median where there is no skin: a hard edge would be followed instead of it."""
+    if valid is None or valid.all():
+        return image
+    inside = np.asarray(image)[valid & np.isfinite(image)]
+    middle = float(np.median(inside)) if inside.size else 0.0
+    return np.where(valid, image, middle)
+
+
+def _to_pixels(gradient: Floats, shift_px: Floats, shape: tuple[int, int]) -> Floats:
+    middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+    turned = _FLIP @ gradient @ _FLIP
+    return np.column_stack([turned, middle + _FLIP @ shift_px - turned @ middle])
+
+
+def _from_pixels(affine: Floats, shape: tuple[int, int]) -> tuple[Floats, Floats]:
+    middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+    shift = affine[:, :2] @ middle + affine[:, 2] - middle
+    return _FLIP @ affine[:, :2] @ _FLIP, _FLIP @ shift
+
+
+def _phase_shift(
+    one: NDArray[np.uint8], two: NDArray[np.uint8], affine: Floats, mask: NDArray[np.bool_]
+) -> Floats:
+    """Return how far the second picture, warped back, lies from the first, px."""
+    size = one.shape[1], one.shape[0]
+    back = cv2.warpAffine(
+        two, affine, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderValue=128
+    )
+    window = cv2.createHanningWindow(size, cv2.CV_32F)
+    weighted = [
+        (np.where(mask, picture, 128).astype(np.float32) - 128.0) * window
+        for picture in (one, back)
+    ]
+    (dx, dy), _ = cv2.phaseCorrelate(weighted[0], weighted[1])
+    return affine[:, :2] @ np.array([dx, dy])
+
+
+def _pyramid(
+    one: NDArray[np.uint8], two: NDArray[np.uint8], affine: Floats, mask: NDArray[np.bool_]
+) -> Floats:
+    """Improve an affine map from coarse to fine; a level that does not converge changes nothing."""
+    levels = [(one.astype(np.float32), two.astype(np.float32), mask.astype(np.uint8))]
+    while min(levels[-1][0].shape) >= 2 * COARSEST_PX and len(levels) < 6:
+        a, b, m = levels[-1]
+        levels.append(
+            (cv2.pyrDown(a), cv2.pyrDown(b), cv2.resize(m, None, fx=0.5, fy=0.5,
+             interpolation=cv2.INTER_NEAREST))
+        )  # fmt: skip
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-6)
+    # the finest level is left to the windows, which also tell the error
+    last = 1 if len(levels) > 2 else 0
+    for level in range(len(levels) - 1, last - 1, -1):
+        a, b, m = levels[level]
+        scale = 2.0**level
+        warp = affine.astype(np.float32)
+        warp[:, 2] = affine[:, 2] / scale
+        if m.shape != a.shape:
+            m = cv2.resize(m, (a.shape[1], a.shape[0]), interpolation=cv2.INTER_NEAREST)
+        try:
+            _, found = cv2.findTransformECC(a, b, warp, cv2.MOTION_AFFINE, criteria, m, 5)
+        except cv2.error:  # no overlap, or no texture, at this level
+            continue
+        affine = np.asarray(found, np.float64)
+        affine[:, 2] *= scale
+    return affine
+
+
+def _by_windows(
+    one: NDArray[np.uint8],
+    two: NDArray[np.uint8],
+    affine: Floats,
+    mask: NDArray[np.bool_],
+    other: NDArray[np.bool_],
+    count: int,
+) -> Strain:
+    """Follow windows of the first picture into the second, warped back, and fit all of them."""
+    shape = one.shape[0], one.shape[1]
+    size = shape[1], shape[0]
+    grid = np.stack(np.meshgrid(np.arange(0, shape[1], 3), np.arange(0, shape[0], 3)), axis=-1)
+    candidates = grid.reshape(-1, 2).astype(np.float64)
+    eroded = cv2.erode(mask.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8))
+    candidates = candidates[eroded[candidates[:, 1].astype(int), candidates[:, 0].astype(int)] > 0]
+    chosen = textured(one, candidates, count=count, cell_px=WINDOW_PX, margin_px=WINDOW_PX // 2 + 1)
+    start = candidates[chosen]
+    for number in range(ROUNDS):
+        back = cv2.warpAffine(
+            two, affine, size, flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, borderValue=128
+        )
+        seen = cv2.warpAffine(
+            other.astype(np.uint8), affine, size,
+            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP, borderValue=0,
+        )  # fmt: skip
+        seen = cv2.erode(seen, np.ones((WINDOW_PX, WINDOW_PX), np.uint8), borderValue=0)
+        tracks = track(one, back, start, window_px=WINDOW_PX, levels=2 if number == 0 else 0)
+        inside = seen[start[:, 1].astype(int), start[:, 0].astype(int)] > 0
+        good = tracks.valid & inside
+        fit = _fit(start[good], tracks.points_px[good], shape, last=number == ROUNDS - 1)
+        if fit is None:
+            gradient, shift = _from_pixels(affine, shape)
+            return Strain(
+                gradient, shift, np.full((6, 6), np.inf), math.inf, int(good.sum()), False
+            )
+        small, covariance, residual, used = fit
+        # back(x) = two(affine x): a window found at small x there is at affine (small x) in two
+        affine = np.column_stack(
+            [affine[:, :2] @ small[:, :2], affine[:, :2] @ small[:, 2] + affine[:, 2]]
+        )
+    gradient, shift = _from_pixels(affine, shape)
+    carried = _carry(covariance, affine[:, :2])
+    return Strain(gradient, shift, carried, residual, used, True)
+
+
+def _fit(
+    start: Floats, found: Floats, shape: tuple[int, int], *, last: bool
+) -> tuple[Floats, Floats, float, int] | None:
+    """Fit an affine map to what is no outlier: by least squares, or with its errors when `last`.
+
+    Returns
+    -------
+    tuple or None
+        The map (2, 3) of pixels; the covariance (6, 6) of its linear part row by row and of the
+        shift of the image's middle; the residual's root mean square; how many were used.
+    """
+    middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+    keep = np.ones(len(start), bool)
+    for _ in range(5):
+        if keep.sum() < LEAST_WINDOWS:
+            return None
+        design = np.column_stack([start[keep] - middle, np.ones(keep.sum())])
+        solution, _, rank, _ = np.linalg.lstsq(design, found[keep] - middle)
+        if rank < 3:
+            return None
+        everywhere = np.column_stack([start - middle, np.ones(len(start))]) @ solution
+        distance = np.linalg.norm(found - middle - everywhere, axis=1)
+        spread = 1.4826 * float(np.median(distance[keep])) / 1.177  # of one coordinate
+        now = distance <= min(max(OUTLIER * spread, 0.02), MISMATCH_PX)
+        if (now == keep).all():
+            break
+        keep = now
+    if keep.sum() < LEAST_WINDOWS:
+        return None
+    design = np.column_stack([start[keep] - middle, np.ones(keep.sum())])
+    covariance = np.full((6, 6), np.inf)
+    if last:
+        solution, covariance = fit_affine(
+            start[keep] - middle, found[keep] - middle, window_px=WINDOW_PX
+        )
+    linear, offset = solution[:2].T, solution[2]
+    rest = found[keep] - middle - design @ solution
+    affine = np.column_stack([linear, middle + offset - linear @ middle])
+    residual = float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
+    return affine, covariance, residual, int(keep.sum())
+
+
+def _carry(covariance: Floats, linear: Floats) -> Floats:
+    """Carry the covariance of a small map through the large one before it, into axes with y up."""
+    jacobian = np.zeros((6, 6))
+    outer = _FLIP @ linear
+    for i in range(2):
+        for j in range(2):
+            # F = flip (linear small) flip: entry (i, j) of F from row k, column j of small
+            for k in range(2):
+                jacobian[2 * i + j, 2 * k + j] = outer[i, k] * _FLIP[j, j]
+        jacobian[4 + i, 4:6] = outer[i]
+    return jacobian @ covariance @ jacobian.T
+
+
+def _stderr(slope: Floats, covariance: Floats) -> float:
+    if not np.isfinite(covariance).all():
+        return math.inf
+    return math.sqrt(max(float(slope @ covariance @ slope), 0.0))

@@ -1,0 +1,1 @@
+"""Scan meshes: repair, parameterization and registration."""

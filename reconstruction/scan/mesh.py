@@ -1,0 +1,242 @@
+"""A scanned mesh made ready for measurements: cleaned, refined to many points, laid out flat."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.scan.repair import (
+    RepairReport,
+    ScanMeshError,
+    TriangleMesh,
+    boundary_edges,
+    crop,
+    repair,
+)
+
+__all__ = [
+    "FACE_BOX_MM",
+    "RefinedScan",
+    "RepairReport",
+    "ScanMeshError",
+    "TriangleMesh",
+    "load_ply",
+    "prepare",
+    "refine",
+    "unwrap",
+]
+
+FACE_BOX_MM: Final = ((-100.0, -108.0, -105.0), (100.0, 150.0, 60.0))
+"""Where a face is in the rig frame; the neck below the chin and clothes are outside."""
+MAX_POINTS: Final = 4_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinedScan:
+    """A surface of many points that photographs are sampled at."""
+
+    points_mm: NDArray[np.float32]
+    """Shape (P, 3)."""
+    normals: NDArray[np.float32]
+    """Unit, outward, shape (P, 3)."""
+    faces: NDArray[np.int32]
+    """Triangles of points, shape (F, 3)."""
+    corner_uv: NDArray[np.float32]
+    """Texture coordinates of each triangle's corners, shape (F, 3, 2), (0, 0) bottom left."""
+    coarse: TriangleMesh
+    """The cleaned scan that was refined, with texture coordinates: for rays."""
+    report: RepairReport
+    """What the cleaning found."""
+
+    def moved(
+        self, rotation: NDArray[np.float64], translation_mm: NDArray[np.float64]
+    ) -> RefinedScan:
+        """Return the surface after a rigid motion ``rotation @ p + translation_mm``."""
+        turn = np.asarray(rotation, np.float64)
+        coarse = TriangleMesh(
+            self.coarse.vertices_mm @ turn.T + translation_mm,
+            self.coarse.faces,
+            self.coarse.corner_uv,
+        )
+        return RefinedScan(
+            (self.points_mm @ turn.T + translation_mm).astype(np.float32),
+            (self.normals @ turn.T).astype(np.float32),
+            self.faces,
+            self.corner_uv,
+            coarse,
+            self.report,
+        )
+
+
+def load_ply(data: bytes) -> TriangleMesh:
+    """Read the mesh that a session holds, a PLY in mm.
+
+    Raises
+    ------
+    ScanMeshError
+        Where the bytes are no mesh.
+    """
+    import trimesh
+
+    try:
+        loaded: Any = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
+        vertices = np.asarray(loaded.vertices, np.float64)
+        faces = np.asarray(loaded.faces, np.int64)
+    except Exception as exc:  # the reader raises whatever its parser meets
+        raise ScanMeshError(f"scan: got no PLY mesh ({exc})") from exc
+    if not len(faces) or not np.isfinite(vertices).all():
+        raise ScanMeshError(
+            f"scan: got {len(faces)} triangles and "
+            f"{np.count_nonzero(~np.isfinite(vertices))} numbers that are not finite"
+        )
+    uv = getattr(loaded.visual, "uv", None)
+    given = uv is not None and len(uv) == len(vertices)
+    return TriangleMesh(vertices, faces, np.asarray(uv, np.float64)[faces] if given else None)
+
+
+def prepare(
+    scan: bytes | TriangleMesh,
+    *,
+    points: int = 500_000,
+    box_mm: tuple[tuple[float, float, float], tuple[float, float, float]] | None = FACE_BOX_MM,
+    max_hole_mm: float = 40.0,
+) -> RefinedScan:
+    """Crop, repair, lay out and refine a scan.
+
+    Parameters
+    ----------
+    scan : bytes or TriangleMesh
+        A PLY in mm, or what `load_ply` returned.
+    points : int
+        About so many points: Loop subdivision multiplies them by four, the nearest step is taken.
+    box_mm : pair of corners, or None
+        What is outside is no face.
+    max_hole_mm : float
+        Holes with a longer rim stay open.
+
+    Returns
+    -------
+    RefinedScan
+        In the frame of the scan; see `reconstruction.scan.registration.register`.
+
+    Raises
+    ------
+    ScanMeshError
+        Where nothing of the scan can be used.
+    """
+    mesh = load_ply(scan) if isinstance(scan, bytes) else scan
+    if box_mm is not None:
+        mesh = crop(mesh, box_mm=box_mm)
+    mesh, report = repair(mesh, max_hole_mm=max_hole_mm)
+    if mesh.corner_uv is None:
+        mesh = unwrap(mesh)
+    return refine(mesh, points=points, report=report)
+
+
+def unwrap(mesh: TriangleMesh) -> TriangleMesh:
+    """Lay a surface out flat with little stretch, in charts that fill the unit square (xatlas)."""
+    import xatlas
+
+    _, index, uv = xatlas.parametrize(
+        np.ascontiguousarray(mesh.vertices_mm, np.float32),
+        np.ascontiguousarray(mesh.faces, np.uint32),
+    )
+    if len(index) != len(mesh.faces):
+        raise ScanMeshError(f"unwrap: got {len(index)} triangles back, expected {len(mesh.faces)}")
+    return TriangleMesh(mesh.vertices_mm, mesh.faces, np.asarray(uv, np.float64)[index])
+
+
+def refine(mesh: TriangleMesh, *, points: int, report: RepairReport | None = None) -> RefinedScan:
+    """Refine a clean surface by Loop subdivision to about `points` points.
+
+    Texture coordinates are refined linearly: each half of an edge is half of it in the texture.
+
+    References
+    ----------
+    Loop 1987, Smooth subdivision surfaces based on triangles, University of Utah.
+    """
+    from trimesh.remesh import subdivide_loop
+
+    if not 3 <= points <= MAX_POINTS:
+        raise ScanMeshError(f"points: got {points}, expected 3 to {MAX_POINTS}")
+    if mesh.corner_uv is None:
+        raise ScanMeshError("mesh: got no texture coordinates, expected some; see unwrap")
+    steps = max(round(float(np.log(points / len(mesh.vertices_mm)) / np.log(4.0))), 0)
+    fine = _split_chords(mesh)
+    for _ in range(steps):
+        uv = fine.corner_uv
+        vertices, faces = subdivide_loop(fine.vertices_mm, fine.faces, iterations=1)
+        fine = TriangleMesh(vertices, np.asarray(faces, np.int64), _halved(uv))
+    uv = fine.corner_uv
+    if uv is None or len(uv) != len(fine.faces):
+        raise ScanMeshError("refine: got another number of triangles than of texture triangles")
+    return RefinedScan(
+        fine.vertices_mm.astype(np.float32),
+        fine.normals(),
+        fine.faces.astype(np.int32),
+        uv.astype(np.float32),
+        mesh,
+        report or RepairReport(),
+    )
+
+
+def _halved(uv: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    """Return texture coordinates of the four triangles of each, in the order of trimesh."""
+    if uv is None:
+        return None
+    a, b, c = uv[:, 0], uv[:, 1], uv[:, 2]
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    rows = [a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca]
+    return np.stack(rows, axis=1).reshape(-1, 3, 2)
+
+
+def _split_chords(mesh: TriangleMesh) -> TriangleMesh:
+    """Halve the inner edges that join two vertices of the rim.
+
+    trimesh takes every neighbour on the rim for a neighbour along it, which would throw the ends
+    of such an edge far off; after the split, and after each subdivision, there is none.
+    """
+    vertices, faces, uv = mesh.vertices_mm, mesh.faces, mesh.corner_uv
+    while True:
+        rim = np.zeros(len(vertices), np.bool_)
+        edges_of_rim = boundary_edges(faces)
+        rim[edges_of_rim] = True
+        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        alone = {tuple(e) for e in np.sort(edges_of_rim, axis=1).tolist()}
+        chord = rim[edges].all(axis=1)
+        rows = [k for k in np.flatnonzero(chord).tolist() if tuple(edges[k].tolist()) not in alone]
+        if not rows:
+            return TriangleMesh(vertices, faces, uv)
+        # one edge a triangle and pass, so that no triangle is halved along two at once
+        by_edge: dict[tuple[int, int], list[int]] = {}
+        for k in rows:
+            by_edge.setdefault(tuple(edges[k].tolist()), []).append(k)
+        taken: set[int] = set()
+        middles: list[NDArray[np.float64]] = []
+        halves: list[NDArray[np.int64]] = []
+        half_uv: list[NDArray[np.float64]] = []
+        for (a, b), pair in by_edge.items():
+            if any(k // 3 in taken for k in pair):
+                continue
+            taken.update(k // 3 for k in pair)
+            new = len(vertices) + len(middles)
+            middles.append(0.5 * (vertices[a] + vertices[b]))
+            for k in pair:
+                i, j = k % 3, (k + 1) % 3
+                for corner in (j, i):  # the half that loses this corner
+                    half = faces[k // 3].copy()
+                    half[corner] = new
+                    halves.append(half)
+                    if uv is not None:
+                        flat = uv[k // 3].copy()
+                        flat[corner] = 0.5 * (uv[k // 3, i] + uv[k // 3, j])
+                        half_uv.append(flat)
+        keep = np.setdiff1d(np.arange(len(faces)), list(taken))
+        vertices = np.concatenate([vertices, np.array(middles)])
+        faces = np.concatenate([faces[keep], np.array(halves)])
+        if uv is not None:
+            uv = np.concatenate([uv[keep], np.array(half_uv)])

@@ -1,0 +1,502 @@
+"""A scan laid onto the dome: the rigid motion under which its normals are those in the photographs.
+
+Each view alone gives normals by photometric stereo, which need no exact geometry: a scan that is a
+few millimetres off moves the directions to the lights by a fraction of a degree. The motion is
+then the one that makes the scan's normals, turned and projected into all views, agree with these.
+Turning the scan turns its normals, so rotation follows from thousands of normals; shifts follow
+from where nose, eyes and mouth bend them. No texture, no landmark and no true mesh is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from model.fresnel import ETA_SKIN, reflectance
+from reconstruction.lumitexels import Camera, Lights, Surface, visibility
+from reconstruction.lumitexels.ray_casting import RayCaster
+from reconstruction.scan.repair import Faces, TriangleMesh
+
+Floats = NDArray[np.floating]
+Double = NDArray[np.float64]
+
+COS_HIGHLIGHT: Final = float(np.cos(np.radians(45.0)))
+"""Half vectors closer to the normal than 45 degrees may be those of a highlight."""
+LEAST_LIGHTS: Final = 9
+"""So many lights take part at a pixel even where some are nearer to the highlight."""
+MIN_COS_LIGHT: Final = 0.3
+MIN_COS_VIEW: Final = 0.2
+WIDEST_PX: Final = 320
+"""Larger images are binned 2 x 2 until they are no wider."""
+MIN_COSINE: Final = 0.35
+"""Points seen at a flatter angle say nothing: 70 degrees."""
+CELL_MM: Final = 20.0
+"""Errors within such a cube are taken for one when standard errors are computed."""
+
+
+class RegistrationError(ValueError):
+    """Photographs that do not say where the scan is."""
+
+
+class RayCamera(Camera, Protocol):
+    """A camera that also gives the rays of its pixels."""
+
+    def rays(self, pixels: ArrayLike) -> Double:
+        """Return unit vectors from the camera through pixels, shape (..., 3)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEvidence:
+    """Normals of one view, as the light on its pixels tells them."""
+
+    camera: RayCamera
+    normals: NDArray[np.float32]
+    """Unit, rig frame, shape (H, W, 3); zeros where unknown."""
+    weight: NDArray[np.float32]
+    """Trust, 0 to 1, shape (H, W)."""
+    binning: int = 1
+    """Camera pixels along each side of a pixel here."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigidFit:
+    """The motion from the scan's frame to the rig's, ``rotation @ p + translation_mm``."""
+
+    rotation: Double
+    """Shape (3, 3)."""
+    translation_mm: Double
+    """Shape (3,)."""
+    center_mm: Double
+    """Centre of the scan in the rig frame; errors of turn and shift are told about it."""
+    stderr: Double
+    """Of the turn about x, y, z, rad, and of the shift of `center_mm` along x, y, z, mm: (6,).
+    From the scatter of residuals between cells of the surface, and from how far the last blur
+    moved the fit: a blur of bent surfaces shifts them."""
+    residual_deg: float
+    """Median angle between the scan's normals and the photographs'."""
+    samples: int
+    """Pairs of point and view that took part."""
+    converged: bool
+
+    def move(self, points_mm: ArrayLike) -> Double:
+        """Return points of the scan in the rig frame."""
+        return np.asarray(points_mm, np.float64) @ self.rotation.T + self.translation_mm
+
+
+def photometric_normals(
+    stack: Floats,
+    camera: RayCamera,
+    lights: Lights,
+    caster: RayCaster,
+    *,
+    surface_normals: Floats,
+    binning: int = 1,
+    rounds: int = 4,
+) -> NormalEvidence:
+    """Return the normals that one view's images under single lights tell.
+
+    Parameters
+    ----------
+    stack : ndarray, shape (L, H, W)
+        Signal under each light, one channel or the mean of several; NaN where not valid.
+    camera : RayCamera
+    lights : Lights
+        As many as there are images.
+    caster : RayCaster
+        The scan about where it is: it tells how far each pixel's surface is from the lights.
+    surface_normals : ndarray, shape (F, 3)
+        Unit normals of the scan's triangles as it is now: they tell, within some degrees, where
+        highlights are.
+    binning : int
+        Camera pixels along each side of an image pixel.
+    rounds : int
+        Of least squares that leave out shadows further.
+
+    Notes
+    -----
+    ``signal / irradiance = albedo T(l) T(v) n . l`` by least squares, with the share T of light
+    that passes the skin's boundary (Fresnel, eta 1.4). Samples are left out whose half vector lies
+    within 45 degrees of the scan's normal, where the boundary itself shines, and flat ones, where
+    T falls steeply; shadows and samples off the fit (Cauchy weights) count less from round to
+    round.
+    """
+    count, height, width = stack.shape
+    if count != len(lights.position_mm):
+        raise RegistrationError(f"stack: got {count} images, expected {len(lights.position_mm)}")
+    row, column = np.mgrid[0:height, 0:width]
+    pixels = np.stack([column, row], axis=-1).reshape(-1, 2) * binning + 0.5 * (binning - 1)
+    ways = camera.rays(pixels)
+    center = np.broadcast_to(camera.center_mm, ways.shape)
+    hit, distance = caster.first_hit(center, ways)
+    met = np.flatnonzero(hit >= 0)
+    normals = np.zeros((height * width, 3), np.float32)
+    weight = np.zeros(height * width, np.float32)
+    for part in np.array_split(met, max(len(met) // 20_000, 1)):
+        points = center[part] + distance[part, None] * ways[part]
+        direction, white = lights.irradiance(points)
+        values = stack.reshape(count, -1)[:, part] / np.maximum(white.mean(axis=-1), 1e-30)
+        rough = surface_normals[hit[part]]
+        cos_view = -np.einsum("pk,pk->p", ways[part], rough)
+        cos_light = np.einsum("lpk,pk->lp", direction, rough)
+        half = direction - ways[part]
+        cos_half = np.einsum("lpk,pk->lp", half, rough) / np.linalg.norm(half, axis=-1)
+        facing_light = cos_light > MIN_COS_LIGHT
+        # of few lights those farthest from the highlight stay
+        ordered = np.sort(np.where(facing_light, cos_half, np.inf), axis=0)
+        edge = np.maximum(ordered[min(LEAST_LIGHTS, count) - 1], COS_HIGHLIGHT)
+        diffuse = facing_light & (cos_half <= edge) & (cos_view > MIN_COS_VIEW)
+        passed = _passed(cos_light) * _passed(cos_view)
+        found, share = _robust_normals(
+            direction, np.where(diffuse, values / passed, np.nan), rounds
+        )
+        facing = np.einsum("pk,pk->p", found, ways[part]) < 0
+        normals[part] = np.where(facing[:, None], found, 0.0)
+        weight[part] = np.where(facing, share, 0.0)
+    return NormalEvidence(
+        camera, normals.reshape(height, width, 3), weight.reshape(height, width), binning
+    )
+
+
+def _passed(cosine: Double) -> Double:
+    """Return the share of light that passes the skin's boundary at a cosine, at least 0.05."""
+    at = np.linspace(0.0, 1.0, 513)
+    share = 1.0 - reflectance(at, ETA_SKIN)
+    return np.maximum(np.interp(cosine, at, share), 0.05)
+
+
+def _robust_normals(direction: Double, values: Floats, rounds: int) -> tuple[Double, Double]:
+    """Return unit normals, shape (P, 3), and the share of the lights that fit them."""
+    good = np.isfinite(values)
+    y = np.where(good, values, 0.0).astype(np.float64)
+    top = np.max(y, axis=0)
+    w = (good & (y > 0.1 * top)).astype(np.float64)
+    n = np.zeros((y.shape[1], 3))
+    for _ in range(rounds):
+        a = np.einsum("lp,lpi,lpj->pij", w, direction, direction)
+        b = np.einsum("lp,lp,lpi->pi", w, y, direction)
+        a += 1e-6 * np.trace(a, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
+        n = np.linalg.solve(a, b[..., None])[..., 0]
+        shading = np.einsum("lpi,pi->lp", direction, n)
+        off = np.where(good, y - shading, np.nan)
+        lit = good & (shading > 0.1 * np.linalg.norm(n, axis=1))
+        with np.errstate(invalid="ignore"):
+            size = np.where(lit, np.abs(off), np.nan)
+        scale = 1.4826 * _median(size) + 1e-3 * np.linalg.norm(n, axis=1) + 1e-30
+        w = np.where(lit, 1.0 / (1.0 + (np.nan_to_num(off) / (2.0 * scale)) ** 2), 0.0)
+    length = np.linalg.norm(n, axis=1)
+    enough = (np.count_nonzero(w > 0.2, axis=0) >= 5) & (length > 0)
+    unit = np.where(enough[:, None], n / np.maximum(length, 1e-30)[:, None], 0.0)
+    return unit, np.where(enough, w.mean(axis=0), 0.0)
+
+
+def _median(values: Floats) -> Double:
+    """Return the median of each column, NaN left out; 0 where nothing is left."""
+    ordered = np.sort(values, axis=0)  # NaN come last
+    count = np.count_nonzero(np.isfinite(values), axis=0)
+    middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[None] // 2, axis=0)[0]
+    return np.where(count > 0, middle, 0.0)
+
+
+def register(
+    points_mm: ArrayLike,
+    normals: ArrayLike,
+    evidence: Sequence[NormalEvidence],
+    *,
+    visible: NDArray[np.bool_] | None = None,
+    start: tuple[ArrayLike, ArrayLike] | None = None,
+    blurs_px: Sequence[float] = (8.0, 3.0, 1.5, 0.5),
+    steps: int = 12,
+) -> RigidFit:
+    """Find the rigid motion of a scan that makes its normals those of the views.
+
+    Parameters
+    ----------
+    points_mm, normals : array_like, shape (P, 3)
+        Of the scan, in its own frame; some thousand are enough.
+    evidence : sequence of NormalEvidence
+        At least one view; several for shifts along each view's axis.
+    visible : ndarray of bool, shape (V, P), optional
+        Points that each view sees; those that face it by default.
+    start : (rotation, translation_mm), optional
+        First guess; no motion by default.
+    blurs_px : sequence of float
+        The normal maps are blurred by these deviations, one after the other: far first.
+    steps : int
+        Most Gauss-Newton steps for each blur.
+
+    Returns
+    -------
+    RigidFit
+
+    Raises
+    ------
+    RegistrationError
+        Where fewer than 200 pairs of point and view take part, or the motion is not determined.
+    """
+    p = np.asarray(points_mm, np.float64)
+    n = np.asarray(normals, np.float64)
+    if p.ndim != 2 or p.shape[1] != 3 or p.shape != n.shape:
+        raise RegistrationError(f"points_mm: got shapes {p.shape} and {n.shape}, expected (P, 3)")
+    if visible is None:
+        visible = np.ones((len(evidence), len(p)), np.bool_)
+    turn = np.eye(3) if start is None else np.asarray(start[0], np.float64)
+    shift = np.zeros(3) if start is None else np.asarray(start[1], np.float64)
+    middle = p.mean(axis=0)
+    system = _System(np.zeros((6, 6)), np.zeros(6), np.zeros((0, 6)), np.zeros(0), 0)
+    converged = False
+    at_blur: list[tuple[Double, Double]] = []
+    for blur in blurs_px:
+        maps = [_blurred(view, blur) for view in evidence]
+        for _ in range(steps):
+            center = turn @ middle + shift
+            system = _gauss_newton(p, n, turn, shift, center, maps, evidence, visible)
+            if system.samples < 200:
+                raise RegistrationError(
+                    f"samples: got {system.samples} points seen, expected at least 200; "
+                    "check the calibration, and the scan's unit and frame"
+                )
+            step = -np.asarray(np.linalg.solve(system.matrix, system.gradient), np.float64)
+            small = _rotation(step[:3])
+            turn = small @ turn
+            shift = small @ (shift - center) + center + step[3:]
+            # bilinear maps have kinks at which steps of this size go to and fro
+            converged = bool(np.linalg.norm(step[:3]) < 1e-4 and np.linalg.norm(step[3:]) < 1e-2)
+            if converged:
+                break
+        at_blur.append((turn, turn @ middle + shift))
+    stderr = _clustered(system, p)
+    if len(at_blur) > 1:
+        (turn_before, center_before), (turn_last, center_last) = at_blur[-2:]
+        turned = turn_last @ turn_before.T
+        vector = 0.5 * np.array(
+            [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
+        )
+        # how large such an error is shows there, not which way it goes
+        sizes = [np.linalg.norm(v) / np.sqrt(3) for v in (vector, center_last - center_before)]
+        stderr = np.hypot(stderr, np.repeat(sizes, 3))
+    angle = np.degrees(2.0 * np.arcsin(np.clip(0.5 * np.median(system.size), 0.0, 1.0)))
+    return RigidFit(
+        turn, shift, turn @ middle + shift, stderr, float(angle), system.samples, converged
+    )
+
+
+def align(
+    mesh: TriangleMesh,
+    *,
+    cameras: Sequence[RayCamera],
+    lights: Lights,
+    stacks: Callable[[int], Floats],
+    binning: int = 1,
+    points: int = 6000,
+    rounds: int = 3,
+    rng: np.random.Generator,
+) -> RigidFit:
+    """Register a scan to a dome from its own images.
+
+    Parameters
+    ----------
+    mesh : TriangleMesh
+        The cleaned scan in its own frame, within about 10 mm and 5 degrees of the rig's.
+    cameras : sequence of RayCamera
+    lights : Lights
+        Those of the images; 20 to 40 well spread ones are enough.
+    stacks : callable
+        Returns the images of a view by its index, shape (L, H, W), NaN where not valid.
+    binning : int
+        Camera pixels along each side of an image pixel.
+    points : int
+        Vertices of the mesh that take part.
+    rounds : int
+        Of photometric normals and fit; each uses the motion found before.
+    rng : numpy.random.Generator
+        Draws the points.
+
+    Returns
+    -------
+    RigidFit
+    """
+    normals = mesh.normals()
+    rows = rng.permutation(len(mesh.vertices_mm))[:points]
+    p, n = mesh.vertices_mm[rows], normals[rows]
+    images = []
+    for view in range(len(cameras)):
+        image, side = _binned(stacks(view))
+        images.append((image, side * binning))
+    fit: RigidFit | None = None
+    for number in range(rounds):
+        moved = mesh.vertices_mm if fit is None else fit.move(mesh.vertices_mm)
+        caster = RayCaster(moved, mesh.faces)
+        evidence = [
+            photometric_normals(
+                image,
+                camera,
+                lights,
+                caster,
+                surface_normals=_face_normals(mesh.faces, normals, fit),
+                binning=side,
+            )
+            for (image, side), camera in zip(images, cameras, strict=True)
+        ]
+        here = p if fit is None else fit.move(p)
+        facing = n if fit is None else n @ fit.rotation.T
+        seen = visibility(
+            Surface(here.astype(np.float32), facing.astype(np.float32)),
+            caster,
+            cameras_mm=np.array([camera.center_mm for camera in cameras]),
+            lights_mm=np.zeros((0, 3)),
+            min_cosine=MIN_COSINE,
+        ).view
+        fit = register(
+            p,
+            n,
+            evidence,
+            visible=seen,
+            start=None if fit is None else (fit.rotation, fit.translation_mm),
+            blurs_px=(8.0, 3.0, 1.5, 0.5) if number == 0 else (1.5, 0.5),
+        )
+    if fit is None:
+        raise RegistrationError(f"rounds: got {rounds}, expected at least 1")
+    return fit
+
+
+def _binned(stack: Floats) -> tuple[NDArray[np.float32], int]:
+    """Return images no wider than `WIDEST_PX`, and the side of their pixels; NaN spreads."""
+    image, side = np.asarray(stack, np.float32), 1
+    while max(image.shape[1:]) > WIDEST_PX:
+        height, width = (n - n % 2 for n in image.shape[1:])
+        blocks = image[:, :height, :width].reshape(len(image), height // 2, 2, width // 2, 2)
+        image, side = blocks.mean(axis=(2, 4)), 2 * side
+    return image, side
+
+
+def _face_normals(faces: Faces, normals: Floats, fit: RigidFit | None) -> Double:
+    """Return the mean of the vertex normals of each triangle, turned as the fit has it."""
+    mean = np.asarray(normals, np.float64)[faces].sum(axis=1)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    return mean if fit is None else mean @ fit.rotation.T
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _System:
+    """Normal equations of one Gauss-Newton step."""
+
+    matrix: Double
+    gradient: Double
+    by_point: Double
+    """Gradient of each point, shape (P, 6)."""
+    size: Double
+    """Length of each residual."""
+    samples: int
+
+
+def _blurred(view: NormalEvidence, blur_px: float) -> NDArray[np.float32]:
+    """Return normals weighed and blurred, and the weight, shape (H, W, 4)."""
+    weight = ndimage.gaussian_filter(view.weight, blur_px)
+    layers = [
+        ndimage.gaussian_filter(view.normals[..., k] * view.weight, blur_px) for k in range(3)
+    ]
+    normals = np.stack(layers, axis=-1) / np.maximum(weight, 1e-6)[..., None]
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    known = (view.weight > 0) & (weight > 0.25 * float(weight.max()))
+    # a rim where the mean leans to one side is left out
+    inner = ndimage.binary_erosion(view.weight > 0, iterations=max(round(blur_px), 1))
+    normals = np.where(length > 0.2, normals / np.maximum(length, 1e-6), 0.0)
+    trust = np.where(known & inner, view.weight, 0.0)
+    return np.concatenate([normals, trust[..., None]], axis=-1).astype(np.float32)
+
+
+def _gauss_newton(
+    p: Double,
+    n: Double,
+    turn: Double,
+    shift: Double,
+    center: Double,
+    maps: Sequence[NDArray[np.float32]],
+    evidence: Sequence[NormalEvidence],
+    visible: NDArray[np.bool_],
+) -> _System:
+    points, model = p @ turn.T + shift, n @ turn.T
+    rows, residuals, jacobians, trusts = [], [], [], []
+    for view, layers, seen in zip(evidence, maps, visible, strict=True):
+        to_camera = view.camera.center_mm - points
+        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+        cosine = np.einsum("pk,pk->p", to_camera, model)
+        row = np.flatnonzero(seen & (cosine > MIN_COSINE))
+        at = _pixels(view, points[row])
+        here = _sampled(layers, at)
+        good = here[:, 3] > 0
+        row, at, here = row[good], at[good], here[good]
+        along = [
+            0.5 * (_sampled(layers, at + d) - _sampled(layers, at - d))[:, :3] for d in np.eye(2)
+        ]
+        slope = np.stack(along, axis=-1)  # (K, 3, 2): of the normal over the pixels
+        by_mm = np.stack(
+            [(_pixels(view, points[row] + 0.05 * e) - at) / 0.05 for e in np.eye(3)], axis=-1
+        )  # (K, 2, 3)
+        by_point = slope @ by_mm
+        jacobian = np.concatenate(
+            [-by_point @ _cross(points[row] - center) + _cross(model[row]), by_point], axis=-1
+        )
+        rows.append(row)
+        residuals.append(here[:, :3] - model[row])
+        jacobians.append(jacobian)
+        trusts.append(here[:, 3] * cosine[row])
+    row = np.concatenate(rows)
+    r, jacobian = np.concatenate(residuals), np.concatenate(jacobians)
+    size = np.linalg.norm(r, axis=1)
+    scale = 1.5 * float(np.median(size)) + 1e-6 if len(size) else 1.0
+    weight = np.concatenate(trusts) / (1.0 + (size / scale) ** 2)
+    each = np.einsum("k,kij,ki->kj", weight, jacobian, r)
+    by_point = np.stack([np.bincount(row, each[:, j], minlength=len(p)) for j in range(6)], axis=-1)
+    matrix = np.einsum("k,kij,kil->jl", weight, jacobian, jacobian)
+    matrix += 1e-9 * np.diag(np.diag(matrix)) + 1e-12 * np.eye(6)
+    return _System(matrix, each.sum(axis=0), by_point, size, len(row))
+
+
+def _clustered(system: _System, p: Double) -> Double:
+    """Return standard errors from the scatter of the gradient between cells of the surface."""
+    _, cell = np.unique(np.floor(p / CELL_MM).astype(int), axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    sums = np.stack([np.bincount(cell, system.by_point[:, j]) for j in range(6)], axis=-1)
+    used = np.count_nonzero(np.abs(sums).sum(axis=1))
+    if used <= 6:
+        raise RegistrationError(f"cells: got {used} with points, expected more than 6")
+    inverse = np.linalg.inv(system.matrix)
+    spread = inverse @ (sums.T @ sums) @ inverse * used / (used - 6)
+    return np.sqrt(np.diag(spread))
+
+
+def _pixels(view: NormalEvidence, points: Double) -> Double:
+    return (view.camera.project(points) - 0.5 * (view.binning - 1)) / view.binning
+
+
+def _sampled(layers: NDArray[np.float32], at: Double) -> Double:
+    place = [np.nan_to_num(at[:, 1], nan=-9.0), np.nan_to_num(at[:, 0], nan=-9.0)]
+    return np.stack(
+        [
+            ndimage.map_coordinates(layers[..., k], place, order=1, mode="constant")
+            for k in range(4)
+        ],
+        axis=-1,
+    ).astype(np.float64)
+
+
+def _cross(vectors: Double) -> Double:
+    """Return the matrices of the cross product by vectors, shape (K, 3, 3)."""
+    x, y, z = vectors.T
+    o = np.zeros_like(x)
+    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(-1, 3, 3)
+
+
+def _rotation(vector: Double) -> Double:
+    """Return the rotation by a vector, Rodrigues' formula."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-15:
+        return np.eye(3)
+    k = _cross(vector[None] / angle)[0]
+    return np.asarray(np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k)

@@ -1,0 +1,296 @@
+"""Levenberg and Marquardt's fit of many radial profiles, a thread for a share of them.
+
+The parallel kernel is called from one thread. Sums may be taken in any order within a profile, but
+a profile's result does not depend on the others nor on the number of threads.
+
+References
+----------
+Marquardt 1963, doi:10.1137/0111030.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+from reconstruction.subsurface.kernels import decay, evaluate_one
+
+MOST_STEP = 1.5
+"""Largest change of a logarithm in one step."""
+CLOSE = 1e-5
+"""A step of the logarithms after which the next would change nothing that matters."""
+_FAST = {"contract", "reassoc", "nsz"}
+_LOWEST = 1e-290
+
+
+@njit(error_model="numpy")
+def _solve(h, g, chosen, count, damping, low, x):  # type: ignore[no-untyped-def]
+    """Solve (h + damping diag h) x = g for the chosen parameters by Cholesky; False: singular."""
+    for r in range(count):
+        i = chosen[r]
+        for c in range(r + 1):
+            j = chosen[c]
+            total = h[i, j]
+            if r == c:
+                total *= 1.0 + damping
+            for e in range(c):
+                total -= low[r, e] * low[c, e]
+            if r == c:
+                if not total > 1e-13 * h[i, i]:
+                    return False
+                low[r, r] = math.sqrt(total)
+            else:
+                low[r, c] = total / low[c, c]
+    for r in range(count):
+        total = g[chosen[r]]
+        for e in range(r):
+            total -= low[r, e] * x[chosen[e]]
+        x[chosen[r]] = total / low[r, r]
+    for r in range(count - 1, -1, -1):
+        total = x[chosen[r]]
+        for e in range(r + 1, count):
+            total -= low[e, r] * x[chosen[e]]
+        x[chosen[r]] = total / low[r, r]
+    return True
+
+
+@njit(fastmath=_FAST, error_model="numpy")
+def _misfit(y, m, weight, logarithmic):  # type: ignore[no-untyped-def]
+    total = 0.0
+    if logarithmic:
+        for f in range(y.size):
+            d = y[f] - math.log(max(m[f], _LOWEST))
+            total += weight[f] * d * d
+    else:
+        for f in range(y.size):
+            d = y[f] - m[f]
+            total += weight[f] * d * d
+    return total
+
+
+@njit(fastmath=_FAST, error_model="numpy")
+def _normal(y, m, jac, weight, logarithmic, active, count, h, g):  # type: ignore[no-untyped-def]
+    """Fill J'WJ and J'W residual of the active parameters; scales `jac` to logs where wanted."""
+    if logarithmic:
+        for r in range(count):
+            row = jac[active[r]]
+            for f in range(y.size):
+                row[f] /= max(m[f], _LOWEST)
+    for r in range(count):
+        i = active[r]
+        for c in range(r + 1):
+            j = active[c]
+            total = 0.0
+            for f in range(y.size):
+                total += weight[f] * jac[i, f] * jac[j, f]
+            h[i, j] = total
+            h[j, i] = total
+        total = 0.0
+        if logarithmic:
+            for f in range(y.size):
+                total += weight[f] * jac[i, f] * (y[f] - math.log(max(m[f], _LOWEST)))
+        else:
+            for f in range(y.size):
+                total += weight[f] * jac[i, f] * (y[f] - m[f])
+        g[i] = total
+
+
+@njit(error_model="numpy")
+def _fit_share(  # type: ignore[no-untyped-def]
+    begin, end, kind, radius, constants, axes, grid, y, variance, model_error, logarithmic, prior,
+    bounds, theta, rounds, most, covariance, chi2, predicted, total, steps,
+):  # fmt: skip
+    """Fit the profiles from `begin` to `end`; see `fit`."""
+    fibres = radius.size
+    m, trial_m = np.empty(fibres), np.empty(fibres)
+    jac, trial_jac = np.empty((4, fibres)), np.empty((4, fibres))
+    weight, w = np.zeros(fibres), np.zeros((6, 4))
+    h, g, low = np.zeros((4, 4)), np.zeros(4), np.zeros((4, 4))
+    x, trial, unit = np.zeros(4), np.zeros(4), np.zeros(4)
+    active, chosen = np.zeros(4, np.int64), np.zeros(4, np.int64)
+    count = 0
+    for p in range(4):
+        if prior[p, 1] > 0.0:
+            active[count] = p
+            count += 1
+    for n in range(begin, end):
+        now = theta[n]
+        evaluate_one(kind, now, radius, constants, axes, grid, w, m, jac)
+        done = 1
+        settled = False
+        best = 0.0
+        changing = not logarithmic and (
+            model_error[0] > 0.0 or model_error[1] > 0.0 or model_error[2] > 0.0
+        )
+        for round_ in range(rounds):
+            close = max(CLOSE, 1e-2 * 0.01**round_) if changing else CLOSE
+            extinction = math.exp(now[0]) + math.exp(now[1])
+            base = model_error[0] ** 2 + (model_error[2] * math.exp(now[0] - now[1])) ** 2
+            for f in range(fibres):
+                v = variance[n, f]
+                if not logarithmic and v < np.inf:
+                    e = base
+                    if model_error[1] > 0.0:
+                        e += (model_error[1] * decay(radius[f] * extinction)) ** 2
+                    v += e * m[f] * m[f]
+                total[n, f] = v
+                weight[f] = 1.0 / v
+            first = True
+            settled = False
+            damping = 1e-4
+            best = _misfit(y[n], m, weight, logarithmic)
+            for r in range(count):
+                p = active[r]
+                best += ((now[p] - prior[p, 0]) / prior[p, 1]) ** 2
+            fresh = True
+            for _ in range(most):
+                if fresh:
+                    _normal(y[n], m, jac, weight, logarithmic, active, count, h, g)
+                    free = 0
+                    for r in range(count):
+                        p = active[r]
+                        h[p, p] += 1.0 / prior[p, 1] ** 2
+                        g[p] -= (now[p] - prior[p, 0]) / prior[p, 1] ** 2
+                        if not (
+                            (now[p] <= bounds[p, 0] and g[p] < 0.0)
+                            or (now[p] >= bounds[p, 1] and g[p] > 0.0)
+                            or h[p, p] <= 0.0
+                        ):
+                            chosen[free] = p
+                            free += 1
+                    fresh = False
+                if free == 0:
+                    settled = True
+                    break
+                x[:] = 0.0
+                if not _solve(h, g, chosen, free, damping, low, x):
+                    damping = max(damping * 10.0, 1e-12)
+                    if damping > 1e10:
+                        break
+                    continue
+                longest = 0.0
+                for p in range(4):
+                    longest = max(longest, abs(x[p]))
+                shrink = min(1.0, MOST_STEP / max(longest, 1e-300))
+                longest = 0.0
+                for p in range(4):
+                    to = now[p] + shrink * x[p]
+                    if x[p] == 0.0:
+                        to = now[p]
+                    trial[p] = min(max(to, bounds[p, 0]), bounds[p, 1])
+                    longest = max(longest, abs(trial[p] - now[p]))
+                if longest < 1e-9:
+                    settled = True
+                    break
+                evaluate_one(kind, trial, radius, constants, axes, grid, w, trial_m, trial_jac)
+                done += 1
+                there = _misfit(y[n], trial_m, weight, logarithmic)
+                for r in range(count):
+                    p = active[r]
+                    there += ((trial[p] - prior[p, 0]) / prior[p, 1]) ** 2
+                if there <= best:
+                    gain = best - there
+                    best = there
+                    now[:] = trial
+                    m, trial_m = trial_m, m
+                    jac, trial_jac = trial_jac, jac
+                    fresh = True
+                    first = first and longest < 1e-7
+                    damping = max(damping * 0.1, 1e-9)
+                    if longest < close or gain <= 1e-13 * best:
+                        settled = True
+                        break
+                else:
+                    if there - best <= 1e-11 * best and longest < 1e-4:
+                        settled = True  # rounding is all that is left
+                        break
+                    damping *= 10.0
+                    if damping > 1e10:
+                        settled = longest < 1e-6
+                        break
+            if not changing or (first and close <= CLOSE):
+                break
+        steps[n] = done if settled else -done
+        chi2[n] = best
+        predicted[n] = m
+        if fresh:
+            _normal(y[n], m, jac, weight, logarithmic, active, count, h, g)
+            for r in range(count):
+                h[active[r], active[r]] += 1.0 / prior[active[r], 1] ** 2
+        covariance[n] = 0.0
+        for r in range(count):
+            unit[:] = 0.0
+            unit[active[r]] = 1.0
+            x[:] = 0.0
+            if _solve(h, unit, active, count, 0.0, low, x):
+                covariance[n, active[r]] = x
+            else:
+                covariance[n, active[r], :] = np.inf
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def fit(
+    kind: Any,
+    radius: Any,
+    constants: Any,
+    axes: Any,
+    grid: Any,
+    y: Any,
+    variance: Any,
+    model_error: Any,
+    logarithmic: Any,
+    prior: Any,
+    bounds: Any,
+    theta: Any,
+    rounds: Any,
+    most: Any,
+    parts: Any,
+    covariance: Any,
+    chi2: Any,
+    predicted: Any,
+    total: Any,
+    steps: Any,
+) -> None:
+    """Fit every profile, from `theta` on.
+
+    Parameters
+    ----------
+    kind : int
+        TABLE or a closed form.
+    radius : (F,)
+        mm.
+    constants : (4,)
+        Of the closed form.
+    axes : (3, 2); grid : (S, U, G, F)
+        Of the table.
+    y : (N, F)
+        Reflectance, or its logarithm where `logarithmic`.
+    variance : (N, F)
+        Of `y`; infinite where a fibre is left out.
+    model_error : (3,)
+        Relative: everywhere; at the source, falling by exp(-r (sigma_a + sigma_s')); and times
+        sigma_a/sigma_s'.
+    logarithmic : bool
+        Compare logarithms; then the model's error is not added.
+    prior : (4, 2)
+        Mean and standard deviation; 0: fixed; infinite: free.
+    bounds : (4, 2)
+        Least and greatest value of each parameter.
+    theta : (N, 4)
+        Start; becomes the result.
+    rounds, most, parts : int
+        Times the model's error is taken anew, steps of a round at most, shares of the profiles.
+    covariance : (N, 4, 4), chi2 : (N,), predicted, total : (N, F), steps : (N,)
+        Results: covariance of theta (infinite where singular); chi2 with the priors' part; the
+        profile; its variance with the model's error; evaluations, negative: not converged.
+    """
+    profiles = y.shape[0]
+    for part in prange(parts):
+        begin, end = part * profiles // parts, (part + 1) * profiles // parts
+        _fit_share(
+            begin, end, kind, radius, constants, axes, grid, y, variance, model_error, logarithmic,
+            prior, bounds, theta, rounds, most, covariance, chi2, predicted, total, steps,
+        )  # fmt: skip

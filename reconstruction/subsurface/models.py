@@ -1,0 +1,321 @@
+"""Models of a radial profile as the fit's kernels take them, and where the fits begin.
+
+"photon_table" is `model.photon_table`, laid out for the fibres at hand as logarithms on a grid;
+"diffusion" is Kienle and Patterson's, "dipole" Jensen's, both as closed forms. Neither of the two
+knows of a fibre's cone or core: R(r) of all directions at the fibre's middle stands for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
+
+from model import fresnel
+from model.dipole import kienle_patterson as diffusion
+from model.photon_table import table as photon_table
+from reconstruction.subsurface import kernels
+
+Floats = NDArray[np.float64]
+Method = Literal["photon_table", "diffusion", "dipole"]
+METHODS: tuple[Method, ...] = ("photon_table", "diffusion", "dipole")
+Collection = Literal["all", "fibre"]
+
+SIGMA_A_LIMITS = (1e-6, 100.0)
+SIGMA_S_LIMITS = (1e-3, 1e3)
+SCALE_LIMITS = (1e-3, 1e3)
+"""Of the closed forms, 1/mm and 1: beyond them nothing that a probe reads changes any more."""
+MOST_RATIO = 0.3
+"""sigma_a/sigma_s' up to which diffusion is within some 25 % of transport beside a fibre."""
+DIFFUSION_ERROR = np.array([0.03, 0.4, 0.8])
+"""Relative: in the middle of a profile of weak absorption, at the source, by sigma_a/sigma_s'.
+From the photon table in fibres of 0.2 mm at 0.3 to 7 mm, sigma_tr 0.3 to 3, sigma_s' 0.5 to 5 per
+mm and g 0.7 to 0.95; to a factor of two."""
+DIFFUSION_BIAS, DIPOLE_BIAS = (0.02, 0.25), (0.1, 0.15)
+"""Relative error of sigma_tr on such profiles, and what is added to it by sigma_a/sigma_s'; rounded
+from -1 to -14 % and -5 to -22 %."""
+DIPOLE_ERROR = np.array([0.1, 0.0, 0.0])
+"""Equal weights; the dipole is off by more than that."""
+START_RATIO = 15.0
+"""Greatest sigma_a/sigma_s' that a fit begins with."""
+TABLE_SIGMA_S = (0.05, 200.0)
+"""Of the table, 1/mm; layered tissue may look like more scattering than any medium has."""
+TABLE_ERROR = np.array([0.005, 0.0, 0.0])
+"""Relative: the table's own noise."""
+DIFFUSE_FROM = 30.0
+"""Distance in 1/sigma_s' from which weakly absorbed light is diffuse: the table over Kienle and
+Patterson's diffusion changes by no more than its own noise beyond. Its last nodes, at 45 to 50, are
+off by up to 3 % under next to no absorption, and beyond it is no table."""
+DIFFUSE_RATIO = (0.003, 0.01)
+"""sigma_a/sigma_s' up to which diffusion continues the table, and from which it does not."""
+START_SIGMA_TR = np.geomspace(0.01, 15.0, 40)
+START_SIGMA_S = np.geomspace(0.06, 190.0, 19)
+"""The pairs that each profile is compared with to find its starts, 1/mm."""
+CACHED = 1024
+"""Profiles whose misfits stay in the cache."""
+LEAST_LOG = -100.0
+"""Logarithms of reflectance below this are as good as none, for starts."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileModel:
+    """One forward model at fixed radii.
+
+    Attributes
+    ----------
+    radius_mm : ndarray, shape (F,)
+    kind : int
+        As `subsurface_kernels.fit` takes it.
+    constants, axes, grid : ndarray
+        Likewise.
+    bounds : ndarray, shape (4, 2)
+        Of log sigma_a, log sigma_s', log of the common factor, g.
+    error : ndarray, shape (3,)
+        Relative model error as `subsurface_kernels.fit` takes it.
+    bias : tuple of float
+        Relative systematic error of sigma_tr, and its growth with sigma_a/sigma_s'.
+    most_ratio : float
+        Greatest sigma_a/sigma_s' that the model is good for.
+    """
+
+    radius_mm: Floats
+    kind: int
+    constants: Floats
+    axes: Floats
+    grid: Floats
+    bounds: Floats
+    error: Floats
+    bias: tuple[float, float]
+    most_ratio: float
+
+    def profiles(self, theta: Floats) -> tuple[Floats, Floats]:
+        """Return profiles (N, F), 1/mm^2, of parameters (N, 4), and derivatives (N, 4, F)."""
+        out = np.empty((theta.shape[0], self.radius_mm.size))
+        slopes = np.zeros((theta.shape[0], kernels.PARAMETERS, self.radius_mm.size))
+        kernels.evaluate(
+            self.kind, np.ascontiguousarray(theta), self.radius_mm, self.constants, self.axes,
+            self.grid, out, slopes,
+        )  # fmt: skip
+        return out, slopes
+
+    def holds(self, theta: Floats) -> NDArray[np.bool_]:
+        """Return where the model is good for parameters (N, 4)."""
+        return np.asarray(theta[:, 0] - theta[:, 1] <= np.log(self.most_ratio))
+
+    def relative_variance(self, theta: Floats) -> Floats:
+        """Return the model's own squared relative error at every fibre, (N, F)."""
+        a, s = np.exp(theta[:, :1]), np.exp(theta[:, 1:2])
+        everywhere, near, by_ratio = self.error
+        source = near * np.exp(-self.radius_mm * (a + s))
+        return np.asarray(everywhere**2 + source**2 + (by_ratio * a / s) ** 2)
+
+    def systematic(self, theta: Floats) -> Floats:
+        """Return by how much log sigma_tr is off for the model's sake, (N,)."""
+        ratio = np.minimum(np.exp(theta[:, 0] - theta[:, 1]), 1.0)
+        return np.asarray(self.bias[0] + self.bias[1] * ratio)
+
+    def starts(
+        self, log_reflectance: Floats, weight: Floats, g: float, common_error: float = 0.0
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return where fits begin: the valleys of the misfit of logarithms along sigma_s'.
+
+        For each sigma_s' of a grid the best sigma_tr is found, between its grid's nodes by the
+        parabola through three of them.
+
+        Parameters
+        ----------
+        log_reflectance, weight : ndarray, shape (N, F)
+            Weight 0 where a logarithm means nothing.
+        g : float
+            Asymmetry to begin with.
+        common_error : float
+            Standard deviation of the log of a common factor, which takes its best value for each
+            pair of the grid; 0: there is none.
+
+        Returns
+        -------
+        best, second : ndarray, shape (N, 4)
+            Parameters in the deepest valley and in the next.
+        rise : ndarray, shape (N,)
+            How much worse the second is, as sum of weighted squares; infinite without a second.
+        """
+        log_k, log_s = np.log(START_SIGMA_TR), np.log(START_SIGMA_S)
+        theta = np.zeros((log_s.size, log_k.size, kernels.PARAMETERS))
+        theta[..., 0] = _log_absorption(log_k, log_s[:, None])
+        theta[..., 1], theta[..., 3] = log_s[:, None], g
+        outside = (theta[..., 0] - theta[..., 1] > np.log(START_RATIO)) | np.any(
+            (theta < self.bounds[:, 0]) | (theta > self.bounds[:, 1]), axis=2
+        )
+        profiles = self.profiles(theta.reshape(-1, kernels.PARAMETERS))[0]
+        curves = np.log(np.maximum(profiles, np.exp(LEAST_LOG)))
+        middle = np.median(curves, axis=0)  # single precision has digits enough for the rest
+        curves = (curves - middle).astype(np.float32)
+        grid = np.concatenate([-2.0 * curves, curves**2], axis=1).T
+        nowhere = np.where(outside.ravel(), np.float32(np.inf), np.float32(0.0))
+        place, depth = np.empty((2, 2, len(weight)))
+        valley = np.empty((2, len(weight)), np.int64)
+        for begin in range(0, len(weight), CACHED):
+            part = slice(begin, begin + CACHED)
+            given = weight[part].astype(np.float32)
+            off = (log_reflectance[part] - middle).astype(np.float32)
+            with _blas().limit(limits=1):  # threads would wait for one another
+                score = np.concatenate([given * off, given], axis=1) @ grid
+                if common_error > 0.0:
+                    left = (given * off).sum(axis=1, keepdims=True) - given @ curves.T
+                    firm = given.sum(axis=1, keepdims=True) + np.float32(common_error**-2)
+                    np.divide(left**2, firm, out=left, where=firm > 0.0)
+                    score -= left
+            score += nowhere
+            kernels.valleys(
+                score.reshape(-1, log_s.size, log_k.size), valley[:, part], place[:, part],
+                depth[:, part],
+            )  # fmt: skip
+        ends = []
+        for which, at in zip(valley, place, strict=True):
+            start = np.zeros((which.size, kernels.PARAMETERS))
+            refined = log_k[0] + at * (log_k[1] - log_k[0])
+            start[:, 0] = _log_absorption(refined, log_s[which])
+            start[:, 1], start[:, 3] = log_s[which], g
+            if common_error > 0.0:
+                shown = np.log(np.maximum(self.profiles(start)[0], np.exp(LEAST_LOG)))
+                off = (weight * (log_reflectance - shown)).sum(axis=1)
+                start[:, 2] = off / (weight.sum(axis=1) + common_error**-2)
+            ends.append(np.clip(start, self.bounds[:, 0], self.bounds[:, 1]))
+        rise = np.full(depth.shape[1], np.inf)
+        np.subtract(depth[1], depth[0], out=rise, where=np.isfinite(depth[1]))
+        return ends[0], ends[1], rise
+
+
+@lru_cache(maxsize=1)
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController().select(user_api="blas")
+
+
+def _log_absorption(log_sigma_tr: Floats, log_sigma_s: Floats) -> Floats:
+    """Return log sigma_a of sigma_tr and sigma_s', without cancellation."""
+    x = 2.0 / 3.0 * np.exp(2.0 * (log_sigma_tr - log_sigma_s))
+    return np.asarray(log_sigma_s + np.log(x) - np.log1p(np.sqrt(1.0 + 2.0 * x)))
+
+
+def profile_model(
+    method: Method,
+    radius_mm: Floats,
+    *,
+    eta: float,
+    collection: Collection,
+    core_mm: float,
+    source_core_mm: float,
+    g: float,
+    g_error: float,
+) -> ProfileModel:
+    """Return a method's model at some radii.
+
+    Parameters
+    ----------
+    method : {"photon_table", "diffusion", "dipole"}
+    radius_mm : ndarray, shape (F,)
+    eta : float
+        Refractive index of the medium over that outside, at least 1.
+    collection, core_mm, source_core_mm
+        As of `model.photon_table.reflectance`; closed forms do without.
+    g, g_error : float
+        The asymmetry's prior; closed forms do without.
+    """
+    if method == "photon_table":
+        return _tabled(radius_mm.tobytes(), eta, collection, core_mm, source_core_mm, g, g_error)
+    nothing = np.ones((3, 2))
+    bounds = np.log(np.array([SIGMA_A_LIMITS, SIGMA_S_LIMITS, SCALE_LIMITS, (1.0, 1.0)]))
+    bounds[3] = 0.0, 1.0
+    constants, error, bias = _CLOSED[method](eta)
+    return ProfileModel(
+        radius_mm, 0, constants, nothing, np.zeros((1, 1, 1, 1)), bounds, error, bias, MOST_RATIO
+    )
+
+
+@lru_cache(maxsize=16)
+def _tabled(
+    radius: bytes,
+    eta: float,
+    collection: Collection,
+    core_mm: float,
+    source_core_mm: float,
+    g: float,
+    g_error: float,
+) -> ProfileModel:
+    """Lay the photon table out as log R + sigma_tr r over (sigma_s', root, g)."""
+    radius_mm = np.frombuffer(radius, np.float64).copy()  # not read-only: one kernel for all
+    held = photon_table.asymmetries()
+    low, high = max(g - 3.0 * g_error, held[0]), min(g + 3.0 * g_error, held[-1])
+    count = 4 if high - low > 1e-6 else 1
+    asymmetries = np.linspace(low, high, count)
+    # a single asymmetry is for layered tissue, which looks like media of much scattering: between
+    # nodes log R bends with sigma_tr r, which grows with it
+    fine = 0.075 if count > 1 else 0.0375
+    steps = np.array([0.1, fine, (high - low) / 3.0 if count > 1 else 1.0])
+    logs = np.arange(np.log(TABLE_SIGMA_S[0]), np.log(TABLE_SIGMA_S[1]) + steps[0], steps[0])
+    most = np.log1p(10.0 * np.sqrt(photon_table.MAX_ABSORPTION_RATIO))
+    roots = np.arange(0.0, most + steps[1], steps[1])
+    s = np.exp(logs)[:, None]
+    a = s * (0.1 * np.expm1(roots)) ** 2
+    grid = np.empty((*a.shape, count, radius_mm.size))
+    decay = np.sqrt(3.0 * a * (a + s))[..., None] * radius_mm  # makes what is left smooth
+    for n, each in enumerate(asymmetries):
+
+        def told(r: Floats, own_mm: float, source_mm: float, g: float = float(each)) -> Floats:
+            profile = photon_table.reflectance(
+                r, a[..., None], s[..., None], eta=eta, g=g, collection=collection,
+                core_mm=own_mm, source_core_mm=source_mm,
+            )  # fmt: skip
+            return np.asarray(np.log(np.maximum(profile, 1e-290)))
+
+        # of points, as light turns diffuse within the cores of fibres where much is scattered
+        end = told(DIFFUSE_FROM / s[..., None], 0.0, 0.0)
+        point = np.where(radius_mm > 0.0, radius_mm, radius_mm.max(initial=1.0))
+        beyond = _diffused(told(point, 0.0, 0.0), point, a[..., None], s[..., None], end, eta)
+        grid[:, :, n] = told(radius_mm, core_mm, source_core_mm) + beyond + decay
+    bounds = np.log(np.array([SIGMA_A_LIMITS, TABLE_SIGMA_S, SCALE_LIMITS, (1.0, 1.0)]))
+    bounds[3] = low, high
+    axes = np.stack([np.array([logs[0], roots[0], low]), steps], axis=1)
+    return ProfileModel(
+        radius_mm, kernels.TABLE, np.zeros(4), axes, grid, bounds, TABLE_ERROR,
+        (0.0, 0.0), photon_table.MAX_ABSORPTION_RATIO,
+    )  # fmt: skip
+
+
+def _diffused(
+    log_profile: Floats, radius_mm: Floats, a: Floats, s: Floats, log_end: Floats, eta: float
+) -> Floats:
+    """Return what diffusion in place of a table's far end adds to its logarithms, (S, U, F).
+
+    Parameters
+    ----------
+    log_profile, log_end
+        Of the table at the radii, and (S, U, 1) at the distance from which light is diffuse.
+    radius_mm, a, s
+        That broadcast to the table.
+    """
+    near, far = DIFFUSE_RATIO
+    share = np.clip((far - a / s) / (far - near), 0.0, 1.0) * (radius_mm * s > DIFFUSE_FROM)
+    weak = np.minimum(a, far * s)  # the rest is not asked for
+    there, end = (diffusion.reflectance(r, weak, s, eta) for r in (radius_mm, DIFFUSE_FROM / s))
+    continued = log_end + np.log(np.maximum(there, 1e-290)) - np.log(np.maximum(end, 1e-290))
+    return np.asarray(share * (continued - log_profile))
+
+
+def _dipole(eta: float) -> tuple[Floats, Floats, tuple[float, float]]:
+    """Return constants of Jensen's dipole; its error, equal for all fibres."""
+    stretch = 1.0 + 4.0 / 3.0 * fresnel.boundary_factor(eta)
+    return np.array([stretch, 0.0, 1.0, 1.0]), DIPOLE_ERROR, DIPOLE_BIAS
+
+
+def _diffusion(eta: float) -> tuple[Floats, Floats, tuple[float, float]]:
+    """Return constants of Kienle and Patterson's diffusion; its error grows at the source."""
+    stretch, (c_phi, c_j) = diffusion.image_depth(eta), diffusion.exit_coefficients(eta)
+    return np.array([stretch, c_phi, c_j, 1.0]), DIFFUSION_ERROR, DIFFUSION_BIAS
+
+
+_CLOSED = {"dipole": _dipole, "diffusion": _diffusion}

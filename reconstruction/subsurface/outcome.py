@@ -1,0 +1,347 @@
+"""What fits of radial profiles tell: estimates with errors and intervals, and what to doubt."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincc, stdtrit
+
+from reconstruction.subsurface.models import Method
+from reconstruction.subsurface.profile_batch import FEWEST_READINGS, MISFIT_CHANCE, ProfileBatch
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Codes = NDArray[np.uint16]
+
+FEWEST_FIBRES = 4
+LOG_LIMIT = 0.5
+"""Standard error of log sigma_tr above which the profile does not tell it."""
+COEFFICIENT_LIMIT = 0.3
+"""Likewise of log sigma_a and log sigma_s', which is said apart."""
+FAR_OFF = 0.7
+"""Root mean square of log(reading / model) above which a profile is of no such medium."""
+MOST_SPREAD = 0.5
+"""Relative model error found from the residuals, likewise."""
+MOST_CORRELATION = 0.9
+"""Of residuals of neighbouring fibres."""
+CLEAR = 0.2
+"""Standard error of log sigma_tr up to which its interval is symmetric in the logarithm."""
+SHARE = 0.6827
+"""Of the interval."""
+BY_CHANCE = 2.0
+"""Standard deviations of the correlation of independent neighbours up to which it says nothing."""
+MOST_OFF = 2.0
+"""Times the misfit that a fibre counts there at most: one must not hide what all others say."""
+
+
+class Outcome(IntFlag):
+    """What became of a fit; the first eight bits make it invalid, the others are remarks."""
+
+    GOOD = 0
+    TOO_FEW_FIBRES = 1
+    NO_SIGNAL = 2
+    NOT_CONVERGED = 4
+    AT_BOUND = 8
+    OUTSIDE_DOMAIN = 16
+    NOT_IDENTIFIED = 32
+    WRONG_PROFILE = 64
+    MISFIT = 256
+    COEFFICIENTS_NOT_IDENTIFIED = 512
+
+
+_INVALID = 255
+REASONS = {
+    Outcome.TOO_FEW_FIBRES: f"fewer than {FEWEST_FIBRES} fibres to use",
+    Outcome.NO_SIGNAL: f"fewer than {FEWEST_READINGS} fibres stand out of their noise",
+    Outcome.NOT_CONVERGED: "the fit did not settle",
+    Outcome.AT_BOUND: "a coefficient runs against its limit",
+    Outcome.OUTSIDE_DOMAIN: "sigma_a / sigma_s' is beyond what the model is good for",
+    Outcome.NOT_IDENTIFIED: "the profile does not tell sigma_tr",
+    Outcome.WRONG_PROFILE: "no medium of this kind has such a profile, or its scale is wrong",
+    Outcome.MISFIT: "residuals exceed their errors; a model error takes up the rest",
+    Outcome.COEFFICIENTS_NOT_IDENTIFIED: "sigma_a and sigma_s' are not told apart well",
+}
+LEFT_OUT = ("used", "masked", "not finite", "no variance", "not above zero", "outlier")
+"""Meaning of `SubsurfaceFit.left_out`."""
+
+
+@dataclass(frozen=True, slots=True)
+class SubsurfaceFit:
+    """Coefficients of the media that profiles come from, leading axes as the profiles'.
+
+    Attributes
+    ----------
+    sigma_a_per_mm, sigma_s_prime_per_mm, sigma_tr_per_mm : ndarray, shape (...)
+        Absorption, reduced scattering, and sqrt(3 sigma_a (sigma_a + sigma_s')), 1/mm; NaN where
+        the fibres do not suffice (`Outcome.TOO_FEW_FIBRES`, `Outcome.NO_SIGNAL`).
+    covariance : ndarray, shape (..., 2, 2)
+        Of (sigma_a, sigma_s'), 1/mm^2, nuisances included; infinite where nothing is told.
+    valid : ndarray of bool, shape (...)
+        sigma_tr can be used. False with a reason in `outcome`.
+    sigma_tr_stderr : ndarray, shape (...)
+        By propagation of `covariance`, and for closed forms with their systematic error, 1/mm.
+    interval_per_mm : ndarray, shape (..., 2)
+        68 % interval of sigma_tr, 1/mm.
+    chi2, p_value : ndarray, shape (...)
+        Squared residuals over their stated variances, with the nuisances' priors; and the chance
+        of more.
+        Without a variance chi2 equals `dof` but for its smoothing and says little.
+    dof : ndarray of int, shape (...)
+        Fibres used less two.
+    inflation : ndarray, shape (...)
+        By how much residuals exceed their stated errors, sqrt(chi2/dof), for a misfit; 1 without.
+    model_error : ndarray, shape (...)
+        Relative error of the model at all fibres that explains a misfit; the fit and its standard
+        errors are made with it. 0 without.
+    bent : ndarray of bool, shape (...)
+        The misfit is one of the profile: neighbouring fibres agree about it by more than chance.
+        Tissue that is none of the model's bends a profile smoothly, while fibres that are each off
+        by themselves, as by dirt, do not agree. False without a misfit.
+    used : ndarray of bool, shape (..., F)
+    left_out : ndarray of uint8, shape (..., F)
+        Index into `LEFT_OUT`, 0 where used.
+    outcome : ndarray of uint16, shape (...)
+        Bits of `Outcome`.
+    predicted_per_mm2 : ndarray, shape (..., F)
+        The fitted profile with the common factor, 1/mm^2, at every fibre.
+    residual : ndarray, shape (..., F)
+        (reflectance - predicted) over its standard deviation, model error included; without a
+        variance of logarithms; 0 where not used.
+    scale : ndarray, shape (...)
+        Common factor of the reading, 1 without ``common_error``.
+    asymmetry : ndarray, shape (...)
+        g as fitted, or as given.
+    evaluations : ndarray of int, shape (...)
+        Profiles computed for the fit.
+    method : str
+    """
+
+    sigma_a_per_mm: Floats
+    sigma_s_prime_per_mm: Floats
+    sigma_tr_per_mm: Floats
+    covariance: Floats
+    valid: Bools
+    sigma_tr_stderr: Floats
+    interval_per_mm: Floats
+    chi2: Floats
+    dof: NDArray[np.int64]
+    p_value: Floats
+    inflation: Floats
+    model_error: Floats
+    bent: Bools
+    used: Bools
+    left_out: NDArray[np.uint8]
+    outcome: Codes
+    predicted_per_mm2: Floats
+    residual: Floats
+    scale: Floats
+    asymmetry: Floats
+    evaluations: NDArray[np.int64]
+    method: Method
+
+    @property
+    def sigma_a_stderr(self) -> Floats:
+        """Standard error of sigma_a, 1/mm, shape (...)."""
+        return np.asarray(np.sqrt(self.covariance[..., 0, 0]))
+
+    @property
+    def sigma_s_prime_stderr(self) -> Floats:
+        """Standard error of sigma_s', 1/mm, shape (...)."""
+        return np.asarray(np.sqrt(self.covariance[..., 1, 1]))
+
+    @property
+    def correlation(self) -> Floats:
+        """Correlation of sigma_a and sigma_s', shape (...); NaN where nothing is told."""
+        spread = self.sigma_a_stderr * self.sigma_s_prime_stderr
+        known = np.isfinite(spread) & (spread > 0.0)
+        ratio = np.full(spread.shape, np.nan)
+        return np.divide(self.covariance[..., 0, 1], spread, out=ratio, where=known)
+
+    @property
+    def coefficients_identified(self) -> Bools:
+        """Whether sigma_a and sigma_s' are told one by one; `valid` speaks of sigma_tr alone."""
+        unclear = Outcome.COEFFICIENTS_NOT_IDENTIFIED | Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL
+        return np.asarray((self.outcome & np.uint16(unclear)) == 0)
+
+    def reason(self, index: int | tuple[int, ...] = ()) -> str:
+        """Return what is to be said of one fit, empty for a good one.
+
+        Parameters
+        ----------
+        index
+            Of the leading axes; () for a single profile.
+        """
+        code = int(self.outcome[index])
+        return "; ".join(text for bit, text in REASONS.items() if code & bit)
+
+
+def judged(
+    batch: ProfileBatch,
+    bounds: Floats,
+    inside: Bools,
+    bias: Floats,
+    left_out: NDArray[np.uint8],
+    shape: tuple[int, ...],
+    method: Method,
+) -> SubsurfaceFit:
+    """Return estimates with errors, and say which can be used."""
+    a, s = np.exp(batch.theta[:, 0]), np.exp(batch.theta[:, 1])
+    sigma_tr = np.sqrt(3.0 * a * (a + s))
+    fibres = batch.used.sum(axis=1)
+    dof = np.maximum(fibres - 2, 0)
+    p_value = np.where(dof > 0, gammaincc(np.maximum(dof, 1) / 2.0, batch.chi2 / 2.0), 1.0)
+    reduced = batch.chi2 / np.maximum(dof, 1)
+    misfit: Bools = np.less(p_value, 0.0 if batch.logarithmic else MISFIT_CHANCE)
+    inflation = np.where(
+        (reduced > 1.0) & np.logical_or(misfit, batch.logarithmic), np.sqrt(reduced), 1.0
+    )
+    residual = _residuals(batch)
+    widening = np.where((batch.spread > 0.0) & batch.erring, _repeats(residual), 1.0)
+    if batch.logarithmic:
+        widening = inflation**2
+    logs = batch.covariance[:, :2, :2] * widening[:, None, None]
+    slope = 0.5 * np.stack([1.0 + a / (a + s), s / (a + s)], axis=1)  # of log sigma_tr
+    told = np.asarray(np.isfinite(logs).all(axis=(1, 2)))
+    safe = np.where(told[:, None, None], logs, 0.0)
+    log_variance = np.einsum("ni,nij,nj->n", slope, safe, slope)
+    log_stderr = np.where(told, np.sqrt(np.maximum(log_variance, 0.0) + bias**2), math.inf)
+    scales = np.stack([a, s], axis=1)
+    covariance = safe * scales[:, :, None] * scales[:, None, :]
+    covariance[~told] = math.inf
+    apart = np.where(told, np.sqrt(np.maximum(safe[:, 0, 0], safe[:, 1, 1])), math.inf)
+
+    seen = batch.seen.sum(axis=1)
+    with np.errstate(divide="ignore"):
+        off = (
+            batch.y - np.log(batch.predicted)
+            if batch.logarithmic
+            else (
+                np.log(np.where(batch.seen, batch.y, 1.0))
+                - np.log(np.maximum(batch.predicted, 1e-290))
+            )
+        )
+    far = np.sqrt(np.where(batch.seen, off**2, 0.0).sum(axis=1) / np.maximum(seen, 1))
+    at_bound = (
+        (batch.theta[:, :2] <= bounds[:2, 0] + 1e-6) | (batch.theta[:, :2] >= bounds[:2, 1] - 1e-6)
+    ).any(axis=1)
+    outcome = np.zeros(a.shape, np.uint16)
+    for bit, where in (
+        (Outcome.TOO_FEW_FIBRES, fibres < FEWEST_FIBRES),
+        (Outcome.NO_SIGNAL, (fibres >= FEWEST_FIBRES) & (seen < FEWEST_READINGS)),
+        (Outcome.NOT_CONVERGED, batch.steps < 0),
+        (Outcome.AT_BOUND, at_bound),
+        (Outcome.OUTSIDE_DOMAIN, ~inside),
+        (Outcome.NOT_IDENTIFIED, log_stderr > LOG_LIMIT),
+        (Outcome.WRONG_PROFILE, (far > FAR_OFF) | (batch.spread > MOST_SPREAD)),
+        (Outcome.MISFIT, misfit),
+        (Outcome.COEFFICIENTS_NOT_IDENTIFIED, apart > COEFFICIENT_LIMIT),
+    ):
+        outcome[where] |= np.uint16(bit)
+    nothing = (outcome & np.uint16(Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL)) != 0
+    outcome[nothing] &= np.uint16(Outcome.TOO_FEW_FIBRES | Outcome.NO_SIGNAL)
+    for estimate in (a, s, sigma_tr, p_value):
+        estimate[nothing] = math.nan
+    covariance[nothing] = math.inf
+    log_stderr[nothing] = math.inf
+    reach = np.full(a.shape, 1.0)
+    if batch.logarithmic:  # the noise itself is known from few residuals
+        reach = stdtrit(np.maximum(dof, 1), 0.5 + 0.5 * SHARE)
+    low, high = _interval(sigma_tr, log_stderr * reach)
+    fibres_in_all = batch.y.shape[1]
+    left_out = np.where(batch.odd, np.uint8(LEFT_OUT.index("outlier")), left_out)
+    predicted = np.where(nothing[:, None], math.nan, batch.predicted)
+    return SubsurfaceFit(
+        sigma_a_per_mm=a.reshape(shape),
+        sigma_s_prime_per_mm=s.reshape(shape),
+        sigma_tr_per_mm=sigma_tr.reshape(shape),
+        covariance=covariance.reshape((*shape, 2, 2)),
+        valid=((outcome & np.uint16(_INVALID)) == 0).reshape(shape),
+        sigma_tr_stderr=_deviation(sigma_tr, log_stderr).reshape(shape),
+        interval_per_mm=np.stack([low, high], axis=-1).reshape((*shape, 2)),
+        chi2=batch.chi2.reshape(shape),
+        dof=dof.reshape(shape),
+        p_value=p_value.reshape(shape),
+        inflation=inflation.reshape(shape),
+        model_error=batch.spread.reshape(shape),
+        bent=_bent(batch).reshape(shape),
+        used=batch.used.reshape((*shape, fibres_in_all)),
+        left_out=left_out.reshape((*shape, fibres_in_all)),
+        outcome=outcome.reshape(shape),
+        predicted_per_mm2=predicted.reshape((*shape, fibres_in_all)),
+        residual=residual.reshape((*shape, fibres_in_all)),
+        scale=np.exp(batch.theta[:, 2]).reshape(shape),
+        asymmetry=batch.theta[:, 3].reshape(shape),
+        evaluations=np.abs(batch.steps).reshape(shape),
+        method=method,
+    )
+
+
+def _residuals(batch: ProfileBatch) -> Floats:
+    """Return residuals over their standard deviations, (N, F), 0 where a fibre is not used."""
+    value = batch.predicted
+    if batch.logarithmic:
+        value = np.log(np.maximum(value, 1e-290))
+    residual = np.zeros(batch.y.shape)
+    np.divide(batch.y - value, np.sqrt(batch.total), out=residual, where=batch.used)
+    return residual
+
+
+def _bent(batch: ProfileBatch) -> Bools:
+    """Return whose neighbouring fibres agree about the misfit by more than chance, (N,).
+
+    By their correlation, of fibres as far as their noise is below the misfit: that of n
+    independent ones is off from 0 by 1 / sqrt(n).
+    """
+    there = batch.used & (batch.spread[:, None] > 0.0)
+    m, y = np.where(there, batch.predicted, 1.0), np.where(there, batch.y, 0.0)
+    noise = np.where(there, batch.variance, 0.0) / (1.0 if batch.logarithmic else m**2)
+    square = np.broadcast_to(batch.spread[:, None] ** 2, y.shape)
+    share = np.divide(square, square + noise, out=np.zeros(y.shape), where=there)
+    off = y - np.log(m) if batch.logarithmic else y / m - 1.0
+    most = MOST_OFF * batch.spread[:, None]
+    off = share * np.clip(off, -most, most)
+    pairs = np.maximum((share[:, 1:] * share[:, :-1]).sum(axis=1), 1e-290)
+    alone = np.maximum((share**2).sum(axis=1), 1e-290)
+    alike = (off[:, 1:] * off[:, :-1]).sum(axis=1) / pairs
+    return np.asarray(alike > BY_CHANCE / np.sqrt(pairs) * (off**2).sum(axis=1) / alone)
+
+
+def _repeats(residual: Floats) -> Floats:
+    """Return how many neighbours tell the same, from the residuals' correlation, (N,).
+
+    A medium that the model does not describe leaves residuals that are smooth over the fibres;
+    (1 + c)/(1 - c) of them count as one, as in a series of the first order.
+    """
+    squares = np.maximum((residual**2).sum(axis=1), 1e-290)
+    c = (residual[:, 1:] * residual[:, :-1]).sum(axis=1) / squares
+    c = np.clip(c, 0.0, MOST_CORRELATION)
+    return np.asarray((1.0 + c) / (1.0 - c))
+
+
+def _interval(sigma_tr: Floats, log_stderr: Floats) -> tuple[Floats, Floats]:
+    """Return the ends of the 68 % interval of sigma_tr.
+
+    Symmetric in the logarithm while that is well told; then in sigma_tr^2, which a profile is
+    linear in where the absorption is next to none.
+    """
+    clear = log_stderr < CLEAR
+    spread = np.where(clear, log_stderr, 0.0)
+    low, high = sigma_tr * np.exp(-spread), sigma_tr * np.exp(spread)
+    wide = np.where(np.isfinite(log_stderr), 2.0 * log_stderr, 0.0)
+    low = np.where(clear, low, sigma_tr * np.sqrt(np.maximum(1.0 - wide, 0.0)))
+    high = np.where(clear, high, sigma_tr * np.sqrt(1.0 + wide))
+    nothing = ~np.isfinite(log_stderr)
+    return np.where(nothing, 0.0, low), np.where(nothing, math.inf, high)
+
+
+def _deviation(sigma_tr: Floats, log_stderr: Floats) -> Floats:
+    """Return the standard error, half the interval where that is wide; infinite where unknown."""
+    low, high = _interval(sigma_tr, log_stderr)
+    half = np.full(sigma_tr.shape, math.inf)
+    np.subtract(0.5 * high, 0.5 * low, out=half, where=np.isfinite(high) & np.isfinite(low))
+    known = np.isfinite(sigma_tr) & (log_stderr < CLEAR)
+    return np.where(known, np.where(known, sigma_tr, 0.0) * np.where(known, log_stderr, 0.0), half)

@@ -1,0 +1,527 @@
+"""A map of translucency, 1/sigma_tr, from a few places of a face, with its standard error.
+
+log(1/sigma_tr) over a face is taken as a person's level plus a smooth field, both normal: the
+prior of a person is a population's (`model.translucency_population`), and correlations over the
+face fall off as ``exp(-d^2 / 2 length^2)``. What a map says is the posterior of that (kriging): it
+runs through well measured places, goes back towards the person's level away from them, and its
+standard error grows to what people and places differ by. Nothing is extrapolated.
+
+Translucency is 1/sigma_tr in mm (Weyrich et al. 2005, section 8): of two places, the one of
+smaller sigma_tr is the more translucent.
+
+References
+----------
+Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, section 2.2.
+Weyrich et al. 2005, MERL TR2005-071, published as doi:10.1145/1141911.1141987
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+from threadpoolctl import ThreadpoolController
+
+from model.translucency_population import TranslucencyPopulation, weyrich_2005
+from reconstruction.correspondence import landmark_table
+
+Floats: TypeAlias = NDArray[np.float64]
+Float32s: TypeAlias = NDArray[np.float32]
+Bools: TypeAlias = NDArray[np.bool_]
+
+SITE_UV: Final[Mapping[str, tuple[float, float]]] = {
+    "forehead": (0.500, 0.820),
+    "cheek": (0.263, 0.528),
+    "cheek left": (0.263, 0.528),
+    "cheek right": (0.737, 0.528),
+    "chin": (0.500, 0.205),
+}
+"""Texture coordinates of the places where a probe is set down, on the simulated heads: of the
+points nearest to the landmarks of `rigsim.head`, means of 8 heads (they differ by 0.002); chin is
+below it, where the skin faces down. Left and right as seen in the picture; a cheek that is not
+named otherwise is the left one."""
+TEXTURE_MM: Final = (200.0, 330.0)
+"""What the width and the height of that texture measure on the skin near the middle of the face;
+towards the ears the width is up to 340."""
+LENGTH_MM: Final = 60.0
+"""Distance at which deviations from the person's level are correlated by 0.61: assumed, about from
+a cheek to the nose. The paper says "slowly varying" and no number."""
+LARGEST_RELATIVE_ERROR: Final = 0.5
+"""A place whose standard error is more of its sigma_tr cannot be told from 0 and is left out."""
+SAME_PLACE_MM: Final = 2.0
+"""Measurements so near to each other are repeats of one place."""
+CONFLICT_RATE: Final = 0.01
+"""Repeats of one place that differ so much by chance only this often are said to contradict."""
+ROUNDING: Final = 1e-10
+"""Of the prior variance: no place is known better."""
+
+
+class TranslucencyError(ValueError):
+    """Places, values or a prior that no map can be made from."""
+
+
+@dataclass(frozen=True, slots=True)
+class TranslucencyPrior:
+    """What is known of log(1/sigma_tr) before a person is measured, by channel.
+
+    Attributes
+    ----------
+    log_mean : ndarray of float64, shape (C,)
+        Mean of log(1/sigma_tr), sigma_tr in 1/mm.
+    person_deviation : ndarray of float64, shape (C,)
+        Standard deviation from person to person of the level of a face, above 0.
+    place_deviation : ndarray of float64, shape (C,)
+        Standard deviation from place to place of a face, above 0.
+    length_mm : float
+        Distance of correlation over the face, above 0.
+    source : str
+    """
+
+    log_mean: Floats
+    person_deviation: Floats
+    place_deviation: Floats
+    length_mm: float = LENGTH_MM
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse deviations and lengths that are not positive."""
+        shape = np.shape(self.log_mean)
+        for name in ("log_mean", "person_deviation", "place_deviation"):
+            values = np.array(getattr(self, name), np.float64)
+            if values.ndim != 1 or values.shape != shape or not np.isfinite(values).all():
+                raise TranslucencyError(
+                    f"{name}: got shape {values.shape}, expected (C,), finite, as of log_mean"
+                )
+            if name != "log_mean" and not (values > 0).all():
+                raise TranslucencyError(f"{name}: got {values.tolist()}, expected above 0")
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+        if not (math.isfinite(self.length_mm) and self.length_mm > 0):
+            raise TranslucencyError(f"length_mm: got {self.length_mm}, expected above 0, finite")
+
+
+def population_prior(
+    population: TranslucencyPopulation | None = None, *, length_mm: float = LENGTH_MM
+) -> TranslucencyPrior:
+    """Return the prior of a person from a population.
+
+    The level varies by the part of the variance that places have in common, the places by the
+    rest and by what their means differ. Variances are averaged over places.
+
+    Parameters
+    ----------
+    population : TranslucencyPopulation, optional
+        Table 2 of Weyrich et al. 2005 by default; its deviations hold the noise of measurement,
+        so that the prior is rather too wide.
+    length_mm : float
+
+    Examples
+    --------
+    >>> prior = population_prior()
+    >>> np.exp(prior.log_mean).round(2).tolist()
+    [1.75, 0.97, 0.61]
+    >>> np.hypot(prior.person_deviation, prior.place_deviation).round(2).tolist()
+    [0.29, 0.26, 0.21]
+    """
+    people = weyrich_2005() if population is None else population
+    deviation, places = people.log_deviation, len(people.sites)
+    variance = (deviation**2).mean(axis=0)
+    # mean covariance of two different places
+    pairs = (deviation.sum(axis=0) ** 2 - (deviation**2).sum(axis=0)) / max(
+        places * (places - 1), 1
+    )
+    shared = max(people.site_correlation, 1e-6) * (pairs if places > 1 else variance)
+    between = people.log_mean.var(axis=0, ddof=1) if places > 1 else 0.0
+    return TranslucencyPrior(
+        log_mean=-people.log_mean.mean(axis=0),
+        person_deviation=np.sqrt(shared),
+        place_deviation=np.sqrt(variance - shared + between),
+        length_mm=length_mm,
+        source=people.source,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class TranslucencyMap:
+    """1/sigma_tr over a texture.
+
+    Attributes
+    ----------
+    values : ndarray of float32, shape (H, W, C)
+        1/sigma_tr, mm, above 0: the posterior's median; 0 where not valid. Row 0 is v = 1.
+    stderr : ndarray of float32, shape (H, W, C)
+        Half of the width of its 68 % interval, mm; 0 where not valid.
+    valid : ndarray of bool, shape (H, W, C)
+        False outside the mask, and in a channel without a usable place.
+    log_stderr : ndarray of float32, shape (H, W, C)
+        Standard deviation of log(1/sigma_tr): the interval is values times exp(-+ log_stderr).
+    used : ndarray of bool, shape (S, C)
+        Measurements that the map rests on.
+    p_value : ndarray of float64, shape (C,)
+        Chance that the population holds a face so unlike its mean; 1 without a usable place. When
+        tiny, standard errors away from the places are not to be relied on.
+    left_out : tuple of (str, str)
+        Measurement and channel, and why it was left out.
+    conflicts : tuple of (str, str)
+        Place and channel whose repeats contradict each other, and how; their error was widened.
+    """
+
+    values: Float32s
+    stderr: Float32s
+    valid: Bools
+    log_stderr: Float32s
+    used: Bools
+    p_value: Floats
+    left_out: tuple[tuple[str, str], ...]
+    conflicts: tuple[tuple[str, str], ...]
+
+
+def interpolate(
+    sites_uv: ArrayLike,
+    sigma_tr_per_mm: ArrayLike,
+    stderr_per_mm: ArrayLike,
+    shape: tuple[int, int],
+    *,
+    valid: ArrayLike | None = None,
+    names: Sequence[str] | None = None,
+    prior: TranslucencyPrior | None = None,
+    texture_mm: tuple[float, float] = TEXTURE_MM,
+    mask: ArrayLike | None = None,
+) -> TranslucencyMap:
+    """Interpolate 1/sigma_tr over a texture from some places.
+
+    Parameters
+    ----------
+    sites_uv : array_like, shape (S, 2)
+        Texture coordinates of the measurements, u to the right, v up, each 0...1; repeats have
+        equal ones (within `SAME_PLACE_MM`).
+    sigma_tr_per_mm, stderr_per_mm : array_like, shape (S, C)
+        Measured, with standard errors, 1/mm.
+    shape : (int, int)
+        Rows and columns of the map.
+    valid : array_like of bool, shape (S, C) or (S,), optional
+        Measurements that count.
+    names : sequence of str, optional
+        What messages call the measurements; by default their numbers.
+    prior : TranslucencyPrior, optional
+        Of C channels; that of table 2's population by default, which has three.
+    texture_mm : (float, float)
+        Width and height of the texture on the skin, mm.
+    mask : array_like of bool, shape (H, W), optional
+        Where there is skin.
+
+    Returns
+    -------
+    TranslucencyMap
+
+    Raises
+    ------
+    TranslucencyError
+        Without a single usable measurement, saying why each was left out; for shapes that do not
+        fit, coordinates beyond the texture, or standard errors below 0.
+
+    Examples
+    --------
+    >>> places = [SITE_UV[name] for name in ("forehead", "cheek", "chin")]
+    >>> sigma_tr = np.array([[0.54, 0.98, 1.55], [0.56, 0.98, 1.55], [0.69, 1.25, 1.92]])
+    >>> found = interpolate(places, sigma_tr, 0.03 * sigma_tr, (64, 64))
+    >>> row, column = int((1 - 0.82) * 64), 32
+    >>> [f"{v:.2f}" for v in found.values[row, column]], f"{found.stderr[row, column, 0]:.2f}"
+    (['1.85', '1.02', '0.64'], '0.06')
+    """
+    prior = population_prior() if prior is None else prior
+    at, sigma, stderr, good, labels = _checked(
+        sites_uv, sigma_tr_per_mm, stderr_per_mm, valid, names, prior
+    )
+    rows, columns = shape
+    if rows < 1 or columns < 1:
+        raise TranslucencyError(f"shape: got {shape}, expected at least (1, 1)")
+    size = np.array(texture_mm, np.float64)
+    if size.shape != (2,) or not (np.isfinite(size).all() and (size > 0).all()):
+        raise TranslucencyError(f"texture_mm: got {texture_mm}, expected two lengths above 0")
+    skin = np.ones(shape, bool) if mask is None else np.asarray(mask, bool)
+    if skin.shape != tuple(shape):
+        raise TranslucencyError(f"mask: got shape {skin.shape}, expected {tuple(shape)}")
+    usable, left_out = _usable(sigma, stderr, good, labels)
+    if not usable.any():
+        why = "; ".join(f"{where}: {reason}" for where, reason in left_out)
+        raise TranslucencyError(f"no usable measurement: {why}")
+
+    channels = prior.log_mean.size
+    values, half, log_stderr = np.zeros((3, rows, columns, channels), np.float32)
+    p_value = np.ones(channels)
+    conflicts: list[tuple[str, str]] = []
+    u_mm = size[0] * (np.arange(columns) + 0.5) / columns
+    v_mm = size[1] * (1.0 - (np.arange(rows) + 0.5) / rows)
+    for c in range(channels):
+        chosen = np.flatnonzero(usable[:, c])
+        if not chosen.size:
+            continue
+        places = _merged(
+            size * at[chosen],
+            -np.log(sigma[chosen, c]),
+            stderr[chosen, c] / sigma[chosen, c],
+            [f"{labels[k]}, channel {c}" for k in chosen],
+        )
+        conflicts += places.conflicts
+        posterior = _Posterior.of(places, prior, c)
+        p_value[c] = posterior.p_value
+        # products this small take longer on several threads than on one
+        with _blas().limit(limits=1):
+            median, deviation = (a.astype(np.float32) for a in posterior.over(u_mm, v_mm))
+        np.exp(median, out=values[..., c])
+        np.multiply(values[..., c], np.sinh(deviation), out=half[..., c])
+        log_stderr[..., c] = deviation
+    for array in (values, half, log_stderr):
+        array[~skin] = 0.0
+    return TranslucencyMap(
+        values=values,
+        stderr=half,
+        valid=skin[..., None] & usable.any(axis=0),
+        log_stderr=log_stderr,
+        used=usable,
+        p_value=p_value,
+        left_out=tuple(left_out),
+        conflicts=tuple(conflicts),
+    )
+
+
+@lru_cache(maxsize=1)
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController().select(user_api="blas")
+
+
+def _checked(
+    sites_uv: ArrayLike,
+    sigma_tr_per_mm: ArrayLike,
+    stderr_per_mm: ArrayLike,
+    valid: ArrayLike | None,
+    names: Sequence[str] | None,
+    prior: TranslucencyPrior,
+) -> tuple[Floats, Floats, Floats, Bools, list[str]]:
+    at = np.asarray(sites_uv, np.float64)
+    sigma = np.asarray(sigma_tr_per_mm, np.float64)
+    stderr = np.asarray(stderr_per_mm, np.float64)
+    if at.ndim != 2 or at.shape[1] != 2 or not len(at):
+        raise TranslucencyError(f"sites_uv: got shape {at.shape}, expected (S, 2), S at least 1")
+    if not ((at >= 0) & (at <= 1)).all():
+        raise TranslucencyError(f"sites_uv: got {at.tolist()}, expected coordinates 0...1")
+    expected = (len(at), prior.log_mean.size)
+    good = np.ones(expected, bool)
+    if valid is not None:
+        good = np.array(valid, bool)
+        good = np.repeat(good[:, None], expected[1], axis=1) if good.ndim == 1 else good
+    for name, array in (("sigma_tr_per_mm", sigma), ("stderr_per_mm", stderr), ("valid", good)):
+        if array.shape != expected:
+            raise TranslucencyError(f"{name}: got shape {array.shape}, expected {expected}")
+    if (stderr[good] < 0).any():
+        raise TranslucencyError(f"stderr_per_mm: got {stderr[good].min()}, expected 0 or above")
+    labels = [str(k) for k in range(len(at))] if names is None else list(names)
+    if len(labels) != len(at):
+        raise TranslucencyError(f"names: got {len(labels)}, expected {len(at)}")
+    return at, sigma, stderr, good, labels
+
+
+def _usable(
+    sigma: Floats, stderr: Floats, good: Bools, labels: list[str]
+) -> tuple[Bools, list[tuple[str, str]]]:
+    """Return which measurements count (S, C), and why the others do not."""
+    usable = np.zeros(good.shape, bool)
+    left_out = []
+    for s, c in np.ndindex(good.shape):
+        value, error = float(sigma[s, c]), float(stderr[s, c])
+        reason = ""
+        if not good[s, c]:
+            reason = "not valid"
+        elif not (math.isfinite(value) and math.isfinite(error)):
+            reason = "sigma_tr or its standard error is not finite"
+        elif value <= 0 or error > LARGEST_RELATIVE_ERROR * value:
+            reason = f"sigma_tr {value:.3g} ± {error:.3g} per mm cannot be told from 0"
+        usable[s, c] = not reason
+        if reason:
+            left_out.append((f"{labels[s]}, channel {c}", reason))
+    return usable, left_out
+
+
+@dataclass(frozen=True, slots=True)
+class _Places:
+    """Different places of one channel: positions (P, 2), mm; logs and their variances (P,)."""
+
+    at_mm: Floats
+    log: Floats
+    variance: Floats
+    conflicts: tuple[tuple[str, str], ...]
+
+
+def _merged(at_mm: Floats, log: Floats, error: Floats, labels: list[str]) -> _Places:
+    """Average repeats of a place by their errors, wider where these do not explain the scatter."""
+    # an error of 0 would leave no weight to others; that of rounding is as good
+    error = np.maximum(error, 1e-7)
+    left = np.arange(len(log))
+    at, mean, variance, conflicts = [], [], [], []
+    while left.size:
+        near = np.hypot(*(at_mm[left] - at_mm[left[0]]).T) <= SAME_PLACE_MM
+        same, left = left[near], left[~near]
+        weight = error[same] ** -2.0
+        center = float((weight * log[same]).sum() / weight.sum())
+        chi2 = float((weight * (log[same] - center) ** 2).sum())
+        dof = same.size - 1
+        spread = max(1.0, chi2 / dof) if dof else 1.0
+        if dof and stats.chi2.sf(chi2, dof) < CONFLICT_RATE:
+            conflicts.append(
+                (
+                    labels[same[0]],
+                    f"{same.size} repeats differ by {math.sqrt(spread):.1f} times their errors",
+                )
+            )
+        at.append(at_mm[same].mean(axis=0))
+        mean.append(center)
+        variance.append(spread / weight.sum())
+    return _Places(np.array(at), np.array(mean), np.array(variance), tuple(conflicts))
+
+
+@dataclass(frozen=True, slots=True)
+class _Posterior:
+    """Normal posterior of log(1/sigma_tr) over the texture, one channel."""
+
+    at_mm: Floats
+    length_mm: float
+    log_mean: float
+    shared: float
+    """Prior variance of the person's level."""
+    local: float
+    """Prior variance of a place about it."""
+    inverse: Floats
+    """Of the covariance of what was measured, (P, P)."""
+    pull: Floats
+    """That inverse times what was measured above the mean, (P,)."""
+    p_value: float
+
+    @classmethod
+    def of(cls, places: _Places, prior: TranslucencyPrior, channel: int) -> _Posterior:
+        shared = float(prior.person_deviation[channel]) ** 2
+        local = float(prior.place_deviation[channel]) ** 2
+        mean = float(prior.log_mean[channel])
+        apart = places.at_mm[:, None] - places.at_mm[None]
+        squared = (apart**2).sum(axis=-1) / prior.length_mm**2
+        noise = places.variance + ROUNDING * (shared + local)
+        covariance = shared + local * np.exp(-0.5 * squared) + np.diag(noise)
+        inverse = np.linalg.inv(covariance)
+        off = places.log - mean
+        pull = inverse @ off
+        p_value = float(stats.chi2.sf(max(float(off @ pull), 0.0), off.size))
+        return cls(places.at_mm, prior.length_mm, mean, shared, local, inverse, pull, p_value)
+
+    def over(self, u_mm: Floats, v_mm: Floats) -> tuple[Floats, Floats]:
+        """Return mean and standard deviation (H, W) at columns ``u_mm`` and rows ``v_mm``.
+
+        The kernel is a product of one over u and one over v, so maps are products of few columns.
+        """
+        across = np.exp(-0.5 * ((u_mm[:, None] - self.at_mm[:, 0]) / self.length_mm) ** 2)
+        along = np.exp(-0.5 * ((v_mm[:, None] - self.at_mm[:, 1]) / self.length_mm) ** 2)
+        first, second = np.triu_indices(len(self.pull))
+        twice = np.where(first == second, 1.0, 2.0) * self.inverse[first, second]
+        total = self.shared + self.local
+        level = self.log_mean + self.shared * self.pull.sum()
+        left = total - self.shared**2 * self.inverse.sum()
+        mean = _product(level, self.local * along * self.pull, across)
+        variance = _product(
+            left,
+            np.column_stack(
+                [
+                    -2.0 * self.shared * self.local * along * self.inverse.sum(axis=0),
+                    -(self.local**2) * along[:, first] * along[:, second] * twice,
+                ]
+            ),
+            np.column_stack([across, across[:, first] * across[:, second]]),
+        )
+        np.maximum(variance, ROUNDING * total, out=variance)
+        return mean, np.sqrt(variance, out=variance)
+
+
+def _product(constant: float, rows: Floats, columns: Floats) -> Floats:
+    """Return ``constant + rows columns'``, (H, W), in one pass."""
+    left = np.column_stack([np.full(len(rows), constant), rows])
+    right = np.column_stack([np.ones(len(columns)), columns])
+    return np.asarray(left @ right.T)
+
+
+def sites_of_labels(
+    labels: Iterable[str], landmarks: Mapping[str, tuple[float, float]] | None = None
+) -> Floats:
+    """Return the texture coordinates (S, 2) of a session's sites.
+
+    Parameters
+    ----------
+    labels : iterable of str
+        Labels of the session's sites.
+    landmarks : mapping of str to (float, float), optional
+        u and v by label, as :func:`read_landmarks` gives; labels that it lacks, and all without
+        it, are looked up in `SITE_UV`.
+
+    Raises
+    ------
+    TranslucencyError
+        For a label found in neither.
+
+    Examples
+    --------
+    >>> sites_of_labels(["chin"]).tolist()
+    [[0.5, 0.205]]
+    """
+    places = {**SITE_UV, **(landmarks or {})}
+    wanted = list(labels)
+    for label in wanted:
+        if label not in places:
+            raise TranslucencyError(
+                f"site: got {label!r}, expected one of {', '.join(sorted(places))}; "
+                "landmarks.csv may name others"
+            )
+    return np.array([places[label] for label in wanted], np.float64).reshape(-1, 2)
+
+
+def read_landmarks(
+    path: str | Path, *, texture_px: tuple[int, int]
+) -> dict[str, tuple[float, float]]:
+    """Read where sites lie on a texture from a table ``name,x,y``.
+
+    Parameters
+    ----------
+    path
+        CSV with a header; x to the right and y down from the centre of the texture's upper left
+        pixel, px.
+    texture_px : (int, int)
+        Height and width of the texture they were read from.
+
+    Returns
+    -------
+    dict
+        Name to (u, v).
+
+    Raises
+    ------
+    TranslucencyError
+        For another header, something that is no number, a name twice, or a place beyond the
+        texture.
+    """
+    height, width = texture_px
+    try:
+        places_px = landmark_table.read(path)
+    except landmark_table.LandmarkError as error:
+        raise TranslucencyError(str(error)) from error
+    found: dict[str, tuple[float, float]] = {}
+    for name, (x, y) in places_px.items():
+        u, v = (x + 0.5) / width, 1.0 - (y + 0.5) / height
+        if not (0 <= u <= 1 and 0 <= v <= 1):
+            raise TranslucencyError(
+                f"{path}: {name!r} lies at ({x}, {y}), expected within {width} x {height} px"
+            )
+        found[name] = (u, v)
+    return found

@@ -1,0 +1,1 @@
+"""Estimates at surface points, their textures and errors."""

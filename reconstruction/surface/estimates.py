@@ -1,0 +1,406 @@
+"""Estimators run over all points of a surface, a bounded chunk of lumitexels at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model import fresnel
+from model.brdf.tables import BrdfBasis
+from reconstruction import brdf_basis, diffuse_albedo, photometric_stereo
+from reconstruction.brdf_basis import mixture_kernels
+from reconstruction.lumitexels import Lumitexels, boundary_kernels
+from reconstruction.lumitexels.store import LumitexelStore
+from reconstruction.photometric_stereo import half_vectors as half_vector_normals
+from reconstruction.surface import model_normals
+
+CHUNK_SAMPLES: Final = 3_000_000
+"""Samples of a chunk; about 60 bytes each."""
+LEAST_LIGHTS: Final = 10
+LEAST_VIEWS: Final = 2
+"""A point lit or seen by fewer has no estimate."""
+LEAST_COS_LIGHT: Final = 0.15
+LEAST_COS_VIEW: Final = 0.2
+"""Normals are not estimated from flatter samples: the boundary's transmittance bends there."""
+GRAZING_COS: Final = 0.05
+"""Light lower than this over the estimated surface is as good as none."""
+LEAST_COS_STRIP: Final = 0.05
+"""Flatter views count as if they were so flat; the albedo's fit leaves them out."""
+HIGHLIGHT_RAD: Final = np.radians(35.0)
+"""Samples whose half vector lies nearer to the normal hold too much of the highlight: skin's
+facets have a Beckmann slope of about 0.3 (Weyrich et al. 2005), of which 98 % lie below this."""
+PEAK_RAD: Final = np.radians(25.0)
+"""The same where the lobes are known and taken off: only their peaks are left out."""
+LOBE_ERROR: Final = 0.1
+"""Relative error of a fitted lobe, for the weight of samples in it."""
+LOBES_ALIKE: Final = 3.8
+"""Standard error of lobes' scale over what it were if every sample erred by itself. Samples of a
+point err alike: by the lobes' shape, the normal and the light from inside that was taken off. On
+simulated faces of seeds 0, 1 and 1 (types III, V and II) it was 3.5, 3.5 and 4.3."""
+LOBE_TILT_RAD: Final = np.radians(0.3)
+"""Standard error, in each direction, of normals by highlights: lobes are known no better."""
+Double = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointValues:
+    """An estimate at each point of a surface.
+
+    Attributes
+    ----------
+    values
+        (P, C) float64; 0 where not valid.
+    stderr
+        (P, C); of a normal the angle in each of two directions across it, rad, in all three.
+    valid
+        (P,) bool.
+    """
+
+    values: Double
+    stderr: Double
+    valid: NDArray[np.bool_]
+
+
+def chunk_points(store: LumitexelStore) -> int:
+    """Return how many points of a store make a chunk."""
+    return max(1, CHUNK_SAMPLES // max(store.light_count * store.view_count, 1))
+
+
+def transmitted(cos_light: NDArray[np.floating], cos_view: NDArray[np.floating]) -> Double:
+    """Return F_t(light) F_t(view), the share that the skin's boundary lets in and out again."""
+    return boundary_kernels.transmitted(np.asarray(cos_light), np.asarray(cos_view))
+
+
+def seen_enough(samples: Lumitexels) -> NDArray[np.bool_]:
+    """Return which points have samples of enough lights and views, shape (P,)."""
+
+    def kinds(index: NDArray[np.integer]) -> NDArray[np.intp]:
+        hit = np.zeros((len(samples.valid), int(index.max(initial=-1)) + 1), bool)
+        for k in range(hit.shape[1]):
+            hit[:, k] = samples.valid[:, index == k].any(axis=1)
+        return np.count_nonzero(hit, axis=1)
+
+    return np.asarray((kinds(samples.light) >= LEAST_LIGHTS) & (kinds(samples.view) >= LEAST_VIEWS))
+
+
+def collect(
+    store: LumitexelStore,
+    estimate: Callable[[slice, Lumitexels], PointValues],
+    *,
+    progress: Callable[[float], None] | None = None,
+) -> PointValues:
+    """Estimate chunk by chunk and put the results together.
+
+    Parameters
+    ----------
+    store
+        Samples of P points.
+    estimate
+        Called with the points of a chunk and their samples.
+    progress
+        Called with the share of the points that is done, 0 to 1.
+    """
+    parts = []
+    count = len(store.surface)
+    for part, samples in store.chunks(chunk_points(store)):
+        parts.append(estimate(part, samples))
+        if progress is not None:
+            progress(part.stop / max(count, 1))
+    return PointValues(
+        np.concatenate([p.values for p in parts]),
+        np.concatenate([p.stderr for p in parts]),
+        np.concatenate([p.valid for p in parts]),
+    )
+
+
+def normals_from_half_vectors(samples: Lumitexels) -> PointValues:
+    """Return the published estimate: half vectors of each view's four brightest samples."""
+    found = half_vector_normals.estimate(
+        samples.f.mean(axis=-1), samples.light_dir, samples.view_dir, samples.view,
+        valid=samples.valid,
+    )  # fmt: skip
+    good = seen_enough(samples) & found.valid
+    return _of_normals(found.normals, found.stderr_rad / np.sqrt(2.0), good)
+
+
+def normals_from_shading(
+    samples: Lumitexels,
+    normals: NDArray[np.floating],
+    *,
+    rounds: int = 3,
+    highlight_rad: float = HIGHLIGHT_RAD,
+) -> PointValues:
+    """Return normals by robust photometric stereo of the light from inside the skin.
+
+    Parameters
+    ----------
+    samples
+        Of P points.
+    normals
+        (P, 3) to begin with, as a rule the scan's: they tell which samples hold highlights, and
+        how much the boundary lets through.
+    rounds
+        Of estimating, each with the normals of the one before.
+    highlight_rad
+        Samples whose half vector lies nearer to the normal are left out.
+
+    Notes
+    -----
+    What has been inside is f_r = R_d F_t F_t / pi, so f_r cos(theta) pi / (F_t F_t) is R_d times
+    n . l, linear in n.
+    """
+    gray = samples.f.mean(axis=-1).astype(np.float64)
+    # samples that do not count have no finite variance
+    spread = np.where(samples.valid, samples.variance.mean(axis=-1), 0.0).astype(np.float64) / 3.0
+    half = samples.light_dir + samples.view_dir
+    half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-6)
+    light_dir = np.ascontiguousarray(samples.light_dir.transpose(1, 0, 2))
+    start = np.asarray(normals, np.float64)
+    good = seen_enough(samples)
+    stderr = np.full(len(start), np.pi)
+    for _ in range(rounds):
+        cos_light = np.einsum("pmk,pk->pm", samples.light_dir, start)
+        cos_view = np.einsum("pmk,pk->pm", samples.view_dir, start)
+        use = (
+            samples.valid
+            & (cos_light > LEAST_COS_LIGHT)
+            & (cos_view > LEAST_COS_VIEW)
+            & (np.einsum("pmk,pk->pm", half, start) < np.cos(highlight_rad))
+        )
+        # the cosine that made f from the radiance is the scan's, not that of this round
+        scale = np.pi * samples.cos_light / np.maximum(transmitted(cos_light, cos_view), 1e-3)
+        found = photometric_stereo.estimate_normals(
+            np.where(use, gray * scale, 0.0).T.astype(np.float32),
+            light_dir,
+            variance=np.where(use, spread * scale**2, 1.0).T.astype(np.float32),
+            valid=np.ascontiguousarray(use.T),
+        )
+        start = np.where(found.valid[:, None], found.normals, start).astype(np.float64)
+        # of the angle; in each of two directions across the normal it is less by the root of two
+        stderr = np.where(found.valid, found.stderr_rad / np.sqrt(2.0), np.pi)
+        good &= found.valid
+    return _of_normals(start, stderr, good)
+
+
+def _of_normals(
+    normals: NDArray[np.floating], stderr_rad: NDArray[np.floating], good: NDArray[np.bool_]
+) -> PointValues:
+    spread = np.repeat(np.asarray(stderr_rad, np.float64)[:, None], 3, axis=1)
+    return PointValues(
+        np.where(good[:, None], normals, 0.0), np.where(good[:, None], spread, 0.0), good
+    )
+
+
+def at_normals(samples: Lumitexels, normals: PointValues) -> Lumitexels:
+    """Return samples whose f_r is that of a surface with these normals, and not of the scan's.
+
+    A sample's radiance was divided by the cosine at the scan's normal, degrees off the true one:
+    by the cosine that the light had, f_r does not change with the light as 1 / cos does.
+
+    Parameters
+    ----------
+    samples
+        Of P points.
+    normals
+        Of the same points; samples of those not valid, and of light below `GRAZING_COS`, are not
+        valid.
+    """
+    cos_light, cos_view = (
+        np.einsum("pmk,pk->pm", way, normals.values.astype(np.float32))
+        for way in (samples.light_dir, samples.view_dir)
+    )
+    good = samples.valid & normals.valid[:, None] & (cos_light > GRAZING_COS)
+    ratio = np.where(good, samples.cos_light / np.maximum(cos_light, GRAZING_COS), 0.0)[..., None]
+    return dataclasses.replace(
+        samples,
+        f=samples.f * ratio,
+        variance=np.where(good[..., None], samples.variance, np.inf)
+        * np.where(good[..., None], np.square(ratio), 1.0),
+        cos_light=np.where(good, cos_light, samples.cos_light),
+        cos_view=np.where(good, cos_view, samples.cos_view),
+        valid=good,
+    )
+
+
+def albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> PointValues:
+    """Return R_d of three channels by eq. (6) of Weyrich et al. 2005, see `diffuse_albedo`.
+
+    Parameters
+    ----------
+    samples
+        Of P points.
+    normals
+        Of the same points.
+    stderr_rad
+        Typical standard error of the normals.
+
+    Notes
+    -----
+    The standard errors hold noise alone: see `surface_errors.of_albedo` for the rest.
+
+    A pixel that sees the surface aslant averages a strip of it that is 1 / cos(view) long, and near
+    a rim what lies behind the face as well: its deviation from the point's own light counts in
+    proportion to that length.
+    """
+    samples = at_normals(samples, normals)
+    strip = 1.0 / np.maximum(samples.cos_view, LEAST_COS_STRIP)[..., None]
+    found = diffuse_albedo.estimate(
+        samples.f, samples.light_dir, samples.view_dir,
+        np.where(normals.valid[:, None], normals.values, np.nan).astype(np.float32),
+        eta=fresnel.ETA_SKIN, variance=samples.variance * np.square(strip), valid=samples.valid,
+        normal_stderr_rad=stderr_rad,
+    )  # fmt: skip
+    good = found.valid & normals.valid & np.isfinite(found.stderr).all(axis=-1)
+    keep = good[:, None]
+    return PointValues(np.where(keep, found.r_d, 0.0), np.where(keep, found.stderr, 0.0), good)
+
+
+def surface_samples(
+    samples: Lumitexels, normals: PointValues, r_d: PointValues
+) -> brdf_basis.SurfaceSamples:
+    """Return what is left of the samples when the light from inside is taken off."""
+    samples = at_normals(samples, normals)
+    return brdf_basis.surface_samples(
+        samples.f, samples.light_dir, samples.view_dir,
+        np.where(normals.valid[:, None], normals.values, (0.0, 0.0, 1.0)),
+        np.where(r_d.valid[:, None], r_d.values, np.nan),
+        eta=fresnel.ETA_SKIN, variance=samples.variance, valid=samples.valid,
+    )  # fmt: skip
+
+
+def lobe_weights(
+    samples: Lumitexels, normals: PointValues, r_d: PointValues, basis: BrdfBasis
+) -> PointValues:
+    """Return the shares of a basis at each point, and in the last column the fit's residual.
+
+    The standard error of the shares is that of the lobe's overall scale: single shares of nearly
+    dependent lobes are not determined.
+    """
+    found = brdf_basis.fit_weights(surface_samples(samples, normals, r_d), basis)
+    good = found.valid & normals.valid & r_d.valid
+    keep = good[:, None]
+    scale = np.where(np.isfinite(found.stderr), LOBES_ALIKE * found.stderr, 1.0)
+    residual = np.where(good, found.residual, 0.0)
+    return PointValues(
+        np.concatenate([np.where(keep, found.weights, 0.0), residual[:, None]], axis=1),
+        np.where(keep, scale[:, None] * np.append(found.weights, residual[:, None], axis=1), 0.0),
+        good,
+    )
+
+
+def normals_from_remainder(
+    samples: Lumitexels,
+    normals: PointValues,
+    r_d: PointValues,
+    weights: Double,
+    basis: BrdfBasis,
+) -> PointValues:
+    """Return normals by photometric stereo of what fitted lobes leave of the samples.
+
+    With the highlights taken off, samples near the mirror direction count too.
+
+    Parameters
+    ----------
+    samples, normals, r_d
+        Of P points.
+    weights
+        Shares of the basis, (P, K).
+    basis
+        The reduced basis.
+    """
+    known = normals.valid & r_d.valid
+    samples = at_normals(samples, normals)
+    lobes = mixture_kernels.evaluate(
+        basis.table,
+        np.where(known[:, None], weights, 0.0),
+        samples.light_dir,
+        samples.view_dir,
+        normals.values,
+    )
+    # a lobe is known no better than a few percent: where it is strong a sample says less
+    bare = dataclasses.replace(
+        samples,
+        f=samples.f - lobes[..., None],
+        variance=samples.variance + np.square(LOBE_ERROR * lobes)[..., None],
+    )
+    good = normals.valid & r_d.valid
+    found = normals_from_shading(
+        bare,
+        np.where(good[:, None], normals.values, (0.0, 0.0, 1.0)),
+        rounds=1,
+        highlight_rad=PEAK_RAD,
+    )
+    good = good & found.valid
+    return _of_normals(found.values, found.stderr[:, 0], good)
+
+
+def normals_from_all_light(
+    samples: Lumitexels,
+    normals: PointValues,
+    r_d: PointValues,
+    weights: Double,
+    basis: BrdfBasis,
+    *,
+    now: Double | None = None,
+) -> PointValues:
+    """Return normals that hold what highlights say, where light from inside says too little.
+
+    Points whose standard error is below `LOBE_TILT_RAD` stay as they are. Those above it are moved
+    to where the whole model fits best, and lie between the two by the weights of their errors.
+
+    Parameters
+    ----------
+    samples, r_d, weights, basis
+        As in `normals_from_remainder`.
+    normals
+        By the light from inside alone.
+    now
+        Normals to begin from, (P, 3); `normals` by default.
+    """
+    rows = np.flatnonzero(normals.valid & r_d.valid & (normals.stderr[:, 0] > LOBE_TILT_RAD))
+    if not len(rows):
+        return normals
+    start = normals.values if now is None else now
+    found = model_normals.estimate(
+        rows_of(samples, rows), start[rows], np.ones(len(rows), np.bool_),
+        r_d.values[rows].mean(axis=-1), weights[rows], basis, lobe_error=LOBE_ERROR,
+        least_cos_light=LEAST_COS_LIGHT, least_cos_view=LEAST_COS_VIEW,
+    )  # fmt: skip
+    ours = np.square(np.hypot(found.stderr_rad, LOBE_TILT_RAD))
+    theirs = np.square(normals.stderr[rows, 0])
+    share = np.where(found.valid, theirs / (theirs + ours), 0.0)[:, None]
+    between = share * found.normals + (1.0 - share) * normals.values[rows]
+    values, stderr = normals.values.copy(), normals.stderr.copy()
+    values[rows] = between / np.linalg.norm(between, axis=-1, keepdims=True)
+    stderr[rows] = np.where(share > 0, np.sqrt(ours * theirs / (ours + theirs))[:, None],
+                            stderr[rows])  # fmt: skip
+    return PointValues(values, stderr, normals.valid)
+
+
+def sample_counts(part: slice, samples: Lumitexels) -> PointValues:
+    """Return how many samples each point has; valid where they are enough for an estimate."""
+    counts = samples.counts[:, None].astype(np.float64)
+    return PointValues(counts, np.zeros_like(counts), seen_enough(samples))
+
+
+def part_of(values: PointValues, rows: slice | NDArray[np.integer]) -> PointValues:
+    """Return the estimates of some of the points."""
+    return PointValues(values.values[rows], values.stderr[rows], values.valid[rows])
+
+
+def rows_of(samples: Lumitexels, rows: NDArray[np.integer]) -> Lumitexels:
+    """Return the samples of some of the points."""
+    return dataclasses.replace(
+        samples,
+        **{
+            name: getattr(samples, name)[rows]
+            for name in (
+                "f", "variance", "light_dir", "view_dir", "cos_light", "cos_view", "valid",
+            )
+        },
+    )  # fmt: skip

@@ -1,0 +1,201 @@
+"""Normals from all light at a point, highlights included, by the whole fitted model.
+
+Light from inside says where a surface looks by its slow cosine; a highlight says it by where it
+stands, and on dark or glossy skin it is most of the light. Given R_d and the shares of the lobes,
+the normal of each point is moved to where the model's samples fit the measured ones best: steps of
+Gauss and Newton on two tilts, with weights that hold how well lobes are known and that let
+outliers pull with constant force, halved while they do not lower the misfit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.brdf.tables import BrdfBasis
+from reconstruction.brdf_basis import mixture_kernels
+from reconstruction.lumitexels import Lumitexels, boundary_kernels
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+STEPS: Final = 2
+"""Of Gauss and Newton; R_d and the lobes are fitted anew in between calls."""
+HALVINGS: Final = 3
+PROBE_RAD: Final = np.radians(0.5)
+"""Tilt of the differences: about what a node of the tables spans at a highlight's flank."""
+LONGEST_RAD: Final = np.radians(3.0)
+"""Longest step: lobes turn faster than their slope says."""
+HUBER: Final = 3.0
+SAMPLE_ERROR: Final = 0.02
+"""Relative error that every sample of the model has, for its weight."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelNormals:
+    """Normals moved to where the model fits best.
+
+    Attributes
+    ----------
+    normals : ndarray of float64, shape (P, 3)
+        Unit vectors; as given where not `valid`.
+    stderr_rad : ndarray of float64, shape (P,)
+        Of each of two tilts, by the misfit's curvature and size; pi where not `valid`.
+    moved_rad : ndarray of float64, shape (P,)
+        From the normals given.
+    valid : ndarray of bool, shape (P,)
+        At least three samples, and a misfit that determines both tilts.
+    """
+
+    normals: Floats
+    stderr_rad: Floats
+    moved_rad: Floats
+    valid: Bools
+
+
+def estimate(
+    samples: Lumitexels,
+    normals: Floats,
+    valid: Bools,
+    r_d: Floats,
+    weights: Floats,
+    basis: BrdfBasis,
+    *,
+    lobe_error: float,
+    least_cos_light: float,
+    least_cos_view: float,
+    steps: int = STEPS,
+) -> ModelNormals:
+    """Move normals to where the model's samples fit the measured ones best.
+
+    Parameters
+    ----------
+    samples : Lumitexels
+        Of P points; f is that of the scan's cosine.
+    normals : ndarray, shape (P, 3)
+        Unit normals to begin from.
+    valid : ndarray of bool, shape (P,)
+        Points to move.
+    r_d : ndarray, shape (P,)
+        Mean of the channels.
+    weights : ndarray, shape (P, K)
+        Shares of the basis.
+    basis : BrdfBasis
+    lobe_error : float
+        Relative error of a fitted lobe, for the weight of samples in it.
+    least_cos_light, least_cos_view : float
+        Flatter samples are not used.
+    steps : int
+        Of Gauss and Newton.
+    """
+    fit = _Fit(samples, valid, r_d, weights, basis, lobe_error, least_cos_light, least_cos_view)
+    n = np.where(valid[:, None], normals, (0.0, 0.0, 1.0)).astype(np.float64)
+    start = n
+    state = fit.at(n)
+    normal_matrix = np.broadcast_to(np.eye(2), (len(n), 2, 2))
+    for _ in range(steps):
+        first, second = _tangents(n)
+        slope = np.stack([fit.slope(n, axis) for axis in (first, second)], axis=-1)
+        pull = np.where(
+            state.misfit2 < HUBER**2, 1.0, HUBER / np.sqrt(np.maximum(state.misfit2, 1))
+        )
+        weight = np.where(state.use, pull / state.variance, 0.0)
+        normal_matrix = np.einsum("pm,pmi,pmj->pij", weight, slope, slope)
+        gradient = np.einsum("pm,pmi,pm->pi", weight, slope, fit.gray - state.value)
+        told = np.linalg.det(normal_matrix) > 1e-12 * np.square(
+            np.trace(normal_matrix, axis1=1, axis2=2)
+        )
+        told &= valid
+        safe = np.where(told[:, None, None], normal_matrix, np.eye(2))
+        step = np.where(told[:, None], np.linalg.solve(safe, gradient[..., None])[..., 0], 0.0)
+        length = np.linalg.norm(step, axis=-1, keepdims=True)
+        step *= np.minimum(1.0, LONGEST_RAD / np.maximum(length, 1e-300))
+        for _ in range(HALVINGS):
+            tried = _unit(n + step[:, [0]] * first + step[:, [1]] * second)
+            there = fit.at(tried)
+            better = there.cost < state.cost
+            n = np.where(better[:, None], tried, n)
+            state = fit.at(n)
+            step = np.where(better[:, None], 0.0, 0.5 * step)
+        valid = valid & told
+    count = np.count_nonzero(state.use, axis=1)
+    valid = valid & (count > 3)
+    size = np.sum(np.where(state.use, np.minimum(state.misfit2, HUBER**2), 0.0), axis=1)
+    inflation = np.maximum(size / np.maximum(count - 3, 1), 1.0)
+    safe = np.where(valid[:, None, None], normal_matrix, np.eye(2))
+    variance = 0.5 * np.trace(np.linalg.inv(safe), axis1=1, axis2=2) * inflation
+    cosine = np.clip(np.sum(n * start, axis=-1), -1.0, 1.0)
+    return ModelNormals(
+        np.where(valid[:, None], n, normals),
+        np.where(valid, np.minimum(np.sqrt(variance), np.pi), np.pi),
+        np.where(valid, np.arccos(cosine), 0.0),
+        valid,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """The model at some normals."""
+
+    value: Floats
+    variance: Floats
+    misfit2: Floats
+    use: Bools
+    cost: Floats
+
+
+class _Fit:
+    """The samples of points, and the model of them as a function of the normals."""
+
+    def __init__(
+        self, samples: Lumitexels, valid: Bools, r_d: Floats, weights: Floats, basis: BrdfBasis,
+        lobe_error: float, least_cos_light: float, least_cos_view: float,
+    ) -> None:  # fmt: skip
+        self.samples, self.basis, self.lobe_error = samples, basis, lobe_error
+        self.least = least_cos_light, least_cos_view
+        self.r_d = np.where(valid, r_d, 0.0)
+        self.weights = np.where(valid[:, None], weights, 0.0)
+        self.gray = samples.f.mean(axis=-1).astype(np.float64)
+        self.noise = np.where(samples.valid, samples.variance.mean(axis=-1), 1.0) / 3.0
+
+    def at(self, normals: Floats) -> _State:
+        value, lobes, cos_light, cos_view = self._predicted(normals)
+        use = self.samples.valid & (cos_light > self.least[0]) & (cos_view > self.least[1])
+        variance = self.noise + np.square(self.lobe_error * lobes) + np.square(SAMPLE_ERROR * value)
+        misfit2 = np.square(self.gray - value) / variance
+        huber = np.where(misfit2 < HUBER**2, misfit2, 2 * HUBER * np.sqrt(misfit2) - HUBER**2)
+        # the weights move with the model: without their logarithm brighter lobes would cost less
+        cost = np.where(use, huber + np.log(variance), 0.0).sum(axis=1)
+        return _State(value, variance, misfit2, use, cost / np.maximum(use.sum(axis=1), 1))
+
+    def slope(self, normals: Floats, axis: Floats) -> Floats:
+        ahead, behind = (
+            self._predicted(_unit(normals + sign * PROBE_RAD * axis))[0] for sign in (1.0, -1.0)
+        )
+        return (ahead - behind) / (2.0 * PROBE_RAD)
+
+    def _predicted(self, normals: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        s = self.samples
+        cos_light = np.einsum("pmk,pk->pm", s.light_dir, normals)
+        cos_view = np.einsum("pmk,pk->pm", s.view_dir, normals)
+        lobes = mixture_kernels.evaluate(
+            self.basis.table, self.weights, s.light_dir, s.view_dir, normals
+        )
+        through = boundary_kernels.transmitted(cos_light, cos_view)
+        # the cosine that made f from the radiance is the scan's
+        ratio = np.clip(cos_light, 0.0, None) / s.cos_light
+        value = (self.r_d[:, None] * through / np.pi + lobes) * ratio
+        return value, lobes * ratio, cos_light, cos_view
+
+
+def _tangents(normals: Floats) -> tuple[Floats, Floats]:
+    helper = np.where(np.abs(normals[:, [0]]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = _unit(np.cross(normals, helper))
+    return first, np.cross(normals, first)
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

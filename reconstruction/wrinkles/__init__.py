@@ -1,0 +1,1 @@
+"""Wrinkle fit: masks, zones and weights from normal maps."""

@@ -1,0 +1,388 @@
+"""Wrinkle maps and zones' weights fitted to normals of a neutral face and of its expressions.
+
+The model says that an expression e adds D_e(x) = (sum_z w_ez m_z(x)) W(x) to the neutral
+derivatives: one wrinkle map W, shown by masks m_z with weights w_ez. Given masks, W is linear in
+the data and so are the weights, each with the other fixed; :func:`fit` takes them in turn.
+Weights and map are determined up to a scale of each zone (and its sign): a fit begins with a
+largest weight of 1 in each, overlapping zones settle theirs, and none ends above 1.
+
+References
+----------
+Jimenez, Echevarria, Oat, Gutierrez 2011, Practical and Realistic Facial Wrinkles Animation,
+GPU Pro 2, chapter 1. ISBN 978-1-56881-718-7
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from model import texture_resampling as resampling
+from model.wrinkles import Layer, Masks, WrinkleError, mask_stack
+from model.wrinkles.evaluation import WrinkleModel
+from model.wrinkles.expressions import CLAMPS, JIMENEZ2011, Clamp, ExpressionTable
+from reconstruction.normal_maps import NormalMaps
+from reconstruction.wrinkles.texels import (
+    TOLERANCE,
+    Derivatives,
+    Texels,
+    derivatives_of,
+    fit_texels,
+)
+from reconstruction.wrinkles.weights import (
+    Difference,
+    ZoneEquations,
+    ZoneWeights,
+    equations_of,
+    zone_weights,
+)
+
+Floats: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
+Measured: TypeAlias = ArrayLike | NormalMaps | Derivatives
+
+ROUNDS = 20
+ROUGH = 256
+"""Texels a side of the map with which weights are sought."""
+SETTLED = 1e-5
+"""Fall of the misfit in a round, relative to the differences, at which the fit ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class WrinkleFit:
+    """A wrinkle map with the weights of the expressions that it was fitted to.
+
+    Attributes
+    ----------
+    layer : Layer
+        Map, masks and table, to be evaluated; with standard error and valid mask.
+    expressions : mapping of str to ZoneWeights
+        The weights that the data ask for, with what is known about them: the rows of the layer's
+        table, unless that was given.
+    base : Derivatives
+        Of the neutral face.
+    explained : float
+        1 - |misfit|^2 / |differences|^2 with the table's weights, all expressions together.
+    rounds : int
+        Of map and weights in turn; 0 where the weights were given.
+    settled : bool
+        The last round explained no more than `SETTLED` of the differences in addition.
+    clamp : {"unit", "signed"}
+        Range of the weights.
+    """
+
+    layer: Layer
+    expressions: Mapping[str, ZoneWeights]
+    base: Derivatives
+    explained: float
+    rounds: int
+    settled: bool
+    clamp: Clamp
+
+    def model(self) -> WrinkleModel:
+        """Return the face with its wrinkles, ready to be evaluated and stored."""
+        stderr = np.sqrt(self.base.variance)
+        errors = {name: tuple(one.stderr) for name, one in self.expressions.items()}
+        return WrinkleModel(
+            self.base.values, (self.layer,), self.clamp, self.base.valid, stderr, errors
+        )
+
+
+def wrinkle_map(neutral: Measured, expression: Measured, *, size: tuple[int, int]) -> Texels:
+    """Return one expression's wrinkle map: difference of derivatives, low-passed to its size.
+
+    Parameters
+    ----------
+    neutral, expression : array_like (H, W, 3), NormalMaps, or Derivatives
+        Tangent-space normals in the same map space; see `wrinkle_texels.derivatives_of` for
+        errors and masks.
+    size : (int, int)
+        Rows and columns of the wrinkle map, at most those of the normals; the paper's is
+        (256, 256).
+
+    Returns
+    -------
+    Texels
+        Derivatives to add to the neutral ones, their standard error and valid mask.
+    """
+    difference = differences(derivatives_of(neutral), {"expression": expression})["expression"]
+    return _map_of([(np.ones(difference.weight.shape), difference)], size)
+
+
+def fit_weights(
+    layer: Layer, neutral: Measured, expression: Measured, *, clamp: Clamp = "unit"
+) -> ZoneWeights:
+    """Return the weights of zones with which a wrinkle map shows a new expression best.
+
+    Parameters
+    ----------
+    layer : Layer
+        Wrinkle map and masks, of any resolution.
+    neutral, expression : array_like (H, W, 3), NormalMaps, or Derivatives
+        Tangent-space normals.
+    clamp : {"unit", "signed"}
+        Bounds of the weights: [0, 1] or [-1, 1].
+
+    Returns
+    -------
+    ZoneWeights
+    """
+    if clamp not in CLAMPS:
+        raise WrinkleError(f"clamp: got {clamp!r}, expected one of {', '.join(CLAMPS)}")
+    difference = differences(derivatives_of(neutral), {"expression": expression})["expression"]
+    wrinkle = _read(np.asarray(layer.wrinkle, np.float64), difference.weight.shape)
+    return zone_weights(np.asarray(layer.masks, np.float64), wrinkle, difference, CLAMPS[clamp])
+
+
+def fit(
+    neutral: Measured,
+    expressions: Mapping[str, Measured],
+    masks: Masks,
+    *,
+    size: tuple[int, int],
+    zones: tuple[str, ...] | None = None,
+    table: ExpressionTable | None = None,
+    clamp: Clamp = "unit",
+) -> WrinkleFit:
+    """Fit one wrinkle map, and the weights of expressions where no table gives them.
+
+    Parameters
+    ----------
+    neutral : array_like (H, W, 3), NormalMaps, or Derivatives
+        Tangent-space normals, +X right, +Y up, of the face at rest.
+    expressions : mapping of str to the same
+        At least one, in the neutral face's map space.
+    masks : array_like, shape (Z, h, w), or RGBA textures
+        Zones, of any resolution; `reconstruction.wrinkles.zones` fits them.
+    size : (int, int)
+        Rows and columns of the wrinkle map.
+    zones : tuple of str, optional
+        Names of the zones; the paper's for eight, numbers otherwise.
+    table : ExpressionTable, optional
+        Known weights with a row an expression: then only the map is fitted with them.
+    clamp : {"unit", "signed"}
+        Range of the weights, as the face will be evaluated: [0, 1], or [-1, 1] in which an
+        expression may flatten what others wrinkle, as anger does the forehead in table 1.1.
+
+    Returns
+    -------
+    WrinkleFit
+
+    Raises
+    ------
+    WrinkleError
+        For sizes that do not fit, or no expression.
+    """
+    if clamp not in CLAMPS:
+        raise WrinkleError(f"clamp: got {clamp!r}, expected one of {', '.join(CLAMPS)}")
+    if not expressions:
+        raise WrinkleError("expressions: got none, expected at least one")
+    stack = mask_stack(masks).astype(np.float64)
+    names = zones if zones is not None else _zone_names(len(stack))
+    if len(names) != len(stack):
+        raise WrinkleError(f"zones: got {len(names)} names, expected {len(stack)}")
+    base = derivatives_of(neutral)
+    data = differences(base, expressions)
+    rounds, settled = 0, True
+    if table is not None:
+        rows = {name: table.row(name) for name in data}
+        for name, row in rows.items():
+            if len(row) != len(stack):
+                raise WrinkleError(f"table[{name!r}]: got {len(row)} zones, expected {len(stack)}")
+    else:
+        rows, rounds, settled = _in_turn(stack, data, base, size, clamp)
+    texels = _shown_by(stack, rows, data, size)
+    wrinkle = _read(texels.values, base.valid.shape)
+    found = {name: zone_weights(stack, wrinkle, one, CLAMPS[clamp]) for name, one in data.items()}
+    source = "fitted to normals" if table is None else table.source
+    if table is None:
+        rows = {name: one.weights for name, one in found.items()}
+    equations = _equations(stack, texels, data)
+    misfit = sum(one.misfit(rows[name]) for name, one in equations.items())
+    total = sum(one.total for one in equations.values())
+    layer = Layer(
+        texels.values.astype(np.float32), stack.astype(np.float32),
+        ExpressionTable(names, {name: tuple(row) for name, row in rows.items()}, source),
+        np.where(texels.valid[..., None], texels.stderr, 0.0).astype(np.float32), texels.valid,
+    )  # fmt: skip
+    return WrinkleFit(
+        layer, found, base, 1.0 - misfit / total if total > 0 else 0.0, rounds, settled, clamp
+    )
+
+
+def _in_turn(
+    masks: Floats, data: Mapping[str, Difference], base: Derivatives, size: tuple[int, int],
+    clamp: Clamp,
+) -> tuple[dict[str, Floats], int, bool]:  # fmt: skip
+    """Return weights that map and weights in turn lead to, the rounds, and whether they settled.
+
+    Weights hardly depend on detail: they are sought at a resolution that two pixels a texel of
+    map or masks suffice for.
+    """
+    rows = _begun(masks, data, base)
+    if len(data) == 1:
+        return rows, 0, True  # every weight is 1
+    shape = base.valid.shape
+    rough = min(size[0], ROUGH), min(size[1], ROUGH)
+    texels = max(rough[0], masks.shape[1]), max(rough[1], masks.shape[2])
+    small = min(2 * texels[0], shape[0]), min(2 * texels[1], shape[1])
+    data = {name: _reduced(one, small) for name, one in data.items()}
+    bounds = (0.0 if clamp == "unit" else -math.inf, math.inf)
+    left = math.inf
+    for rounds in range(1, ROUNDS + 1):
+        equations = _equations(masks, _shown_by(masks, rows, data, rough, tolerance=1e-7), data)
+        free = {name: one.least(bounds) for name, one in equations.items()}
+        rows = _limited(free)
+        misfit = sum(equations[name].misfit(row) for name, row in free.items())
+        total = sum(one.total for one in equations.values())
+        if left - misfit <= SETTLED * total:
+            return rows, rounds, True
+        left = misfit
+    return rows, ROUNDS, False
+
+
+def _reduced(difference: Difference, shape: tuple[int, int]) -> Difference:
+    """Return a difference averaged to fewer pixels, by its weights."""
+    height, width = difference.weight.shape
+    if shape == (height, width):
+        return difference
+    ay = resampling.averaging_matrix(height, shape[0])
+    ax = resampling.averaging_matrix(width, shape[1])
+
+    def mean(image: NDArray[np.floating]) -> Floats:
+        return np.asarray((ay @ image.astype(np.float64)) @ ax.T)
+
+    v = difference.weight.astype(np.float64)
+    weight = mean(v)
+    inverse = np.divide(1.0, weight, out=np.zeros_like(weight), where=weight > 0)
+    pixels = height * width / (shape[0] * shape[1])
+    values = [mean(v * difference.values[..., c]) * inverse for c in (0, 1)]
+    variance = [mean(v * v * difference.variance[..., c]) * inverse**2 / pixels for c in (0, 1)]
+    return Difference(
+        np.stack(values, axis=-1).astype(np.float32),
+        np.stack(variance, axis=-1).astype(np.float32),
+        weight.astype(np.float32),
+    )
+
+
+def differences(base: Derivatives, expressions: Mapping[str, Measured]) -> dict[str, Difference]:
+    """Return expressions less the neutral face, on pixels that are valid in both."""
+    data = {}
+    for name, given in expressions.items():
+        one = derivatives_of(given)
+        if one.values.shape != base.values.shape:
+            raise WrinkleError(
+                f"{name}: got shape {one.values.shape[:2]}, expected that of neutral, "
+                f"{base.values.shape[:2]}"
+            )
+        good = base.valid & one.valid
+        kept = good[..., None]
+        variance = np.where(kept, base.variance + one.variance, 0.0).astype(np.float32)
+        values = np.where(kept, one.values - base.values, 0.0).astype(np.float32)
+        data[name] = Difference(values, variance, _pixel_weights(variance, good))
+    return data
+
+
+def _pixel_weights(variance: NDArray[np.floating], good: Bools) -> NDArray[np.float32]:
+    """Return 1/variance relative to its median; 1 where no variance is known; 0 where invalid."""
+    mean = variance.mean(axis=2)
+    known = good & (mean > 0)
+    if not known.any():
+        return good.astype(np.float32)
+    low, middle = np.percentile(mean[known], [5, 50])
+    return np.where(good, middle / np.maximum(mean, low), 0.0).astype(np.float32)
+
+
+def _zone_names(count: int) -> tuple[str, ...]:
+    known = JIMENEZ2011.zones
+    return known if count == len(known) else tuple(f"zone {z}" for z in range(count))
+
+
+def _read(texels: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.floating]:
+    planes = resampling.resampled(np.moveaxis(texels, 2, 0), (shape[0], shape[1]))
+    return np.moveaxis(planes, 0, 2)
+
+
+def _shown_by(
+    masks: Floats, rows: Mapping[str, Floats], data: Mapping[str, Difference],
+    size: tuple[int, int], *, tolerance: float = TOLERANCE,
+) -> Texels:  # fmt: skip
+    """Return the map that expressions with known weights show best."""
+    parts = []
+    for name, one in data.items():
+        shape = one.weight.shape
+        small = np.tensordot(rows[name], masks, axes=1)
+        parts.append((resampling.resampled(small, (shape[0], shape[1])), one))
+    return _map_of(parts, size, tolerance=tolerance)
+
+
+def _map_of(
+    parts: list[tuple[NDArray[np.floating], Difference]], size: tuple[int, int],
+    *, tolerance: float = TOLERANCE,
+) -> Texels:  # fmt: skip
+    """Return the map that differences show, each with a strength (H, W)."""
+    shape = parts[0][0].shape
+    weight, covered = np.zeros(shape), np.zeros(shape)
+    product, noise = np.zeros((*shape, 2)), np.zeros((*shape, 2))
+    for strength, one in parts:
+        v = one.weight * strength
+        weight += v * strength
+        product += v[..., None] * one.values
+        noise += (v * v)[..., None] * one.variance
+        covered = np.maximum(covered, one.weight > 0)
+    return fit_texels(weight, product, noise, covered, size, tolerance=tolerance)
+
+
+def _equations(
+    masks: Floats, texels: Texels, data: Mapping[str, Difference]
+) -> dict[str, ZoneEquations]:
+    shape = next(iter(data.values())).weight.shape
+    return equations_of(masks, _read(texels.values, shape), data, with_noise=False)
+
+
+def _begun(masks: Floats, data: Mapping[str, Difference], base: Derivatives) -> dict[str, Floats]:
+    """Return first weights: in each zone, the leading direction of the expressions' products.
+
+    With one zone at a pixel, sum_x m_z D_e . D_f is w_e w_f times the zone's energy; errors add
+    to it on the diagonal, and those of the shared neutral everywhere.
+    """
+    names = list(data)
+    texels, shape = masks.shape[1:], base.valid.shape
+    reduced = resampling.resampled(masks, (min(texels[0], shape[0]), min(texels[1], shape[1])))
+    by, bx = (
+        resampling.reading_matrix(t, p) for t, p in zip(reduced.shape[1:], shape, strict=True)
+    )
+    products = np.zeros((len(masks), len(names), len(names)))
+    for i, first in enumerate(names):
+        for j, second in enumerate(names[: i + 1]):
+            a, b = data[first], data[second]
+            both = (a.weight > 0) & (b.weight > 0)
+            shared = a.variance if i == j else base.variance
+            dot = (a.values.astype(np.float64) * b.values - shared).sum(axis=2) * both
+            small = (by.T @ dot) @ bx
+            products[:, i, j] = products[:, j, i] = np.tensordot(reduced, small, axes=2)
+    rows = np.zeros((len(names), len(masks)))
+    for z, gram in enumerate(products):
+        values, vectors = np.linalg.eigh(gram)
+        if values[-1] > 0:
+            rows[:, z] = vectors[:, -1]
+    return _scaled({name: rows[i] for i, name in enumerate(names)})
+
+
+def _limited(rows: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Return weights divided by the largest of all, by size, where that is above 1."""
+    largest = max(1.0, *(float(np.abs(row).max()) for row in rows.values()))
+    return {name: row / largest for name, row in rows.items()}
+
+
+def _scaled(rows: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Return weights whose largest, by size, is 1 in each zone; zones of zeros stay."""
+    table = np.stack(list(rows.values()))
+    largest = np.take_along_axis(table, np.abs(table).argmax(axis=0)[None], axis=0)[0]
+    table = table / np.where(largest == 0, 1.0, largest)
+    return dict(zip(rows, table, strict=True))

@@ -1,0 +1,270 @@
+"""Weights of zones that show an expression best: eight unknowns, bounded, with their errors.
+
+With the wrinkle map W read at full resolution, an expression's difference from neutral is linear
+in the weights, and masks are read bilinearly: the normal equations of all weights follow from one
+scalar image, |W|^2, gathered at the masks' resolution.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from model import texture_resampling as resampling
+from reconstruction.wrinkles.texels import gathered, normal_matrix
+
+Floats: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
+
+MOST_STDERR = 0.5
+"""A weight that is known no better tells nothing about [0, 1]."""
+BLOCKS = 16
+"""Squares a side into which the face is cut to see how misfit scatters."""
+SINGULAR = 1e-9
+"""Eigenvalues of the scaled normal matrix below this leave a weight undetermined."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """An expression's derivatives less the neutral ones.
+
+    Attributes
+    ----------
+    values, variance : ndarray, shape (H, W, 2), float32
+        0 where not valid; variance 0 everywhere when no error is known.
+    weight : ndarray, shape (H, W), float32
+        Of the pixel in sums of squares; 0 where not valid.
+    """
+
+    values: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    weight: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class ZoneWeights:
+    """Weights of zones that show one expression best, given wrinkle map and masks.
+
+    Attributes
+    ----------
+    weights : ndarray, shape (Z,)
+        Within the bounds; 0 where not valid.
+    stderr : ndarray, shape (Z,)
+        As without bounds: the larger of what the normals' stated errors and what the scatter of
+        the misfit over the face lead to. Infinite where nothing determines the weight. The
+        wrinkle map counts as known.
+    valid : ndarray of bool, shape (Z,)
+        Determined, with a standard error below `MOST_STDERR`.
+    at_bound : ndarray of bool, shape (Z,)
+    covariance : ndarray, shape (Z, Z)
+        Of the normals' stated errors alone; 0 for weights that are not determined.
+    explained : float
+        1 - |misfit|^2 / |difference from neutral|^2 over the valid pixels; 0 where there is no
+        difference. Noise is not explained: see `noise_fraction`.
+    noise_fraction : float
+        Part of |difference|^2 that the normals' stated errors account for.
+    """
+
+    weights: Floats
+    stderr: Floats
+    valid: Bools
+    at_bound: Bools
+    covariance: Floats
+    explained: float
+    noise_fraction: float
+
+
+@dataclass(frozen=True, slots=True)
+class ZoneEquations:
+    """Normal equations N w = b of the zones' weights of one expression.
+
+    Attributes
+    ----------
+    matrix, vector : ndarray, shapes (Z, Z) and (Z,)
+    noise : ndarray, shape (Z, Z)
+        Covariance of `vector` by the stated errors.
+    total, expected : float
+        Weighted sum of squared differences, and the part that stated errors add to it.
+    """
+
+    matrix: Floats
+    vector: Floats
+    noise: Floats
+    total: float
+    expected: float
+
+    def misfit(self, weights: Floats) -> float:
+        """Return the weighted sum of squares that weights leave, at least 0."""
+        left = self.total - 2.0 * weights @ self.vector + weights @ self.matrix @ weights
+        return max(float(left), 0.0)
+
+    def determined(self) -> Bools:
+        """Return which weights the equations hold fast, (Z,)."""
+        diagonal = np.diag(self.matrix)
+        some = diagonal > SINGULAR * diagonal.max(initial=0.0)
+        if not some.any():
+            return some
+        values, vectors = np.linalg.eigh(self._scaled(some))
+        loose = vectors[:, values < SINGULAR * values[-1]]
+        fast = some.copy()
+        fast[some] = (np.abs(loose) < 1e-6).all(axis=1)
+        return fast
+
+    def _scaled(self, some: Bools) -> Floats:
+        part = self.matrix[np.ix_(some, some)]
+        root = np.sqrt(np.diag(part))
+        return part / np.outer(root, root)
+
+    def inverse(self) -> Floats:
+        """Return the pseudo-inverse of the matrix; rows of undetermined weights mean nothing."""
+        diagonal = np.diag(self.matrix)
+        root = np.sqrt(np.where(diagonal > SINGULAR * diagonal.max(initial=0.0), diagonal, np.inf))
+        scaled = self.matrix / np.outer(root, root)
+        return np.linalg.pinv(scaled, rcond=SINGULAR, hermitian=True) / np.outer(root, root)
+
+    def least(self, bounds: tuple[float, float]) -> Floats:
+        """Return the weights within bounds that leave least; 0 for zones without a wrinkle."""
+        diagonal = np.diag(self.matrix)
+        some = diagonal > SINGULAR * diagonal.max(initial=0.0)
+        weights = np.zeros(len(diagonal))
+        if not some.any():
+            return weights
+        root = np.sqrt(diagonal[some])
+        values, vectors = np.linalg.eigh(self._scaled(some))
+        kept = values > SINGULAR * values[-1]
+        factor = np.sqrt(values[kept])[:, None] * vectors[:, kept].T
+        target = (vectors[:, kept].T @ (self.vector[some] / root)) / np.sqrt(values[kept])
+        if not math.isfinite(bounds[0]):
+            scaled, *_ = np.linalg.lstsq(factor, target, rcond=None)
+        else:
+            limits = bounds[0] * root, bounds[1] * root
+            scaled = lsq_linear(factor, target, bounds=limits, method="bvls").x
+        weights[some] = scaled / root
+        return np.clip(weights, *bounds)
+
+
+def zone_equations(
+    masks: NDArray[np.floating], wrinkle: NDArray[np.floating], difference: Difference
+) -> ZoneEquations:
+    """Return the normal equations of one expression's weights.
+
+    Parameters
+    ----------
+    masks : ndarray, shape (Z, h, w)
+    wrinkle : ndarray, shape (H, W, 2)
+        At the resolution of the difference.
+    difference : Difference
+    """
+    return equations_of(masks, wrinkle, {"": difference})[""]
+
+
+def equations_of(
+    masks: NDArray[np.floating], wrinkle: NDArray[np.floating], data: Mapping[str, Difference],
+    *, with_noise: bool = True,
+) -> dict[str, ZoneEquations]:  # fmt: skip
+    """Return the normal equations of several expressions' weights for the same wrinkle map.
+
+    Parameters
+    ----------
+    masks, wrinkle
+        As of :func:`zone_equations`.
+    data : mapping of str to Difference
+    with_noise : bool
+        False leaves `noise` at 0, which weights do not need.
+    """
+    shape = next(iter(data.values())).weight.shape
+    masks = resampling.resampled(
+        masks, (min(masks.shape[1], shape[0]), min(masks.shape[2], shape[1]))
+    )
+    h, w = masks.shape[1:]
+    by, bx = (resampling.reading_matrix(t, p) for t, p in zip((h, w), shape, strict=True))
+    flat = masks.reshape(len(masks), -1)
+
+    def squares(image: Floats) -> Floats:
+        return np.asarray(flat @ (normal_matrix(by, bx, image, (h, w)) @ flat.T))
+
+    energy = np.einsum("hwc,hwc->hw", wrinkle, wrinkle)
+    weight: NDArray[np.float32] | None = None
+    matrix = np.zeros((len(masks), len(masks)))
+    found = {}
+    for name, one in data.items():
+        v = one.weight.astype(np.float64)
+        if weight is None or not np.array_equal(weight, one.weight):
+            weight, matrix = one.weight, squares(energy * v)
+        agreement = np.einsum("hwc,hwc->hw", wrinkle, one.values) * v
+        total = np.einsum("hwc,hwc->hw", one.values, one.values, dtype=np.float64)
+        noise = np.zeros_like(matrix)
+        if with_noise and one.variance.any():
+            scatter = np.einsum("hwc,hwc,hwc->hw", wrinkle, wrinkle, one.variance)
+            noise = squares(scatter * v * v)
+        found[name] = ZoneEquations(
+            matrix,
+            flat @ gathered(by, bx, agreement).ravel(),
+            noise,
+            float((v * total).sum()),
+            float((v * one.variance.sum(axis=2)).sum()),
+        )
+    return found
+
+
+def zone_weights(
+    masks: Floats,
+    wrinkle: NDArray[np.floating],
+    difference: Difference,
+    bounds: tuple[float, float],
+) -> ZoneWeights:
+    """Return the bounded weights of one expression with their errors.
+
+    Parameters
+    ----------
+    masks, wrinkle, difference
+        As of :func:`zone_equations`.
+    bounds : (float, float)
+    """
+    equations = zone_equations(masks, wrinkle, difference)
+    fast = equations.determined()
+    weights = np.where(fast, equations.least(bounds), 0.0)
+    inverse = equations.inverse()
+    covariance = inverse @ equations.noise @ inverse
+    seen = inverse @ _scatter(masks, wrinkle, difference, weights) @ inverse
+    variance = np.maximum(np.diag(covariance), np.diag(seen))
+    stderr = np.where(fast, np.sqrt(np.maximum(variance, 0.0)), np.inf)
+    covariance[~fast] = 0.0
+    covariance[:, ~fast] = 0.0
+    valid = fast & (stderr < MOST_STDERR)
+    weights[~valid] = 0.0
+    total = equations.total
+    return ZoneWeights(
+        weights, stderr, valid, valid & np.isin(weights, bounds), covariance,
+        1.0 - equations.misfit(weights) / total if total > 0 else 0.0,
+        equations.expected / total if total > 0 else 0.0,
+    )  # fmt: skip
+
+
+def _scatter(
+    masks: Floats, wrinkle: NDArray[np.floating], difference: Difference, weights: Floats
+) -> Floats:
+    """Return the covariance of the equations' right side that the misfit shows, block by block.
+
+    Misfit of a model is even over furrows, not independent from pixel to pixel; its sums over
+    squares of the face nearly are.
+    """
+    shape = difference.weight.shape
+    size = (shape[0], shape[1])
+    strength = resampling.resampled(np.tensordot(weights, masks, axes=1), size)
+    left = difference.values - strength[..., None] * wrinkle
+    score = np.einsum("hwc,hwc->hw", wrinkle, left) * difference.weight
+    rows, columns = (np.arange(min(BLOCKS, n)) * n // min(BLOCKS, n) for n in size)
+    sums = []
+    for mask in masks:
+        image = resampling.resampled(mask, size) * score
+        sums.append(np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1).ravel())
+    blocks = np.stack(sums)
+    count = max(int(np.count_nonzero(np.abs(blocks).sum(axis=0))), 1)
+    return blocks @ blocks.T * (count / max(count - 1, 1))

@@ -1,0 +1,286 @@
+"""Zones of wrinkles found in the data: where expressions raise wrinkles in the same proportions.
+
+Within a texel of the masks, eq. D_e(x) = a_e W(x) says that the expressions' differences are one
+pattern times a number each: their matrix of products has rank one. Its leading direction is the
+texel's amplitudes a_e, up to a common scale and sign; texels with the same amplitudes form a zone.
+What the data cannot tell: the scale of a zone against its wrinkle map, and two zones whose weights
+are proportional (left and right of a face), which only their places or a first layout keep apart.
+
+References
+----------
+Jimenez, Echevarria, Oat, Gutierrez 2011, Practical and Realistic Facial Wrinkles Animation,
+GPU Pro 2, chapter 1 (zones of figure 1.3, which an artist drew). ISBN 978-1-56881-718-7
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+from scipy.ndimage import distance_transform_edt
+
+from model.texture_resampling import averaging_matrix
+from model.wrinkles import Masks, WrinkleError, mask_stack
+from reconstruction.wrinkles.fit import Measured, differences
+from reconstruction.wrinkles.texels import derivatives_of
+
+Floats: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
+
+LEAST_SIGNAL = 3.0
+"""A texel's pattern counts when its energy is so many times the scatter that stated errors lead
+to: their variance over the square root of pixels an expression."""
+LEAST_ENERGY = 1e-3
+"""And so large a part of the strongest texel's."""
+ROUNDS = 40
+STEPS = 60
+PRIOR = 0.03
+"""Weight of the first layout, against the data of a texel well above noise."""
+ALIKE = 0.98
+"""Cosine above which two zones' weights count as proportional."""
+
+
+@dataclass(frozen=True, slots=True)
+class Amplitudes:
+    """How strongly each expression shows a texel's wrinkles.
+
+    Attributes
+    ----------
+    values : ndarray, shape (E, h, w)
+        Largest by size 1 in each texel; 0 where not valid.
+    energy : ndarray, shape (h, w)
+        Mean square of the pattern at amplitude 1, errors taken off.
+    rank_one_share : ndarray, shape (h, w)
+        Part of the expressions' squares in the texel that one pattern explains; 0 where not valid.
+    valid : ndarray of bool, shape (h, w)
+        Some expression moves the texel beyond its errors.
+    names : tuple of str
+        The expressions.
+    """
+
+    values: Floats
+    energy: Floats
+    rank_one_share: Floats
+    valid: Bools
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ZoneFit:
+    """Masks found in the data.
+
+    Attributes
+    ----------
+    masks : ndarray, shape (Z, h, w), float32
+        At least 0, with a sum of 1 in every texel.
+    weights : mapping of str to tuple of float
+        A row an expression; the scale of a zone is that of its amplitudes.
+    valid : ndarray of bool, shape (h, w)
+        The data speak for the texel's mask; elsewhere it is the layout's.
+    rank_one_share : float
+        Part of all squares that one pattern a texel explains: how far the premise of one wrinkle
+        map holds at all.
+    explained : float
+        Part of the amplitudes' squares that the masks explain, by energy.
+    distinct : int
+        Zones whose weights are not proportional to another's: what the data alone tell apart.
+    """
+
+    masks: NDArray[np.float32]
+    weights: Mapping[str, tuple[float, ...]]
+    valid: Bools
+    rank_one_share: float
+    explained: float
+    distinct: int
+
+
+def amplitudes(
+    neutral: Measured, expressions: Mapping[str, Measured], *, size: tuple[int, int] = (64, 64)
+) -> Amplitudes:
+    """Return the rank-one amplitudes of expressions in each texel of the masks.
+
+    Parameters
+    ----------
+    neutral : array_like (H, W, 3), NormalMaps, or Derivatives
+    expressions : mapping of str to the same
+        At least one.
+    size : (int, int)
+        Rows and columns of texels, at most those of the normals.
+    """
+    if not expressions:
+        raise WrinkleError("expressions: got none, expected at least one")
+    base = derivatives_of(neutral)
+    shape = base.valid.shape
+    if size[0] > shape[0] or size[1] > shape[1] or min(size) < 1:
+        raise WrinkleError(f"size: got {size}, expected 1 to {shape} texels")
+    data = differences(base, expressions)
+    names = tuple(data)
+    ay, ax = averaging_matrix(shape[0], size[0]), averaging_matrix(shape[1], size[1])
+    seen = np.logical_and.reduce([one.weight > 0 for one in data.values()])
+    part = (ay @ seen.astype(np.float64)) @ ax.T
+    count = len(names)
+    gram, noise = np.zeros((*size, count, count)), np.zeros(size)
+    for i, first in enumerate(names):
+        for j, second in enumerate(names[: i + 1]):
+            a, b = data[first], data[second]
+            shared = a.variance if i == j else base.variance
+            dot = (a.values.astype(np.float64) * b.values - shared).sum(axis=2) * seen
+            mean = (ay @ dot) @ ax.T / np.maximum(part, 1e-12)
+            gram[..., i, j] = gram[..., j, i] = mean
+        noise = np.maximum(noise, (ay @ (a.variance.sum(axis=2) * seen)) @ ax.T)
+    values, vectors = np.linalg.eigh(gram)
+    leading, trace = np.maximum(values[..., -1], 0.0), np.trace(gram, axis1=2, axis2=3)
+    direction = np.moveaxis(vectors[..., -1], -1, 0)
+    peak = np.take_along_axis(direction, np.abs(direction).argmax(axis=0)[None], axis=0)
+    energy = leading * peak[0] ** 2
+    valid = (part > 0.1) & (leading > 0) & (energy >= LEAST_ENERGY * energy.max(initial=0.0))
+    pixels = np.maximum(part * seen.size / (size[0] * size[1]), 1.0)
+    valid &= energy > LEAST_SIGNAL * noise * np.sqrt(count / pixels)
+    amplitude = np.where(valid, direction / np.where(peak == 0, 1.0, peak), 0.0)
+    share = np.divide(leading, np.maximum(trace, leading), out=np.zeros_like(leading), where=valid)
+    return Amplitudes(amplitude, np.where(valid, energy, 0.0), share, valid, names)
+
+
+def fit_zones(
+    found: Amplitudes,
+    *,
+    zones: int = 8,
+    layout: Masks | None = None,
+    place_weight: float = 1.0,
+    rng: np.random.Generator,
+) -> ZoneFit:
+    """Return masks of zones, from a first layout or from amplitudes and places alone.
+
+    Parameters
+    ----------
+    found : Amplitudes
+    zones : int
+        How many, without a layout.
+    layout : array_like, shape (Z, h, w), optional
+        Rough regions at the resolution of the amplitudes, e.g. an artist's; they are refined, and
+        kept where the data are silent.
+    place_weight : float
+        Without a layout: how much a way across the whole face counts against opposite
+        amplitudes. 0 joins left and right.
+    rng
+        Draws the first centres, without a layout.
+    """
+    shape = found.valid.shape
+    if not found.valid.any():
+        raise WrinkleError("amplitudes: got no texel with a wrinkle, expected some")
+    if layout is None:
+        start = _clustered(found, zones, place_weight, rng)
+    else:
+        start = mask_stack(layout).astype(np.float64)
+        if start.shape[1:] != shape:
+            raise WrinkleError(f"layout: got {start.shape[1:]} texels, expected {shape}")
+        start = np.maximum(start, 0.0)
+        total = start.sum(axis=0)
+        start = np.where(total > 0, start / np.where(total > 0, total, 1.0), 1.0 / len(start))
+    count = len(start)
+    prior = start.reshape(count, -1).T
+    target = found.values.reshape(len(found.names), -1).T
+    strength = found.energy.ravel()
+    relative = strength / strength[strength > 0].mean()
+    trust = np.where(found.valid.ravel(), relative / (relative + 0.1), 0.0)
+    masks = prior.copy()
+    weights = np.zeros((count, target.shape[1]))
+    for _ in range(ROUNDS):
+        before = weights
+        weights = _weights_of(masks, target, strength)
+        masks = _on_simplex_fit(masks, prior, target, weights, trust)
+        if np.abs(weights - before).max() < 1e-5:
+            break
+    left = (strength[:, None] * (target - masks @ weights) ** 2).sum()
+    whole = (strength[:, None] * target**2).sum()
+    squares = strength / np.maximum(found.rank_one_share.ravel(), 1e-12)
+    squares *= (target**2).sum(axis=1)
+    return ZoneFit(
+        masks.T.reshape(count, *shape).astype(np.float32),
+        {name: tuple(map(float, weights[:, e])) for e, name in enumerate(found.names)},
+        found.valid,
+        float((strength * (target**2).sum(axis=1)).sum() / squares.sum()),
+        float(1.0 - left / whole),
+        _distinct(weights),
+    )
+
+
+def _clustered(
+    found: Amplitudes, zones: int, place_weight: float, rng: np.random.Generator
+) -> Floats:
+    """Return regions (Z, h, w) by k-means of amplitudes and places; silent texels go to the near.
+
+    The best of several seeded starts is taken.
+    """
+    h, w = found.valid.shape
+    y, x = np.mgrid[:h, :w]
+    places = np.stack([(x + 0.5) / w, (y + 0.5) / h], axis=-1)
+    good = found.valid
+    if zones < 1 or zones > np.count_nonzero(good):
+        raise WrinkleError(
+            f"zones: got {zones}, expected 1 to {np.count_nonzero(good)} texels with a wrinkle"
+        )
+    features = np.concatenate([found.values[:, good].T, 2.0 * place_weight * places[good]], axis=1)
+    best, least = None, np.inf
+    for _ in range(8):
+        centres, label = kmeans2(features, zones, iter=30, minit="++", seed=rng, missing="warn")
+        cost = float((found.energy[good] * ((features - centres[label]) ** 2).sum(axis=1)).sum())
+        if cost < least:
+            best, least = label, cost
+    assert best is not None  # noqa: S101
+    near = distance_transform_edt(~good, return_distances=False, return_indices=True)
+    labels = np.zeros((h, w), int)
+    labels[good] = best
+    labels = labels[near[0], near[1]]
+    return (labels == np.arange(zones)[:, None, None]).astype(np.float64)
+
+
+def _weights_of(masks: Floats, target: Floats, strength: Floats) -> Floats:
+    """Return weights (Z, E) by least squares over texels; a little held to plain averages."""
+    counted = masks * strength[:, None]
+    mass = counted.sum(axis=0)
+    mean = (counted.T @ target) / np.maximum(mass, 1e-300)[:, None]
+    ridge = 1e-3 * mass + 1e-12 * mass.max()
+    return np.linalg.solve(
+        counted.T @ masks + np.diag(ridge), counted.T @ target + ridge[:, None] * mean
+    )
+
+
+def _on_simplex_fit(
+    masks: Floats, prior: Floats, target: Floats, weights: Floats, trust: Floats
+) -> Floats:
+    """Return each texel's shares m >= 0 with sum 1: least trust |a - m w|^2 + PRIOR |m - prior|^2.
+
+    Projected gradient; every texel has the same matrix up to its trust.
+    """
+    gram = weights @ weights.T
+    scale = 1.0 / (np.linalg.eigvalsh(gram)[-1] + PRIOR)
+    pull = target @ weights.T
+    for _ in range(STEPS):
+        slope = trust[:, None] * (masks @ gram - pull) + PRIOR * (masks - prior)
+        masks = _projected(masks - scale * slope)
+    return masks
+
+
+def _projected(v: Floats) -> Floats:
+    """Return the nearest points of the simplex, row by row (Held, Wolfe and Crowder 1974)."""
+    ordered = -np.sort(-v, axis=1)
+    sums = np.cumsum(ordered, axis=1) - 1.0
+    ranks = np.arange(1, v.shape[1] + 1)
+    last = (ordered - sums / ranks > 0).sum(axis=1)
+    shift = np.take_along_axis(sums, last[:, None] - 1, axis=1) / last[:, None]
+    return np.maximum(v - shift, 0.0)
+
+
+def _distinct(weights: Floats) -> int:
+    """Return how many directions the zones' weights have, proportional ones counted once."""
+    lengths = np.linalg.norm(weights, axis=1)
+    kept: list[Floats] = []
+    for row in weights[lengths > 1e-6] / lengths[lengths > 1e-6, None]:
+        if all(abs(float(row @ other)) < ALIKE for other in kept):
+            kept.append(row)
+    return len(kept)
